@@ -71,6 +71,8 @@ def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, tmp_path):
 def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="models without a sky"):
         train(tiny_scene, tmp_path / "run", RANDOM, "model.background=directions", "optimize.steps=2")
-    asked = load("smoke", [f"scene.path='{tiny_scene}'", RANDOM, "model.background=directions"])
+    asked = load(
+        "smoke", [f"scene.path='{tiny_scene}'", "optimize.background=transparent", "model.background=directions"]
+    )
     with pytest.raises(ConfigError, match="models without a sky"):
         describe(asked, tmp_path / "other", None, "new")

@@ -143,6 +143,9 @@ def test_a_list_is_not_refused_for_what_is_known_when_cameras_are(photos, caplog
     out = photos.parent / "runs" / "a"
     check_split(asked, asked.preparation(out), out)
     assert "HEIC" not in caplog.text, "the step that leaves it out says so"
+    apart = "scene={train: {every: 2}, validation: {names: ['02', '05']}}"
+    left_out = load("photos", [apart, f"scene.path='{photos}'"])
+    check_split(left_out, left_out.preparation(out), out)
     told = describe(asked, out, None, "new")
     assert "if all 23 photographs are placed, the run is refused:" in told
     assert "'00.png' is held out for testing" in told

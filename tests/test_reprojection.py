@@ -31,6 +31,8 @@ from tests.yards import Yard
 VECTOR = np.array([1.2, -0.9])  # px, 1.5 long
 OFFSET = np.array([0.1, 0.2, 0.3])
 
+STATE = ("status.json", "log.txt")  # which tell of the refusal
+
 
 def missing(folder: Path, vector: np.ndarray, rng: np.random.Generator, exact: tuple[str, ...] = ()) -> Path:
     """Write a yard whose photographs show all points so far from where cameras do, but for some photographs."""
@@ -144,11 +146,24 @@ def test_a_sky_that_may_be_chosen_is_off_beside_what_it_does_not_go_with(of_step
     assert f"model.background: off, since {reason}" in caplog.messages
 
 
-def test_poses_beside_a_sky_are_refused_before_the_first_stage(tmp_path, rng):
-    folder = missing(tmp_path / "scene", VECTOR, rng)
-    sets = ["optimize.poses={start: 1}", "model.background=directions"]
+def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
     with pytest.raises(ConfigError, match="not learned together with poses"):
-        describe(load("smoke", [f"scene.path='{folder}'", *sets]), tmp_path / "run", None, "new")
+        load("smoke", ["optimize.poses={start: 1}", "model.background=directions"])
+    load("photos", ["model.background=directions"])  # whose choices may learn poses
+
+
+@pytest.mark.slow
+def test_poses_that_are_chosen_beside_a_sky_are_refused_before_anything_changes(tmp_path, rng):
+    folder, out = missing(tmp_path / "scene", VECTOR, rng), tmp_path / "run"
+    asked = [f"scene.path='{folder}'", *FEW]
+    run_pipeline(load("smoke", asked), out, None, "new")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name not in STATE}
+    choice = "{keys: [optimize.poses], by: photographs, values: [[0, {start: 1}]], since: x}"
+    both = load("smoke", [*asked, f"choices=[{choice}]", "model.background=directions"])
+    for begin in (describe, run_pipeline):
+        with pytest.raises(ConfigError, match="not learned together with poses"):
+            begin(both, out, None, "restart")
+    assert {path: path.read_bytes() for path in before} == before
 
 
 @pytest.mark.slow

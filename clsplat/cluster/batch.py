@@ -24,6 +24,7 @@ from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import plan, prepare
 from clsplat.runs.failures import Failures
+from clsplat.runs.unprepared import check_split
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.stages.training import Training
 
@@ -166,7 +167,10 @@ def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
     settings = cell.pipeline.settings
     if settings.prepare:
         folder = settings.scene.folder
-        prepare(plan(settings.prepare, folder, store.prepared), folder, store.prepared)
+        planned = plan(settings.prepare, folder, store.prepared)
+        if any(one.why for one in planned):
+            check_split(cell.pipeline, planned, store.prepared.parent / cell.name)
+        prepare(planned, folder, store.prepared)
     known = scenes.known(cell.pipeline)
     need = Need.of(cell.pipeline, known.scene) if known.scene else None
     own = Cell.of(cell.name, cell.pipeline, known.digest, bits="")

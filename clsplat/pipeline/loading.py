@@ -14,6 +14,7 @@ from clsplat.density.edit import Rule
 from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.names import PREPARED
+from clsplat.pipeline.behind import check_behind
 from clsplat.pipeline.choosing import check_choices, check_keeping, held, overridden
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
@@ -118,10 +119,8 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
     _check_order(path, settings)
     _check_screen_filter(path, settings)
     try:
-        check_keeping(settings)
-        check_choices(settings)
-        check_moving(settings)
-        check_on_host(settings)
+        for check in (check_keeping, check_choices, check_behind, check_moving, check_on_host):
+            check(settings)
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
     return settings.model_copy(update={"plugins": plugins.used_by(_kinds(settings))})

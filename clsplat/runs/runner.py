@@ -52,11 +52,12 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> Lost:
 
     Return which files of an earlier end are lost.
     """
-    taken = None
+    taken = restore(pipeline, run) if start == "resume" else None
+    for stage in pipeline.stages[run.cursor :]:
+        stage.check_in(run)
     if start == "restart":
         clear(run.status)
     if start == "resume":
-        taken = restore(pipeline, run)
         LOG.info("resumed at step %d" if taken else "nothing to resume; starting from the beginning%.0s", run.step)
     run.status.enter("running", step=run.step)  # a refusal leaves all as it was; from here on files change
     lost = keep_checksums(Course(pipeline, run.out, run), run)

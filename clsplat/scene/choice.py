@@ -85,9 +85,9 @@ class Choice(Settings):
         if self.every is not None:
             return []
         place, listed = self._listed(folders)
-        own = _Ends(names)
+        own, held_out = _Ends(names), {*tested}
         found = {name: own.indices_of(name) for name in listed}
-        if name := next((one for one in listed if found[one] and {names[i] for i in found[one]} <= {*tested}), None):
+        if name := next((one for one in listed if found[one] and {names[i] for i in found[one]} <= held_out), None):
             raise _held_out(place, name)
         if name := next((one for one in listed if not found[one]), None):
             raise _unknown(name, names, place)
@@ -183,4 +183,4 @@ def _unknown(listed: str, names: Sequence[str], place: str) -> DataError:
     more = (
         f"did you mean {quoted(near[0])}?" if near else f"the first is {quoted(names[0])}: correct or remove the name"
     )
-    return DataError(f"{place}: no photograph is called {quoted(listed)}; {more}")
+    return OfPlaced(f"{place}: no photograph is called {quoted(listed)}; {more}")

@@ -17,7 +17,7 @@ from clsplat.stages.densify import Densify
 from clsplat.stages.keeping import Keeping
 from clsplat.stages.progress import report
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.backgrounds import Behind, drawn_backgrounds, require_no_sky_behind
+from clsplat.training.backgrounds import Behind, drawn_backgrounds, is_drawn, require_no_sky_behind
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.depths import known_depths
 from clsplat.training.distractors import photograph_distractors
@@ -103,11 +103,13 @@ class Optimize(Keeping):
     def check_in(self, run: Run) -> None:
         if self.poses and self.poses.focal:
             require_zoom(run.original)
-        sky = will_learn_sky(run)
-        if self.poses:
-            require_no_sky(sky)
-        if self.background == "random":
-            require_no_sky_behind(sky)
+        if will_learn_sky(run):
+            self.check_beside_a_sky(drawn=is_drawn(self.background, run.scene))
+
+    def check_beside_a_sky(self, drawn: bool) -> None:
+        """Raise ConfigError for what does not go with a sky; drawn: whether steps draw what is behind everything."""
+        require_no_sky(self.poses is not None)
+        require_no_sky_behind(drawn)
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""

@@ -4,6 +4,7 @@ import logging
 from typing import Literal
 
 from clsplat.errors import ConfigError
+from clsplat.scene.scene import Scene
 from clsplat.scene.transparency import background_shows
 from clsplat.training.run import Run
 from clsplat.views.backgrounds import Backgrounds
@@ -17,20 +18,25 @@ def drawn_backgrounds(setting: Behind, run: Run) -> Backgrounds | None:
 
     The photographs of the run keep their transparency for them.  Raises ConfigError for a model with a sky.
     """
+    drawn = is_drawn(setting, run.scene)
     if setting == "transparent":
-        shows = background_shows(run.scene)
-        setting = "random" if shows else "scene"
-        LOG.info("background of the steps: %s, since %s shows behind photographs", setting, "it" if shows else "none")
-    if setting == "scene":
+        now, what = ("random", "it") if drawn else ("scene", "none")
+        LOG.info("background of the steps: %s, since %s shows behind photographs", now, what)
+    if not drawn:
         return None
-    require_no_sky_behind(run.sky is not None)
+    require_no_sky_behind(drawn=run.sky is not None)
     run.photographs.keep_transparency()
     return Backgrounds(run.device, run.seed)
 
 
-def require_no_sky_behind(sky: bool) -> None:
-    """Raise ConfigError where the model has a sky."""
-    if sky:
+def is_drawn(setting: Behind, scene: Scene) -> bool:
+    """Whether steps draw what is behind everything; `transparent`: where it shows behind photographs."""
+    return setting == "random" or (setting == "transparent" and background_shows(scene))
+
+
+def require_no_sky_behind(drawn: bool) -> None:
+    """Raise ConfigError where backgrounds are drawn beside a sky."""
+    if drawn:
         raise ConfigError(
             "optimize.background: a drawn one is for models without a sky; leave model.background out, or set "
             "optimize.background to scene"
