@@ -245,6 +245,7 @@ DIFFERENCES = {
         *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),
         *(f"densify~2.rules.prune_useless.{key}" for key in ("of_all", "of_view")),
         *("densify.rules.clone.size_below", "views.resolution.until", "steps"),
+        *("losses.l1.weight", "losses.l2", "losses.l2.weight"),
     },
     ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
     ("mip_splatting_7k", "dash_mip_7k"): DASH | {"refresh_filter.start"},
