@@ -122,18 +122,21 @@ def test_the_device_stands_before_the_command_or_after_it(finished):
     assert "no device matches 'x:²'" in clsplat("--device", "x:²", "evaluate", finished, expect=4).stderr
 
 
-JSON = ["check smoke --json", "check --schema", "devices --json", "pipelines --json", "pipelines splat --json",
-        "status RUN --json", "evaluate RUN", "evaluate RUN/point_cloud.ply --scene SCENE", "inspect SCENE --json",
-        "bench --scenes , --model RUN/point_cloud.ply --scene SCENE --repeats 1 --json",
-        "pipelines smoke --copy FILE --json"]  # fmt: skip
+JSON = ["check smoke --json", "check --schema", "pipelines --json", "pipelines splat --json", "status RUN --json",
+        "inspect SCENE --json", "pipelines smoke --copy FILE --json"]  # fmt: skip
+JSON_OF_DEVICES = ["devices --json", "evaluate RUN", "evaluate RUN/point_cloud.ply --scene SCENE",
+                   "bench --scenes , --model RUN/point_cloud.ply --scene SCENE --repeats 1 --json"]  # fmt: skip
 
 
-@pytest.mark.parametrize("arguments", JSON)
-def test_json_is_all_that_stdout_holds(arguments, finished, tiny_scene, tmp_path):
+@pytest.mark.parametrize(
+    ("run", "arguments"),
+    [*((clsplat, line) for line in JSON), *((process, line) for line in JSON_OF_DEVICES)],  # whose runtimes print too
+)
+def test_json_is_all_that_stdout_holds(run, arguments, finished, tiny_scene, tmp_path):
     places = {"RUN": str(finished), "SCENE": str(tiny_scene), "FILE": str(tmp_path / "x.yaml")}
     for name, place in places.items():
         arguments = arguments.replace(name, place)
-    assert json.loads(process(*arguments.split()).stdout)
+    assert json.loads(run(*arguments.split()).stdout)
 
 
 def test_pipelines_lists_every_recipe_on_a_line():
