@@ -14,7 +14,6 @@ from clsplat.density.edit import Rule
 from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.names import PREPARED
-from clsplat.pipeline.behind import check_behind
 from clsplat.pipeline.choosing import check_choices, check_keeping, held, overridden
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
@@ -24,6 +23,7 @@ from clsplat.pipeline.on_host import check_on_host
 from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
 from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.settable import CADENCE, settable
+from clsplat.pipeline.sky import check_sky
 from clsplat.pipeline.yaml_file import Document, read_yaml, yaml_text
 from clsplat.prepare.cache import Planned, plan
 from clsplat.settings import Settings, variants
@@ -119,7 +119,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
     _check_order(path, settings)
     _check_screen_filter(path, settings)
     try:
-        for check in (check_keeping, check_choices, check_behind, check_moving, check_on_host):
+        for check in (check_keeping, check_choices, check_sky, check_moving, check_on_host):
             check(settings)
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
@@ -204,8 +204,8 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
 
 def _late(stages: Sequence[Stage], need: str) -> str:
     """Say of a part what should make it during a training, but does not act; "" where there is none."""
-    for training in (stage for stage in stages if isinstance(stage, Training)):
-        for inner in training.during:
+    for training in stages:
+        for inner in training.during if isinstance(training, Training) else ():
             if need in inner.makes:
                 cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
                 return f"{cadence}; the training ends before: set {inner.stage}.start earlier, or use --minutes"

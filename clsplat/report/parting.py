@@ -8,7 +8,7 @@ from clsplat.training.run import Run
 
 REMEDY = (
     "More photographs, from places between these, help most; `scene.validation: auto` with `optimize.keep: best`, in a "
-    "pipeline without `take_average` such as splat_7k, keeps the model that is best elsewhere. More steps do not help."
+    "pipeline without `take_average` such as splat_7k, keeps the model that is best elsewhere."
 )
 
 

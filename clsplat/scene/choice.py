@@ -1,7 +1,7 @@
 """A choice of a scene's views by their names: every n-th, a list, or the lines of a file."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
@@ -15,7 +15,6 @@ from clsplat.scene.scene import every_nth
 from clsplat.settings import ReadPath, Settings, in_one_sentence
 
 LOG = logging.getLogger("clsplat")
-Indices = dict[tuple[str, ...], list[int]]
 LARGEST = 1 << 24  # bytes of a list of names
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
@@ -130,9 +129,10 @@ class _Ends:
 
     def __init__(self, names: Sequence[str]):
         paths = [PurePosixPath(name) for name in names]
+        stems = [path.with_suffix("") for path in paths]
         self._at = {name: i for i, name in reversed([*enumerate(names)])}
-        self._ends, self._stems = _by_end(paths), _by_end([path.with_suffix("") for path in paths])
-        self._whole = _by_whole([path.with_suffix("") for path in paths])
+        self._ends, self._stems = _grouped(_ends_of(paths)), _grouped(_ends_of(stems))
+        self._whole = _grouped((stem.parts, i) for i, stem in enumerate(stems))
 
     def indices_of(self, listed: str) -> list[int]:
         """Return the indices of names that a listed one means, whole or as an end, with or without its suffix.
@@ -146,18 +146,16 @@ class _Ends:
         return self._ends.get(wanted.parts) or self._whole.get(stem) or self._stems.get(stem, [])
 
 
-def _by_whole(paths: Sequence[PurePosixPath]) -> Indices:
-    found: Indices = {}
-    for i, path in enumerate(paths):
-        found.setdefault(path.parts, []).append(i)
-    return found
+def _ends_of(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
+    """Each end of each path, the whole one too, with its index."""
+    return ((path.parts[first:], i) for i, path in enumerate(paths) for first in range(len(path.parts)))
 
 
-def _by_end(paths: Sequence[PurePosixPath]) -> Indices:
-    found: Indices = {}
-    for i, path in enumerate(paths):
-        for first in range(len(path.parts)):
-            found.setdefault(path.parts[first:], []).append(i)
+def _grouped(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ...], list[int]]:
+    """The indices of each of these."""
+    found: dict[tuple[str, ...], list[int]] = {}
+    for parts, i in indexed:
+        found.setdefault(parts, []).append(i)
     return found
 
 

@@ -17,13 +17,13 @@ from clsplat.stages.densify import Densify
 from clsplat.stages.keeping import Keeping
 from clsplat.stages.progress import report
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.backgrounds import Behind, drawn_backgrounds, is_drawn, require_no_sky_behind
+from clsplat.training.backgrounds import Behind, drawn_backgrounds, drawn_beside_a_sky, is_drawn
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.depths import known_depths
 from clsplat.training.distractors import photograph_distractors
 from clsplat.training.forecast import Forecast
 from clsplat.training.placing import more_room, place_harmonics
-from clsplat.training.poses import photograph_poses, require_no_sky, require_zoom, write_view_poses
+from clsplat.training.poses import photograph_poses, poses_beside_a_sky, require_zoom, write_view_poses
 from clsplat.training.profile import clocks
 from clsplat.training.rescue import finite_values
 from clsplat.training.run import Run
@@ -108,8 +108,10 @@ class Optimize(Keeping):
 
     def check_beside_a_sky(self, drawn: bool) -> None:
         """Raise ConfigError for what does not go with a sky; drawn: whether steps draw what is behind everything."""
-        require_no_sky(self.poses is not None)
-        require_no_sky_behind(drawn)
+        if self.poses:
+            raise poses_beside_a_sky()
+        if drawn:
+            raise drawn_beside_a_sky()
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""

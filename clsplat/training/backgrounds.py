@@ -24,7 +24,8 @@ def drawn_backgrounds(setting: Behind, run: Run) -> Backgrounds | None:
         LOG.info("background of the steps: %s, since %s shows behind photographs", now, what)
     if not drawn:
         return None
-    require_no_sky_behind(drawn=run.sky is not None)
+    if run.sky:
+        raise drawn_beside_a_sky()
     run.photographs.keep_transparency()
     return Backgrounds(run.device, run.seed)
 
@@ -34,10 +35,9 @@ def is_drawn(setting: Behind, scene: Scene) -> bool:
     return setting == "random" or (setting == "transparent" and background_shows(scene))
 
 
-def require_no_sky_behind(drawn: bool) -> None:
-    """Raise ConfigError where backgrounds are drawn beside a sky."""
-    if drawn:
-        raise ConfigError(
-            "optimize.background: a drawn one is for models without a sky; leave model.background out, or set "
-            "optimize.background to scene"
-        )
+def drawn_beside_a_sky() -> ConfigError:
+    """The error of backgrounds that are to be drawn with a model that has a sky."""
+    return ConfigError(
+        "optimize.background: a drawn one is for models without a sky; leave model.background out, or set "
+        "optimize.background to scene"
+    )

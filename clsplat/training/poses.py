@@ -38,7 +38,8 @@ def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPose
     if poses is None:
         learned = PhotographPoses(views, focals=focals)  # by a training before, whose model this one goes on with
         return learned if learned.begun(run.numbers) else None
-    require_no_sky(learned=run.sky is not None)
+    if run.sky:
+        raise poses_beside_a_sky()
     rates = poses.rates(last, len({view.name for view in views}))
     cameras = len({focals.cameras[view.name] for view in views})
     found = PhotographPoses(views, poses.start, *rates, replace(focals, rate=poses.focal_rate(last, cameras)))
@@ -49,13 +50,12 @@ def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPose
     return found
 
 
-def require_no_sky(learned: bool) -> None:
-    """Raise ConfigError where poses are learned beside a sky."""
-    if learned:
-        raise ConfigError(
-            "optimize.poses: the model has a sky, which is not learned together with poses; leave out optimize.poses, "
-            "or model.background"
-        )
+def poses_beside_a_sky() -> ConfigError:
+    """The error of poses that are to be learned with a model that has a sky."""
+    return ConfigError(
+        "optimize.poses: the model has a sky, which is not learned together with poses; leave out optimize.poses, "
+        "or model.background"
+    )
 
 
 def require_zoom(scene: Scene) -> None:

@@ -5,7 +5,7 @@ from clsplat.render.backdrops import Directions
 from clsplat.stages.optimize import Optimize
 
 
-def check_behind(settings: PipelineFile) -> None:
+def check_sky(settings: PipelineFile) -> None:
     """Raise ConfigError where poses are learned, or backgrounds drawn, beside colours by direction.
 
     A sky that `auto` may choose is left out there, by the run.
