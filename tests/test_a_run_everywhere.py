@@ -96,6 +96,13 @@ def test_the_summary_names_what_there_is(done, tiny_scene):
     assert {"init", "optimize", "evaluate", "export"} <= spent.keys()
 
 
+def test_the_summary_offers_no_more_steps_to_what_is_learnt_by_heart(done, tmp_path):
+    folder = shutil.copytree(done, tmp_path / "run")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    (folder / "metrics.json").write_text(json.dumps({**metrics, "by_heart": True}))
+    assert summary(folder)[-1].endswith("in a browser; the photographs are learnt by heart: more of them help most")
+
+
 def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):
     assert photographs_text(FOUND) == "32 of 33 photographs placed, 1.27 px; left out: IMG_0034.jpg"
     assert photographs_text({}) == photographs_text({"map_cameras": {"registered": "x"}}) == ""

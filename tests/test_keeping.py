@@ -15,7 +15,7 @@ from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
 from clsplat.report.charts import NAMES
-from clsplat.report.parting import parting
+from clsplat.report.parting import is_by_heart, parting
 from clsplat.runs.experiment import Job
 from clsplat.runs.refitting import as_trained
 from clsplat.runs.summary import summary
@@ -384,8 +384,10 @@ def test_a_run_without_validation_is_told_when_it_has_learnt_by_heart(tiny_scene
     plain = ("scene.validation=0", "optimize.keep=last", "optimize.steps=8")
     run = train(tiny_scene, tmp_path / "run", *plain, pipeline=pipeline)
     assert parting(run) == ""
+    assert not is_by_heart(run)
     run.records.add(8, "evaluate", split="train", downscale=1, psnr=40.0, ssim=1.0)
     run.records.write()
     assert "40.0 dB at training views" in parting(run)
     assert "dB at test views, more than 6 dB apart: the photographs are learnt by heart" in parting(run)
     assert "`scene.validation: auto` with `optimize.keep: best`" in parting(run)
+    assert is_by_heart(run)

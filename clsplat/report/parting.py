@@ -13,21 +13,34 @@ REMEDY = (
 
 
 def parting(run: Run) -> str:
-    """Return how good the model is where it was trained and elsewhere; "" where that is not known, or unremarkable.
+    """Return how good the model is where it was trained and elsewhere; "" where that is not known, or unremarkable."""
+    if run.best:
+        return run.best.told()
+    split, now = _measured(run)
+    if now is None:
+        return ""
+    text = now.told(split)
+    return f"{text} {REMEDY}" if now.is_apart else text if split == "validation" else ""
+
+
+def is_by_heart(run: Run) -> bool:
+    """Return whether more steps would learn the photographs further by heart, as far as that is known."""
+    now = run.best.last if run.best else _measured(run)[1]
+    return now is not None and now.is_apart
+
+
+def _measured(run: Run) -> tuple[str, Measured | None]:
+    """The split whose views were not trained on, and the last PSNR there and at training views.
 
     Validation views come before test views; training views that were not measured count as the reports saw them.
     """
-    if run.best:
-        return run.best.told()
     lines = [line for line in run.records.read("evaluate") if line["downscale"] == run.downscale]
     for split in ("validation", "test"):
         measured = [line for line in lines if line["split"] == split]
         train = _training(run, lines, measured[-1]["step"]) if measured else None
         if train is not None:
-            now = Measured(step=measured[-1]["step"], train=train, validation=measured[-1]["psnr"])
-            text = now.told(split)
-            return f"{text} {REMEDY}" if now.is_apart else text if split == "validation" else ""
-    return ""
+            return split, Measured(step=measured[-1]["step"], train=train, validation=measured[-1]["psnr"])
+    return "", None
 
 
 def _training(run: Run, lines: list[dict[str, Any]], step: int) -> float | None:

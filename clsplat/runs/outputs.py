@@ -12,6 +12,7 @@ from clsplat.names import BEFORE_A_RUN, CHECKSUMS, LOCK, LOG_FILE, METRICS, OF_A
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json, sha256
+from clsplat.report.parting import is_by_heart
 from clsplat.runs.course import Course, is_below
 from clsplat.runs.found import has_begun, not_whole, read_sums, sum_of
 from clsplat.stages.base import Stage
@@ -29,6 +30,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "train": run.metrics.get("train", {}),
         **({"validation": run.metrics["validation"]} if "validation" in run.metrics else {}),
         **({"kept": run.best.figures()} if run.best else {}),
+        **({"by_heart": True} if is_by_heart(run) else {}),
         "gaussians": run.gaussians,
         **({"parameters": run.learned_field.field.shape.learned} if run.learned_field else {}),
         "steps": run.step,

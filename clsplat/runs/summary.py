@@ -50,5 +50,9 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"  time     {', '.join(long)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
-        longer = f"; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"
-        yield f"next: open {page} in a browser{'' if kept and kept['refit'] else longer}"
+        more = f"; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"
+        if metrics.get("by_heart"):
+            more = "; the photographs are learnt by heart: more of them help most"
+        elif kept and (kept["refit"] or kept["step"] < kept["last"]["step"]):  # validation has found where to end
+            more = ""
+        yield f"next: open {page} in a browser{more}"
