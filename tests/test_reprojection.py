@@ -147,8 +147,11 @@ def test_a_sky_that_may_be_chosen_is_off_beside_what_it_does_not_go_with(of_step
 
 
 def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
-    with pytest.raises(ConfigError, match="not learned together with poses"):
-        load("smoke", ["optimize.poses={start: 1}", "model.background=directions"])
+    for recipe in ("smoke", "photos"):  # whose choices have a key for either
+        with pytest.raises(ConfigError, match="not learned together with poses"):
+            load(recipe, ["optimize.poses={start: 1}", "model.background=directions"])
+        with pytest.raises(ConfigError, match="a drawn one is for models without a sky"):
+            load(recipe, ["optimize.background=random", "model.background=directions"])
     load("photos", ["model.background=directions"])  # whose choices may learn poses
 
 
@@ -180,3 +183,22 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
     background = written.model.background
     assert (background.chosen, background.reason) == ("off", "optimize.poses are learned, which a sky does not go with")
     assert (tmp_path / "run" / "view_poses.json").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        (["optimize.during.0={snapshot: {every: 2, view: nosuch}}"], "the scene has no view 'nosuch'"),
+        (["optimize.losses=[l1, inverse_depth]", "optimize.poses={start: 1}"], "does not go with optimize.poses"),
+    ],
+)
+def test_what_a_run_can_know_is_refused_before_anything_changes(changes, fault, tmp_path, rng):
+    folder, out = missing(tmp_path / "scene", VECTOR, rng), tmp_path / "run"
+    asked = [f"scene.path='{folder}'", *FEW]
+    run_pipeline(load("smoke", asked), out, None, "new")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name not in STATE}
+    for begin in (describe, run_pipeline):
+        with pytest.raises(ConfigError, match=fault):
+            begin(load("smoke", [*asked, *changes]), out, None, "restart")
+    assert {path: path.read_bytes() for path in before} == before

@@ -1,22 +1,19 @@
 """Make the choices of a pipeline that follow from its photographs, and undo them."""
 
-import copy
-import json
-from collections.abc import Callable, Collection, Iterator, Sequence
-from itertools import compress
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from pydantic import ValidationError
 
-from clsplat.errors import ConfigError, OverrideError, shortened
-from clsplat.pipeline.choices import CaptureChoice, Others, without_choices
+from clsplat.errors import ConfigError
+from clsplat.pipeline.choice_places import place_in, set_at, touch
+from clsplat.pipeline.choices import CaptureChoice, Others
 from clsplat.pipeline.explanation import first_fault, place_text
 from clsplat.pipeline.file import PipelineFile
-from clsplat.pipeline.overrides import apply, split, value_at
-from clsplat.pipeline.renamed import with_new_names
+from clsplat.pipeline.keeping import check_keeping
+from clsplat.pipeline.overrides import value_at
 from clsplat.pipeline.yaml_file import Place
 from clsplat.scene.capture import Measures
-from clsplat.stages.optimize import Optimize
 
 LATE = ("model", "stages")  # parts of a pipeline that are used after the photographs are read
 
@@ -57,13 +54,15 @@ def _checked(made: Callable[[], PipelineFile], what: str) -> PipelineFile:
     return settings
 
 
-def check_keeping(settings: PipelineFile) -> None:
-    """Raise ConfigError where a training has nothing to choose its model by, or one of several is a refit."""
-    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-    if any(stage.keep == "best" for stage in trainings) and settings.scene.validation == 0:
-        raise ConfigError("optimize.keep: best chooses by validation views; expected scene.validation: auto")
-    if any(stage.refit for stage in trainings) and len(trainings) > 1:
-        raise ConfigError(f"optimize.refit: expected one stage that trains, found {len(trainings)}")
+def as_asked(settings: PipelineFile) -> PipelineFile:
+    """Return the settings with what `--set` gave for keys of choices, and nothing that follows from photographs.
+
+    Where that does not go together without what follows, they are as they were.
+    """
+    try:
+        return choose(settings, {}) if any(one.given for one in settings.choices) else settings
+    except ConfigError:
+        return settings
 
 
 def undone(settings: PipelineFile) -> PipelineFile:
@@ -78,107 +77,6 @@ def undone(settings: PipelineFile) -> PipelineFile:
     return _checked(lambda: _with(settings, [one.undone() for one in settings.choices], before), "instead_of")
 
 
-def forgotten(data: dict[str, Any]) -> dict[str, Any]:
-    """Return a file's data as they were before a run chose for its own photographs, by `choices` and keys `auto`."""
-    data, before = copy.deepcopy(data), list[tuple[str, Any]]()
-    for _, choice in _choices(data):
-        made = [choice.pop(name, None) for name in ("reason", "chosen", "instead_of")]
-        if made[0] and isinstance(made[2], list):
-            before += zip(choice["keys"], made[2], strict=False)
-    for key, value in before:
-        _set(data, key, value)
-    return dict(without_choices(data))
-
-
-def held(data: dict[str, Any], places: Sequence[Place]) -> dict[Place, tuple[int, str]]:
-    """Return those places of overrides that are one of several keys of a choice, with its number and the key.
-
-    It has the value in the place of its rows', so that the file's need not go together with it.
-    """
-    found: dict[Place, tuple[int, str]] = {}
-    for number, choice in _choices(data):
-        if len(choice["keys"]) < 2:
-            continue
-        for key in choice["keys"]:
-            own = _place(data, key)
-            if {place for place in places if _touch(place, own)} == {own}:
-                found[own] = number, key
-    return found
-
-
-def _is_of_photographs(override: str) -> bool:
-    """Whether an override sets which photographs are trained with, by which a run may have chosen."""
-    names, _ = split(override)
-    return names[0] == "scene" and names[1:2] != ["validation"]
-
-
-def overridden(tagged: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """Return a file's data with overrides, also in its choices; with other photographs what a run chose is forgotten.
-
-    Raises OverrideError.
-    """
-    if any(_is_of_photographs(override) for override in overrides):
-        tagged = forgotten(tagged)
-    data, places = _applied(tagged, overrides, warn="yes")
-    chosen = held(data, places)
-    if not chosen:
-        return without_overridden(data, places)
-    less, _ = _applied(tagged, [one for one, place in zip(overrides, places, strict=True) if place not in chosen])
-    for number, key in chosen.values():
-        choice, value = less["choices"][number], value_at(data, key, PipelineFile)
-        choice["given"] = {**choice.get("given", {}), key: value}
-        if isinstance(chosen_values := choice.get("chosen"), list):  # by a run
-            pairs = zip(choice["keys"], chosen_values, strict=False)
-            choice["chosen"] = [value if one == key else old for one, old in pairs]
-            _set(less, key, value)
-    return without_overridden(less, [place for place in places if place not in chosen])
-
-
-def _applied(
-    tagged: dict[str, Any], overrides: Sequence[str], warn: Literal["yes", "no"] = "no"
-) -> tuple[dict[str, Any], list[Place]]:
-    """A file's data with overrides at their places, and these."""
-    data, places = copy.deepcopy(tagged), list[Place]()
-    for override in overrides:
-        places.append(apply(data, override, PipelineFile))
-        data = with_new_names(data, warn_about=f"--set {override}" if warn == "yes" else "", old_wins=True)
-    return data, places
-
-
-def without_overridden(data: dict[str, Any], places: Collection[Place]) -> dict[str, Any]:
-    """Return a file's data with choices without the keys that an override has set, around them or inside of them."""
-    if not places or not isinstance(choices := data.get("choices"), list):
-        return data
-    left = list(choices)
-    for number, choice in _choices(data):
-        own = [_place(data, key) for key in choice["keys"]]
-        kept = [not any(_touch(one, place) for place in places) for one in own]
-        if not all(kept):
-            left[number] = _columns(choice, kept)
-    return {**data, "choices": [one for one in left if one is not None]}
-
-
-def _columns(choice: dict[str, Any], kept: list[bool]) -> dict[str, Any] | None:
-    """A choice of some of its keys; None of none."""
-    own = {name: choice[name] for name in ("keys", "chosen", "instead_of") if isinstance(choice.get(name), list)}
-    rows = [[row[0], *compress(row[1:], kept)] for row in choice["values"]]
-    less = {**choice, **{name: list(compress(values, kept)) for name, values in own.items()}, "values": rows}
-    if given := choice.get("given"):
-        less["given"] = {key: value for key, value in given.items() if key in less["keys"]}
-    return less if any(kept) else None
-
-
-def _choices(data: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The choices of a file's data that have the shape of one, with their numbers."""
-    choices = data.get("choices")
-    for number, one in enumerate(choices if isinstance(choices, list) else ()):
-        keys, rows = (one.get("keys"), one.get("values")) if isinstance(one, dict) else (None, None)
-        if not isinstance(keys, list) or not isinstance(rows, list) or not isinstance(one.get("given", {}), dict):
-            continue
-        if all(isinstance(key, str) for key in keys) and all(isinstance(row, list) and row for row in rows):
-            yield number, one
-
-
 def check_choices(settings: PipelineFile) -> None:
     """Raise ConfigError where a choice has no place, where two have the same, or where values do not go together.
 
@@ -186,10 +84,10 @@ def check_choices(settings: PipelineFile) -> None:
     """
     data, places = settings.model_dump(mode="json"), list[Place]()
     for number, key in [(number, key) for number, one in enumerate(settings.choices) for key in one.keys]:
-        place, what = _place(data, key), f"choices[{number}]: {key}"
+        place, what = place_in(data, key), f"choices[{number}]: {key}"
         if place[0] not in LATE and place != ("scene", "validation"):
             raise ConfigError(f"{what} is used before photographs are measured; expected a key of {' or '.join(LATE)}")
-        if any(_touch(place, other) for other in places):
+        if any(touch(place, other) for other in places):
             raise ConfigError(f"{what} is chosen twice; expected one choice for each place")
         places.append(place)
     still_open, faults = undone(settings), list[ConfigError]()
@@ -206,23 +104,5 @@ def check_choices(settings: PipelineFile) -> None:
 def _with(settings: PipelineFile, choices: Sequence[CaptureChoice], values: Sequence[tuple[str, Any]]) -> PipelineFile:
     data = settings.model_dump(mode="json")
     for key, value in values:
-        _set(data, key, value)
+        set_at(data, key, value)
     return PipelineFile.model_validate({**data, "choices": [one.model_dump(mode="json") for one in choices]})
-
-
-def _set(data: dict[str, Any], key: str, value: Any) -> Place:
-    return apply(data, f"{key}={json.dumps(value)}", PipelineFile)
-
-
-def _place(data: dict[str, Any], key: str) -> Place:
-    """The place of a key of a choice in a file's data.  Raises ConfigError where there is none."""
-    try:
-        return _set(copy.deepcopy(data), key, None)
-    except OverrideError as error:
-        raise ConfigError(f"choices: {shortened(key)}: {error.reason}") from error
-
-
-def _touch(one: Place, other: Place) -> bool:
-    """Whether one of two places is the other, or holds it."""
-    shorter = min(len(one), len(other))
-    return shorter > 0 and one[:shorter] == other[:shorter]

@@ -14,12 +14,14 @@ from clsplat.density.edit import Rule
 from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.names import PREPARED
-from clsplat.pipeline.choosing import check_choices, check_keeping, held, overridden
+from clsplat.pipeline.choosing import check_choices
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
+from clsplat.pipeline.keeping import check_keeping
 from clsplat.pipeline.moving import check_moving
 from clsplat.pipeline.on_host import check_on_host
+from clsplat.pipeline.overridden import held, overridden
 from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
 from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.settable import CADENCE, settable
@@ -146,8 +148,7 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
     """Raise the error of the file without overrides, or else that of the first invalid override."""
     known = [key.place for key in settable(_validated(data, path, document))]
     for override in overrides:
-        names, _ = split(override)
-        before = copy.deepcopy(data)
+        (names, _), before = split(override), copy.deepcopy(data)
         try:
             place = apply(data, override, PipelineFile)
         except NoSuchKey as error:

@@ -15,7 +15,7 @@ from clsplat.runs.default_folder import start_of
 from clsplat.runs.folders import Start, check_run_folder
 from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
-from clsplat.runs.runner import restore
+from clsplat.runs.runner import check_in, restore
 from clsplat.runs.scenes import ReadScene, read_run_scene
 from clsplat.runs.unprepared import known, listed
 from clsplat.scene.capture import Measures
@@ -64,8 +64,7 @@ def describe(
         if start == "resume":
             resumed = restore(pipeline, run)
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
-        for stage in pipeline.stages[run.cursor :]:
-            stage.check_in(run)
+        check_in(pipeline, run)
     names = listed(pipeline, planned, out) if run is None else []
     measures, head = _known(pipeline, names)
     choices = _choices(pipeline, measures)

@@ -17,7 +17,7 @@ from clsplat.pipeline.stretching import fewest_steps, last_edit, stretched, with
 from clsplat.runs.folders import Start
 from clsplat.runs.prediction import Rehearsal, most_steps, predicted
 from clsplat.runs.rehearsing import Limit, new_run, rehearse, reporting, too_little
-from clsplat.runs.runner import write_pipeline
+from clsplat.runs.runner import check_in, write_pipeline
 from clsplat.signals import stop_if_signalled
 from clsplat.stages.keeping import Keeping
 from clsplat.stages.training import Training
@@ -38,6 +38,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
     Raises ConfigError where not exactly one stage trains, or its fewest steps take longer, and what `execute` raises.
     """
     until = time.perf_counter() + 60 * minutes
+    check_in(pipeline, run)
     rehearsals = rehearsals_of(pipeline, run, minutes)
     chosen = pipeline_for(pipeline, rehearsals, until - time.perf_counter(), minutes)
     last, plan = rehearsals[-1], chosen

@@ -53,8 +53,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> Lost:
     Return which files of an earlier end are lost.
     """
     taken = restore(pipeline, run) if start == "resume" else None
-    for stage in pipeline.stages[run.cursor :]:
-        stage.check_in(run)
+    check_in(pipeline, run)
     if start == "restart":
         clear(run.status)
     if start == "resume":
@@ -68,6 +67,12 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> Lost:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
     run.records.start(run.is_refit)
     return lost
+
+
+def check_in(pipeline: Pipeline, run: Run) -> None:
+    """Raise what stages that are still to run can know of the run before any of them; nothing is written."""
+    for stage in pipeline.stages[run.cursor :]:
+        stage.check_in(run)
 
 
 def write_pipeline(pipeline: Pipeline, run: Run) -> None:

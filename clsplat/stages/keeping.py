@@ -87,15 +87,21 @@ class Keeping(Training):
             raise ConfigError(
                 "optimize.keep: best chooses by validation views; expected some: set scene.validation=auto"
             )
-        last = run.step - run.stage_step + self.steps
+        self.require_measured(run.step - run.stage_step)
+        if run.stage_step == 0:
+            run.best, run.best_tables = None, {}
+
+    def require_measured(self, begun: int) -> None:
+        """Raise ConfigError where `keep: best` measures nothing before the last step; begun: global step before it."""
+        if self.keep == "last":
+            return
+        last = begun + self.steps
         found = [stage for stage in self.in_turn(self.during) if _validates(stage)]
-        if not any(stage.due(step, step == last) for stage in found for step in range(last - self.steps + 1, last + 1)):
+        if not any(stage.due(step, step == last) for stage in found for step in range(begun + 1, last + 1)):
             raise ConfigError(
                 "optimize.keep: best needs a measurement of the validation views before the last step; expected "
                 "an `evaluate: {every: …, split: validation}` in `during` that is due, or none: it is made then"
             )
-        if run.stage_step == 0:
-            run.best, run.best_tables = None, {}
 
     def judge(self, run: Run, stage: Scheduled) -> None:
         """After a measurement of the validation views, keep the model where it is the best so far."""

@@ -19,7 +19,7 @@ from clsplat.stages.progress import report
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.backgrounds import Behind, drawn_backgrounds, drawn_beside_a_sky, is_drawn
 from clsplat.training.colours import photograph_colours, write_view_colours
-from clsplat.training.depths import known_depths
+from clsplat.training.depths import known_depths, require_depths
 from clsplat.training.distractors import photograph_distractors
 from clsplat.training.forecast import Forecast
 from clsplat.training.placing import more_room, place_harmonics
@@ -101,6 +101,8 @@ class Optimize(Keeping):
             pass
 
     def check_in(self, run: Run) -> None:
+        super().check_in(run)
+        require_depths(self.losses, run.scene, poses=bool(self.poses))
         if self.poses and self.poses.focal:
             require_zoom(run.original)
         if will_learn_sky(run):

@@ -76,7 +76,8 @@ class TrainField(Training):
 
     def check_in(self, run: Run) -> None:
         """Raise ConfigError for a grid that the scene does not touch, MemoryLimitError for a field that does not fit,
-        before it is made."""
+        before it is made, and what stages of `during` raise."""
+        super().check_in(run)
         require_seen(self.field, run.scene)
         views = run.scene.split("train")
         held = min(run.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))

@@ -40,6 +40,10 @@ class Training(Stage):
         for stage in self.during:
             stage.check()
 
+    def check_in(self, run: Run) -> None:
+        for stage in self.during:
+            stage.check_in(run)
+
     def outputs(self, out: Path) -> list[Path]:
         return [path for stage in self.during for path in stage.outputs(out)]
 

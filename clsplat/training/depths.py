@@ -6,6 +6,7 @@ from pathlib import Path
 from clsplat.errors import ConfigError, DataError
 from clsplat.losses.base import Loss
 from clsplat.losses.depth import InverseDepth
+from clsplat.scene.scene import Scene
 from clsplat.training.run import Run
 from clsplat.views.depth_maps import DepthMaps
 from clsplat.views.known_depths import PointDepths
@@ -15,24 +16,37 @@ from clsplat.views.photograph_poses import PhotographPoses
 def known_depths(losses: Sequence[Loss], run: Run, poses: PhotographPoses | None) -> PointDepths | None:
     """Return the depths of the points that each training photograph shows; None where no loss reads them.
 
-    Raises DataError where nothing tells which photographs show a point, ConfigError where poses are learned, or where
-    two losses name different folders.
+    Raises what `require_depths` raises.
     """
-    folders = {loss.folder for loss in losses if isinstance(loss, InverseDepth)}
-    if not folders:
+    require_depths(losses, run.scene, poses=bool(poses))
+    folders = _folders(losses)
+    if not folders or run.scene.tracks is None:
         return None
+    names = [view.name for view in run.scene.split("train")]
+    folder = folders.pop()
+    maps = DepthMaps(Path(folder)) if folder else None
+    return PointDepths(run.device, run.scene.tracks, names, run.scene.extent, maps)
+
+
+def require_depths(losses: Sequence[Loss], scene: Scene, poses: bool) -> None:
+    """Raise DataError where nothing tells which photographs show a point, ConfigError where poses are learned, or where
+    two losses name different folders; nothing where no loss reads depths."""
+    folders = _folders(losses)
+    if not folders:
+        return
     if len(folders) > 1:
         raise ConfigError("the loss 'inverse_depth' is given with two folders; expected one loss of it, or one folder")
     if poses:
         raise ConfigError(
             "the loss 'inverse_depth' does not go with optimize.poses, which it would not move; leave one of them out"
         )
-    if run.scene.tracks is None:
+    if scene.tracks is None:
         raise DataError(
-            f"{run.scene.path}: nothing tells which photographs show a point, which the loss 'inverse_depth' needs; "
+            f"{scene.path}: nothing tells which photographs show a point, which the loss 'inverse_depth' needs; "
             "expected a COLMAP model with points: leave the loss out"
         )
-    names = [view.name for view in run.scene.split("train")]
-    folder = folders.pop()
-    maps = DepthMaps(Path(folder)) if folder else None
-    return PointDepths(run.device, run.scene.tracks, names, run.scene.extent, maps)
+
+
+def _folders(losses: Sequence[Loss]) -> set[str | None]:
+    """The folders of depth maps that losses name; None: points alone."""
+    return {loss.folder for loss in losses if isinstance(loss, InverseDepth)}

@@ -53,8 +53,8 @@ def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPose
 def poses_beside_a_sky() -> ConfigError:
     """The error of poses that are to be learned with a model that has a sky."""
     return ConfigError(
-        "optimize.poses: the model has a sky, which is not learned together with poses; leave out optimize.poses, "
-        "or model.background"
+        "optimize.poses: the model has a sky, which is not learned together with poses; set optimize.poses to null, "
+        "or leave model.background out"
     )
 
 
