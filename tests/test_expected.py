@@ -126,6 +126,7 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
         ("scene.validation=1", "scene.validation takes 20 of 20 training photographs"),
         ("scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train with"),
         ("scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected 4 or more"),
+        ("scene={train: {names: ['01', '02']}, validation: {names: ['05']}}", "'05' is left out by scene.train"),
         ("scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is held out for testing"),
     ],
 )
@@ -146,6 +147,8 @@ def test_a_list_is_not_refused_for_what_is_known_when_cameras_are(photos, caplog
     apart = "scene={train: {every: 2}, validation: {names: ['02', '05']}}"
     left_out = load("photos", [apart, f"scene.path='{photos}'"])
     check_split(left_out, left_out.preparation(out), out)
+    assert "is refused: " in (described := describe(left_out, out, None, "new"))
+    assert "'02' is left out by scene.train" in described
     told = describe(asked, out, None, "new")
     assert "if all 23 photographs are placed, the run is refused:" in told
     assert "'00.png' is held out for testing" in told

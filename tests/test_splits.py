@@ -115,6 +115,13 @@ def test_a_test_photograph_in_another_list_is_named(folder, split):
         read_scene(folder, split)
 
 
+def test_a_photograph_that_is_left_out_is_named_in_another_list(folder):
+    fault = "scene.validation: the list of names: 'c' is left out by scene.train; .* or put it into scene.train"
+    for train in (Choice(every=2), Choice(names=["b", "d"])):
+        with pytest.raises(DataError, match=fault):
+            read_scene(folder, Split(8, train, Choice(names=["c"])))
+
+
 def test_a_name_that_two_photographs_end_in_is_refused(tmp_path):
     write(tmp_path, **LENS, frames=frames("a/1.png", "b/1.png", "c.png"))
     with pytest.raises(DataError, match=r"'1.png' means 'a/1.png' and 'b/1.png'; give more of the path"):
@@ -202,6 +209,7 @@ def test_a_dataset_without_any_photograph_is_refused(folder):
         ("holdout={every: 8, offset: 8}", "expected an offset below every, 8"),
         ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
         ("holdout={names: [42]}", "expected names of photographs as text: put numbers in quotes, as in '0042'"),
+        ("holdout={names: [a, '']}", "expected names of photographs, got an empty one"),
         ("train={names: [1.5]}", "put numbers in quotes, as in '0042', got 1.5"),
         ("validation=best", "or auto, got 'best'"),
         ("missing=ignore", "'refuse' or 'skip'"),

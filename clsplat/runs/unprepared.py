@@ -16,7 +16,6 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.capture import Measures
 from clsplat.scene.choice import OfPlaced
 from clsplat.scene.scene import Scene, every_nth, make_scene
-from clsplat.scene.split import Split
 from clsplat.scene.view import View
 from data_tools.gather import list_photographs
 
@@ -40,11 +39,9 @@ def check_split(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> No
         names = listed(pipeline, planned, out)
     if not names:
         return
-    split = pipeline.settings.scene.split
-    split.check(pipeline.settings.scene.folder, names)
-    chosen = any("scene.validation" in one.keys for one in pipeline.settings.choices)
+    pipeline.settings.scene.split.check(pipeline.settings.scene.folder, names)
     with suppress(OfPlaced):  # a dry run says it
-        _applied(replace(split, validation=0) if chosen else split, pipeline.settings.scene.folder, names)
+        _applied(pipeline, names)
 
 
 def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
@@ -54,12 +51,17 @@ def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
     """
     if not names:
         return {}
-    split = replace(pipeline.settings.scene.split, validation=0)
-    return {"photographs": len(_applied(split, pipeline.settings.scene.folder, names).train)}
+    return {"photographs": len(_applied(pipeline, names).with_fold().train)}
 
 
-def _applied(split: Split, folder: Path, names: Sequence[str]) -> Scene:
-    """The scene of named photographs, all placed, with a split.  Raises DataError."""
+def _applied(pipeline: Pipeline, names: Sequence[str]) -> Scene:
+    """The scene of named photographs, all placed, with the split; without a validation that is still to be chosen.
+
+    Raises DataError.
+    """
+    folder, split = pipeline.settings.scene.folder, pipeline.settings.scene.split
+    if any("scene.validation" in one.keys for one in pipeline.settings.choices):
+        split = replace(split, validation=0)
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
     with only(logging.ERROR):

@@ -1,7 +1,7 @@
 """A choice of a scene's views by their names: every n-th, a list, or the lines of a file."""
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
@@ -16,12 +16,17 @@ from clsplat.settings import ReadPath, Settings, in_one_sentence
 
 LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
+TakenBy = Literal["holdout", "train"]
+Others = Mapping[TakenBy, Sequence[str]]  # names that are no training views, by the key that says so
+NONE: Others = {}
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
 
 def _text(value: Any) -> Any:
     if not isinstance(value, str):
         raise ValueError("expected names of photographs as text: put numbers in quotes, as in '0042'")
+    if not value.strip():
+        raise ValueError("expected names of photographs, got an empty one")
     return value
 
 
@@ -58,38 +63,40 @@ class Choice(Settings):
         place = super().place_of(key, scene)
         return place and Path(scene or "") / place
 
-    def of(self, names: Sequence[str], folders: Sequence[Path], tested: Sequence[str] = ()) -> set[int]:
+    def of(self, names: Sequence[str], folders: Sequence[Path], others: Others = NONE) -> set[int]:
         """Return the indices of the chosen ones of `names`.
 
-        folders: where a relative file is looked for, in order; tested: names that are for testing.
+        folders: where a relative file is looked for, in order; others: names that may not be chosen.
         Raises DataError for a name that no view has, or several have.
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
         place, listed = self._listed(folders)
-        own, others = _Ends(names), _Ends(tested)
+        own, of_others = _Ends(names), {key: _Ends(taken) for key, taken in others.items()}
         found_at = {name: own.indices_of(name) for name in listed}
-        if name := next((one for one in listed if not found_at[one] and others.indices_of(one)), None):
-            raise _held_out(place, name)
+        for name in (one for one in listed if not found_at[one]):
+            for key in (key for key, taken in of_others.items() if taken.indices_of(name)):
+                raise _taken(place, name, key)
         chosen = {name: _only(name, found, names, place) for name, found in found_at.items()}
         for name, i in chosen.items():
             _tell_of_another(name, names[i], place)
         return set(chosen.values())
 
-    def check(self, names: Sequence[str], folders: Sequence[Path], tested: Sequence[str] = ()) -> list[str]:
+    def check(self, names: Sequence[str], folders: Sequence[Path], others: Others = NONE) -> list[str]:
         """Return those of `names` that are listed, some of which may be left out later; none of every n-th.
 
-        tested: names that a list holds out for testing.  Raises DataError for a name that means none, or one of these.
+        others: names that may not be chosen.  Raises DataError for a name that means none, or only such.
         """
         if self.every is not None:
             return []
         place, listed = self._listed(folders)
-        own, held_out = _Ends(names), {*tested}
+        own, of_others = _Ends(names), {key: {*taken} for key, taken in others.items()}
         found = {name: own.indices_of(name) for name in listed}
-        if name := next((one for one in listed if found[one] and {names[i] for i in found[one]} <= held_out), None):
-            raise _held_out(place, name)
-        if name := next((one for one in listed if not found[one]), None):
-            raise _unknown(name, names, place)
+        for name, indices in found.items():
+            if not indices:
+                raise _unknown(name, names, place)
+            for key in (key for key, taken in of_others.items() if {names[i] for i in indices} <= taken):
+                raise _taken(place, name, key)
         return [names[i] for indices in found.values() for i in indices]
 
     def _listed(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
@@ -109,19 +116,22 @@ Chosen = Annotated[Number | Choice, in_one_sentence(NOTATIONS)]
 ChosenOrAuto = Annotated[Number | Choice | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
 
 
-def _held_out(place: str, name: str) -> DataError:
-    return OfPlaced(
-        f"{place}: {quoted(name)} is held out for testing; expected training photographs: take it out of this list, or "
-        "out of scene.holdout"
-    )
+def _taken(place: str, name: str, key: TakenBy) -> DataError:
+    """The error of a name that cannot be chosen, since a key of the scene's settings leaves it to another use."""
+    why, remedy = {
+        "holdout": ("is held out for testing", "out of scene.holdout"),
+        "train": ("is left out by scene.train", "put it into scene.train"),
+    }[key]
+    told = f"{quoted(name)} {why}; expected training photographs: take it out of this list, or {remedy}"
+    return OfPlaced(f"{place}: {told}")
 
 
-def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], tested: Sequence[str] = ()) -> set[int]:
+def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], others: Others = NONE) -> set[int]:
     """Return the indices of the chosen names; a number chooses every n-th from the first on, 0 none.
 
     Raises DataError as Choice.of does.
     """
-    return choice.of(names, folders, tested) if isinstance(choice, Choice) else every_nth(names, choice)
+    return choice.of(names, folders, others) if isinstance(choice, Choice) else every_nth(names, choice)
 
 
 class _Ends:

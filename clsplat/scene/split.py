@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from clsplat.errors import DataError, amount
-from clsplat.scene.choice import Choice, choose
+from clsplat.scene.choice import NONE, Choice, Others, TakenBy, choose
 from clsplat.scene.images import Missing
 from clsplat.scene.scene import HOLDOUT, Scene, make_scene
 
@@ -46,35 +46,44 @@ class Split:
                     "train with: name fewer of them, or raise `every`"
                 )
             scene = _with_test(scene, test)
+        left_out: list[str] = []
         if self.train is not None:
             kept = _of(scene, "train", self.train, folders) | set(scene.test)
             if kept == set(scene.test):
                 raise DataError(f"{scene.path}: scene.train leaves no photograph to train with; expected some of them")
             LOG.info("scene.train leaves out %s", amount(len(scene.views) - len(kept), "photograph"))
             views = [view for i, view in enumerate(scene.views) if i in kept]
+            left_out = [view.name for i, view in enumerate(scene.views) if i not in kept]
             tested = {scene.views[i].name for i in scene.test}
             smaller = replace(scene, views=tuple(views))
             scene = _with_test(smaller, {i for i, view in enumerate(views) if view.name in tested})
-        return self.with_validation(scene)
+        return self.with_validation(scene, left_out)
 
     def check(self, folder: Path, names: Sequence[str]) -> None:
         """Raise DataError for lists with names of none of the photographs in a folder, however many are placed, or with
-        one photograph for testing and not."""
-        tested: list[str] = []
+        one photograph for testing and not, or for validation and not for training."""
+        others: dict[TakenBy, list[str]] = {}
         for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
             if isinstance(choice, Choice):
                 try:
-                    listed = choice.check(names, [folder], tested)
+                    listed = {*choice.check(names, [folder], others)}
                 except DataError as error:
                     raise DataError(f"{folder}: scene.{key}: {error}") from error
-                tested = listed if key == "holdout" else tested
+                if listed and key == "holdout":
+                    others["holdout"] = [*listed]
+                if listed and key == "train":
+                    others["train"] = [name for name in names if name not in listed]
 
-    def with_validation(self, scene: Scene) -> Scene:
-        """Return a scene that has all training views, some of them for validation.  Raises DataError as `applied`."""
+    def with_validation(self, scene: Scene, left_out: Sequence[str] = ()) -> Scene:
+        """Return a scene that has all training views, some of them for validation.
+
+        left_out: names of views that were left out of it.  Raises DataError as `applied`.
+        """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:
             return scene
-        fold = _auto(scene) if self.validation == "auto" else _of(scene, "validation", self.validation, folders)
+        chosen = self.validation
+        fold = _auto(scene) if chosen == "auto" else _of(scene, "validation", chosen, folders, left_out)
         train = tuple(i for i in scene.train if i not in fold)
         if not fold or not train:
             raise DataError(
@@ -90,17 +99,26 @@ def _with_test(scene: Scene, test: set[int]) -> Scene:
     return replace(scene, train=made.train, test=made.test, extent=made.extent)
 
 
-def _of(scene: Scene, key: str, choice: int | Choice, folders: Sequence[Path]) -> set[int]:
+def _of(
+    scene: Scene, key: str, choice: int | Choice, folders: Sequence[Path], left_out: Sequence[str] = ()
+) -> set[int]:
     """The indices of the chosen ones of the training views; key: the setting that chooses."""
     names = [scene.views[i].name for i in scene.train]
-    return {scene.train[i] for i in _chosen(scene, key, choice, names, folders)}
+    others: Others = {"holdout": [scene.views[i].name for i in scene.test], "train": left_out}
+    return {scene.train[i] for i in _chosen(scene, key, choice, names, folders, others)}
 
 
-def _chosen(scene: Scene, key: str, choice: int | Choice, names: Sequence[str], folders: Sequence[Path]) -> set[int]:
+def _chosen(
+    scene: Scene,
+    key: str,
+    choice: int | Choice,
+    names: Sequence[str],
+    folders: Sequence[Path],
+    others: Others = NONE,
+) -> set[int]:
     """The indices of the chosen names.  Raises DataError, with the place of the choice."""
-    tested = [scene.views[i].name for i in scene.test] if key != "holdout" else []
     try:
-        return choose(choice, names, folders, tested)
+        return choose(choice, names, folders, others)
     except DataError as error:
         raise type(error)(f"{scene.path}: scene.{key}: {error}") from error
 
