@@ -7,16 +7,20 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError
+from clsplat.cluster.batch import wanted_cell
+from clsplat.cluster.fingerprint import Scenes
+from clsplat.cluster.store import Store
+from clsplat.errors import ConfigError, DataError
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import load
+from clsplat.pipeline.matrix import Cell
 from clsplat.prepare.cache import plan
 from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step, Undistort
 from clsplat.runs import expected as module
 from clsplat.runs.description import describe
 from clsplat.runs.experiment import Job
 from clsplat.runs.single import run_pipeline
-from clsplat.runs.unprepared import check_split, known, listed
+from clsplat.runs.unprepared import check_preparation, known, listed
 from clsplat.settings import Settings
 from clsplat.stages.optimize import Optimize
 from data_tools.matching import MAX_EXHAUSTIVE, most_pairs
@@ -113,7 +117,11 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
     assert known(asked, []) == {}
 
 
-@pytest.mark.parametrize("begin", [describe, run_pipeline])
+def as_cell(asked, out, device, start):
+    return wanted_cell(Cell("a", asked), Scenes(out.parent / "scenes"), Store(out.parent))
+
+
+@pytest.mark.parametrize("begin", [describe, run_pipeline, as_cell])
 @pytest.mark.parametrize(
     ("sets", "complaint"),
     [
@@ -127,12 +135,13 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
         ("scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train with"),
         ("scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected 4 or more"),
         ("scene={train: {names: ['01', '02']}, validation: {names: ['05']}}", "'05' is left out by scene.train"),
+        ("scene.masks=masks", "prepared photographs have another shape"),
         ("scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is held out for testing"),
     ],
 )
 def test_a_split_that_photographs_do_not_have_is_refused_before_they_are_prepared(photos, begin, sets, complaint):
     asked = load("photos", [sets, f"scene.path='{photos}'"])
-    with pytest.raises(DataError, match=complaint):
+    with pytest.raises((ConfigError, DataError), match=complaint):
         begin(asked, photos.parent / "runs" / "a", None, "new")
     assert not (photos.parent / "runs" / "prepared").exists()
 
@@ -142,11 +151,11 @@ def test_a_list_is_not_refused_for_what_is_known_when_cameras_are(photos, caplog
     asked = load("photos", [f"scene.path='{photos}'", "scene.train={names: [00.png, '08', 01.jpg]}"])
     (photos / "left.heic").write_bytes(b"")
     out = photos.parent / "runs" / "a"
-    check_split(asked, asked.preparation(out), out)
+    check_preparation(asked, out)
     assert "HEIC" not in caplog.text, "the step that leaves it out says so"
     apart = "scene={train: {every: 2}, validation: {names: ['02', '05']}}"
     left_out = load("photos", [apart, f"scene.path='{photos}'"])
-    check_split(left_out, left_out.preparation(out), out)
+    check_preparation(left_out, out)
     assert "is refused: " in (described := describe(left_out, out, None, "new"))
     assert "'02' is left out by scene.train" in described
     told = describe(asked, out, None, "new")

@@ -22,9 +22,9 @@ from clsplat.errors import ClsplatError, Interrupted
 from clsplat.pipeline import matrix
 from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.loading import Pipeline
-from clsplat.prepare.cache import plan, prepare
+from clsplat.prepare.cache import prepare
 from clsplat.runs.failures import Failures
-from clsplat.runs.unprepared import check_split
+from clsplat.runs.unprepared import check_preparation
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.stages.training import Training
 
@@ -164,13 +164,8 @@ def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
 
     Raises ConfigError, DataError and the errors of the steps.
     """
-    settings = cell.pipeline.settings
-    if settings.prepare:
-        folder = settings.scene.folder
-        planned = plan(settings.prepare, folder, store.prepared)
-        if any(one.why for one in planned):
-            check_split(cell.pipeline, planned, store.prepared.parent / cell.name)
-        prepare(planned, folder, store.prepared)
+    if planned := check_preparation(cell.pipeline, store.prepared.parent / cell.name):
+        prepare(planned, cell.pipeline.settings.scene.folder, store.prepared)
     known = scenes.known(cell.pipeline)
     need = Need.of(cell.pipeline, known.scene) if known.scene else None
     own = Cell.of(cell.name, cell.pipeline, known.digest, bits="")

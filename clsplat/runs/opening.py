@@ -16,7 +16,7 @@ from clsplat.progress import Listener, heard_by
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.folders import Start
 from clsplat.runs.scenes import ReadScene, RunScene, read_run_scene
-from clsplat.runs.unprepared import check_split
+from clsplat.runs.unprepared import check_preparation
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 from clsplat.views.photographs import Photographs
@@ -73,15 +73,11 @@ def check_start(
     for stage in pipeline.stages:
         stage.check()
     opened = open_correct(device, settings.rasterizer.schedule, settings.rasterizer.sort)
-    planned = pipeline.preparation(out)
+    planned = check_preparation(pipeline, out)
     if planned and start != "restart" and noted(out) not in (None, note(planned)):
         raise ConfigError(
             f"{out}: was started with other photographs, or other settings of `prepare`; give another folder"
         )
-    if planned and planned[0].why:
-        planned[0].step.check(settings.scene.folder.resolve(), prepared_folder(out).parent)
-    if any(one.why for one in planned):
-        check_split(pipeline, planned, out)
     return opened, planned
 
 

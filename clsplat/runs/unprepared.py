@@ -33,7 +33,20 @@ def listed(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[st
         return []
 
 
-def check_split(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> None:
+def check_preparation(pipeline: Pipeline, out: Path) -> list[Planned]:
+    """Return the steps that prepare the photographs of a run in `out`; nothing is written.
+
+    Raises what is known before the first of them: ConfigError or DataError.
+    """
+    planned = pipeline.preparation(out)
+    if planned and planned[0].why:
+        planned[0].step.check(pipeline.settings.scene.folder.resolve(), prepared_folder(out).parent)
+    if any(one.why for one in planned):
+        _check_split(pipeline, planned, out)
+    return planned
+
+
+def _check_split(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> None:
     """Raise DataError where the photographs that are to be prepared do not have the split, however many are placed."""
     with only(logging.ERROR):
         names = listed(pipeline, planned, out)
