@@ -26,6 +26,7 @@ from clsplat.training.run import Progress, Run
 LOG = logging.getLogger("clsplat")
 FIRST = 200  # steps of the first rehearsal at most; a training says how many of its own are enough
 LONGER = 3  # times the steps of one before
+COARSE = 4  # times as few steps as the pipeline has make a coarse model (ours)
 SHARE = 0.03  # of the time: rehearsals that took less are followed by a longer one
 
 Show = Callable[[Progress], None]
@@ -137,4 +138,11 @@ def pipeline_for(pipeline: Pipeline, rehearsals: Sequence[Rehearsal], seconds: f
     told = f"{number:,} steps in the place of {steps:,}, which take about {seconds / 60:.1f} minutes more"
     reason = f"--minutes {minutes:g}: {told}, by a rehearsal in {rehearsals[-1].steps:,} steps"
     LOG.info("%s", reason)
+    if COARSE * number < steps:
+        whole = minutes + (predicted(rehearsals, steps) - seconds) / 60
+        LOG.warning(
+            "%s of %s steps make a coarse model: for all of them give --minutes %d, or smaller photographs "
+            "(scene.downscale)",
+            *(f"{number:,}", f"{steps:,}", math.ceil(whole)),
+        )
     return replace(pipeline, settings=reporting(stretched(pipeline.settings, Fraction(number, steps))), reason=reason)
