@@ -11,6 +11,7 @@ from clsplat.pipeline.stretching import of_trainings
 from clsplat.render.backdrops import Auto as AutoSky
 from clsplat.scene.capture import measured, nearest_points
 from clsplat.stages.optimize import Optimize
+from clsplat.training.backgrounds import is_drawn
 from clsplat.training.colours import settled
 from clsplat.training.run import Run
 from clsplat.training.skies import settled as settled_sky
@@ -89,13 +90,18 @@ def _with_colours(pipeline: Pipeline, run: Run) -> Pipeline:
 def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
     """Settings with the choice of a sky, where it is open: none beside what it does not go with."""
     background = settings.model.background
-    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-    poses, drawn = any(one.poses for one in trainings), any(one.background == "random" for one in trainings)
-    if (poses or drawn) and isinstance(background, AutoSky) and background.chosen is None:
-        reason = WITH_POSES if poses else WITH_DRAWN
+    if isinstance(background, AutoSky) and background.chosen is None and (reason := _against_a_sky(settings, run)):
         background = background.model_copy(update={"chosen": "off", "reason": reason})
         LOG.info("model.background: off, since %s", reason)
     background = settled_sky(background, run)
     if background is settings.model.background:
         return settings
     return settings.model_copy(update={"model": settings.model.model_copy(update={"background": background})})
+
+
+def _against_a_sky(settings: PipelineFile, run: Run) -> str:
+    """What a sky does not go with, of what the trainings do; "" where there is nothing."""
+    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
+    if any(one.poses for one in trainings):
+        return WITH_POSES
+    return WITH_DRAWN if any(is_drawn(one.background, run.scene) for one in trainings) else ""

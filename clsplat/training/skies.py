@@ -60,8 +60,9 @@ def share_with_sky(run: Run) -> float | None:
     """
     if _unknown(run):
         return None
-    seen = _seen(run, run.scene.with_fold())
-    return _number(seen, Auto().share) / len(seen)
+    background = run.model_settings.background
+    number, count = _counted(run, (background if isinstance(background, Auto) else Auto()).share)
+    return number / count
 
 
 def _unknown(run: Run) -> str:
@@ -71,22 +72,25 @@ def _unknown(run: Run) -> str:
     return "the photographs have transparency" if is_transparent(run.scene) else ""
 
 
-def _number(seen: list[Seen], share: float) -> int:
-    """How many photographs show the sky in such a share of their upper third, or more."""
-    return sum(one.share >= share for one in seen)
+def _counted(run: Run, share: float) -> tuple[int, int]:
+    """How many training photographs show the sky in such a share of their upper third, or more, and how many there are.
+
+    Views for validation count as training views.
+    """
+    seen = _seen(run, run.scene.with_fold())
+    return sum(one.share >= share for one in seen), len(seen)
 
 
 def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
     """Whether there is a sky, and why."""
     if why := _unknown(run):
         return "off", why
-    seen = _seen(run, run.scene)
-    number = _number(seen, background.share)
+    number, count = _counted(run, background.share)
     text = (
-        f"{number} of {len(seen)} photographs show bright or blue regions above the horizon, without points, in "
+        f"{number} of {count} photographs show bright or blue regions above the horizon, without points, in "
         f"{background.share:.0%} or more of their upper third"
     )
-    enough = number >= background.photographs * len(seen)
+    enough = number >= background.photographs * count
     return ("on" if enough else "off"), f"{text}; {'' if enough else 'not '}{background.photographs:.0%} of them"
 
 
