@@ -119,6 +119,7 @@ def test_its_metrics_are_those_of_that_model(best):
     assert found["train"]["1"]["views"] == 6
     assert found["test"]["1"]["psnr"] == psnr_of(best, "test")[BEST]
     assert f"kept     {BEST} steps, the best model" in "\n".join(summary(best))
+    assert summary(best)[-1].endswith("in a browser"), "more steps were no better"
 
 
 def test_its_page_shows_the_three_splits_and_the_best_step(best):
@@ -199,6 +200,17 @@ def test_a_measurement_that_is_never_due_is_refused_before_the_first_step(tiny_s
     during = f"optimize.during=[evaluate: {own}]"
     with pytest.raises(ConfigError, match="needs a measurement of the validation views before the last step"):
         train(tiny_scene, tmp_path / "run", during, pipeline=pipeline)
+
+
+def test_measurements_of_a_later_training_count_from_where_it_begins(tmp_path):
+    during = "during: [{evaluate: {every: 8, split: validation}}]"
+    stages = "stages:\n  - {}\n  - init\n  - optimize: {{steps: {}, losses: [l1], keep: best, {}}}\n"
+    for first in ("train_field: {steps: 4, during: []}", "init\n  - optimize: {steps: 4, losses: [l1]}"):
+        (tmp_path / "x.yaml").write_text("name: x\nscene: {validation: auto}\n" + stages.format(first, 4, during))
+        assert load(str(tmp_path / "x.yaml")).settings.training
+        (tmp_path / "x.yaml").write_text("name: x\nscene: {validation: auto}\n" + stages.format(first, 3, during))
+        with pytest.raises(ConfigError, match="needs a measurement of the validation views before the last step"):
+            load(str(tmp_path / "x.yaml"))
 
 
 def test_a_measurement_at_another_size_is_not_the_one_to_choose_by(tiny_scene, tmp_path, pipeline):

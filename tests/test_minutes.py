@@ -116,6 +116,7 @@ def test_it_takes_the_time_that_was_given(monkeypatch, given, growth, until_shar
     monkeypatch.setattr(minutes, "rehearse", rehearse)
     monkeypatch.setattr(minutes, "new_run", lambda *given: SimpleNamespace(interrupted=False))
     monkeypatch.setattr(minutes, "write_pipeline", lambda *given: None)
+    monkeypatch.setattr(minutes, "check_in", lambda *given: None)
     run = SimpleNamespace(status=SimpleNamespace(stage=lambda name: nullcontext(), note=lambda **values: None))
     minutes.execute_within(given, load("splat_7k"), run, "new", lambda progress: None, execute)
     assert clock[0] == pytest.approx(60 * given, rel=0.05)

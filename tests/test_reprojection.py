@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, DataError
 from clsplat.inspect.findings import POSES, POSES_ERROR
 from clsplat.inspect.inspection import Inspection
 from clsplat.pipeline.choosing import choose
@@ -190,6 +190,7 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
     ("changes", "fault"),
     [
         (["optimize.during.0={snapshot: {every: 2, view: nosuch}}"], "the scene has no view 'nosuch'"),
+        (["optimize.losses=[l1, {type: inverse_depth, folder: nosuch}]"], "no such file; expected the depth map of"),
         (["optimize.losses=[l1, inverse_depth]", "optimize.poses={start: 1}"], "does not go with optimize.poses"),
     ],
 )
@@ -199,6 +200,6 @@ def test_what_a_run_can_know_is_refused_before_anything_changes(changes, fault, 
     run_pipeline(load("smoke", asked), out, None, "new")
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name not in STATE}
     for begin in (describe, run_pipeline):
-        with pytest.raises(ConfigError, match=fault):
+        with pytest.raises((ConfigError, DataError), match=fault):
             begin(load("smoke", [*asked, *changes]), out, None, "restart")
     assert {path: path.read_bytes() for path in before} == before

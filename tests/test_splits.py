@@ -122,6 +122,13 @@ def test_a_photograph_that_is_left_out_is_named_in_another_list(folder):
             read_scene(folder, Split(8, train, Choice(names=["c"])))
 
 
+def test_a_photograph_that_a_number_holds_out_is_not_called_left_out(folder):
+    names = [f"images/{letter}.jpg" for letter in LETTERS]
+    Split(8, Choice(names=["b", "d"]), Choice(names=["a"])).check(folder, names)  # the placed ones decide
+    with pytest.raises(DataError, match=r"'c' is left out by scene\.train"):
+        Split(8, Choice(names=["b", "d"]), Choice(names=["c"])).check(folder, names)
+
+
 def test_a_name_that_two_photographs_end_in_is_refused(tmp_path):
     write(tmp_path, **LENS, frames=frames("a/1.png", "b/1.png", "c.png"))
     with pytest.raises(DataError, match=r"'1.png' means 'a/1.png' and 'b/1.png'; give more of the path"):
@@ -209,7 +216,7 @@ def test_a_dataset_without_any_photograph_is_refused(folder):
         ("holdout={every: 8, offset: 8}", "expected an offset below every, 8"),
         ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
         ("holdout={names: [42]}", "expected names of photographs as text: put numbers in quotes, as in '0042'"),
-        ("holdout={names: [a, '']}", "expected names of photographs, got an empty one"),
+        ("holdout={names: [a, '']}", "expected names of photographs that are not empty"),
         ("train={names: [1.5]}", "put numbers in quotes, as in '0042', got 1.5"),
         ("validation=best", "or auto, got 'best'"),
         ("missing=ignore", "'refuse' or 'skip'"),

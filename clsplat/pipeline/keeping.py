@@ -3,6 +3,7 @@
 from clsplat.errors import ConfigError
 from clsplat.pipeline.file import PipelineFile
 from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 
 
 def check_keeping(settings: PipelineFile) -> None:
@@ -10,7 +11,12 @@ def check_keeping(settings: PipelineFile) -> None:
     trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
     if any(stage.keep == "best" for stage in trainings) and settings.scene.validation == 0:
         raise ConfigError("optimize.keep: best chooses by validation views; expected scene.validation: auto")
-    if trainings:
-        trainings[0].require_measured(0)  # where a later one begins, the patience of this one decides
     if any(stage.refit for stage in trainings) and len(trainings) > 1:
         raise ConfigError(f"optimize.refit: expected one stage that trains, found {len(trainings)}")
+    begun = 0  # global step
+    for stage in settings.stages:
+        if isinstance(stage, Optimize):
+            stage.require_measured(begun)
+            if stage.patience:  # nobody knows at which step the next one begins
+                return
+        begun += stage.steps if isinstance(stage, Training) else 0

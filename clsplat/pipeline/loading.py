@@ -10,8 +10,6 @@ from typing import Any
 from pydantic import ValidationError
 
 from clsplat import plugins
-from clsplat.density.edit import Rule
-from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.names import PREPARED
 from clsplat.pipeline.choosing import check_choices
@@ -19,16 +17,18 @@ from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
 from clsplat.pipeline.keeping import check_keeping
+from clsplat.pipeline.kinds import kinds_of
 from clsplat.pipeline.moving import check_moving
 from clsplat.pipeline.on_host import check_on_host
 from clsplat.pipeline.overridden import held, overridden
 from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
 from clsplat.pipeline.renamed import with_new_names
+from clsplat.pipeline.screen_filter import check_screen_filter
 from clsplat.pipeline.settable import CADENCE, settable
 from clsplat.pipeline.sky import check_sky
 from clsplat.pipeline.yaml_file import Document, read_yaml, yaml_text
 from clsplat.prepare.cache import Planned, plan
-from clsplat.settings import Settings, variants
+from clsplat.settings import variants
 from clsplat.stages.base import Scheduled, Stage, written_twice
 from clsplat.stages.training import Training
 
@@ -119,36 +119,20 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
     except ValidationError as error:
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
-    _check_screen_filter(path, settings)
     try:
-        for check in (check_keeping, check_choices, check_sky, check_moving, check_on_host):
+        for check in (check_screen_filter, check_keeping, check_choices, check_sky, check_moving, check_on_host):
             check(settings)
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
-    return settings.model_copy(update={"plugins": plugins.used_by(_kinds(settings))})
-
-
-def _kinds(value: object) -> set[type]:
-    """The classes of all settings inside settings, and of the statistics that their rules read."""
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list | tuple):
-        return {kind for inner in value for kind in _kinds(inner)}
-    if not isinstance(value, Settings):
-        return set()
-    kinds = {type(value), *_kinds([getattr(value, name) for name in type(value).model_fields])}
-    if isinstance(value, Rule):
-        known = variants(Statistic)
-        read = {known[name] for name in value.statistics if name in known}
-        kinds |= read | {known[kind.divisor] for kind in read if kind.divisor in known}
-    return kinds
+    return settings.model_copy(update={"plugins": plugins.used_by(kinds_of(settings))})
 
 
 def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
     """Raise the error of the file without overrides, or else that of the first invalid override."""
     known = [key.place for key in settable(_validated(data, path, document))]
     for override in overrides:
-        (names, _), before = split(override), copy.deepcopy(data)
+        names, _ = split(override)
+        before = copy.deepcopy(data)
         try:
             place = apply(data, override, PipelineFile)
         except NoSuchKey as error:
@@ -211,21 +195,6 @@ def _late(stages: Sequence[Stage], need: str) -> str:
                 cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
                 return f"{cadence}; the training ends before: set {inner.stage}.start earlier, or use --minutes"
     return ""
-
-
-def _check_screen_filter(path: Path, settings: PipelineFile) -> None:
-    """Raise ConfigError where a rule reads what the screen filter does not compute."""
-    if not settings.model.screen_filter.pixel_box:
-        return
-    for i, stage in enumerate(settings.stages):
-        for rule in [rule for inner in getattr(stage, "during", ()) for rule in getattr(inner, "rules", ())]:
-            for kind in _kinds(rule):
-                if issubclass(kind, Statistic) and kind.reads_conics:
-                    raise ConfigError(
-                        f"{path}: stages[{i}] {stage.stage}: the rule '{rule.type}' reads the inverse covariance of "
-                        "splats, which model.screen_filter.type 'box' does not have; expected another screen filter "
-                        "(mip is the nearest), or another rule"
-                    )
 
 
 def _check_order(path: Path, settings: PipelineFile) -> None:

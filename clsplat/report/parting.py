@@ -24,8 +24,8 @@ def parting(run: Run) -> str:
 
 
 def is_by_heart(run: Run) -> bool:
-    """Return whether more steps would learn the photographs further by heart, as far as that is known."""
-    now = run.best.last if run.best else _measured(run)[1]
+    """Return whether the model of a run has learnt its photographs by heart, as far as that is known."""
+    now = run.best.found if run.best else _measured(run)[1]
     return now is not None and now.is_apart
 
 

@@ -17,8 +17,8 @@ from clsplat.settings import ReadPath, Settings, in_one_sentence
 LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
 TakenBy = Literal["holdout", "train"]
-Others = Mapping[TakenBy, Sequence[str]]  # names that are no training views, by the key that says so
-NONE: Others = {}
+Taken = Mapping[TakenBy, Sequence[str]]  # names that are no training views, by the key that says so
+NONE: Taken = {}
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
 
@@ -26,7 +26,7 @@ def _text(value: Any) -> Any:
     if not isinstance(value, str):
         raise ValueError("expected names of photographs as text: put numbers in quotes, as in '0042'")
     if not value.strip():
-        raise ValueError("expected names of photographs, got an empty one")
+        raise ValueError("expected names of photographs that are not empty")
     return value
 
 
@@ -63,7 +63,7 @@ class Choice(Settings):
         place = super().place_of(key, scene)
         return place and Path(scene or "") / place
 
-    def of(self, names: Sequence[str], folders: Sequence[Path], others: Others = NONE) -> set[int]:
+    def of(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
         """Return the indices of the chosen ones of `names`.
 
         folders: where a relative file is looked for, in order; others: names that may not be chosen.
@@ -82,7 +82,7 @@ class Choice(Settings):
             _tell_of_another(name, names[i], place)
         return set(chosen.values())
 
-    def check(self, names: Sequence[str], folders: Sequence[Path], others: Others = NONE) -> list[str]:
+    def check(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> list[str]:
         """Return those of `names` that are listed, some of which may be left out later; none of every n-th.
 
         others: names that may not be chosen.  Raises DataError for a name that means none, or only such.
@@ -126,7 +126,7 @@ def _taken(place: str, name: str, key: TakenBy) -> DataError:
     return OfPlaced(f"{place}: {told}")
 
 
-def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], others: Others = NONE) -> set[int]:
+def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
     """Return the indices of the chosen names; a number chooses every n-th from the first on, 0 none.
 
     Raises DataError as Choice.of does.

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Literal
 
 from clsplat.errors import DataError, amount
-from clsplat.scene.choice import NONE, Choice, Others, TakenBy, choose
+from clsplat.scene.choice import NONE, Choice, Taken, TakenBy, choose
 from clsplat.scene.images import Missing
-from clsplat.scene.scene import HOLDOUT, Scene, make_scene
+from clsplat.scene.scene import HOLDOUT, Scene, every_nth, make_scene
 
 LOG = logging.getLogger("clsplat")
 FOLD, FOLD_OFFSET = 8, 4  # of the training views, in order of name: not the first, the end of many a path
@@ -72,7 +72,14 @@ class Split:
                 if listed and key == "holdout":
                     others["holdout"] = [*listed]
                 if listed and key == "train":
-                    others["train"] = [name for name in names if name not in listed]
+                    others["train"] = [name for name in names if name not in listed | self._counted_out(names)]
+
+    def _counted_out(self, names: Sequence[str]) -> set[str]:
+        """Names that a number holds out for testing, where all are placed."""
+        every, offset = self.of_reader, 0
+        if isinstance(self.holdout, Choice):
+            every, offset = self.holdout.every or 0, self.holdout.offset
+        return {sorted(names)[i] for i in every_nth(sorted(names), every, offset)}
 
     def with_validation(self, scene: Scene, left_out: Sequence[str] = ()) -> Scene:
         """Return a scene that has all training views, some of them for validation.
@@ -104,7 +111,7 @@ def _of(
 ) -> set[int]:
     """The indices of the chosen ones of the training views; key: the setting that chooses."""
     names = [scene.views[i].name for i in scene.train]
-    others: Others = {"holdout": [scene.views[i].name for i in scene.test], "train": left_out}
+    others: Taken = {"holdout": [scene.views[i].name for i in scene.test], "train": left_out}
     return {scene.train[i] for i in _chosen(scene, key, choice, names, folders, others)}
 
 
@@ -114,7 +121,7 @@ def _chosen(
     choice: int | Choice,
     names: Sequence[str],
     folders: Sequence[Path],
-    others: Others = NONE,
+    others: Taken = NONE,
 ) -> set[int]:
     """The indices of the chosen names.  Raises DataError, with the place of the choice."""
     try:

@@ -42,7 +42,8 @@ class Training(Stage):
 
     def check_in(self, run: Run) -> None:
         for stage in self.during:
-            stage.check_in(run)
+            if stage.stop is None or stage.stop > run.step + 1:  # else its time has passed
+                stage.check_in(run)
 
     def outputs(self, out: Path) -> list[Path]:
         return [path for stage in self.during for path in stage.outputs(out)]

@@ -23,14 +23,12 @@ def known_depths(losses: Sequence[Loss], run: Run, poses: PhotographPoses | None
     if not folders or run.scene.tracks is None:
         return None
     names = [view.name for view in run.scene.split("train")]
-    folder = folders.pop()
-    maps = DepthMaps(Path(folder)) if folder else None
-    return PointDepths(run.device, run.scene.tracks, names, run.scene.extent, maps)
+    return PointDepths(run.device, run.scene.tracks, names, run.scene.extent, _maps(folders))
 
 
 def require_depths(losses: Sequence[Loss], scene: Scene, poses: bool) -> None:
-    """Raise DataError where nothing tells which photographs show a point, ConfigError where poses are learned, or where
-    two losses name different folders; nothing where no loss reads depths."""
+    """Raise DataError where nothing tells which photographs show a point, or one has no depth map, ConfigError where
+    poses are learned, or where two losses name different folders; nothing where no loss reads depths."""
     folders = _folders(losses)
     if not folders:
         return
@@ -45,6 +43,14 @@ def require_depths(losses: Sequence[Loss], scene: Scene, poses: bool) -> None:
             f"{scene.path}: nothing tells which photographs show a point, which the loss 'inverse_depth' needs; "
             "expected a COLMAP model with points: leave the loss out"
         )
+    if maps := _maps(folders):
+        maps.require(view.name for view in scene.split("train"))
+
+
+def _maps(folders: set[str | None]) -> DepthMaps | None:
+    """The maps in the one folder that is named; None: points alone."""
+    (folder,) = folders
+    return DepthMaps(Path(folder)) if folder else None
 
 
 def _folders(losses: Sequence[Loss]) -> set[str | None]:

@@ -6,6 +6,7 @@ give it.  Both come from the points that the photograph shows, by least absolute
 
 import logging
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,12 +34,21 @@ class DepthMaps:
 
     folder: Path
 
+    def require(self, names: Iterable[str]) -> None:
+        """Raise DataError where one of the photographs has no map."""
+        for name in names:
+            if not self._file(name).is_file():
+                raise DataError(
+                    f"{self._file(name)}: no such file; expected the depth map of {name}, or --set another folder"
+                )
+
+    def _file(self, name: str) -> Path:
+        return (self.folder / name).with_suffix(".png")
+
     def read(self, name: str, width: int, height: int) -> Floats:
         """Return the map of a photograph by name, [height, width] in [0, 1].  Raises DataError without one."""
-        file = (self.folder / name).with_suffix(".png")
-        if not file.is_file():
-            raise DataError(f"{file}: no such file; expected the depth map of {name}, or --set another folder")
-        pixels = read_image(file)[:, :, 0]
+        self.require([name])
+        pixels = read_image(self._file(name))[:, :, 0]
         values: NDArray[Any] = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
         if values.shape != (height, width):
             values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
