@@ -161,5 +161,5 @@ def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tin
 
 @pytest.mark.slow
 def test_a_sky_is_refused(tiny_scene, tmp_path):
-    with pytest.raises(ConfigError, match=r"optimize.poses: the model has a sky.*leave out"):
+    with pytest.raises(ConfigError, match=r"optimize\.poses: the model has a sky.*set optimize\.poses to null"):
         train(tiny_scene, tmp_path / "run", *ON, "model.background=directions")
