@@ -72,7 +72,8 @@ class Split:
                 if listed and key == "holdout":
                     others["holdout"] = [*listed]
                 if listed and key == "train":
-                    others["train"] = [name for name in names if name not in listed | self._counted_out(names)]
+                    free = listed | self._counted_out(names)
+                    others["train"] = [name for name in names if name not in free]
 
     def _counted_out(self, names: Sequence[str]) -> set[str]:
         """Names that a number holds out for testing, where all are placed."""
