@@ -74,7 +74,7 @@ def test_the_choice_stretches_every_schedule_and_gives_its_reason():
 
 
 def test_less_than_a_quarter_of_the_steps_is_warned_of_with_what_all_would_take(caplog):
-    """All 7 000 steps take 5 + 70 s, and 20 of 60 s have gone."""
+    """All 7 000 steps take 5 + 70 s, and some 22 of 60 s are left."""
     pipeline_for(load("splat_7k"), [rehearsal(200, 0.01)], seconds=22.6, minutes=1.0)
     assert "coarse" not in caplog.text
     pipeline_for(load("splat_7k"), [rehearsal(200, 0.01)], seconds=22.455, minutes=1.0)

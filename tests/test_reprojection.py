@@ -31,6 +31,7 @@ from tests.yards import Yard
 VECTOR = np.array([1.2, -0.9])  # px, 1.5 long
 OFFSET = np.array([0.1, 0.2, 0.3])
 
+OF_POSES = "{keys: [optimize.poses], by: photographs, values: [[0, {start: 1}]], since: x}"
 STATE = ("status.json", "log.txt")  # which tell of the refusal
 
 
@@ -156,20 +157,6 @@ def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
 
 
 @pytest.mark.slow
-def test_poses_that_are_chosen_beside_a_sky_are_refused_before_anything_changes(tmp_path, rng):
-    folder, out = missing(tmp_path / "scene", VECTOR, rng), tmp_path / "run"
-    asked = [f"scene.path='{folder}'", *FEW]
-    run_pipeline(load("smoke", asked), out, None, "new")
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name not in STATE}
-    choice = "{keys: [optimize.poses], by: photographs, values: [[0, {start: 1}]], since: x}"
-    both = load("smoke", [*asked, f"choices=[{choice}]", "model.background=directions"])
-    for begin in (describe, run_pipeline):
-        with pytest.raises(ConfigError, match="not learned together with poses"):
-            begin(both, out, None, "restart")
-    assert {path: path.read_bytes() for path in before} == before
-
-
-@pytest.mark.slow
 def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
     """With photographs that choose the steps, and a training on all of them after that."""
     folder = missing(tmp_path / "scene", VECTOR, rng)
@@ -192,6 +179,7 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
         (["optimize.during.0={snapshot: {every: 2, view: nosuch}}"], "the scene has no view 'nosuch'"),
         (["optimize.losses=[l1, {type: inverse_depth, folder: nosuch}]"], "no such file; expected the depth map of"),
         (["optimize.losses=[l1, inverse_depth]", "optimize.poses={start: 1}"], "does not go with optimize.poses"),
+        ([f"choices=[{OF_POSES}]", "model.background=directions"], "not learned together with poses"),
     ],
 )
 def test_what_a_run_can_know_is_refused_before_anything_changes(changes, fault, tmp_path, rng):

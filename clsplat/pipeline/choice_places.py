@@ -12,7 +12,7 @@ from clsplat.pipeline.yaml_file import Place
 
 
 def choices_in(data: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The choices of a file's data that have the shape of one, with their numbers."""
+    """Yield the choices of a file's data that have the shape of one, with their numbers."""
     choices = data.get("choices")
     for number, one in enumerate(choices if isinstance(choices, list) else ()):
         keys, rows = (one.get("keys"), one.get("values")) if isinstance(one, dict) else (None, None)
@@ -23,11 +23,12 @@ def choices_in(data: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def set_at(data: dict[str, Any], key: str, value: Any) -> Place:
+    """Set a key of a choice in a file's data; return its place.  Raises OverrideError where there is none."""
     return apply(data, f"{key}={json.dumps(value)}", PipelineFile)
 
 
 def place_in(data: dict[str, Any], key: str) -> Place:
-    """The place of a key of a choice in a file's data.  Raises ConfigError where there is none."""
+    """Return the place of a key of a choice in a file's data.  Raises ConfigError where there is none."""
     try:
         return set_at(copy.deepcopy(data), key, None)
     except OverrideError as error:
@@ -35,6 +36,6 @@ def place_in(data: dict[str, Any], key: str) -> Place:
 
 
 def touch(one: Place, other: Place) -> bool:
-    """Whether one of two places is the other, or holds it."""
+    """Return whether one of two places is the other, or holds it."""
     shorter = min(len(one), len(other))
     return shorter > 0 and one[:shorter] == other[:shorter]
