@@ -45,12 +45,24 @@ void peak_exp(
     VSTORE(sum + other, result + i * LANES);
 }
 
-/* Copy: reads and writes 4 bytes a lane. */
+/* What an item reads and writes at once: a vector of LANES, or of four where an item has one lane. */
+#if LANES == 1
+#define PIECE 4
+typedef float4 piece_t;
+#else
+#define PIECE LANES
+typedef VF_in_memory piece_t;
+#endif
+
+/* Copy: reads and writes 64 bytes an item, in pieces; those of a group's items lie beside each other. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void peak_copy(
-    __global const float *restrict values,  // [items*LANES]
-    __global float *restrict copied)        // [items*LANES]
+    __global const float *restrict values,  // [items*16]
+    __global float *restrict copied)        // [items*16]
 {
-    const size_t i = get_global_id(0) * (size_t)LANES;
-    VSTORE(VLOAD(values + i), copied + i);
+    const size_t first = get_group_id(0) * (size_t)(GROUP * 16) + get_local_id(0) * PIECE;
+    for (uint k = 0; k < 16 / PIECE; k++) {
+        const size_t i = first + k * (GROUP * PIECE);
+        *(__global piece_t *)(copied + i) = *(__global const piece_t *)(values + i);
+    }
 }

@@ -89,7 +89,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "find_tile_offsets": ("pairs.cl", "sorted_tile[pair - 1] + 1", "sorted_tile[pair - 1] + 2"),
     "peak_fma": ("peak.cl", "c = c * m + step", "c = c * m - step"),
     "peak_exp": ("peak.cl", "y = x - 0.5f", "y = x - 0.51f"),
-    "peak_copy": ("peak.cl", "VSTORE(VLOAD(values + i)", "VSTORE(1.0001f * VLOAD(values + i)"),
+    "peak_copy": ("peak.cl", "= *(__global const piece_t *)(values", "= 1.0001f * *(__global const piece_t *)(values"),
     "covariance_trace": ("penalty.cl", "2.0f * weight", "weight"),
     "anisotropy": ("penalty.cl", "(up - down)", "(up + down)"),
     "mean_scale": ("penalty.cl", "total += scale;", "total += 2.0f * scale;"),

@@ -1,10 +1,12 @@
 """Peak rates of a device, from which the floors of stages are computed."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from clsplat.opencl.device import Device
+
+LEAST = 2e-3  # s of a measurement: the first launch and the wait for the last take some 0.02 ms of it
 
 
 @dataclass(frozen=True)
@@ -20,24 +22,29 @@ def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
     """Measure the rates of multiply-adds, exponentials and copies: the best of `repeats`."""
     program, lanes = device.program("peak.cl"), int(device.tuning["LANES"])
     group = int(device.tuning["GROUP"])
-    items = 64 * group * max(1, device.info.units // 8)
+    items = 64 * group * max(1, device.info.units // 2)  # as many as a unit of a GPU runs at once
     result = device.empty(items * lanes)
 
-    def seconds(launch: Any) -> float:
-        best = float("inf")
-        for _ in range(repeats + 1):
-            device.finish()
-            start = time.perf_counter()
+    def spent(launch: Callable[[], None], times: int) -> float:
+        device.finish()
+        start = time.perf_counter()
+        for _ in range(times):
             launch()
-            device.finish()
-            best = min(best, time.perf_counter() - start)
-        return best
+        device.finish()
+        return time.perf_counter() - start
 
-    rounds = 40_000 if device.info.kind == "CPU" else 1000  # long enough for the system to spread the threads
+    def seconds(launch: Callable[[], None]) -> float:
+        times = 1
+        spent(launch, times)  # builds it
+        while (taken := spent(launch, times)) < LEAST:
+            times *= 4
+        return min(taken, *(spent(launch, times) for _ in range(repeats))) / times
+
+    rounds = 40_000 if device.info.kind == "CPU" else 4000  # long enough for the system to spread the threads
     fma = seconds(lambda: program.peak_fma(items=items, result=result, factor=0.5, rounds=rounds))
     exp = seconds(lambda: program.peak_exp(items=items, result=result, step=1e-3, rounds=rounds))
-    length = min(64 << 20, device.info.allocation // 16 // 4) // (group * lanes) * (group * lanes)  # floats
+    length = min(64 << 20, device.info.allocation // 16 // 4) // (16 * group) * (16 * group)  # floats
     source, copied = device.zeros(length), device.zeros(length)
-    copy = seconds(lambda: program.peak_copy(items=length // lanes, values=source, copied=copied))
+    copy = seconds(lambda: program.peak_copy(items=length // 16, values=source, copied=copied))
     work = items * lanes * rounds
     return Peaks(16 * work / fma / 1e9, 2 * work / exp / 1e9, 8 * length / copy / 1e9)
