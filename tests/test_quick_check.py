@@ -24,6 +24,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.errors import DeviceError, MemoryLimitError
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import tuning_of
+from clsplat.render.tiles import known_sort
 from tests.proving import worker
 from tests.test_model import model_of
 
@@ -217,8 +218,10 @@ def test_where_the_cache_cannot_be_written_a_device_is_checked_each_time(monkeyp
 
 
 def test_the_two_second_form_holds(info, empty_cache):
-    quick.ensure_correct(Device(info))
-    assert len(list((empty_cache / "conformance").iterdir())) == 1
+    opened = Device(info)
+    quick.ensure_correct(opened)
+    records = list((empty_cache / "conformance").iterdir())
+    assert len(records) == (1 if known_sort(opened, "auto") == "radix" else 2)  # either sort may be chosen
 
 
 # ---- wherever a device works
