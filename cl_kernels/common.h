@@ -30,9 +30,6 @@
 #ifndef SORT_CAPACITY
 #define SORT_CAPACITY 1024  // pairs of a tile that the bitonic sort holds in local memory, 8 bytes each
 #endif
-#ifndef SPLAT_GROUP
-#define SPLAT_GROUP 32  // splats per batch of the simt backward pass
-#endif
 #ifndef PIXEL_SUMS
 #define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11, 13 or 15 where a density statistic needs more
 #endif

@@ -125,18 +125,15 @@ class Device:
             self._fit_groups()
 
     def _fit_groups(self) -> None:
-        """Take tiles of 8 x 8 px where the compiler allows blending no group of 16 x 16 items; in the backward pass as
-        many splats as the device runs items together, which leaves none of them idle."""
+        """Take tiles of 8 x 8 px where the compiler allows blending no group of 16 x 16 items."""
         try:
-            blend = self.program("blend_simt.cl")
+            self.program("blend_simt.cl")
         except KernelError as error:
             if self.tuning["TILE"] == 8:
                 raise
             LOG.info("tiles of 8 x 8 px instead of 16 x 16: %s", error)
             self.tuning["TILE"] = 8
-            blend = self.program("blend_simt.cl")
-        if blend.blend_backward.together >= 64:
-            self.tuning["SPLAT_GROUP"] = 64
+            self.program("blend_simt.cl")
 
     @property
     def text(self) -> str:

@@ -127,8 +127,7 @@ class Kernel:
         info, opened = cl.kernel_work_group_info, device.context.devices[0]
         self.group = tuple(int(n) for n in kernel.get_work_group_info(info.COMPILE_WORK_GROUP_SIZE, opened))
         items, most = math.prod(self.group), group_limit(kernel, opened)
-        self.together = group_multiple(kernel, opened)
-        if items > most and not understates_groups(device.info, most, self.together):
+        if items > most and not understates_groups(device.info, most, group_multiple(kernel, opened)):
             raise KernelError(
                 f"{label} has work-groups of {items} items, and {device.info.text} allows it {most}; "
                 "use another device, rasterizer.schedule or rasterizer.sort"

@@ -4,7 +4,6 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -22,7 +21,6 @@ GPU = DeviceInfo(
     group=256, float_width=1, place=(0, 0),
 )  # fmt: skip
 DEVICES = {"simt": [GPU, replace(GPU, group=64)], "wide": [GPU]}  # wide where somebody asks a GPU for it
-FITTED: tuple[dict[str, int | str], ...] = ({}, {"SPLAT_GROUP": 64})  # once it is open, by its waves
 SCHEDULES: tuple[Schedule, ...] = ("simt", "wide")
 SUMS = sorted({kind.pixel_sums for kind in variants(Statistic).values()} - {PIXEL_SUMS})
 BOX = {"PIXEL_BOX": 1}
@@ -80,9 +78,9 @@ def _of_file(path: Path, schedule: Schedule) -> Iterator[Build]:
     words = set(re.findall(r"\w+", flatten(path, {KERNELS / "common.h"})))
     first: dict[str, int | str] = {}
     seen: set[tuple[tuple[str, int | str], ...]] = set()
-    for info, fitted in product(DEVICES[schedule], FITTED if "SPLAT_GROUP" in words else FITTED[:1]):
+    for info in DEVICES[schedule]:
         for passed in [{}, *PASSED.get(path.name, [])]:
-            defines = {**tuning_of(info, schedule), **fitted, **passed}
+            defines = {**tuning_of(info, schedule), **passed}
             read = {name: value for name, value in sorted(defines.items()) if name in words}
             first = first or read
             if tuple(read.items()) not in seen:

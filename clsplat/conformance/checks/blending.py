@@ -59,6 +59,7 @@ def pixel_sums_of(
     if texture is not None:
         planes[3, : camera.height, : camera.width] = texture
     uploaded = None if texture is None else device.upload(planes[3])
+    rasterizer.workspace.array("pair_sums", (frame.lists.pairs, RECORD)).fill(np.nan)  # none of these may stay
     pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), count, uploaded)
     return pixel_sums.get()[:, : model.gaussians.count].T.astype(np.float64)
 
@@ -113,6 +114,8 @@ def gradients_of_blending(device: Device, rng: np.random.Generator) -> Iterator[
     case = safe_case(rng, 300, 14, 14, 2e-6, _opaque)
     weights = rng.normal(size=(3, 14, 14)).astype(np.float32)
     yield from sum_figures(case, pixel_sums_of(device, case, weights), weights, "long tiles, finished pixels")
+    case = safe_case(rng, 300, 14, 14, 2e-6, dim)
+    yield from sum_figures(case, pixel_sums_of(device, case, weights), weights, "long tiles, dim pixels")
 
 
 @CHECKS.add("blend_backward", "sum_records")

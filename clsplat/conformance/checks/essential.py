@@ -22,8 +22,9 @@ def rendering(device: Device, rng: np.random.Generator) -> Iterator[Figure | Not
     yield from blending.blend_figures(device, case, what)
     many = safe_case(rng, 300, 14, 14, change=blending.dim)
     yield from blending.blend_figures(device, many, "300 that cover each other")
-    weights = rng.normal(size=(3, 30, 40)).astype(np.float32)
-    yield from blending.sum_figures(case, blending.pixel_sums_of(device, case, weights), weights, what)
+    for one, of in ((case, what), (many, "300 that cover each other")):
+        weights = rng.normal(size=(3, *one.size[::-1])).astype(np.float32)
+        yield from blending.sum_figures(one, blending.pixel_sums_of(device, one, weights), weights, of)
     yield from projection.gradient_figures(device, case, rng, what)
     filtered = with_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
     yield from projection.record_figures(device, filtered, "30 filtered Gaussians")
