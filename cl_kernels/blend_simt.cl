@@ -195,15 +195,17 @@ void blend_backward(
         for (uint step = 0; step < steps; step++) {
             if (step == item) {
                 active = begin + item < last;
-                pair = coming_pair[item];
-                float4 quads[QUADS];
-                for (uint k = 0; k < QUADS; k++)
-                    quads[k] = coming[item][k];
-                unpack_quads(quads, splat);
-                m = (pixel_sums_t){0.0f};
+                if (active) {
+                    float4 quads[QUADS];
+                    for (uint k = 0; k < QUADS; k++)
+                        quads[k] = coming[item][k];
+                    unpack_quads(quads, splat);
+                    pair = coming_pair[item];
+                    m = (pixel_sums_t){0.0f};
+                }
             }
-            const uint i = (step - item) % PIXELS;
             if (active) {
+                const uint i = (step - item) % PIXELS;
                 const float pixel = tile_x * TILE + i % TILE + 0.5f, row = tile_y * TILE + i / TILE + 0.5f;
                 grad_pixels_t p = pixels[i];
                 blend_backward_step(&p, SPLAT_AT(splat, row, pixel), pixel, splat + SPLAT_RED, &m);

@@ -54,15 +54,12 @@ typedef float4 piece_t;
 typedef VF_in_memory piece_t;
 #endif
 
-/* Copy: reads and writes 64 bytes an item, in pieces; those of a group's items lie beside each other. */
+/* Copy: reads and writes a piece an item. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void peak_copy(
-    __global const float *restrict values,  // [items*16]
-    __global float *restrict copied)        // [items*16]
+    __global const float *restrict values,  // [items*PIECE]
+    __global float *restrict copied)        // [items*PIECE]
 {
-    const size_t first = get_group_id(0) * (size_t)(GROUP * 16) + get_local_id(0) * PIECE;
-    for (uint k = 0; k < 16 / PIECE; k++) {
-        const size_t i = first + k * (GROUP * PIECE);
-        *(__global piece_t *)(copied + i) = *(__global const piece_t *)(values + i);
-    }
+    const size_t i = get_global_id(0) * (size_t)PIECE;
+    *(__global piece_t *)(copied + i) = *(__global const piece_t *)(values + i);
 }

@@ -174,6 +174,12 @@ MORE = {  # that smaller pictures do not show
     "emit_large simt, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),
     "emit_large wide, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),
     "project_forward wide, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
+    "blend_backward simt, a later batch": (
+        "blend_simt.cl",
+        "active = begin + item < last",
+        "active = begin + item < first + PIXELS",
+    ),
+    "blend_backward simt, the end of the last batch": ("blend_simt.cl", "begin < last + PIXELS &&", "begin < last &&"),
     "project_forward simt, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
 }
 OPTIONAL = {  # in what few runs compute: doctor notices them, the check before every run has no time for it
@@ -243,12 +249,6 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
         "p.rest + VLOAD(behind + at)",
         "p.rest - VLOAD(behind + at)",
     ),
-    "blend_backward simt, a later batch": (
-        "blend_simt.cl",
-        "active = begin + item < last",
-        "active = begin + item < first + PIXELS",
-    ),
-    "blend_backward simt, the end of the last batch": ("blend_simt.cl", "begin < last + PIXELS &&", "begin < last &&"),
     "blend_backward simt, what no pixel blends": ("blend_simt.cl", "uint k = last + item", "uint k = end + item"),
     "blend_backward simt, what is left": ("blend_simt.cl", "own.rest + behind[at]", "own.rest - behind[at]"),
     "sky_forward, the lower half": ("sky.cl", "a = (x - run->sign_x * below)", "a = (x + run->sign_x * below)"),

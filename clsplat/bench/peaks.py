@@ -22,7 +22,8 @@ def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
     """Measure the rates of multiply-adds, exponentials and copies: the best of `repeats`."""
     program, lanes = device.program("peak.cl"), int(device.tuning["LANES"])
     group = int(device.tuning["GROUP"])
-    items = 64 * group * max(1, device.info.units // 2)  # as many as a unit of a GPU runs at once
+    is_cpu = device.info.kind == "CPU"
+    items = 64 * group * max(1, device.info.units // (8 if is_cpu else 2))  # a unit of a GPU runs some 2048 at once
     result = device.empty(items * lanes)
 
     def spent(launch: Callable[[], None], times: int) -> float:
@@ -38,13 +39,14 @@ def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
         spent(launch, times)  # builds it
         while (taken := spent(launch, times)) < LEAST:
             times *= 4
-        return min(taken, *(spent(launch, times) for _ in range(repeats))) / times
+        return min([taken, *(spent(launch, times) for _ in range(repeats - 1))]) / times
 
-    rounds = 40_000 if device.info.kind == "CPU" else 4000  # long enough for the system to spread the threads
+    piece = max(lanes, 4)  # floats that an item copies
+    rounds = 40_000 if is_cpu else 4000  # long enough for the system to spread the threads
     fma = seconds(lambda: program.peak_fma(items=items, result=result, factor=0.5, rounds=rounds))
     exp = seconds(lambda: program.peak_exp(items=items, result=result, step=1e-3, rounds=rounds))
-    length = min(64 << 20, device.info.allocation // 16 // 4) // (16 * group) * (16 * group)  # floats
+    length = min(64 << 20, device.info.allocation // 16 // 4) // (piece * group) * (piece * group)  # floats
     source, copied = device.zeros(length), device.zeros(length)
-    copy = seconds(lambda: program.peak_copy(items=length // 16, values=source, copied=copied))
+    copy = seconds(lambda: program.peak_copy(items=length // piece, values=source, copied=copied))
     work = items * lanes * rounds
     return Peaks(16 * work / fma / 1e9, 2 * work / exp / 1e9, 8 * length / copy / 1e9)

@@ -32,7 +32,7 @@ def test_exponentials(device, items):
 @pytest.mark.parametrize("groups", [1, 2, 5])
 def test_copies(device, rng, groups):
     items = groups * int(device.tuning["GROUP"])
-    values = rng.normal(size=items * 16).astype(np.float32)
+    values = rng.normal(size=items * max(int(device.tuning["LANES"]), 4)).astype(np.float32)
     copied = device.zeros(len(values))
     device.program("peak.cl").peak_copy(items=items, values=device.upload(values), copied=copied)
     np.testing.assert_array_equal(copied.get(), values)
