@@ -45,17 +45,20 @@ void peak_exp(
     VSTORE(sum + other, result + i * LANES);
 }
 
-/* What an item reads and writes at once: a vector of LANES, or of four where an item has one lane. */
+/* What an item copies at once: a vector of LANES, or of four where an item has one lane; there in the largest groups,
+ * for a GPU begins small ones too slowly. */
 #if LANES == 1
 #define PIECE 4
+#define COPY_GROUP (TILE * TILE)
 typedef float4 piece_t;
 #else
 #define PIECE LANES
+#define COPY_GROUP GROUP
 typedef VF_in_memory piece_t;
 #endif
 
 /* Copy: reads and writes a piece an item. */
-__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+__kernel __attribute__((reqd_work_group_size(COPY_GROUP, 1, 1)))
 void peak_copy(
     __global const float *restrict values,  // [items*PIECE]
     __global float *restrict copied)        // [items*PIECE]

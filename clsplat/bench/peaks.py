@@ -41,11 +41,11 @@ def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
             times *= 4
         return min([taken, *(spent(launch, times) for _ in range(repeats - 1))]) / times
 
-    piece = max(lanes, 4)  # floats that an item copies
+    piece, whole = max(lanes, 4), program.peak_copy.group[0]  # floats that an item copies, and items of a group
     rounds = 40_000 if is_cpu else 4000  # long enough for the system to spread the threads
     fma = seconds(lambda: program.peak_fma(items=items, result=result, factor=0.5, rounds=rounds))
     exp = seconds(lambda: program.peak_exp(items=items, result=result, step=1e-3, rounds=rounds))
-    length = min(64 << 20, device.info.allocation // 16 // 4) // (piece * group) * (piece * group)  # floats
+    length = min(64 << 20, device.info.allocation // 16 // 4) // (piece * whole) * (piece * whole)  # floats
     source, copied = device.zeros(length), device.zeros(length)
     copy = seconds(lambda: program.peak_copy(items=length // piece, values=source, copied=copied))
     work = items * lanes * rounds

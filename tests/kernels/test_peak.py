@@ -31,10 +31,11 @@ def test_exponentials(device, items):
 
 @pytest.mark.parametrize("groups", [1, 2, 5])
 def test_copies(device, rng, groups):
-    items = groups * int(device.tuning["GROUP"])
+    copy = device.program("peak.cl").peak_copy
+    items = groups * copy.group[0]
     values = rng.normal(size=items * max(int(device.tuning["LANES"]), 4)).astype(np.float32)
     copied = device.zeros(len(values))
-    device.program("peak.cl").peak_copy(items=items, values=device.upload(values), copied=copied)
+    copy(items=items, values=device.upload(values), copied=copied)
     np.testing.assert_array_equal(copied.get(), values)
 
 

@@ -146,9 +146,10 @@ def yardsticks(device: Device, rng: np.random.Generator) -> Iterator[Figure | No
     x = -0.01 * (np.arange(whole) % 8)
     sums = sum(np.exp(x - 1e-3 * k) + np.exp(x - 0.5 - 1e-3 * k) for k in range(4))
     yield by_element("peak_exp", "sums of exponentials", result.get(), np.repeat(sums, lanes), 1e-5)
-    values = rng.normal(size=whole * max(lanes, 4)).astype(np.float32)
+    items = 2 * program.peak_copy.group[0]
+    values = rng.normal(size=items * max(lanes, 4)).astype(np.float32)
     copied = device.zeros(len(values))
-    program.peak_copy(items=whole, values=device.upload(values), copied=copied)
+    program.peak_copy(items=items, values=device.upload(values), copied=copied)
     yield equal("peak_copy", "copied values", copied.get(), values)
 
 
