@@ -249,27 +249,6 @@ def test_a_compiler_that_caps_blending_gets_smaller_tiles_and_the_same_image(inf
     np.testing.assert_array_equal(image_of(device, np.random.default_rng(1)), image)
 
 
-@pytest.mark.parametrize(("together", "splats"), [(8, 32), (32, 32), (64, 64), (128, 64)])
-def test_the_backward_pass_takes_as_many_splats_as_run_together_and_gives_the_same_bits(
-    info, monkeypatch, together, splats
-):
-    def sums(device: Device) -> np.ndarray:
-        rng = np.random.default_rng(2)
-        case, rasterizer = random_case(rng, 150, 40, 30), Rasterizer(device, "radix")
-        model, camera = case.model(device), case.device_camera(device)
-        frame = rasterizer.forward(model, camera, device.zeros(3))
-        gradient = np.zeros((3, camera.rows, camera.stride), np.float32)
-        gradient[:, :30, :40] = rng.normal(size=(3, 30, 40))
-        return rasterizer.pixel_sums(model, frame, device.upload(gradient)).get()[:, :150]
-
-    monkeypatch.setattr(program, "group_multiple", lambda *_: 32)
-    expected = sums(Device(info, "simt"))
-    monkeypatch.setattr(program, "group_multiple", lambda *_: together)
-    device = Device(info, "simt")
-    assert device.program("blend_simt.cl").blend_backward.group[0] == splats
-    np.testing.assert_array_equal(sums(device), expected)
-
-
 def test_a_kernel_whose_group_is_too_large_is_refused_in_a_sentence(info, monkeypatch):
     capped(monkeypatch, 63, "scan_blocks")
     with pytest.raises(KernelError, match=r"scan.cl:scan_blocks has work-groups of 64 items, and .* allows it 63; use"):

@@ -57,6 +57,21 @@ def compare(values: dict, expected: dict, tolerance: float) -> None:
         assert relative_error(values[name], truth) < tolerance, name
 
 
+def _faint(parameters: dict[str, np.ndarray]) -> None:
+    """Each covers the whole picture, and light comes through all."""
+    parameters["log_scales"] += 4
+    parameters["logit_opacity"][:] = -4.6
+
+
+@pytest.mark.parametrize("count", [255, 256, 257, 512, 513])
+def test_tiles_whose_lists_end_where_a_batch_does(device, rng, count):
+    case = safe_case(rng, count, 14, 14, change=_faint)
+    weights = rng.normal(size=(3, 14, 14)).astype(np.float32)
+    values, frame, _ = gradients_of(device, case, weights)
+    assert frame.lists.pairs >= count
+    compare(values, expected_gradients(case, weights), GRADIENT)
+
+
 @pytest.mark.parametrize(
     ("count", "width", "height"), [(1, 16, 16), (16, 20, 18), (17, 33, 15), (40, 40, 30), (65, 24, 24)]
 )
