@@ -174,13 +174,13 @@ MORE = {  # that smaller pictures do not show
     "emit_large simt, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),
     "emit_large wide, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),
     "project_forward wide, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
+    "project_forward simt, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
     "blend_backward simt, a later batch": (
         "blend_simt.cl",
         "active = begin + item < last",
         "active = begin + item < first + PIXELS",
     ),
     "blend_backward simt, the end of the last batch": ("blend_simt.cl", "begin < last + PIXELS &&", "begin < last &&"),
-    "project_forward simt, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
 }
 OPTIONAL = {  # in what few runs compute: doctor notices them, the check before every run has no time for it
     **{

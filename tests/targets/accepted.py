@@ -8,7 +8,7 @@ ACCEPTED = {
     "pvc project_backward (TILE 8) spills registers (26)": "the same",
     "pvc project_backward (PIXEL_BOX 1) spills registers (12)": "the recipes `box` and `box_7k` alone",
     "pvc project_backward (PIXEL_BOX 1, TILE 8) spills registers (12)": "the recipes `box` and `box_7k` alone",
-    "pvc blend_backward (PIXEL_BOX 1, PIXEL_SUMS 13) spills registers (30)": "the box with such statistics alone",
+    "pvc blend_backward (PIXEL_BOX 1, PIXEL_SUMS 13) spills registers (30)": "the box with sums of textures alone",
     "pvc blend_backward (PIXEL_BOX 1, PIXEL_SUMS 13, TILE 8) spills registers (30)": "the same",
 }
 
