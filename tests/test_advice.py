@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from clsplat.metrics.views import ViewMetrics
-from clsplat.report.advice import FEW, far_below, of_capture, of_test_views, of_training_views, widest_gap
+from clsplat.render.backdrops import Auto, Directions
+from clsplat.report.advice import FEW, far_below, of_capture, of_sky, of_test_views, of_training_views, widest_gap
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
@@ -51,6 +52,13 @@ def test_colours_that_differ_are_said_where_none_are_trained(gained, has_colours
 def test_test_views_that_are_much_worse_are_named():
     (text,) = of_test_views({"a": 22.0, "b": 16.0, "c": 26.0})
     assert text.startswith("b: much worse")
+
+
+def test_a_sky_that_was_added_is_said_with_its_reason():
+    added = Auto(chosen="on", reason="25 of 25 photographs show one")
+    (text,) = of_sky(added)
+    assert text.startswith("a sky was added, since 25 of 25 photographs show one; ")
+    assert not [text for other in (None, Directions(), Auto(), Auto(chosen="off")) for text in of_sky(other)]
 
 
 def test_few_photographs_are_said():

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import amount
 from clsplat.metrics.views import ViewMetrics, measure
+from clsplat.render.backdrops import Auto, Backdrop
 from clsplat.scene.stand import across, closest_point, upward
 from clsplat.scene.view import View, some_of
 from clsplat.training.colours import colours_of
@@ -38,6 +39,7 @@ def advice(run: Run) -> list[str]:
         *of_training_views(found, has_colours=colours_of(run) is not None),
         *of_test_views(test),
         *of_capture(views, run.original.views),
+        *of_sky(run.model_settings.background),
     ]
 
 
@@ -70,6 +72,12 @@ def of_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
     if gap := widest_gap(views):
         degrees, one, other = gap
         yield f"no photograph is from the {degrees:.0f}° between {one} and {other}; take some there"
+
+
+def of_sky(background: Backdrop | None) -> Iterator[str]:
+    """What a sky means that was chosen by the photographs."""
+    if isinstance(background, Auto) and background.in_use is not None:
+        yield f"a sky was added, since {background.reason}; other viewers show it after `--set export.sky=splats`"
 
 
 def far_below(psnr: Mapping[str, float]) -> list[str]:
