@@ -282,7 +282,16 @@ def test_the_recipe_for_photographs_chooses_by_their_number_and_by_the_sky(photo
     growing = [stage for stage in training.during if isinstance(stage, Densify)]
     assert [one.per_pixel for one in growing] == [most, None]
     many, fast = choose(settings, {"photographs": 200, "sky": 1}), load("fast").settings
-    assert (many.stages, many.model) == (fast.stages, fast.model), "nothing is lost where there are many"
+    assert (many.training.poses, many.training.colours.above) == (None, 0.2)
+    init, training, *others = many.stages
+    alike = [init, training.model_copy(update={"colours": None}), *others]
+    assert (alike, many.model) == (fast.stages, fast.model), "nothing is lost where there are many"
+
+
+def test_the_recipe_for_photographs_leaves_none_out_of_a_step_where_it_learns_poses():
+    training = choose(load("photos").settings, {"photographs": 20, "reprojection_error": 1}).training
+    assert (training.dropout, training.background, training.colours.above) == (0, "transparent", 0.03)
+    assert training.poses.start == 500
 
 
 SKY = "{keys: [model.sh_degree], by: [photographs, sky], values: [[[0, 0], 0], [[0, 0.5], 1], [[20, 0], 2]], since: x}"
