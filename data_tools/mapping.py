@@ -29,6 +29,10 @@ Mapper = Literal["incremental", "global"]
 ENOUGH = 0.9  # share of the photographs: with more, no more features are looked for
 DENSE = f".dense.{DATABASE}"
 DENSER = Sought(long_side=2400, count=16384, contrast=0.01)
+TURNED = (
+    "match like those of a camera that only turned on the spot, which tell no depth; walk around the scene, a step "
+    "between photographs"
+)
 LOOSE = {  # COLMAP's own values: 100 matches, 16 and 1.5 degrees, 30 matches, a quarter of them
     "init_min_num_inliers": 50,
     "init_min_tri_angle": 5.0,
@@ -71,10 +75,7 @@ def map_cameras(
     names = image_names(pycolmap, source / DATABASE)
     matched = Matched.of(pycolmap, source / DATABASE, source / IMAGES)
     if only_turned(pycolmap, source / DATABASE):
-        raise DataError(
-            f"{source / IMAGES}: the photographs match like those of a camera that only turned on the spot, which tell "
-            "no depth; walk around the scene, a step between photographs"
-        )
+        raise DataError(f"{source / IMAGES}: the photographs {TURNED}")
     models, used = list[Any](), (first := Attempt("as set", mapper))
     for attempt in (first, *LATER)[:attempts]:
         placed = models[0].num_reg_images() if models else 0
@@ -93,10 +94,14 @@ def map_cameras(
             models, used = found, attempt
     if not models:
         raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnosis(matched)}")
+    database = out / DENSE if used.dense else source / DATABASE
+    if only_turned(pycolmap, database, placed_names := _names(models[0])):
+        told = f"the {len(placed_names)} of {len(names)} photographs that could be placed"
+        raise DataError(f"{source / IMAGES}: {told} {TURNED}")
     if used.dense:
-        matched = Matched.of(pycolmap, out / DENSE, source / IMAGES)
+        matched = Matched.of(pycolmap, database, source / IMAGES)
     if fewest == PAIR:
-        models[0] = with_pairs(models[0], out / DENSE if used.dense else source / DATABASE, out, threads)
+        models[0] = with_pairs(models[0], database, out, threads)
     figures = {**_written(models, out, names), "attempt": used.told}
     figures["reasons"] = reasons(matched, [_names(model) for model in models])
     for left in out.glob(".*"):

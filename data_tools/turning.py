@@ -5,7 +5,7 @@ that K⁻¹ H K is a rotation for one focal length and all pairs.  A plane that 
 too, but R + t nᵀ/d is no rotation.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_tools.database import opened
+from data_tools.reasons import FEW_MATCHES
 
 PHOTOGRAPHS = 60  # that are looked at, evenly spaced, each with the one that it has the most matches with
 NEAR = 3.0  # px: of a match that a homography explains
@@ -24,48 +25,55 @@ MADE_UP = 0.1  # how far K⁻¹ H K may be from a rotation, by how far that is f
 Floats = NDArray[np.float64]
 
 
-def only_turned(pycolmap: ModuleType, database: Path) -> bool:
-    """Return whether nearly all photographs match another one as those of a camera that turned."""
-    homographies = _homographies(pycolmap, database)
-    return len(homographies) > 1 and min(_from_turns(homographies, focal) for focal in FOCALS) < MADE_UP
+def only_turned(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> bool:
+    """Return whether nearly all of the named photographs match another one as those of a camera that turned.
 
-
-def _homographies(pycolmap: ModuleType, database: Path) -> list[Floats]:
-    """Homographies that explain the matches of photographs, in units of the longer side from the middle; none where
-    they do not for one photograph of ten."""
+    Without names: of those that match another one well, where these are half of the photographs at least.  A stranger
+    among them tells nothing; of fewer, further attempts may find more matches.
+    """
     with opened(pycolmap, database) as rows:
         images = {image.image_id: image for image in rows.read_all_images()}
-        cameras = {camera.camera_id: camera for camera in rows.read_all_cameras()}
-        numbers, geometries = rows.read_two_view_geometries()
-        names = sorted(images)
-        sample = names[:: -(-len(names) // PHOTOGRAPHS)]
-        best = _best_pairs(pycolmap, dict(zip(numbers, geometries, strict=True)))
+        sizes = {camera.camera_id: (camera.width, camera.height) for camera in rows.read_all_cameras()}
+        chosen = {number for number, image in images.items() if names is None or image.name in names}
+        best = _best_pairs(pycolmap, rows, chosen)
+        known = sorted(best) if names is None else sorted(chosen)
+        if 2 * len(known) < len(chosen):
+            return False
+        sample = known[:: max(1, -(-len(known) // PHOTOGRAPHS))]
         pairs = [best[number] for number in sample if number in best]
         points = {}
         for number in {one for pair, _ in pairs for one in pycolmap.pair_id_to_image_pair(pair)}:
-            camera = cameras[images[number].camera_id]
-            size = np.array([camera.width, camera.height])
-            points[number] = (rows.read_keypoints(number)[:, :2] - size / 2) / size.max(), size.max()
+            size = np.array(sizes[images[number].camera_id])
+            points[number] = (rows.read_keypoints(number)[:, :2] - size / 2) / size.max(), float(size.max())
     found = []
     for pair, geometry in pairs:
         a, b = pycolmap.pair_id_to_image_pair(pair)
         matches = np.asarray(geometry.inlier_matches)
-        if len(matches) >= 8:
-            first, second = points[a][0][matches[:, 0]], points[b][0][matches[:, 1]]
-            matrix, explained = cv2.findHomography(first, second, cv2.RANSAC, NEAR / points[b][1])
-            if matrix is not None and explained.mean() >= EXPLAINED:
-                found.append(np.asarray(matrix, np.float64))
-    return found if len(found) >= EXPLAINED * len(sample) else []
+        matrix = _homography(points[a][0][matches[:, 0]], points[b][0][matches[:, 1]], NEAR / points[b][1])
+        if matrix is not None:
+            found.append(matrix)
+    is_most = len(found) > 1 and len(found) >= EXPLAINED * len(sample)
+    return is_most and min(_from_turns(found, focal) for focal in FOCALS) < MADE_UP
 
 
-def _best_pairs(pycolmap: ModuleType, geometries: Mapping[int, Any]) -> dict[int, tuple[int, Any]]:
-    """The pair of the most matches, with its geometry, by photograph."""
+def _best_pairs(pycolmap: ModuleType, rows: Any, chosen: Set[int]) -> dict[int, tuple[int, Any]]:
+    """The pair of the most matches between photographs of these, with its geometry, by photograph that matches well."""
     found: dict[int, tuple[int, Any]] = {}
-    for pair, geometry in geometries.items():
-        for number in pycolmap.pair_id_to_image_pair(pair):
-            if number not in found or len(geometry.inlier_matches) > len(found[number][1].inlier_matches):
-                found[number] = pair, geometry
+    for pair, geometry in zip(*rows.read_two_view_geometries(), strict=True):
+        both = pycolmap.pair_id_to_image_pair(pair)
+        if len(geometry.inlier_matches) >= FEW_MATCHES and set(both) <= chosen:
+            for number in both:
+                if number not in found or len(geometry.inlier_matches) > len(found[number][1].inlier_matches):
+                    found[number] = pair, geometry
     return found
+
+
+def _homography(first: Floats, second: Floats, near: float) -> Floats | None:
+    """The homography that explains nearly all matches of a pair, in units of the longer side from the middle."""
+    matrix, explained = cv2.findHomography(first, second, cv2.RANSAC, near)
+    if matrix is None or explained.mean() < EXPLAINED:
+        return None
+    return np.asarray(matrix, np.float64)
 
 
 def _from_turns(homographies: Sequence[Floats], focal: float) -> float:

@@ -234,23 +234,46 @@ def turned(number: int) -> np.ndarray:
     return cv2.warpPerspective(blocks(1, 600, 300), far @ turn @ np.linalg.inv(near), (240, 180), flags=flags)
 
 
+def stranger(number: int) -> np.ndarray:
+    return blocks(10 + number, 240, 180)
+
+
+def prepared(tmp_path: Path, pictures: list[np.ndarray], **matching: object) -> tuple[Path, Path]:
+    """The folder of matches of pictures, and an empty one for their cameras."""
+    pytest.importorskip("pycolmap")
+    for name in ("photographs", "features", "matches", "cameras"):
+        (tmp_path / name).mkdir()
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(tmp_path / "photographs" / f"{number:02}.png"), picture)
+    find_features(tmp_path / "photographs", tmp_path / "features", Sought(240, 600))
+    match_features(tmp_path / "features", tmp_path / "matches", **matching)
+    return tmp_path / "matches", tmp_path / "cameras"
+
+
+@pytest.fixture
+def dense(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapping, "DENSER", Sought(240, 1000, 0.01))
+
+
 @pytest.mark.parametrize(
     ("pixels", "sentence"),
     [
         (turned, "match like those of a camera that only turned on the spot"),
-        (lambda number: blocks(10 + number, 240, 180), "no two of them show the same features"),
+        (lambda number: (turned if number else stranger)(number), "match like those of a camera that only turned"),
+        (stranger, "no two of them show the same features"),
         (lambda number: np.full((180, 240, 3), 180 + number, np.uint8), "half of them have at most 0 features"),
     ],
-    ids=["turned", "other places", "a wall"],
+    ids=["turned", "turned, with a stranger", "other places", "a wall"],
 )
-def test_sets_that_cannot_work_end_in_a_sentence(tmp_path, monkeypatch, pixels, sentence):
-    pytest.importorskip("pycolmap")
-    monkeypatch.setattr(mapping, "DENSER", Sought(240, 1000, 0.01))
-    for name in ("photographs", "features", "matches", "cameras"):
-        (tmp_path / name).mkdir()
-    for number in range(6):
-        cv2.imwrite(str(tmp_path / "photographs" / f"{number}.png"), pixels(number))
-    find_features(tmp_path / "photographs", tmp_path / "features", Sought(240, 600))
-    match_features(tmp_path / "features", tmp_path / "matches")
+def test_sets_that_cannot_work_end_in_a_sentence(tmp_path, dense, pixels, sentence):
+    matches, cameras = prepared(tmp_path, [pixels(number) for number in range(6)])
     with pytest.raises(DataError, match=sentence):
-        map_cameras(tmp_path / "matches", tmp_path / "cameras")
+        map_cameras(matches, cameras)
+
+
+def test_a_model_of_a_camera_that_only_turned_is_refused_where_most_photographs_are_strangers(tmp_path, dense):
+    """Before there is one, too few photographs match to know."""
+    matches, cameras = prepared(tmp_path, [turned(number) if number < 6 else stranger(number) for number in range(14)])
+    with pytest.raises(DataError, match=r"the \d of 14 photographs that could be placed match like those"):
+        map_cameras(matches, cameras)
+    assert not (cameras / "sparse").exists()
