@@ -10,6 +10,7 @@ from types import ModuleType
 from clsplat.errors import amount, first_few
 from clsplat.scene.sharpness import BLURRED, sharpness_of
 from data_tools.database import feature_counts, verified
+from data_tools.gather import MIN_PHOTOGRAPHS
 
 FEW_FEATURES = 300  # of a photograph: a wall of one colour has tens, a garden thousands
 FEW_MATCHES = 30  # of a photograph with the points of a model: COLMAP places none with fewer
@@ -38,6 +39,16 @@ class Matched:
             found[a][b] = found[b][a] = count
         return found
 
+    def groups(self, fewest: int) -> list[list[str]]:
+        """The photographs that pairs with so many matches join, each group sorted, the largest first."""
+        group_of = {name: {name} for name in self.features}
+        for (a, b), count in self.pairs.items():
+            if count >= fewest and group_of[a] is not group_of[b]:
+                group_of[a] |= group_of[b]
+                group_of.update(dict.fromkeys(group_of[b], group_of[a]))
+        groups = {id(group): sorted(group) for group in group_of.values()}
+        return sorted(groups.values(), key=lambda group: (-len(group), group))
+
     def sharpness_of(self, name: str) -> float:
         """The sharpness of a photograph, measured once."""
         if name not in self.sharpness:
@@ -47,8 +58,7 @@ class Matched:
 
 def diagnosis(matched: Matched) -> str:
     """Return the likely reason why photographs give no model, with a remedy."""
-    count, middle = len(matched.features), round(median(matched.features.values()))
-    alone = sum(not others for others in matched.matches.values())
+    middle = round(median(matched.features.values()))
     if middle < FEW_FEATURES:
         return (
             f"half of them have at most {middle} features, where thousands are usual: they are blurred, or show plain "
@@ -56,12 +66,21 @@ def diagnosis(matched: Matched) -> str:
         )
     if not matched.pairs:
         return "no two of them show the same features; take some with more overlap, of a scene in which nothing moves"
-    if alone > count / 2:
-        return (
-            f"{alone} of them match no other one, and {amount(len(matched.pairs), 'pair')} show the same features; "
-            "take photographs of one scene, with more overlap"
-        )
+    groups = matched.groups(FEW_MATCHES)
+    if len(groups[0]) < max(MIN_PHOTOGRAPHS, len(matched.features) / 2):
+        return f"{_parts(matched, groups)}; take photographs of one scene, with more overlap"
     return "take more sharp ones, from places a step apart, of a textured scene in which nothing moves"
+
+
+def _parts(matched: Matched, groups: Sequence[list[str]]) -> str:
+    """Which photographs belong together, and which do not, in words."""
+    alone = [name for group in groups if len(group) == 1 for name in group]
+    count = len(groups) - len(alone)
+    if not count:
+        return f"no two of them show enough of the same: {max(matched.pairs.values())} matches at most"
+    others = f", and {len(alone)} without a good match ({first_few(alone)})" if alone else ""
+    largest = f"{len(groups[0])} ({first_few(groups[0])})"
+    return f"they do not belong together: {amount(count, 'group')} of good matches, the largest of {largest}{others}"
 
 
 def reasons(matched: Matched, models: Sequence[set[str]]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -190,7 +191,20 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     assert reasons(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"] == "in another model, with other"
     figures = {"registered": 3, "not_registered": ["plain"], "reasons": found, "other_models": [2]}
     assert "1 of 4 photographs could not be placed: plain (only 40 features: blurred" in left_out(figures)[0]
-    assert diagnosis(matched(tmp_path)).startswith("take more sharp ones")
+
+
+def test_a_set_that_gives_no_model_is_told_by_what_belongs_together(tmp_path):
+    found = matched(tmp_path)
+    assert diagnosis(found) == (
+        "they do not belong together: 2 groups of good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
+        "without a good match (alone, elsewhere, few, plain, soft); take photographs of one scene, with more overlap"
+    )
+    joined = replace(found, pairs={**found.pairs, ("a", "pair"): 30})
+    assert diagnosis(joined).startswith("take more sharp ones"), "seven of twelve belong together"
+    weak = replace(found, pairs={("a", "b"): 20, ("b", "c"): 29})
+    assert diagnosis(weak).startswith("no two of them show enough of the same: 29 matches at most; take")
+    two = Matched(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
+    assert "the largest of 2 (a, b), and 1 without a good match (c); take" in diagnosis(two)
 
 
 def blocks(seed: int, width: int, height: int) -> np.ndarray:
