@@ -33,6 +33,7 @@ TURNED = (
     "match like those of a camera that only turned on the spot, which tell no depth; walk around the scene, a step "
     "between photographs"
 )
+NOT_DENSER = "denser features would not help: there are enough, and most photographs have nothing in common"
 LOOSE = {  # COLMAP's own values: 100 matches, 16 and 1.5 degrees, 30 matches, a quarter of them
     "init_min_num_inliers": 50,
     "init_min_tri_angle": 5.0,
@@ -80,6 +81,9 @@ def map_cameras(
     for attempt in (first, *LATER)[:attempts]:
         placed = models[0].num_reg_images() if models else 0
         if placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
+            break
+        if attempt.dense and not models and matched.have_nothing_in_common():
+            LOG.info("%s", NOT_DENSER)
             break
         if attempt is not first:
             LOG.info("%d of %d photographs are placed; another attempt: %s", placed, len(names), attempt.told)

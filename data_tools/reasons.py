@@ -13,6 +13,7 @@ from data_tools.database import feature_counts, verified
 from data_tools.gather import MIN_PHOTOGRAPHS
 
 FEW_FEATURES = 300  # of a photograph: a wall of one colour has tens, a garden thousands
+TEXTURED = 1000  # features: photographs with as many are not weakly textured; three times FEW_FEATURES
 FEW_MATCHES = 30  # of a photograph with the points of a model: COLMAP places none with fewer
 SHARPNESS_OF = 15  # placed photographs that the others are compared with
 
@@ -48,6 +49,16 @@ class Matched:
                 group_of.update(dict.fromkeys(group_of[b], group_of[a]))
         groups = {id(group): sorted(group) for group in group_of.values()}
         return sorted(groups.values(), key=lambda group: (-len(group), group))
+
+    def have_nothing_in_common(self) -> bool:
+        """Whether denser features are without a chance: most photographs are in no group of pairs, however few matches
+        these have, although there are features enough.
+
+        Photographs of one scene match here and there, by fewer than a camera needs; photographs of plain surfaces have
+        no features, until more are looked for.
+        """
+        is_textured = median(self.features.values()) >= TEXTURED
+        return is_textured and len(self.groups(1)[0]) < max(MIN_PHOTOGRAPHS, len(self.features) / 2)
 
     def sharpness_of(self, name: str) -> float:
         """The sharpness of a photograph, measured once."""

@@ -13,6 +13,7 @@ from clsplat.errors import DataError
 from clsplat.scene.exif import copied, exposure_of, optics_of
 from clsplat.scene.images import read_grey, read_header, read_image
 from data_tools import mapping
+from data_tools import reasons as reasons_tool
 from data_tools.database import image_names, opened
 from data_tools.features import Sought, find_features, sift
 from data_tools.gather import gather, list_photographs
@@ -291,3 +292,31 @@ def test_a_model_of_a_camera_that_only_turned_is_refused_where_most_photographs_
     with pytest.raises(DataError, match=r"the \d of 14 photographs that could be placed match like those"):
         map_cameras(matches, cameras)
     assert not (cameras / "sparse").exists()
+
+
+def test_features_are_not_looked_for_again_where_photographs_have_enough_and_nothing_in_common(
+    tmp_path, dense, monkeypatch, caplog
+):
+    monkeypatch.setattr(reasons_tool, "TEXTURED", 100)
+    caplog.set_level("INFO")
+    matches, cameras = prepared(tmp_path, [stranger(number) for number in range(6)])
+    with pytest.raises(DataError, match="no two of them show the same features"):
+        map_cameras(matches, cameras)
+    assert "denser features would not help" in caplog.text
+    assert "another attempt: denser" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("features", "pairs", "expected"),
+    [
+        (3000, "", True),
+        (3000, "ab bc ad ef", True),
+        (3000, "ab bc ad ae", False),
+        (900, "", False),
+    ],
+    ids=["no pair", "chance pairs", "half of them", "plain surfaces"],
+)
+def test_when_photographs_have_nothing_in_common(tmp_path, features, pairs, expected):
+    """Ten photographs; however few matches a pair has."""
+    found = Matched(tmp_path, dict.fromkeys("abcdefghij", features), {(a, b): 15 for a, b in pairs.split()})
+    assert found.have_nothing_in_common() == expected
