@@ -38,6 +38,23 @@ def only(level: int) -> Iterator[None]:
 
 
 @contextmanager
+def kept(level: int) -> Iterator[list[str]]:
+    """Collect what the block tells from a level of `logging` on, in the place of telling it: it is shown elsewhere."""
+    told: list[str] = []
+
+    def keep(record: logging.LogRecord) -> bool:
+        told.append(record.getMessage())
+        return False
+
+    with only(level):
+        LOG.addFilter(keep)
+        try:
+            yield told
+        finally:
+            LOG.removeFilter(keep)
+
+
+@contextmanager
 def heard_by(listener: Listener) -> Iterator[None]:
     """Call `listener` for each step of the work in this block, beside those of blocks around it.
 

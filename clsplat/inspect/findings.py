@@ -1,16 +1,13 @@
 """Findings: what the facts about a dataset mean for training, each with its remedy."""
 
-import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 from clsplat.errors import amount, shortened
+from clsplat.inspect.finding import LEVELS, Finding
 from clsplat.inspect.points import MAX_DISTANCE, PointFacts
 from clsplat.inspect.survey import MIN_SEEN, CameraFacts, Facts
+from clsplat.inspect.unprepared import unprepared
 
-Level = Literal["error", "warning", "note"]
-LEVELS: tuple[Level, ...] = ("error", "warning", "note")
 MAX_NAMES = 4  # names in a finding
 MIN_VIEWS = 10  # for training
 MIN_POINTS = 100
@@ -22,23 +19,9 @@ MIN_SHARE_KEPT = 0.6  # share of a photograph
 FOCAL_RANGE = (0.2, 20.0)  # focal length by image width: 136 to 3 degrees
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A fault of a dataset and its remedy.  With an error, training does not start."""
-
-    level: Level
-    fault: str
-    remedy: str = ""
-
-    @property
-    def text(self) -> str:
-        """Fault and remedy in one sentence."""
-        return f"{self.fault}: {self.remedy}" if self.remedy else self.fault
-
-
 def findings(facts: Facts) -> list[Finding]:
     """Return the findings about a dataset, errors first, then warnings and notes."""
-    parts = (_unreadable, _photographs, _looks, _cameras, _poses, _points)
+    parts = (unprepared, _unreadable, _photographs, _looks, _cameras, _poses, _points)
     found = [finding for part in parts for finding in part(facts)]
     if facts.refusal and not any(finding.level == "error" for finding in found):
         found.append(Finding("error", facts.refusal))
@@ -68,10 +51,6 @@ def verdict(found: Sequence[Finding]) -> str:
 
 
 def _unreadable(facts: Facts) -> Iterator[Finding]:
-    if facts.kind == "none" and facts.on_disk:
-        folder = os.path.dirname(os.path.join(facts.path, facts.unregistered[0]))
-        fault = f"{facts.path} holds {amount(facts.on_disk, 'photograph')} but no camera poses"
-        yield Finding("error", fault, f"`clsplat run photos --scene {folder}` finds the cameras")
     yield from (Finding("error", fault) for fault in facts.faults[:MAX_NAMES])
     if len(facts.faults) > MAX_NAMES:
         more = f"{amount(len(facts.faults) - MAX_NAMES, 'more part')} of the dataset cannot be read"

@@ -4,7 +4,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from clsplat.inspect.findings import Finding, findings, trainable, verdict
+from clsplat.inspect.finding import Finding
+from clsplat.inspect.findings import findings, trainable, verdict
 from clsplat.inspect.parts import read_parts
 from clsplat.inspect.survey import Facts, survey
 from clsplat.scene.parts import Parts

@@ -34,6 +34,7 @@ class LookFacts:
     blurred: list[str]  # much less sharp than the others
     same: list[list[str]]  # photographs that look the same
     jumps: list[tuple[str, str, float]]  # one and the next, and the stops between their exposures as EXIF tells them
+    unreadable: dict[str, str]  # the reason why they cannot be decoded
     padded: dict[str, int]  # px of an edge that repeat the line beside them, in the first photographs
 
 
@@ -54,7 +55,8 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
     names = sorted(files)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8), "looking") as pool:
         read = counted(pool.map(_look, (files[name] for name in names)), "photographs looked at", len(names))
-        found = {name: look for name, look in zip(names, read, strict=True) if look}
+        looked = dict(zip(names, read, strict=True))
+    found = {name: look for name, look in looked.items() if not isinstance(look, DataError)}
     if exposures is None:
         exposures = {name: exposure_of(files[name]) for name in found}
     values = [(name, exposure.value) for name in names if (exposure := exposures.get(name))]
@@ -64,16 +66,21 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
         blurred=[name for name, (sharp, _) in found.items() if sharp < BLURRED * middle],
         same=_same(list(found), [thumbnail for _, thumbnail in found.values()]),
         jumps=[step for step in steps if step[2] > JUMP],
+        unreadable={
+            name: str(error).removeprefix(f"{files[name]}: ").partition(";")[0]
+            for name, error in looked.items()
+            if isinstance(error, DataError)
+        },
         padded=padding(files[name] for name in found),
     )
 
 
-def _look(file: Path) -> tuple[float, NDArray[np.float32]] | None:
-    """Sharpness and thumbnail of a photograph; None where it cannot be read."""
+def _look(file: Path) -> tuple[float, NDArray[np.float32]] | DataError:
+    """Sharpness and thumbnail of a photograph, or why it cannot be read."""
     try:
         grey = read_grey(file, SIDE)[0]
-    except DataError:
-        return None
+    except DataError as error:
+        return error
     small = cv2.resize(grey, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
     return sharpness(grey), small.astype(np.float32).ravel()
 

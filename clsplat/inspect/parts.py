@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from clsplat.errors import DataError
-from clsplat.progress import only
+from clsplat.progress import kept, only
 from clsplat.scene.detect import read_scene, reader_of
 from clsplat.scene.images import is_image
 from clsplat.scene.parts import Parts
 from clsplat.stages.init import require_ahead
+from data_tools.gather import list_photographs
 
 LOG = logging.getLogger("clsplat")
 
@@ -30,7 +31,9 @@ def read_parts(path: Path) -> Parts:
         if reader := reader_of(path):
             parts.kind = reader.name
             reader.list_parts(parts)
-    if parts.image_folder or not parts.expected:
+    if parts.kind == "none":
+        _list_photographs(parts)
+    elif parts.image_folder or not parts.expected:
         folder = parts.image_folder or path / "images"
         parts.on_disk = list(image_files(folder if folder.is_dir() else path, deep=True))
     else:
@@ -39,6 +42,17 @@ def read_parts(path: Path) -> Parts:
     if parts.scene:  # some views may be on no split's list
         parts.views = list(parts.scene.views)
     return parts
+
+
+def _list_photographs(parts: Parts) -> None:
+    """List the photographs of a folder without cameras, and what their preparation would say of them."""
+    parts.on_disk = list(image_files(parts.path, deep=True))
+    with kept(logging.WARNING) as parts.left_out:
+        try:
+            list_photographs(parts.path)
+        except DataError as error:
+            if parts.on_disk or parts.left_out:
+                parts.refusal = str(error)
 
 
 def image_files(folder: Path, deep: bool) -> Iterator[Path]:

@@ -74,6 +74,7 @@ class Facts:
     same_pose: list[list[str]]
     same_but_case: list[list[str]]
     same_base: int  # names that several folders hold
+    left_out: list[str]  # sentences about files that `prepare` does not read as photographs
     faults: list[str]  # why pieces of it cannot be read
     refusal: str  # why training does not start
 
@@ -115,6 +116,7 @@ def survey(parts: Parts) -> Facts:
         same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         same_base=sum(count > 1 for count in Counter(file.name for file in set(expected)).values()),
+        left_out=parts.left_out,
         faults=parts.faults,
         refusal=parts.refusal,
     )

@@ -30,6 +30,7 @@ class Parts:
     on_disk: list[Path] = field(default_factory=list)  # image files where the views' files are looked for
     expected: list[Path] = field(default_factory=list)  # files that the dataset names
     faults: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)  # what is told of files that are no photographs for `prepare`
     scene: Scene | None = None
     refusal: str = ""
     _said: set[str] = field(default_factory=set)  # of `faults`
