@@ -1,9 +1,16 @@
 """The inspection of a folder of photographs that have no cameras yet."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
 import pytest
 
 from clsplat.errors import DataError
 from clsplat.inspect.inspection import Inspection
+from clsplat.inspect.looks import looks
+from clsplat.scene.exif import CameraExposure
 from data_tools.gather import list_photographs
 from tests.test_inspect import photograph, said
 
@@ -55,3 +62,41 @@ def test_three_of_which_one_is_damaged_are_too_few(tmp_path):
     inspection = Inspection.of(tmp_path)
     assert said(inspection, "error").endswith("only 2 of 3 photographs can be read; export them again")
     assert said(inspection, "warning").startswith("1 of 3 photographs cannot be read: c.jpg")
+
+
+def shown(folder: Path, factors: list[float]) -> dict[str, Path]:
+    """Photographs of one textured thing, each with its brightness by that of the first."""
+    rng, files = np.random.default_rng(1), {}
+    for i, factor in enumerate(factors):
+        files[f"{i}.png"] = folder / f"{i}.png"
+        cv2.imwrite(str(folder / f"{i}.png"), (rng.integers(80, 240, (48, 64)) * factor).astype(np.uint8))
+    return files
+
+
+def test_a_dark_photograph_is_not_blurred_and_a_dark_blurred_one_is(tmp_path):
+    files = shown(tmp_path, [1, 0.3, 1, 0.3, 1, 0.3])
+    assert looks(files).blurred == []
+    pixels = cv2.imread(str(files["3.png"]))
+    cv2.imwrite(str(files["3.png"]), cv2.GaussianBlur(pixels, (0, 0), 1))
+    assert looks(files).blurred == ["3.png"]
+
+
+def test_where_exif_tells_no_exposure_a_step_of_the_brightness_is_a_hint(tmp_path):
+    files = shown(tmp_path, [1, 0.9, 0.4, 0.6, 0.7, 1])
+    ((a, b, ratio),) = looks(files).steps
+    assert (a, b, ratio) == ("1.png", "2.png", pytest.approx(0.4 / 0.9, abs=0.02))
+    (note,) = texts(Inspection.of(tmp_path), "note")
+    assert note.startswith("1 photograph is more than twice as bright or dark as the one before (1.png to 2.png: 0.45")
+    told = CameraExposure(0.01, 2.0, 100.0)
+    found = looks(files, dict.fromkeys(files, told) | {"2.png": replace(told, seconds=0.001)})
+    assert not found.steps
+    assert [(a, b) for a, b, _ in found.jumps] == [("1.png", "2.png"), ("2.png", "3.png")]
+
+
+def test_a_thing_before_black_that_is_larger_in_one_photograph_is_no_step_of_the_brightness(tmp_path):
+    files = shown(tmp_path, [1, 1, 1])
+    for name, wide in zip(files, (10, 30, 10), strict=True):
+        pixels = cv2.imread(str(files[name]))
+        pixels[:, wide:] = 0
+        cv2.imwrite(str(files[name]), pixels)
+    assert looks(files).steps == []

@@ -19,12 +19,22 @@ from clsplat.scene.exif import CameraExposure, exposure_of
 from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.images import read_grey
 from clsplat.scene.parts import Parts
-from clsplat.scene.sharpness import BLURRED, SIDE, sharpness
+from clsplat.scene.sharpness import BLURRED, SIDE, relative_sharpness
 from clsplat.scene.view import NO_FILE
 
 THUMBNAIL = 32  # px, of each side
 SAME = 1.0  # grey levels between thumbnails: frames of a video are 9 apart, two codings of one photograph 0.3
 JUMP = 1.0  # stops from one photograph to the next
+STEP = 2.0  # brightness of a photograph by that of the one before: at most 1.4 in five captures with one exposure
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is measured of one photograph."""
+
+    sharpness: float  # relative
+    brightness: NDArray[np.float64]  # mean and median, grey levels
+    thumbnail: NDArray[np.float32]  # [THUMBNAIL²], grey levels
 
 
 @dataclass(frozen=True)
@@ -34,6 +44,7 @@ class LookFacts:
     blurred: list[str]  # much less sharp than the others
     same: list[list[str]]  # photographs that look the same
     jumps: list[tuple[str, str, float]]  # one and the next, and the stops between their exposures as EXIF tells them
+    steps: list[tuple[str, str, float]]  # one, the next, and its brightness by that of the first; where EXIF is silent
     unreadable: dict[str, str]  # the reason why they cannot be decoded
     padded: dict[str, int]  # px of an edge that repeat the line beside them, in the first photographs
 
@@ -61,11 +72,12 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
         exposures = {name: exposure_of(files[name]) for name in found}
     values = [(name, exposure.value) for name in names if (exposure := exposures.get(name))]
     steps = [(a, b, round(abs(y - x), 2)) for (a, x), (b, y) in pairwise(values)]
-    middle = float(np.median([sharp for sharp, _ in found.values()])) if found else 0.0
+    middle = float(np.median([look.sharpness for look in found.values()])) if found else 0.0
     return LookFacts(
-        blurred=[name for name, (sharp, _) in found.items() if sharp < BLURRED * middle],
-        same=_same(list(found), [thumbnail for _, thumbnail in found.values()]),
+        blurred=[name for name, look in found.items() if look.sharpness < BLURRED * middle],
+        same=_same(list(found), [look.thumbnail for look in found.values()]),
         jumps=[step for step in steps if step[2] > JUMP],
+        steps=[] if values else _steps({name: look.brightness for name, look in found.items()}),
         unreadable={
             name: str(error).removeprefix(f"{files[name]}: ").partition(";")[0]
             for name, error in looked.items()
@@ -75,14 +87,25 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
     )
 
 
-def _look(file: Path) -> tuple[float, NDArray[np.float32]] | DataError:
-    """Sharpness and thumbnail of a photograph, or why it cannot be read."""
+def _look(file: Path) -> Look | DataError:
+    """Measure a photograph; or return why it cannot be read."""
     try:
         grey = read_grey(file, SIDE)[0]
     except DataError as error:
         return error
     small = cv2.resize(grey, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
-    return sharpness(grey), small.astype(np.float32).ravel()
+    brightness = np.maximum([grey.mean(), np.median(grey)], 1.0)
+    return Look(relative_sharpness(grey), brightness, small.astype(np.float32).ravel())
+
+
+def _steps(brightness: Mapping[str, NDArray[np.float64]]) -> list[tuple[str, str, float]]:
+    """Neighbours of which mean and median both differ by more than STEP times: one of them follows what is shown."""
+    found = []
+    for (a, x), (b, y) in pairwise(brightness.items()):
+        ratios = y / x
+        if min(ratios) > STEP or max(ratios) < 1 / STEP:
+            found.append((a, b, round(float(ratios[0]), 2)))
+    return found
 
 
 def _same(names: Sequence[str], thumbnails: Sequence[NDArray[np.float32]]) -> list[list[str]]:
