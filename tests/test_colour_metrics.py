@@ -1,10 +1,14 @@
 """Figures in the colours of the photographs, beside PSNR."""
 
+import re
+
 import numpy as np
 import pytest
 
-from clsplat.metrics.colours import colour_figures, corrected_by_regression, in_colours_of
+from clsplat.metrics.colours import PIXELS, colour_figures, corrected_by_regression, in_colours_of, mean_figures
 from clsplat.metrics.images import MAX_PSNR, psnr, to_8_bits
+from clsplat.stages.keeping import compared
+from clsplat.training.colours import tell_of_colours
 from clsplat.views.colours import Affine, Gain
 
 GAINS = np.array([1.3, 0.9, 1.1])
@@ -49,8 +53,59 @@ def test_white_black_and_masked_pixels_say_nothing_of_colours(image, rng):
     photograph[~counted] = 128
     changed = in_colours_of(image.astype(np.float64), photograph, counted, Gain())
     assert changed[counted] == pytest.approx(truth[counted], abs=0.01)
-    nothing = np.zeros(image.shape[:2], bool)
-    assert in_colours_of(image.astype(np.float64), photograph, nothing, Affine()) == pytest.approx(image)
+
+
+@pytest.mark.parametrize(("model", "numbers"), [(Gain(), 1), (Affine(), 4)])
+@pytest.mark.parametrize("half", [np.s_[:, :15], np.s_[:, 15:]])
+def test_a_half_with_too_few_pixels_gives_no_figure_in_the_photographs_colours(image, model, numbers, half):
+    photograph, counted = to_8_bits(image), everywhere(image)
+    counted[half] = False
+    rows, columns = np.nonzero(~counted)
+    for number, has in ((PIXELS * numbers - 1, False), (PIXELS * numbers, True)):
+        counted[rows[:number], columns[:number]] = True
+        found = colour_figures(image, photograph, counted, model)
+        assert ("psnr_colour" in found) == has
+        assert "psnr_affine" in found
+
+
+def test_a_mean_says_of_how_many_views_it_is():
+    both, one = {"psnr_colour": 30.0, "psnr_affine": 32.0}, {"psnr_affine": 20.0}
+    assert mean_figures([both, both]) == both
+    assert mean_figures([{}, {}]) == {}
+    assert mean_figures([both, one]) == {
+        "psnr_colour": 30.0,
+        "psnr_affine": 26.0,
+        "psnr_colour_views": 1,
+        "psnr_colour_reason": "1 of 2 views have a half with too few pixels to fit colours to",
+    }
+    none = mean_figures([one])
+    assert (none["psnr_colour"], none["psnr_colour_views"]) == (None, 0)
+
+
+def test_the_log_says_of_how_many_views_the_mean_is(caplog):
+    caplog.set_level("INFO", "clsplat")
+    whole = {"psnr": 20.0, "psnr_colour": 24.0}
+    tell_of_colours({"psnr": 20.0})
+    assert not caplog.messages
+    for averages, said in (
+        (whole, r"PSNR 24.00 dB; exposures of these photographs differ"),
+        ({**whole, "psnr_colour_views": 1, "psnr_colour_reason": "why"}, r"PSNR 24.00 dB, the mean of 1 view: why$"),
+        (
+            {"psnr": 20.0, "psnr_colour": None, "psnr_colour_reason": "why"},
+            r"^no PSNR in the .* colours: why$",
+        ),
+    ):
+        caplog.clear()
+        tell_of_colours(averages)
+        (message,) = caplog.messages
+        assert re.search(said, message)
+
+
+def test_the_best_model_is_chosen_by_psnr_where_no_view_has_colours():
+    fitted, bare = {"psnr": 20.0, "psnr_colour": 24.0}, {"psnr": 21.0, "psnr_colour": None}
+    assert compared([fitted, fitted]) == [24.0, 24.0]
+    assert compared([fitted, bare]) == compared([fitted, {"psnr": 21.0}]) == [20.0, 21.0]
+    assert compared([fitted, {}]) == [20.0, None]
 
 
 def test_the_regression_is_of_the_image_on_the_photograph(rng):

@@ -5,13 +5,20 @@ photograph asks for, so that no pixel is measured in colours that were fitted to
 colour-corrected, fitted on the whole photograph, to compare with its figures alone.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.metrics.images import Mask, psnr
+from clsplat.metrics.stillness import means
 from clsplat.views.colours import OwnColours
 
 LEAST = 1e-3  # slope of a regression, below which there is nothing to divide by
+# Usable pixels for each number that is fitted to a channel: p numbers of n independent errors add p / n of their
+# variance to what is measured elsewhere, here 1 / 64, which is 0.07 dB.
+PIXELS = 64
 
 
 def colour_figures(
@@ -19,25 +26,42 @@ def colour_figures(
 ) -> dict[str, float]:
     """Return `psnr_colour` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
 
-    mask: pixels that count, [height, width].
+    mask: pixels that count, [height, width].  Without `psnr_colour` where a half has too few pixels to fit colours to.
     """
     truth = photograph / 255.0
     counted = np.ones(truth.shape[:2], bool) if mask is None else mask
     changed = in_colours_of(image.astype(np.float64), photograph, counted, model)
     corrected = corrected_by_regression(image.astype(np.float64), truth, counted)
-    return {"psnr_colour": psnr(changed, photograph, counted), "psnr_affine": psnr(corrected, photograph, counted)}
+    own = {} if changed is None else {"psnr_colour": psnr(changed, photograph, counted)}
+    return {**own, "psnr_affine": psnr(corrected, photograph, counted)}
+
+
+def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
+    """Return the averages over views of what colour_figures returned, with the keys of metrics.json.
+
+    Where views have no `psnr_colour`, `psnr_colour_views` is the number of those that have, and `psnr_colour_reason`
+    says why; where none has, it is None.
+    """
+    found, has = means(rows), [row for row in rows if "psnr_colour" in row]
+    if not found or len(has) == len(rows):
+        return found
+    reason = f"{len(rows) - len(has)} of {len(rows)} views have a half with too few pixels to fit colours to"
+    return {"psnr_colour": None, **found, "psnr_colour_views": len(has), "psnr_colour_reason": reason}
 
 
 def in_colours_of(
     image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: OwnColours
-) -> NDArray[np.float64]:
+) -> NDArray[np.float64] | None:
     """Return the image with each half, left and right, in the colours that the other half of the photograph asks for.
 
-    Pixels that are black or white in the photograph, or beyond white in the image, say nothing of its colours.
+    Pixels that are black or white in the photograph, or beyond white in the image, say nothing of its colours.  None
+    where a half has fewer than PIXELS others for each number that is fitted to a channel.
     """
     usable = counted & ((photograph > 0) & (photograph < 255) & (image < 1)).all(axis=2)
     middle, truth, changed = image.shape[1] // 2, photograph / 255.0, image.copy()
     left, right = np.s_[:, :middle], np.s_[:, middle:]
+    if min(np.count_nonzero(usable[half]) for half in (left, right)) < PIXELS * model.fitted_to_a_channel:
+        return None
     for half, other in ((left, right), (right, left)):
         matrix = model.fitted(image[other][usable[other]], truth[other][usable[other]])
         changed[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError, NumericError
 from clsplat.losses.base import Comparison
 from clsplat.losses.image import ssim_maps
-from clsplat.metrics.colours import colour_figures
+from clsplat.metrics.colours import colour_figures, mean_figures
 from clsplat.metrics.held_out import by_moment
 from clsplat.metrics.images import psnr, ssim, to_8_bits
 from clsplat.metrics.perceptual import Image, Perceptual
@@ -133,7 +133,7 @@ def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM)
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),
-        **{name: float(np.mean([r.colours[name] for r in results])) for name in results[0].colours},
+        **mean_figures([r.colours for r in results]),
         **means([r.moments for r in results]),
         **means([r.still for r in results]),
         **perceptual.mean([r.perceptual for r in results]),

@@ -50,7 +50,8 @@ def of_training_views(found: Sequence[ViewMetrics], has_colours: bool) -> Iterat
             f"{_listed(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the others: look for blur, "
             "a wrong camera, or what has moved, and leave such photographs out, or mask what has moved"
         )
-    gained = float(np.mean([one.colours["psnr_colour"] - one.psnr for one in found])) if found else 0.0
+    gains = [one.colours["psnr_colour"] - one.psnr for one in found if "psnr_colour" in one.colours]
+    gained = float(np.mean(gains)) if gains else 0.0
     if not has_colours and gained >= GAINED:
         yield (
             f"exposures or colours differ: in their own colours photographs would be {gained:.1f} dB nearer; "

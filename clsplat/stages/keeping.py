@@ -1,8 +1,8 @@
 """Which model a training leaves: that of its last step, or the best one by photographs that it did not see."""
 
 import logging
-from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -109,7 +109,7 @@ class Keeping(Training):
             return
         averages = {split: run.metrics.get(split, {}) for split in ("train", "validation")}
         measured = [one.get(f"{run.downscale:g}", {}) for one in averages.values()]
-        train, validation = (one.get("psnr_colour", one.get("psnr")) for one in measured)
+        train, validation = compared(measured)
         if train is None or validation is None:  # at another size, or masks leave out all
             return
         best, now = run.best, Measured(step=run.step, train=train, validation=validation)
@@ -152,6 +152,13 @@ class Keeping(Training):
             run.best = best.model_copy(update={"taken": run.step, "refit": "due" if self.refit else "none"})
             run.best_tables = {}
         LOG.info("%s", run.best.told())
+
+
+def compared(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
+    """Return the PSNR of averages of metrics, dB, None where there is none: in the photographs' colours where all have
+    it."""
+    figure = "psnr" if any(one.get("psnr_colour") is None for one in measured) else "psnr_colour"
+    return [one.get(figure) for one in measured]
 
 
 def _validates(stage: Scheduled) -> bool:

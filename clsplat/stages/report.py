@@ -100,7 +100,8 @@ def _figures(run: Run) -> dict[str, str]:
             values[f"{split} PSNR{suffix} ({amount(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
             for key, (name, unit) in MORE.items():
                 if averages.get(key) is not None:
-                    values[f"{split} {name}{suffix}"] = f"{averages[key]:.2f} {unit}"
+                    some = f" ({amount(averages[f'{key}_views'], 'view')})" if f"{key}_views" in averages else ""
+                    values[f"{split} {name}{suffix}{some}"] = f"{averages[key]:.2f} {unit}"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     if run.is_refit and run.best:
         found = run.best.found

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, NumericError, quoted
+from clsplat.errors import DataError, NumericError, amount, quoted
 from clsplat.files import atomic, write_text
 from clsplat.names import VIEW_COLOURS
 from clsplat.reading import read_json
@@ -127,6 +127,15 @@ def tell_of_colours(averages: dict[str, Any]) -> None:
     """Log the figures of a split in the photographs' colours, where there are any."""
     if "psnr_colour" not in averages:
         return
-    differ = averages["psnr_colour"] - averages["psnr"] > GUESSED
-    why = "; exposures of these photographs differ, which PSNR counts as errors" if differ else ""
-    LOG.info("in the photographs' colours: PSNR %.2f dB%s", averages["psnr_colour"], why)
+    figure, reason = averages["psnr_colour"], averages.get("psnr_colour_reason")
+    if figure is None:
+        LOG.warning("no PSNR in the photographs' colours: %s", reason)
+    elif reason:
+        LOG.warning(
+            "in the photographs' colours: PSNR %.2f dB, the mean of %s: %s",
+            *(figure, amount(averages["psnr_colour_views"], "view"), reason),
+        )
+    else:
+        differ = figure - averages["psnr"] > GUESSED
+        why = "; exposures of these photographs differ, which PSNR counts as errors" if differ else ""
+        LOG.info("in the photographs' colours: PSNR %.2f dB%s", figure, why)

@@ -62,6 +62,7 @@ class Affine(ColourModel):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
     columns: ClassVar[tuple[str, ...]] = tuple(f"{y}_{c}" for y in ("red", "green", "blue") for c in "rgb1")
+    fitted_to_a_channel: ClassVar[int] = 4
 
     type: Literal["affine"] = "affine"
     weight: Annotated[float, Field(ge=0)] = 1e-2

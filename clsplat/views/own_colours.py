@@ -39,6 +39,7 @@ class OwnColours(Colours):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
     columns: ClassVar[tuple[str, ...]] = ()  # names of what the numbers of a run have for each photograph
+    fitted_to_a_channel: ClassVar[int] = 1  # numbers that `fitted` finds for each of red, green and blue
 
     rate: RateOrAuto = "auto"
     """Learning rate of the numbers, by Adam, by step; auto: 1e-2 to 1e-3, where each photograph is visited 400 times or
