@@ -4,6 +4,7 @@ import gzip
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from clsplat.formats import sh_rounding
 from clsplat.formats.packing import morton_order
@@ -11,7 +12,10 @@ from clsplat.formats.sh_rounding import base_for, rounded_rows, steps, usual_ste
 from clsplat.formats.sh_tree import LEVELS, tree_palette
 from clsplat.formats.splats import SH_C0, SplatFile, Writing, unit
 from clsplat.formats.table import write
-from clsplat.formats.weights import LARGEST, log_weights
+from clsplat.formats.weights import LARGEST, before_a_gap, log_weights
+from clsplat.gaussians.model import Model
+from clsplat.gaussians.sky import Sky
+from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.harmonics import basis, mean_basis
 from tests.formats.models import splats, there_and_back
 
@@ -58,6 +62,34 @@ def test_weights_do_not_depend_on_the_size_of_the_scene_and_grow_with_opacity_an
     after = log_weights(more)
     changed = after - found - np.median(after - found)
     assert (changed[middle[:2]] > 0.1).all()
+
+
+@pytest.mark.parametrize("count", [400, 3000])
+def test_a_sky_of_gaussians_does_not_decide_how_the_scene_is_rounded(count, rng, tmp_path):
+    """Of the scene: its weights, and the errors of its positions in files."""
+    source, texels = splats(rng, count), rng.uniform(0, 1, (64, 3)).astype(np.float32)
+    source.parameters["log_scales"] = rng.uniform(-3.5, -3, (count, 3)).astype(np.float32)
+    baked = with_sky_splats(Model(**source.parameters, sky=Sky(texels)), 5000)
+    behind = SplatFile({name: getattr(baked, name) for name in source.parameters})
+    alone, beside = log_weights(source.parameters), log_weights(behind.parameters)[:count]
+    np.testing.assert_allclose(beside, alone, atol=0.15)
+    for name in ("a.spz", "a.sog"):
+        errors = []
+        for one in (source, behind):
+            found = there_and_back(tmp_path / name, one).parameters["means"]
+            errors.append(np.median(cKDTree(found).query(source.parameters["means"])[0]))
+        assert errors[1] < 1.3 * errors[0], name
+
+
+def test_without_a_gap_all_gaussians_count(rng):
+    for power in (1, 2, 4):
+        assert before_a_gap(rng.uniform(0, 1, 2000) ** power).all()
+    few = np.append(rng.uniform(0, 1, 980), rng.uniform(40, 50, 20))
+    assert before_a_gap(few).all(), "too few to decide a median"
+    assert before_a_gap(np.zeros(50)).all()
+    assert before_a_gap(np.array([0.0, 1.0])).all()
+    sky = np.append(rng.uniform(0, 1, 300), np.full(700, 10.0))
+    np.testing.assert_array_equal(before_a_gap(sky), sky < 5)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 50])
