@@ -16,7 +16,7 @@ from clsplat.progress import Count
 from data_tools.database import clear_features, explained, image_names, verified
 from data_tools.features import Sought, add_features
 from data_tools.gather import MIN_PHOTOGRAPHS, link
-from data_tools.matching import Pairing, match_within
+from data_tools.matching import Pairing, match_pairs, match_within, more_pairs
 from data_tools.names import DATABASE, IMAGES, MODEL
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.reasons import Matched, diagnosis, reasons
@@ -27,7 +27,7 @@ from data_tools.turning import only_turned
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
 ENOUGH = 0.9  # share of the photographs: with more, no more features are looked for
-DENSE = f".dense.{DATABASE}"
+DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
 DENSER = Sought(long_side=2400, count=16384, contrast=0.01)
 TURNED = (
     "match like those of a camera that only turned on the spot, which tell no depth; walk around the scene, a step "
@@ -49,11 +49,17 @@ class Attempt:
     told: str
     mapper: Mapper = "incremental"
     loose: bool = False  # fewer matches and smaller angles are enough
-    dense: bool = False  # with more features, matched as those of the first attempt are
+    wider: bool = False  # photographs that are left out are matched with more others, where not all pairs were matched
+    dense: bool = False  # with more features, matched as those of the attempts before are
+
+    def database(self, source: Path, out: Path) -> Path:
+        """The database of its features and matches."""
+        return out / DENSE if self.dense else out / WIDER if self.wider else source / DATABASE
 
 
 LATER = (
     Attempt("smaller angles and fewer matches", loose=True),
+    Attempt("more pairs", loose=True, wider=True),
     Attempt("denser features", loose=True, dense=True),
     Attempt("denser features, all cameras at once", "global", dense=True),
 )
@@ -77,28 +83,34 @@ def map_cameras(
     matched = Matched.of(pycolmap, source / DATABASE, source / IMAGES)
     if only_turned(pycolmap, source / DATABASE):
         raise DataError(f"{source / IMAGES}: the photographs {TURNED}")
-    models, used = list[Any](), (first := Attempt("as set", mapper))
+    models, used, more = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]]()
     for attempt in (first, *LATER)[:attempts]:
         placed = models[0].num_reg_images() if models else 0
         if placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
             break
+        if attempt.wider:
+            more = more_pairs(source / DATABASE, set(names) - _names(*models[:1]))
+            if not more:
+                continue
         if attempt.dense and not models and matched.have_nothing_in_common():
             LOG.info("%s", NOT_DENSER)
             break
         if attempt is not first:
             LOG.info("%d of %d photographs are placed; another attempt: %s", placed, len(names), attempt.told)
         try:
-            found = _attempt(source, out, attempt, threads, models[:1])
+            found = _attempt(source, out, attempt, threads, models[:1], more)
         except (DataError, RuntimeError, ValueError) as error:  # pycolmap's are of the last two
             if not models:
                 raise
             LOG.warning("the attempt failed (%s); the model from before stays", error)
             break
+        if attempt.wider:
+            matched = Matched.of(pycolmap, attempt.database(source, out), source / IMAGES)
         if found and found[0].num_reg_images() > placed:
             models, used = found, attempt
     if not models:
         raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnosis(matched)}")
-    database = out / DENSE if used.dense else source / DATABASE
+    database = used.database(source, out)
     if only_turned(pycolmap, database, placed_names := _names(models[0])):
         told = f"the {len(placed_names)} of {len(names)} photographs that could be placed"
         raise DataError(f"{source / IMAGES}: {told} {TURNED}")
@@ -114,12 +126,12 @@ def map_cameras(
     return figures
 
 
-def _attempt(source: Path, out: Path, attempt: Attempt, threads: int, before: Sequence[Any]) -> list[Any]:
+def _attempt(
+    source: Path, out: Path, attempt: Attempt, threads: int, before: Sequence[Any], more: Sequence[tuple[str, str]]
+) -> list[Any]:
     """The models of an attempt, the largest first; one of the same features goes on with the model from before."""
     pycolmap = require_pycolmap()
-    database, work = source / DATABASE, out / ".models"
-    if attempt.dense:
-        database = _denser(source, out)
+    database, work = _filled(source, out, attempt, more), out / ".models"
     if not verified(pycolmap, database):
         return []
     shutil.rmtree(work, ignore_errors=True)
@@ -139,27 +151,34 @@ def _attempt(source: Path, out: Path, attempt: Attempt, threads: int, before: Se
         def placed() -> None:
             count.reach(min(max(2, count.done) + 1, count.total))
 
-        more: dict[str, Any] = {} if is_global else {"next_image_callback": placed}
+        given: dict[str, Any] = {} if is_global else {"next_image_callback": placed}
         if attempt.loose and not attempt.dense and before:
             (out / ".before").mkdir(exist_ok=True)
             before[0].write(str(out / ".before"))
-            more["input_path"] = str(out / ".before")
+            given["input_path"] = str(out / ".before")
             count.reach(before[0].num_reg_images())
-        found = function(str(database), str(out / IMAGES), str(work), options=options, **more).values()
+        found = function(str(database), str(out / IMAGES), str(work), options=options, **given).values()
     models = [model for model in found if model.num_reg_images() >= MIN_PHOTOGRAPHS and model.num_points3D()]
     return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
-def _denser(source: Path, out: Path) -> Path:
-    """A database with more features of the same images, matched; one that was begun is gone on with."""
-    database = out / DENSE
+def _filled(source: Path, out: Path, attempt: Attempt, more: Sequence[tuple[str, str]]) -> Path:
+    """The database of an attempt, with its features and matches; one that was begun is gone on with.
+
+    The pairs follow from the first database and the model before, so that they are the same after a kill.
+    """
+    database, pairing = attempt.database(source, out), Pairing.beside(source)
     if not database.exists():
         half = database.with_name(f".half.{DATABASE}")
         shutil.copyfile(source / DATABASE, half)
-        clear_features(require_pycolmap(), half)
+        if attempt.dense:
+            clear_features(require_pycolmap(), half)
         half.replace(database)
-    add_features(source / IMAGES, database, DENSER)
-    match_within(database, Pairing.beside(source))
+    if attempt.dense:
+        add_features(source / IMAGES, database, DENSER)
+        match_within(database, pairing)
+    if attempt.dense or attempt.wider:
+        match_pairs(database, more, pairing.threads)
     return database
 
 
@@ -178,5 +197,5 @@ def _written(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[str
     }
 
 
-def _names(model: Any) -> set[str]:
-    return {model.images[number].name for number in model.reg_image_ids()}
+def _names(*models: Any) -> set[str]:
+    return {model.images[number].name for model in models for number in model.reg_image_ids()}

@@ -3,16 +3,18 @@
 import json
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, amount
 from clsplat.files import write_text
 from clsplat.progress import Count, watched
 from clsplat.reading import read_json
@@ -20,7 +22,7 @@ from data_tools.database import explained, image_names, opened, pairs_done, veri
 from data_tools.gather import link
 from data_tools.names import DATABASE, IMAGES, MATCHING, PAIRS
 from data_tools.pycolmap_import import require_pycolmap
-from data_tools.vocabulary import alike
+from data_tools.vocabulary import alike, likeness
 
 LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
@@ -78,13 +80,7 @@ def match_within(database: Path, how: Pairing) -> Matching:
     pycolmap = require_pycolmap()
     count, matching, neighbours = len(image_names(pycolmap, database)), how.matching, how.neighbours
     chosen = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
-    options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
-    options.use_gpu, options.num_threads, verification.ransac.random_seed = False, how.threads, 0
-    common = {
-        "matching_options": options,
-        "verification_options": verification,
-        "device": pycolmap.Device.cpu,
-    }
+    common = _options(pycolmap, how.threads)
     LOG.info("matching %d photographs, %s", count, chosen)
     with explained(database, "match photographs"):
         if chosen == "sequential":
@@ -95,27 +91,101 @@ def match_within(database: Path, how: Pairing) -> Matching:
                 pycolmap.match_sequential(str(database), pairing_options=pairing, **common)
         elif chosen == "vocabulary":
             pairs = _alike_pairs(pycolmap, database, 2 * neighbours)
-            listed = database.with_name(PAIRS)
-            write_text(listed, "".join(f"{a} {b}\n" for a, b in pairs))
-            imported = pycolmap.ImportedPairingOptions()
-            imported.match_list_path = listed
             with _counted(database, len(pairs)):
-                pycolmap.match_image_pairs(str(database), pairing_options=imported, **common)
+                _match_listed(database, pairs, common)
         else:
             with _counted(database, count * (count - 1) // 2):
                 pycolmap.match_exhaustive(str(database), **common)
     return chosen
 
 
+def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) -> None:
+    """Match these photographs of a database, but for pairs that it holds.  Raises DataError."""
+    pycolmap = require_pycolmap()
+    with opened(pycolmap, database) as rows:
+        numbers = {image.name: image.image_id for image in rows.read_all_images()}
+        missing = [(a, b) for a, b in pairs if not rows.exists_two_view_geometry(numbers[a], numbers[b])]
+        done = rows.num_matched_image_pairs()
+    if not missing:
+        return
+    LOG.info("matching %s more, of photographs that are left out", amount(len(missing), "pair"))
+    with explained(database, "match photographs"), _counted(database, done + len(missing)):
+        _match_listed(database, missing, _options(pycolmap, threads))
+
+
+def more_pairs(database: Path, left_out: Set[str]) -> list[tuple[str, str]]:
+    """Return pairs of photographs that are left out with any others, which `match_within` has not looked at.
+
+    They are no more than it has looked at, so that the matching takes twice as long at most: all, or those of each
+    photograph with the most similar ones.
+    """
+    pycolmap = require_pycolmap()
+    with opened(pycolmap, database) as rows:
+        images = sorted(rows.read_all_images(), key=lambda image: image.name)
+        most = rows.num_matched_image_pairs()
+        if most == len(images) * (len(images) - 1) // 2:
+            return []
+        if spaced := [image.name for image in images if _is_spaced(image.name)]:
+            LOG.warning(
+                "'%s': a name with spaces, which COLMAP's lists of pairs do not allow: no more pairs", spaced[0]
+            )
+            images = [image for image in images if not _is_spaced(image.name)]
+        is_left = [image.name in left_out for image in images]
+        found = [
+            (i, j)
+            for i, j in combinations(range(len(images)), 2)
+            if (is_left[i] or is_left[j]) and not rows.exists_two_view_geometry(images[i].image_id, images[j].image_id)
+        ]
+        if len(found) > most:
+            found = _closest(found, likeness(_descriptors(rows, images)), is_left, max(1, most // sum(is_left)))
+    return [(images[i].name, images[j].name) for i, j in found]
+
+
+def _closest(
+    pairs: Sequence[tuple[int, int]], close: NDArray[np.float64], is_left: Sequence[bool], count: int
+) -> list[tuple[int, int]]:
+    """Those of the pairs in which a photograph that is left out is with one of the `count` most similar ones to it."""
+    taken, chosen = [0] * len(is_left), []
+    for i, j in sorted(pairs, key=lambda pair: -close[pair]):
+        if any(is_left[one] and taken[one] < count for one in (i, j)):
+            chosen.append((i, j))
+            taken[i] += 1
+            taken[j] += 1
+    return sorted(chosen)
+
+
+def _options(pycolmap: ModuleType, threads: int) -> dict[str, Any]:
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.use_gpu, matching.num_threads, verification.ransac.random_seed = False, threads, 0
+    return {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
+
+
+def _match_listed(database: Path, pairs: Sequence[tuple[str, str]], options: dict[str, Any]) -> None:
+    pycolmap = require_pycolmap()
+    listed = database.with_name(PAIRS)
+    write_text(listed, "".join(f"{a} {b}\n" for a, b in pairs))
+    imported = pycolmap.ImportedPairingOptions()
+    imported.match_list_path = listed
+    pycolmap.match_image_pairs(str(database), pairing_options=imported, **options)
+
+
 def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[tuple[str, str]]:
     with opened(pycolmap, database) as rows:
         images = sorted(rows.read_all_images(), key=lambda image: image.name)
-        tables = [np.asarray(rows.read_descriptors(image.image_id).data, np.float32) for image in images]
-    if spaced := [image.name for image in images if len(image.name.split()) > 1]:
+        tables = _descriptors(rows, images)
+    if spaced := [image.name for image in images if _is_spaced(image.name)]:
         raise DataError(
             f"'{spaced[0]}': COLMAP's lists of pairs allow no spaces in names; rename it, or match all pairs"
         )
     return [(images[i].name, images[j].name) for i, j in alike(tables, neighbours)]
+
+
+def _descriptors(rows: Any, images: Sequence[Any]) -> list[NDArray[np.float32]]:
+    return [np.asarray(rows.read_descriptors(image.image_id).data, np.float32) for image in images]
+
+
+def _is_spaced(name: str) -> bool:
+    return len(name.split()) > 1
 
 
 @contextmanager

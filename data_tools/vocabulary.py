@@ -12,7 +12,15 @@ ROUNDS = 10  # of k-means
 
 
 def alike(tables: Sequence[NDArray[np.float32]], neighbours: int) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, of each photograph with the `neighbours` most similar ones.
+    """Return pairs (i, j), i < j, of each photograph with the `neighbours` most similar ones, by `likeness`."""
+    close = likeness(tables)
+    np.fill_diagonal(close, -1)
+    nearest = np.argsort(-close, axis=1, kind="stable")[:, : min(neighbours, len(tables) - 1)]
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row})
+
+
+def likeness(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+    """Return how alike photographs are, 0 to 1, [N, N].
 
     tables: descriptors [M, 128] of each photograph.  A word is a cell of k-means over a sample of the descriptors;
     photographs are compared by the cosine of their TF-IDF vectors.
@@ -30,10 +38,7 @@ def alike(tables: Sequence[NDArray[np.float32]], neighbours: int) -> list[tuple[
     rarity = np.log(len(tables) / np.maximum((counts > 0).sum(axis=0), 1))
     vectors = counts * rarity
     vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
-    likeness = vectors @ vectors.T
-    np.fill_diagonal(likeness, -1)
-    nearest = np.argsort(-likeness, axis=1, kind="stable")[:, : min(neighbours, len(tables) - 1)]
-    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row})
+    return np.asarray(vectors @ vectors.T)
 
 
 def _words(sample: NDArray[np.float32]) -> NDArray[np.float32]:

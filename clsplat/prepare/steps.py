@@ -128,8 +128,10 @@ class MatchFeatures(Step):
 
 
 class MapCameras(Step):
-    """Find cameras and points from matches; where photographs are left out, again with other settings."""
+    """Find cameras and points from matches; where photographs are left out, again with other settings, and matched with
+    more others where `match_features` has not matched all pairs."""
 
+    version: ClassVar[int] = 2  # more pairs of photographs that are left out
     resumes: ClassVar[bool] = True
     of_first: ClassVar[tuple[float, float]] = 0.3, 3.0  # 0.4 to 0.7 in three captures; further attempts take more
 
@@ -140,7 +142,8 @@ class MapCameras(Step):
     threads: Positive = 1
     """Number of threads; more than one are faster, and the result does not repeat to the bit."""
     attempts: Annotated[int, Field(ge=1, le=MOST)] = MOST
-    """Largest number of attempts; 1: none but the first.  Further ones match as `match_features` does."""
+    """Largest number of attempts; 1: none but the first.  2 takes smaller angles and fewer matches, 3 more pairs of
+    photographs that are left out, where not all were matched; 4 and 5 find denser features, and match as before."""
     fewest_views: Literal[2, 3] = 3
     """Number of photographs that must show a point; COLMAP leaves out those of two.  On one scene
     there are 2.5 times as many points with them."""
