@@ -5,7 +5,10 @@ traceback (`--debug` shows one).
 """
 
 import errno
+import os
 import reprlib
+import shlex
+import subprocess
 import traceback
 from collections.abc import Sequence
 from itertools import islice
@@ -138,6 +141,11 @@ def first_few(names: Sequence[str]) -> str:
 def amount(count: int, word: str) -> str:
     """Return a number with its noun: `1 view`, `2,000 views`."""
     return f"{count:,} {word}{'s' if count != 1 else ''}"
+
+
+def in_shell(path: object) -> str:
+    """Return a path as a shell reads it, for a command in a message."""
+    return subprocess.list2cmdline([str(path)]) if os.name == "nt" else shlex.quote(str(path))
 
 
 def shortened(text: str, limit: int = QUOTE_LIMIT) -> str:

@@ -1,12 +1,25 @@
 """Messages: one line of limited length, with the values of the input cut."""
 
+import re
+import shlex
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from clsplat import cli
-from clsplat.errors import MESSAGE_LIMIT, QUOTE_LIMIT, DataError, OverrideError, amount, one_line, quoted, shortened
+from clsplat.errors import (
+    MESSAGE_LIMIT,
+    QUOTE_LIMIT,
+    DataError,
+    OverrideError,
+    amount,
+    in_shell,
+    one_line,
+    quoted,
+    shortened,
+)
 from tests.commands import process
 
 VALUES = [
@@ -113,3 +126,26 @@ def test_whatever_is_raised_ends_as_one_line_with_a_code(raised, in_thread, monk
     assert line.startswith("error: ")
     assert len(line) <= MESSAGE_LIMIT + len("error: ")
     assert ("run with --debug" in line) == (code == 1)
+
+
+NO_PATHS = {"lower_rate(run, broken)", "2 * state.stage_step", "2 * metrics['steps']", "pipeline"}
+
+
+def test_a_path_in_a_command_is_one_word_of_a_shell():
+    assert in_shell("runs/a-1.b_2") == "runs/a-1.b_2", "no quotes where none are needed"
+    for name in ("my ü/a 'b' $c", "(x)", "a;b"):
+        assert shlex.split(f"clsplat resume {in_shell(Path(name))} --steps 2") == [
+            "clsplat",
+            "resume",
+            name,
+            "--steps",
+            "2",
+        ]
+
+
+def test_every_command_in_a_message_has_its_paths_quoted():
+    sources = "".join(path.read_text() for path in Path(cli.__file__).parents[1].rglob("*.py"))
+    commands = re.findall(r"`clsplat [^`\n]*`", sources)
+    places = {place for command in commands for place in re.findall(r"\{([^{}]*)\}", command)}
+    assert len(places) > 8
+    assert {place for place in places if not place.startswith("in_shell(")} <= NO_PATHS

@@ -19,7 +19,7 @@ from clsplat.blocks.times import block_seconds
 from clsplat.cluster.batch import Batch
 from clsplat.cluster.store import Store
 from clsplat.conformance.quick import open_correct
-from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError, amount, quoted
+from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError, amount, in_shell, quoted
 from clsplat.formats.ply_joining import join_plys
 from clsplat.formats.table import detect
 from clsplat.gaussians.model import load as load_model
@@ -146,7 +146,8 @@ class Blocks:
                     LOG.warning("%s: no Gaussian is left in its cell; the model goes on without it", block.name)
         if failures:
             remedy = "when that is mended, the same command trains them, and leaves the others alone"
-            other = f"other settings need another --out; --coarse {self.out / COARSE} keeps the coarse model there"
+            kept = in_shell(self.out / COARSE)
+            other = f"other settings need another --out; --coarse {kept} keeps the coarse model there"
             whole = failures.whole(len(pipelines))
             error = ClsplatError(f"{whole}; {remedy if self.given else f'{remedy}; {other}'}")
             error.exit_code = whole.exit_code

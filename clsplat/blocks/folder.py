@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.cluster.overview import is_store, store_status
-from clsplat.errors import ConfigError, DataError, one_line
+from clsplat.errors import ConfigError, DataError, in_shell, one_line
 from clsplat.names import END_STATES
 from clsplat.reading import read_json
 from clsplat.results import check_result
@@ -76,7 +76,7 @@ def verify_blocks(out: Path) -> dict[str, Any]:
         "state": state,
         "whole": all(one["whole"] for one in objects),
         "objects": objects,
-        "remedy": f"give its `clsplat blocks … --out {out}` again, which makes again what is lost",
+        "remedy": f"give its `clsplat blocks … --out {in_shell(out)}` again, which makes again what is lost",
     }
 
 

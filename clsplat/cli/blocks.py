@@ -8,6 +8,7 @@ import typer
 from clsplat import terminal
 from clsplat.api import blocks as api
 from clsplat.cli.app import DeviceOption, JsonOption, PipelineArgument, SetOption, command
+from clsplat.errors import in_shell
 
 
 @command(
@@ -75,4 +76,4 @@ def blocks(
     if plan:
         terminal.remark(f"{out}/partition.json: the plan; the same command without --plan trains the blocks")
     else:
-        terminal.remark(f"{found['run']}: {found['metrics']['gaussians']:,} Gaussians; `clsplat view {found['run']}`")
+        terminal.remark(f"`clsplat view {in_shell(found['run'])}` shows {found['metrics']['gaussians']:,} Gaussians")

@@ -8,7 +8,7 @@ import typer
 from clsplat import terminal
 from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, JsonOption, LiveOption, PipelineArgument, SetOption, command, recipe_names
-from clsplat.errors import ConfigError, DataError, OutputError
+from clsplat.errors import ConfigError, DataError, OutputError, in_shell
 
 OnOption = Annotated[
     Path | None,
@@ -228,7 +228,7 @@ def pipelines(
         if as_json:
             terminal.show_json({"copy": str(target)})
         else:
-            terminal.remark(f"{target}: a copy of {name}; `clsplat check {target}` validates it")
+            terminal.remark(f"{target}: a copy of {name}; `clsplat check {in_shell(target)}` validates it")
     elif as_json:
         terminal.show_json(commands.pipelines(name or None))
     else:

@@ -1,9 +1,8 @@
 """What a preparation would say of a folder of photographs without cameras."""
 
-import shlex
 from collections.abc import Iterator
 
-from clsplat.errors import amount
+from clsplat.errors import amount, in_shell
 from clsplat.inspect.finding import Finding
 from clsplat.inspect.survey import Facts
 from data_tools.gather import MIN_PHOTOGRAPHS
@@ -20,7 +19,7 @@ def unprepared(facts: Facts) -> Iterator[Finding]:
     if count < MIN_PHOTOGRAPHS:  # told with the files that are left out
         remedy, texts = facts.refusal.removeprefix(f"{facts.path}: "), []
     else:
-        remedy, texts = f"`clsplat run photos --scene {shlex.quote(facts.path)}` finds the cameras", facts.left_out
+        remedy, texts = f"`clsplat run photos --scene {in_shell(facts.path)}` finds the cameras", facts.left_out
         if readable < MIN_PHOTOGRAPHS:
             remedy = f"only {readable} of {count} photographs can be read; export them again"
     yield Finding("error", f"{facts.path} holds {held} no camera poses", remedy)

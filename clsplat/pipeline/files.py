@@ -4,7 +4,7 @@ import difflib
 from pathlib import Path
 
 from clsplat import resource_dir
-from clsplat.errors import ConfigError, quoted
+from clsplat.errors import ConfigError, in_shell, quoted
 from clsplat.names import PIPELINE
 
 
@@ -31,9 +31,11 @@ def find(name: str) -> Path:
     if name in files:
         return files[name]
     if is_run:
-        raise ConfigError(f"{path}: is a run folder, expected a pipeline; `clsplat resume {path}` goes on with the run")
+        raise ConfigError(
+            f"{path}: is a run folder, expected a pipeline; `clsplat resume {in_shell(path)}` goes on with the run"
+        )
     if is_folder:
-        remedy = f"with a scene it is `clsplat run splat_7k --scene {path}`"
+        remedy = f"with a scene it is `clsplat run splat_7k --scene {in_shell(path)}`"
         raise ConfigError(f"{path}: is a folder, expected a pipeline file; {remedy}")
     near = difflib.get_close_matches(name, files, n=1)
     unknown = ", and no such file or folder; `clsplat pipelines` lists pipelines"

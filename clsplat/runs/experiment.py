@@ -10,7 +10,7 @@ from typing import Any
 
 from clsplat import terminal
 from clsplat.compare.page import write_comparison
-from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted
+from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, in_shell
 from clsplat.files import is_there, write_text
 from clsplat.live.live import Live
 from clsplat.names import COMPARISON, OF_A_MATRIX, PIPELINE, STATUS
@@ -82,7 +82,9 @@ class Job:
         """
         file = out / PIPELINE
         if not file.is_file():
-            again = f"; give its `clsplat run … --out {out} --resume` again" if (out / STATUS).is_file() else ""
+            again = (
+                f"; give its `clsplat run … --out {in_shell(out)} --resume` again" if (out / STATUS).is_file() else ""
+            )
             raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has begun{again}")
         return cls.open(str(file), scene, out, overrides, "resume", execution)
 
@@ -121,7 +123,7 @@ class Job:
         if start is None:
             LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
         elif start == "resume" and not (folder := self.work.settings.scene.folder).exists():
-            remedy = f"`clsplat resume {self.out} --scene DIR` says where they are now"
+            remedy = f"`clsplat resume {in_shell(self.out)} --scene DIR` says where they are now"
             raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
         else:
             run_pipeline(self.work, self.out, device, start, live, minutes)
@@ -181,7 +183,9 @@ def _run_cells(
                     LOG.info("%s", title)
                     run_pipeline(cell.pipeline, folder, device, start, live)
         except Interrupted as stopped:
-            raise Interrupted(f"stopped in {title}; `clsplat resume {status.out}` goes on with it") from stopped
+            raise Interrupted(
+                f"stopped in {title}; `clsplat resume {in_shell(status.out)}` goes on with it"
+            ) from stopped
         status.note(done=number, failed=failures.texts())
         status.refresh()
     return failures

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.compare.run_folder import read_metrics
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ConfigError, DataError, in_shell
 from clsplat.names import CHECKSUMS, METRICS, PIPELINE, STATUS, is_inside
 from clsplat.pipeline.choices import without_choices
 from clsplat.pipeline.choosing import undone
@@ -71,8 +71,8 @@ def restart(out: Path) -> str:
     pipeline = "…"
     with suppress(ConfigError):  # where it is lost
         load(str(out / PIPELINE))
-        pipeline = str(out / PIPELINE)
-    return f"`clsplat run {pipeline} --out {out} --restart`"
+        pipeline = in_shell(out / PIPELINE)
+    return f"`clsplat run {pipeline} --out {in_shell(out)} --restart`"
 
 
 def read_sums(out: Path) -> dict[str, str] | None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from clsplat.errors import ConfigError, DataError, Interrupted
+from clsplat.errors import ConfigError, DataError, Interrupted, in_shell
 from clsplat.files import write_text
 from clsplat.inspect.findings import few_views
 from clsplat.names import CHECKSUMS, NOTE, PIPELINE
@@ -137,7 +137,9 @@ def run_stages(pipeline: Pipeline, run: Run) -> None:
             run.next_stage(cursor + 1)  # a resumed run must not repeat an edit
         if run.interrupted:
             path = checkpoint.save(run)
-            raise Interrupted(f"stopped in {stage.stage}, saved in {path}; `clsplat resume {run.out}` goes on from it")
+            raise Interrupted(
+                f"stopped in {stage.stage}, saved in {path}; `clsplat resume {in_shell(run.out)}` goes on from it"
+            )
         if is_due(run):
             run_stages(pipeline, run)
             return

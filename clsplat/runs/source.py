@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 
 from clsplat.compare.run_folder import read_metrics
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ConfigError, DataError, in_shell
 from clsplat.formats.model_files import located
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL, model_at, model_of_run
@@ -80,10 +80,12 @@ def _no_model(folder: Path, name: str = MODEL) -> DataError:
     if _has_field(folder):
         return DataError(f"{folder}: has no file of its field; run its pipeline again with the stage export_field")
     if has_pipeline(folder):
-        return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {folder}`")
+        return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {in_shell(folder)}`")
     fault = f"{folder}: has no {PIPELINE}; expected a model file or a run folder"
     if any(map(is_image, chain(folder.glob("*"), folder.glob("images/*")))):
-        return DataError(f"{fault}; for a model of its photographs, run `clsplat run photos --scene {folder}` first")
+        return DataError(
+            f"{fault}; for a model of its photographs, run `clsplat run photos --scene {in_shell(folder)}` first"
+        )
     return DataError(fault)
 
 

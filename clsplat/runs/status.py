@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.compare.run_folder import read_metrics
-from clsplat.errors import DataError, one_line
+from clsplat.errors import DataError, in_shell, one_line
 from clsplat.names import END_STATES, METRICS, PIPELINE, SILENT, STATUS
 from clsplat.processes import Owner
 from clsplat.training import checkpoint
@@ -31,7 +31,9 @@ def run_status(out: Path) -> dict[str, Any]:
     try:
         known = status_of(status)
     except DataError as error:
-        raise DataError(f"{out / STATUS}: damaged ({error}); `clsplat check {out}` tells what else is") from error
+        raise DataError(
+            f"{out / STATUS}: damaged ({error}); `clsplat check {in_shell(out)}` tells what else is"
+        ) from error
     if known is None:
         raise DataError(f"{out / STATUS}: of a newer clsplat; update clsplat to read it")
     status["state"] = state_of(status)
@@ -88,13 +90,15 @@ def status_text(status: dict[str, Any]) -> str:
 def _advice(status: dict[str, Any]) -> str:
     """How to go on with a run that has ended before its end."""
     out, message = Path(status["run"]), str(status.get("message"))
-    if not (out / PIPELINE).is_file() or f"clsplat resume {out}" in message or "--restart" in message:
+    resume = f"clsplat resume {in_shell(out)}"
+    if not (out / PIPELINE).is_file() or resume in message or "--restart" in message:
         return ""
     if "cells" in status or checkpoint.saved(out):
-        return f"`clsplat resume {out}` goes on with it"
+        return f"`{resume}` goes on with it"
     if status.get("checkpoint"):  # without which it does not go on
-        return f"its checkpoints are gone; `clsplat run {out / PIPELINE} --out {out} --restart` begins it again"
-    return f"no checkpoint was saved; `clsplat resume {out}` begins it again"
+        again = f"`clsplat run {in_shell(out / PIPELINE)} --out {in_shell(out)} --restart`"
+        return f"its checkpoints are gone; {again} begins it again"
+    return f"no checkpoint was saved; `{resume}` begins it again"
 
 
 def _progress(status: dict[str, Any]) -> str:

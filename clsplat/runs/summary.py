@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, in_shell
 from clsplat.names import METRICS, VIEW_COLOURS, VIEW_POSES
 from clsplat.reading import read_json
 from clsplat.training.found import photographs_text, size_text
@@ -50,7 +50,7 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"  time     {', '.join(long)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
-        more = f"; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"
+        more = f"; `clsplat resume {in_shell(folder)} --steps {2 * metrics['steps']}` trains longer"
         if metrics.get("by_heart"):
             more = "; the photographs are learnt by heart: more of them help most"
         elif kept and (kept["refit"] or kept["step"] < kept["last"]["step"]):  # validation has found where to end

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from clsplat.errors import in_shell
 from clsplat.names import PIPELINE
 from clsplat.runs.course import beyond_repair
 from clsplat.runs.found import has_state, restart
@@ -34,8 +35,8 @@ def _remedy(found: dict[str, Any], file: str) -> str:
     damaged = [cell / name for name, good in whole.items() if not good]
     left = beyond_repair(cell, damaged)
     if not whole.get(PIPELINE):
-        return f"give its `clsplat run … --out {cell}` again, with {'--restart' if left else '--resume'}"
-    resume = f"`clsplat resume {cell}` makes them again"
+        return f"give its `clsplat run … --out {in_shell(cell)}` again, with {'--restart' if left else '--resume'}"
+    resume = f"`clsplat resume {in_shell(cell)}` makes them again"
     if not left:
         return resume
     others = "" if len(left) == len(damaged) else f"; {resume} but for {', '.join(map(str, left))}"

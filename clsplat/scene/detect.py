@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ConfigError, DataError, in_shell
 from clsplat.formats.table import detect as model_format
 from clsplat.scene.blender import BlenderReader
 from clsplat.scene.colmap import ColmapReader
@@ -71,6 +71,8 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
         reader.missing = split.missing
         return split.applied(reader.read(path, split.of_reader))
     if any(is_image(file) for file in path.iterdir()):
-        raise DataError(f"{path}: photographs without cameras; `clsplat run photos --scene {path}` finds the cameras")
+        raise DataError(
+            f"{path}: photographs without cameras; `clsplat run photos --scene {in_shell(path)}` finds the cameras"
+        )
     known = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
     raise DataError(f"{path}: no dataset found; looked for {known}")

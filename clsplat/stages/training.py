@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from pydantic import Field, field_validator
 
-from clsplat.errors import Interrupted
+from clsplat.errors import Interrupted, in_shell
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.training import checkpoint
@@ -97,7 +97,7 @@ class Training(Stage):
             self.act_between(run)
         run.between()
         if run.interrupted:
-            told = f"saved in {checkpoint.save(run)}; `clsplat resume {run.out}` goes on from it"
+            told = f"saved in {checkpoint.save(run)}; `clsplat resume {in_shell(run.out)}` goes on from it"
             raise Interrupted(f"stopped at step {run.step}, {told}")
         if self.has_ended(run):
             self.leave(run)

@@ -14,7 +14,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from clsplat import __version__
-from clsplat.errors import ClsplatError, ConfigError, DataError, NotFiniteError, OutputError
+from clsplat.errors import ClsplatError, ConfigError, DataError, NotFiniteError, OutputError, in_shell
 from clsplat.files import atomic
 from clsplat.names import CHECKPOINTS, PIPELINE
 from clsplat.training import archive, run_tables
@@ -59,7 +59,7 @@ def set_aside(run: Run, broken: list[str]) -> str:
     good = saved(run.out)
     return (
         f"parameters not finite: {', '.join(broken) or 'none'}; {state}; "
-        f"`clsplat resume {run.out} --set {lower_rate(run, broken)}` lowers a rate and "
+        f"`clsplat resume {in_shell(run.out)} --set {lower_rate(run, broken)}` lowers a rate and "
         f"{f'goes on from {good[-1].name}' if good else 'starts again'}"
     )
 
@@ -102,7 +102,9 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
     when no checkpoint is whole, or all are gone.
     """
     paths = saved(run.out)
-    again = f"`clsplat run {run.out / PIPELINE} --out {run.out} --restart` starts from the beginning"
+    again = (
+        f"`clsplat run {in_shell(run.out / PIPELINE)} --out {in_shell(run.out)} --restart` starts from the beginning"
+    )
     for path in reversed(paths):
         try:
             state, tables = load(path)
@@ -197,7 +199,7 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
             raise ConfigError(f"{path} is of a refit, whose steps validation has found: {difference}; {remedy}")
         is_end = difference.place.endswith(".steps")  # an end before the one that was planned
         if difference.stage == state.cursor and state.is_trained(run.pipeline) and not is_end:
-            more = f"`clsplat resume {run.out} --steps {2 * state.stage_step}` with that setting trains on"
+            more = f"`clsplat resume {in_shell(run.out)} --steps {2 * state.stage_step}` with that setting trains on"
             raise ConfigError(f"{path}: no step is left to train, at step {state.step}: {difference}; {more}")
         changed.append(f"step {state.step}: {difference}")
     run.changes = [*state.changes, *changed]
