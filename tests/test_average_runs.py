@@ -87,9 +87,20 @@ def test_an_average_that_nothing_adds_to_is_refused(tmp_path, pipeline):
     ):
         load(pipeline, ["optimize.add_to_average.start=30"])
     with pytest.raises(
-        ConfigError, match=r"the training ends before: set add_to_average\.start earlier"
+        ConfigError, match=r"the training ends before: set add_to_average\.every below 30"
     ):  # no edit follows the last step
         load(pipeline, ["optimize.add_to_average.every=30", "optimize.add_to_average.start=0"])
+
+
+def test_the_figures_of_the_error_are_those_of_all_overrides():
+    told = r"optimize\.steps=40: .* at every 50 steps after step 10; .* set add_to_average\.every below 40, or"
+    with pytest.raises(ConfigError, match=told):
+        load("photos", ["optimize.steps=40", "add_to_average.start=10"])
+    with pytest.raises(ConfigError, match=r"optimize\.steps=40: .* after step 60; .*\.start earlier"):
+        load("photos", ["optimize.steps=40", "add_to_average.every=20", "add_to_average.start=60"])
+    load("photos", ["optimize.steps=40", "add_to_average.start=10", "add_to_average.every=20"])
+    with pytest.raises(ConfigError, match=r"--set add_to_average\.start=-1: "):
+        load("photos", ["optimize.steps=40", "add_to_average.start=-1"])
 
 
 STAGES = {

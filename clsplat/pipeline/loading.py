@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from clsplat import plugins
+from clsplat.cadence import is_act
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.names import PREPARED
 from clsplat.pipeline.choosing import check_choices
@@ -130,6 +131,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
 def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
     """Raise the error of the file without overrides, or else that of the first invalid override."""
     known = [key.place for key in settable(_validated(data, path, document))]
+    without: tuple[str, ConfigError] | None = None  # what is not there since an override; a later one may make it
     for override in overrides:
         names, _ = split(override)
         before = copy.deepcopy(data)
@@ -143,12 +145,15 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
         data = with_new_names(data, old_wins=True)
         try:
             _check_order(path, PipelineFile.model_validate(data))
+            without = None
         except ValidationError as error:
             where, complaint = first_fault(error, PipelineFile)
             around = where == place[: len(where)]
             raise OverrideError(override, complaint if around else f"{place_text(where)}: {complaint}") from error
         except ConfigError as error:
-            raise OverrideError(override, one_line(error).removeprefix(f"{path}: ")) from error
+            without = (without[0] if without else override), error
+    if without:
+        raise OverrideError(without[0], one_line(without[1]).removeprefix(f"{path}: ")) from without[1]
 
 
 def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
@@ -189,11 +194,18 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
 
 def _late(stages: Sequence[Stage], need: str) -> str:
     """Say of a part what should make it during a training, but does not act; "" where there is none."""
+    step = 0
     for training in stages:
-        for inner in training.during if isinstance(training, Training) else ():
-            if need in inner.makes:
+        if not isinstance(training, Training):
+            continue
+        for inner in training.during:
+            if need in inner.makes and inner.every:
                 cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
-                return f"{cadence}; the training ends before: set {inner.stage}.start earlier, or use --minutes"
+                remedy = f"set {inner.stage}.start earlier"
+                if not any(is_act(inner.every, one) for one in range(step + 1, step + training.steps)):
+                    remedy = f"set {inner.stage}.every below {training.steps}"
+                return f"{cadence}; the training ends before: {remedy}, or use --minutes"
+        step += training.steps
     return ""
 
 
