@@ -18,6 +18,7 @@ from clsplat.files import write_text
 from clsplat.reading import read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera
 from clsplat.scene.scene import PointCloud
+from clsplat.scene.tracks import Tracks
 from clsplat.scene.transforms import Frame
 from clsplat.scene.view import View
 
@@ -26,8 +27,8 @@ MAX_BYTES = 1 << 27
 MAX_VIEWS = 100_000
 
 
-def write(out: Path, views: list[Posed], points: PointCloud | None) -> list[Path]:
-    """Write out/cameras.json; return it.  The points have no place in it.  Raises OutputError."""
+def write(out: Path, views: list[Posed], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
+    """Write out/cameras.json; return it.  Points and tracks have no place in it.  Raises OutputError."""
     write_text(out / FILE, json.dumps([_camera(one, i) for i, one in enumerate(views)], indent=1) + "\n")
     centre_lost(out / FILE, [one.view.camera for one in views], "other programs")
     return [out / FILE]

@@ -10,6 +10,7 @@ from clsplat.files import write_text
 from clsplat.scene.lens import Lens
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
+from clsplat.scene.tracks import Tracks
 from clsplat.scene.transforms import opengl_matrix
 
 FILE, POINTS = "transforms.json", "points3d.ply"
@@ -27,8 +28,8 @@ DISTORTION = {  # of COLMAP's models: the model that nerfstudio knows, and the n
 REMEDY = "write colmap, or `clsplat data undistort` first"
 
 
-def write(out: Path, views: list[Posed], points: PointCloud | None) -> list[Path]:
-    """Write out/transforms.json, and the points where there are some; return the files.
+def write(out: Path, views: list[Posed], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
+    """Write out/transforms.json, and the points where there are some, without tracks; return the files.
 
     nerfstudio evaluates at the validation views, for which the test views are named too.
     Raises OutputError where it cannot be written.

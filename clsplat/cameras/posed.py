@@ -1,6 +1,5 @@
 """The views of a scene as files name them: unique names of images below one folder, and lenses."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -9,9 +8,8 @@ from clsplat.scene.images import is_image
 from clsplat.scene.lens import Lens
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE, View
-from clsplat.scene.zoom import zoomed
+from clsplat.scene.zoom import lens_of
 
-ROUNDING = 1e-12
 IMAGES = "images"  # the folder of the photographs, as COLMAP and nerfstudio have it
 
 
@@ -26,11 +24,7 @@ class Posed:
     @property
     def lens(self) -> Lens:
         """The lens of the photograph as it is on disk: that of the view, or its pinhole camera."""
-        c, lens = self.view.camera, self.view.lens
-        if lens is not None:
-            factor = c.fx / lens.pinhole.resized(c.width, c.height).fx  # 1, unless the focal length was learned
-            return lens if math.isclose(factor, 1, rel_tol=ROUNDING) else zoomed(lens, factor)
-        return Lens(c.width, c.height, "PINHOLE", (c.fx, c.fy, c.cx, c.cy))
+        return lens_of(self.view)
 
 
 def posed(scene: Scene) -> list[Posed]:

@@ -11,10 +11,13 @@ from clsplat.errors import ConfigError, DataError, quoted
 from clsplat.files import atomic, is_there
 from clsplat.progress import counted
 from clsplat.reading import opened
+from clsplat.scene.exif import BESIDE, write_exposures
+from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.scene import PointCloud, Scene
+from clsplat.scene.tracks import Tracks
 
 LOG = logging.getLogger("clsplat")
-WRITERS: dict[str, Callable[[Path, list[Posed], PointCloud | None], list[Path]]] = {
+WRITERS: dict[str, Callable[[Path, list[Posed], PointCloud | None, Tracks | None], list[Path]]] = {
     "colmap": colmap.write,
     "nerfstudio": nerfstudio.write,
     "inria": inria.write,
@@ -32,6 +35,7 @@ PLACES = {  # that each writes
 UNDISTORTED = ("inria",)  # formats of cameras without lenses
 COPIES = ("none", "copy")  # of the photographs
 SPLIT = "nerfstudio"  # what keeps it, and times
+TRACKS = "colmap"  # what keeps which points the photographs show
 
 
 def checked(scene: Scene, format_: str) -> list[Posed]:
@@ -42,7 +46,8 @@ def checked(scene: Scene, format_: str) -> list[Posed]:
 
 
 def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", over: bool = False) -> list[Path]:
-    """Write the cameras of a scene, and the photographs where they are to be copied; return the files of cameras.
+    """Write the cameras of a scene, and the photographs where they are to be copied, with what their cameras noted of
+    the exposures; return the files of cameras.
 
     The views have the size of the dataset.  over: whether files there may be replaced.
     Raises ConfigError for another name and where a file is there, DataError where the format cannot hold the scene.
@@ -57,16 +62,22 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
             "`clsplat data undistort` first, or write the cameras alone"
         )
     copies = image_files(views, out / IMAGES) if images == "copy" else {}
-    for path in () if over else (*(out / place for place in PLACES[format_]), *copies):
+    beside = [out / IMAGES / BESIDE] if copies else []
+    for path in () if over else (*(out / place for place in PLACES[format_]), *copies, *beside):
         if is_there(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
-    written = WRITERS[format_](out, views, scene.points)
+    written = WRITERS[format_](out, views, scene.points, scene.tracks)
     if format_ != SPLIT and scene.test:
         lost = f"{len(scene.test)} of {len(views)}"
         LOG.warning("%s: %s does not keep which views are for testing, %s; %s does", out, format_, lost, SPLIT)
     if format_ != SPLIT and any(one.view.time is not None for one in views):
         LOG.warning("%s: %s does not keep the times of the views; %s does", out, format_, SPLIT)
+    if format_ != TRACKS and copies and scene.tracks is not None:
+        LOG.warning("%s: %s does not keep which points the photographs show; %s does", out, format_, TRACKS)
     for path, source in counted(copies.items(), "photographs copied", len(copies)):
         with opened(source, "an image") as old, atomic(path) as new:
             shutil.copyfileobj(old, new)
+    if copies:
+        found = camera_exposures([one.view for one in views])
+        write_exposures(out / IMAGES, {one.name: exposure for one, exposure in zip(views, found, strict=True)})
     return written

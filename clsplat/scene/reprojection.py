@@ -1,12 +1,15 @@
 """How far the points of a dataset are from where its photographs show them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.scene.scene import Scene
 from clsplat.scene.tracks import Tracks
 from clsplat.scene.view import View
+from clsplat.scene.zoom import lens_of
 
 Floats = NDArray[np.float64]
 EXACT = 1e-3  # px: below it places were computed from the cameras, and tell nothing of them
@@ -15,15 +18,36 @@ EXACT = 1e-3  # px: below it places were computed from the cameras, and tell not
 def misses(view: View, positions: NDArray[np.floating], places: Floats) -> Floats:
     """Return the vectors, [K, 2] px, from where a view at its full size shows positions, [K, 3], to places, [K, 2] px
     of the photograph as it was taken; NaN behind the camera, and for places far outside the photograph."""
-    points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
-    camera, taken = view.camera, view.lens or view.camera
+    taken = view.lens or view.camera
     size = np.array([taken.width, taken.height])
-    near = (np.abs(places - size / 2) <= size).all(axis=1)  # a place of a damaged file says nothing of cameras
-    points[~(near & (points[:, 2] > 0))] = np.nan
+    # a place of a damaged file says nothing of cameras
+    near = np.all(np.abs(places - size / 2) <= size, axis=1, keepdims=True)
+    return np.where(near, places - projected(view, positions), np.nan)
+
+
+def projected(view: View, positions: NDArray[np.floating]) -> Floats:
+    """Return where a view at its full size shows positions, [K, 3]: [K, 2] px of the photograph as it was taken, NaN
+    behind the camera."""
+    points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
+    points[~(points[:, 2] > 0)] = np.nan
     with np.errstate(all="ignore"):
         if view.lens is not None:
-            return np.asarray(places - view.lens.project(points))
-        return np.asarray(places - points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) - (camera.cx, camera.cy))
+            return lens_of(view).project(points)
+        camera = view.camera
+        return np.asarray(points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
+
+
+def with_cameras(scene: Scene, views: Sequence[View]) -> Scene:
+    """Return a scene, at its full size, whose views have other cameras; photographs show its points where they did."""
+    tracks, missed = scene.tracks, dict[str, Floats]()
+    if tracks is not None:
+        for old, new in zip(scene.views, views, strict=True):
+            if old.name in tracks.misses:
+                positions = tracks.positions[tracks.seen[old.name]]
+                moved = projected(old, positions) - projected(new, positions)
+                missed[old.name] = tracks.misses[old.name] + moved
+        tracks = replace(tracks, misses={**tracks.misses, **missed})
+    return replace(scene, views=tuple(views), tracks=tracks)
 
 
 def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats | None:

@@ -5,10 +5,14 @@ has the same f.  Where that camera has s f, the lens of s f with D'(u) = D(s u) 
 coefficient of a polynomial term of degree n + 1 is multiplied by s^n.
 """
 
+import math
 from dataclasses import replace
 
 from clsplat.errors import DataError
 from clsplat.scene.lens import MODELS, Lens
+from clsplat.scene.view import View
+
+ROUNDING = 1e-12
 
 DEGREES: dict[str, tuple[int, ...]] = {  # n of each coefficient after the middle, in COLMAP's order
     "SIMPLE_PINHOLE": (),
@@ -41,3 +45,15 @@ def zoomed(lens: Lens, factor: float) -> Lens:
     lengths, middle, rest = lens.params[:focals], lens.params[focals : focals + 2], lens.params[focals + 2 :]
     scaled = [value * factor**degree for value, degree in zip(rest, DEGREES[lens.model], strict=True)]
     return replace(lens, params=(*(factor * length for length in lengths), *middle, *scaled))
+
+
+def lens_of(view: View) -> Lens:
+    """Return the lens of a view's photograph as it is on disk: a pinhole where it has no distortion.
+
+    Raises DataError where its focal length was learned and its model has none with another.
+    """
+    c, lens = view.camera, view.lens
+    if lens is None:
+        return Lens(c.width, c.height, "PINHOLE", (c.fx, c.fy, c.cx, c.cy))
+    factor = c.fx / lens.pinhole.resized(c.width, c.height).fx  # 1, unless the focal length was learned
+    return lens if math.isclose(factor, 1, rel_tol=ROUNDING) else zoomed(lens, factor)

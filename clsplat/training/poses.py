@@ -14,6 +14,7 @@ from clsplat.errors import ConfigError, DataError, PoseError, amount, quoted
 from clsplat.files import write_text
 from clsplat.names import VIEW_POSES
 from clsplat.reading import read_json
+from clsplat.scene.reprojection import with_cameras
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.scene.zoom import zooms
@@ -107,7 +108,7 @@ def refined(numbers: Mapping[str, float], scene: Scene) -> Scene:
         camera = view.camera.zoomed(focals.factor(numbers, view.name))
         return replace(view, world_to_camera=pose(view), camera=camera)
 
-    return replace(scene, views=tuple(map(found, scene.views)))
+    return with_cameras(scene, list(map(found, scene.views)))
 
 
 def _centre(pose: Floats) -> Floats:
@@ -163,7 +164,7 @@ def poses_beside(model: Path, scene: Scene) -> Scene:
     found = data.get("photographs") if isinstance(data, dict) else None
     if not isinstance(found, dict):
         raise DataError(f"{path}: expected a mapping 'photographs'; train again, or remove the file")
-    return replace(scene, views=tuple(_with_pose(path, view, found.get(view.name)) for view in scene.views))
+    return with_cameras(scene, [_with_pose(path, view, found.get(view.name)) for view in scene.views])
 
 
 def _with_pose(path: Path, view: View, row: Any) -> View:

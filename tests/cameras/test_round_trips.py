@@ -15,9 +15,13 @@ from clsplat import cli
 from clsplat.cameras import inria
 from clsplat.cameras.nerfstudio import DISTORTION
 from clsplat.errors import ConfigError, DataError
+from clsplat.scene.exif import CameraExposure, write_exposures
+from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.lens import MODELS, Lens
 from clsplat.scene.quaternion import rotation_matrix
+from clsplat.scene.reprojection import with_cameras
 from clsplat.scene.scene import PointCloud, make_scene
+from clsplat.scene.tracks import Tracks
 from clsplat.scene.view import View
 from clsplat.stages.cameras import Cameras
 from tests.commands import clsplat as command
@@ -217,6 +221,77 @@ def test_what_cannot_be_written_is_refused(scene_of, tmp_path):
     with pytest.raises(DataError, match="has no photograph to copy"):
         clsplat.write_cameras(nameless, tmp_path / "out", images="copy")
     assert not (tmp_path / "out").exists()
+
+
+def with_tracks(scene, rng):
+    """The scene whose points lie before all cameras; each photograph shows four of them, a little off."""
+    views = [
+        replace(view, world_to_camera=np.column_stack([np.eye(3), [i / 10, 0, 0]]))
+        for i, view in enumerate(scene.views)
+    ]
+    positions = np.column_stack([rng.uniform(-0.2, 0.2, (7, 2)), rng.uniform(2, 3, 7)]).astype(np.float32)
+    seen = {view.name: np.sort(rng.choice(7, 4, replace=False)) for view in views}
+    tracks = Tracks(positions, seen, {view.name: rng.normal(0, 1, (4, 2)) for view in views})
+    return replace(scene, views=tuple(views), points=replace(scene.points, positions=positions), tracks=tracks)
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
+def test_colmap_keeps_which_points_the_photographs_show_and_where(model, scene_of, tmp_path, rng):
+    scene = with_tracks(scene_of(model), rng)
+    clsplat.write_cameras(scene, tmp_path / "out", "colmap", images="copy")
+    found = clsplat.read_scene(tmp_path / "out").tracks
+    np.testing.assert_array_equal(found.positions, scene.tracks.positions)
+    for view in scene.views:
+        np.testing.assert_array_equal(found.seen[view.name], scene.tracks.seen[view.name])
+        np.testing.assert_allclose(found.misses[view.name], scene.tracks.misses[view.name], atol=1e-9)
+    lines = (tmp_path / "out/sparse/0/points3D.txt").read_text().splitlines()[1:]
+    images = (tmp_path / "out/sparse/0/images.txt").read_text().splitlines()[1:]
+    for line in lines:
+        point, *words = line.split()
+        for image, at in np.array(words[7:], int).reshape(-1, 2):
+            assert images[2 * image - 1].split()[3 * at + 2] == point, "both files tell the same"
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+def test_photographs_show_points_where_they_did_also_with_learned_cameras(model, scene_of, tmp_path, rng):
+    scene = with_tracks(scene_of(model), rng)
+    learned = [
+        replace(
+            view,
+            world_to_camera=view.world_to_camera + np.column_stack([np.zeros((3, 3)), [0.1, 0.05, 0]]),
+            camera=view.camera.zoomed(1.1),
+        )
+        for view in scene.views
+    ]
+    for name, one in (("a", scene), ("b", with_cameras(scene, learned))):
+        clsplat.write_cameras(one, tmp_path / name, "colmap", images="copy")
+    places = [
+        [
+            np.array(line.split(), float)
+            for line in (tmp_path / name / "sparse/0/images.txt").read_text().splitlines()[2::2]
+        ]
+        for name in "ab"
+    ]
+    np.testing.assert_allclose(places[1], places[0], atol=1e-9)
+    (one, *_), found = scene.views, clsplat.read_scene(tmp_path / "b").tracks
+    assert np.abs(found.misses[one.name] - scene.tracks.misses[one.name]).max() > 1, "px"
+
+
+@pytest.mark.parametrize("form", ["colmap", "nerfstudio"])
+def test_exposures_lie_beside_copied_photographs(form, scene_of, tmp_path, rng, caplog):
+    scene = with_tracks(scene_of("PINHOLE"), rng)
+    noted = {view.name: CameraExposure(0.01 * (i + 1), 2.0, 100.0) for i, view in enumerate(scene.views[1:])}
+    write_exposures(tmp_path / "photographs", noted)
+    clsplat.write_cameras(scene, tmp_path / "out", form, images="copy")
+    found = clsplat.read_scene(tmp_path / "out")
+    told = dict(zip([view.name for view in found.views], camera_exposures(found.views), strict=True))
+    prefix = "images/" if form == "nerfstudio" else ""
+    assert told == {prefix + view.name: noted.get(view.name) for view in scene.views}
+    assert (found.tracks is None) == (form == "nerfstudio")
+    said = "nerfstudio does not keep which points the photographs show; colmap does"
+    assert (said in caplog.text) == (form == "nerfstudio")
+    clsplat.write_cameras(scene, tmp_path / "alone", form)
+    assert not (tmp_path / "alone/images").exists()
 
 
 def test_a_blender_scene_becomes_one_of_colmap(tiny_scene, tmp_path):
