@@ -17,9 +17,9 @@ from clsplat.runs.found import has_ended
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.single import run_pipeline
 from clsplat.training import checkpoint
-from clsplat.training.colours import colours_beside, colours_of
+from clsplat.training.colours import colours_beside, colours_of, settled
 from clsplat.views.colours import Affine, Auto, Gain
-from clsplat.views.exposures import UNKNOWN
+from clsplat.views.exposures import UNKNOWN, Exposures
 from tests.few_steps import FEW, killed
 from tests.test_exposures import Wall
 from tests.test_training import digest, train
@@ -163,6 +163,22 @@ def test_a_run_chooses_colours_where_exposures_differ_and_begins_with_them(rng, 
     with folders.opened(tmp_path / "run", "resume", step=0) as status:
         run = opening.open_run(load(str(tmp_path / "run" / "pipeline.yaml")), tmp_path / "run", None, "resume", status)
     assert run.settings.training.colours == found, "who goes on takes the choice"
+
+
+@pytest.mark.parametrize(
+    ("spread", "explained", "chosen", "said"),
+    [
+        (0.133, 0.32, "off", "; not more than 33% of what differs"),
+        (0.02, 0.9, "off", "; not more than 3.0%"),
+        (0.02, 0.1, "off", "; not more than 3.0% nor 33% of what differs"),
+        (0.133, 0.7, "on", "; more than 3.0%, and than 33% of what differs"),
+    ],
+)
+def test_the_reason_says_which_bound_decided(spread, explained, chosen, said):
+    exposures = Exposures({"a": np.full(3, spread), "b": np.full(3, -spread)}, "at 9 points", explained)
+    run = SimpleNamespace(scene=SimpleNamespace(split=lambda _: []), exposures={(): exposures})
+    found = settled(Auto(), run)
+    assert (found.chosen, found.reason) == (chosen, exposures.text + said)
 
 
 def test_what_a_run_chose_is_no_setting_of_its_pipeline():

@@ -70,9 +70,12 @@ def settled(colours: Auto, run: Run) -> Auto:
     exposures = exposures_of(run)
     if not exposures.log_gains:
         return colours.choose("off", exposures.text)
-    differ = exposures.spread > colours.above and exposures.explained > colours.explained
-    bounds = f"more than {colours.above:.1%} and {colours.explained:.0%}"
-    return colours.choose("on" if differ else "off", f"{exposures.text}; {'' if differ else 'not '}{bounds}")
+    few, alike = exposures.spread <= colours.above, exposures.explained <= colours.explained
+    bounds = [f"{colours.above:.1%}", f"{colours.explained:.0%} of what differs"]
+    if not few and not alike:
+        return colours.choose("on", f"{exposures.text}; more than {bounds[0]}, and than {bounds[1]}")
+    missed = " nor ".join(bound for bound, decides in zip(bounds, (few, alike), strict=True) if decides)
+    return colours.choose("off", f"{exposures.text}; not more than {missed}")
 
 
 def colours_of(run: Run) -> OwnColours | None:
