@@ -1,15 +1,17 @@
-"""Points for a scene without points: a plane sweep over its photographs (Collins 1996).
+"""Points from the photographs of a scene: a plane sweep over them (Collins 1996).
 
 For every photograph and each of PLANES depths, the neighbours are projected onto the plane at that depth.  The surface
-lies at the depth where they agree best.  A pixel becomes a point when its neighbours find the same depth.
+lies at the depth where they agree best.  A pixel can become a point when its neighbours find the same depth.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.scene.detail import spacing
 from clsplat.scene.scene import PointCloud, View
 
 Floats = NDArray[np.floating]
@@ -24,13 +26,65 @@ MIN_VOTES = 2  # neighbours that find the depth of a point too
 MAX_DIFFERENCE = 1.5  # of agreeing depths, planes
 
 
+@dataclass(frozen=True)
+class Surface:
+    """What a small photograph shows where its neighbours agree on the depth."""
+
+    view: View
+    image: Floats  # [H, W, 3] float32, in [0, 1]
+    inverse: Floats  # [H, W], 1 / depth, 1 / scene units; 0 where they do not agree
+    step: float  # from one plane to the next, 1 / scene units
+
+    def is_new(self, points: Floats) -> NDArray[np.bool_]:
+        """Return which pixels, [H, W], show none of some points [M, 3], and nothing behind one.
+
+        A pixel shows a point that lies in it, unless its depth is more than a plane nearer.
+        """
+        seen, row, column, depth = _pixels(self.view, points)
+        nearest = np.zeros(self.inverse.shape)
+        np.maximum.at(nearest, (row[seen], column[seen]), 1 / depth[seen])
+        return np.asarray((nearest == 0) | (self.inverse > nearest + self.step))
+
+
 def swept_points(
-    views: Sequence[View], centre: Floats, load: Callable[[View], NDArray[np.uint8]], count: int, seed: int
+    views: Sequence[View],
+    centre: Floats,
+    load: Callable[[View], NDArray[np.uint8]],
+    count: int,
+    seed: int,
+    chance: Callable[[Floats], Floats] | None = None,
+    beside: Floats | None = None,
+    shown: Callable[[View], NDArray[np.bool_] | None] = lambda view: None,
 ) -> PointCloud:
     """Return at most `count` coloured points on the surfaces that neighbouring views agree on, perhaps none.
 
-    centre: what the cameras look at, [3].  `load` returns the photograph of a view, [H, W, 3].
+    centre: what the cameras look at, [3].  `load` returns the photograph of a view, [H, W, 3].  `chance` returns the
+    chance of each pixel of a photograph in [0, 1] to be taken, [H, W]; then points have sizes, that of the pixels
+    between them at their depth.  Without it all pixels are alike.  beside: points [M, 3] that are there already; pixels
+    that are not new beside them give none.  `shown` returns which pixels of a view may give points, [H, W]; None: all.
     """
+    positions, colours, sizes = [], [], []
+    for i, surface in enumerate(surfaces(views, centre, load)):
+        view, image, taken = surface.view, surface.image, surface.inverse > 0
+        if (may := shown(view)) is not None:
+            taken &= may
+        if beside is not None:
+            taken &= surface.is_new(beside)
+        chances = np.ones(taken.shape) if chance is None else chance(image)
+        taken &= np.random.default_rng([seed, count, i + 1]).random(taken.shape) < chances
+        rows, columns = np.nonzero(taken)
+        depth = 1 / surface.inverse[taken]
+        positions.append(_lifted(view, rows, columns, depth))
+        colours.append(image[taken])
+        sizes.append(depth / view.camera.fx * spacing(chances[taken], view.camera.width))
+    everywhere, everything = np.concatenate(positions), np.concatenate(colours)
+    chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(everywhere))[:count])
+    size = None if chance is None else np.concatenate(sizes)[chosen].astype(np.float32)
+    return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen], sizes=size)
+
+
+def surfaces(views: Sequence[View], centre: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:
+    """Return what each view shows where its neighbours agree; arguments as of `swept_points`."""
     small = [
         view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
         for view in views
@@ -40,15 +94,11 @@ def swept_points(
     distance = float(np.median([np.linalg.norm(view.position - centre) for view in small]))
     inverse = np.linspace(1 / (MAX_DEPTH * distance), 1 / (MIN_DEPTH * distance), PLANES)
     planes = [_best_planes(i, small, images, near[i], inverse) for i in range(len(small))]
-    positions, colours = [], []
-    for i, view in enumerate(small):
-        rows, columns = np.nonzero(_confirmed(i, small, planes, near[i], inverse))
-        points = _lifted(view, rows, columns, 1 / inverse[planes[i][rows, columns]])
-        positions.append(points)
-        colours.append(images[i][rows, columns])
-    everywhere, everything = np.concatenate(positions), np.concatenate(colours)
-    chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(everywhere))[:count])
-    return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen])
+    step = float(inverse[1] - inverse[0])
+    return [
+        Surface(view, images[i], np.where(_confirmed(i, small, planes, near[i], inverse), inverse[planes[i]], 0), step)
+        for i, view in enumerate(small)
+    ]
 
 
 def _neighbours(i: int, views: Sequence[View]) -> list[int]:
@@ -106,6 +156,18 @@ def _lifted(view: View, rows: Places, columns: Places, depth: Floats) -> Floats:
     return points
 
 
+def _pixels(view: View, points: Floats) -> tuple[NDArray[np.bool_], Places, Places, Floats]:
+    """Which points [M, 3] lie in a photograph, their rows and columns, and their depths, 1 for those behind it."""
+    camera, pose = view.camera, view.world_to_camera
+    x, y, z = (points @ pose[:, :3].T + pose[:, 3]).T
+    ahead = z > 0
+    depth = np.where(ahead, z, 1)
+    column = np.floor(x / depth * camera.fx + camera.cx).clip(-1, camera.width).astype(int)
+    row = np.floor(y / depth * camera.fy + camera.cy).clip(-1, camera.height).astype(int)
+    seen = ahead & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    return seen, row, column, depth
+
+
 def _confirmed(
     i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], near: Sequence[int], inverse: Floats
 ) -> NDArray[np.bool_]:
@@ -115,13 +177,7 @@ def _confirmed(
     points = _lifted(views[i], rows, columns, 1 / inverse[planes[i].ravel()])
     votes = np.zeros(len(points), int)
     for j in near:
-        camera, pose = views[j].camera, views[j].world_to_camera
-        x, y, z = (points @ pose[:, :3].T + pose[:, 3]).T
-        ahead = z > 0
-        depth = np.where(ahead, z, 1)
-        column = np.floor(x / depth * camera.fx + camera.cx).clip(-1, camera.width).astype(int)
-        row = np.floor(y / depth * camera.fy + camera.cy).clip(-1, camera.height).astype(int)
-        seen = ahead & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        seen, row, column, depth = _pixels(views[j], points)
         found = inverse[planes[j][row * seen, column * seen]]
         votes += seen & (np.abs(found - 1 / depth) < MAX_DIFFERENCE * (inverse[1] - inverse[0]))
     middle = (planes[i] > 0) & (planes[i] < len(inverse) - 1)

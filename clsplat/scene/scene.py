@@ -40,15 +40,20 @@ class PointCloud:
     positions: Floats  # [M, 3] float32, scene units
     colours: Floats  # [M, 3] float32, in [0, 1]
     times: Floats | None = None  # [M] float32, in [0, 1], at which they were seen, where a moving scene has that
+    sizes: Floats | None = None  # [M] float32, scene units, of the Gaussians they become; NaN and None: unknown
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def joined(self, other: "PointCloud") -> "PointCloud":
-        """Return these points, then those of another cloud; with times where both have them."""
+        """Return these points, then those of another cloud; with times where both have them, sizes where one has."""
         pairs = [(self.positions, other.positions), (self.colours, other.colours)]
         pairs += [(self.times, other.times)] if self.times is not None and other.times is not None else []
-        return PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
+        both = PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
+        if self.sizes is None and other.sizes is None:
+            return both
+        sizes = [np.full(len(one), np.nan) if one.sizes is None else one.sizes for one in (self, other)]
+        return replace(both, sizes=np.concatenate(sizes).astype(np.float32))
 
 
 @dataclass(frozen=True)

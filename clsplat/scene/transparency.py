@@ -2,6 +2,9 @@
 
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, load_mask, load_transparency, some_of
 
@@ -19,6 +22,16 @@ def background_shows(scene: Scene) -> bool:
     It cannot behind those with masks.  Raises DataError.
     """
     return any(load_transparency(view) is not None for view in some_of(scene.split("train"), LOOKED_AT))
+
+
+def opaque_pixels(view: View) -> NDArray[np.bool_] | None:
+    """Return which pixels of a photograph count and show no background, [H, W], or None when all do.
+
+    Raises DataError.
+    """
+    shows, counted = load_transparency(replace(view, mask_path=None)), load_mask(view)
+    masks = [mask for mask in (None if shows is None else shows == 0, counted) if mask is not None]
+    return np.logical_and.reduce(masks) if masks else None
 
 
 def _is_transparent(view: View) -> bool:

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -14,15 +15,14 @@ from clsplat.errors import ConfigError, DataError
 from clsplat.formats.splats import Parameters, with_degree
 from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
-from clsplat.scene.hull import hull_points
-from clsplat.scene.middle import centre_of, looked_at_box, random_points
-from clsplat.scene.plane_sweep import swept_points
+from clsplat.scene.detail import laplacian_chance
+from clsplat.scene.middle import random_points
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.transparency import is_transparent
-from clsplat.scene.view import load_image, load_rgba
 from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
 from clsplat.stages.first_motion import moving, require_times, with_motion
+from clsplat.stages.first_points import enough_swept, on_hull, own_points, points_and_sweep, swept
 from clsplat.training.memory import first_tables, last_place
 from clsplat.training.placing import more_room
 from clsplat.training.run import Run
@@ -30,8 +30,8 @@ from clsplat.training.skies import begin_sky
 
 LOG = logging.getLogger("clsplat")
 MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
-MIN_POINTS = 100  # with fewer from a sweep or a hull, random ones are used
 MODEL_SOURCES = ("model", "ply")
+CHANCES = {"uniform": None, "laplacian": laplacian_chance}  # of a pixel to become a point of a sweep
 
 
 class Init(Stage):
@@ -40,7 +40,8 @@ class Init(Stage):
     `source: auto` uses the scene's points if it has points.  Without points it uses a plane sweep over the photographs,
     or, where these have transparent pixels, what `transparent` says: random points in a box around the point
     that the cameras look at, as published, or points on the hull of the silhouettes in that box.  Where a scene has
-    fewer points than `fewest`, and its photographs are opaque, those of a sweep join them.
+    fewer points than `fewest`, and its photographs are opaque, those of a sweep join them.  `source: points+sweep`
+    adds those of a sweep however many points the scene has, but where a pixel shows one of them or is transparent.
     """
 
     stage: Literal["init"] = "init"
@@ -48,7 +49,7 @@ class Init(Stage):
     takes: ClassVar[frozenset[str]] = frozenset({"average", "palette", "field"})
     edits: ClassVar[bool] = True
 
-    source: Literal["auto", "points", "sweep", "hull", "random", "model", "ply"] = "auto"
+    source: Literal["auto", "points", "points+sweep", "sweep", "hull", "random", "model", "ply"] = "auto"
     """Source of the first Gaussians; `ply` is an older name of `model`."""
     transparent: Literal["random", "hull"] = "random"
     """Source of `auto` for a scene without points whose photographs are transparent."""
@@ -62,6 +63,9 @@ class Init(Stage):
     """Number of random points; largest number of points on a hull."""
     swept: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
+    detail: Literal["uniform", "laplacian"] = "uniform"
+    """Which pixels of a sweep become points: all with the same chance, and sizes are those of neighbours; or where the
+    photographs have detail, by their Laplacian, and sizes are the distances of such pixels."""
     times: Literal["uniform", "per_frame"] = "uniform"
     """Where Gaussians move, the time of each: drawn, or that at which its point was seen, where the dataset says so.
     Points whose neighbours were seen at all times begin as what stands still; others have the spread of those times as
@@ -85,8 +89,8 @@ class Init(Stage):
             self._read()
         elif source in ("random", "hull"):
             self._require_memory(run, self.count)
-        elif source == "points":
-            self._require_memory(run, len(self._points(run)))
+        elif source in ("points", "points+sweep"):
+            self._require_memory(run, len(own_points(run.scene)))
 
     def run(self, run: Run) -> None:
         degree = run.model_settings.sh_degree
@@ -106,14 +110,14 @@ class Init(Stage):
         source = self._source(scene)
         if source in MODEL_SOURCES:
             return len(self._read()["means"])
-        if source == "points":
+        if source in ("points", "points+sweep"):
             return (0 if scene.points is None else len(scene.points)) + self.swept * self._is_joined(scene)
         return self.swept if source == "sweep" else self.count
 
     def _is_joined(self, scene: Scene) -> bool:
         """Whether points of a sweep join those of the scene."""
         few = scene.points is not None and len(scene.points) < self.fewest
-        return self.source == "auto" and few and not is_transparent(scene)
+        return self.source == "points+sweep" or (self.source == "auto" and few and not is_transparent(scene))
 
     def _origin(self, source: str, scene: Scene) -> str:
         names = {
@@ -121,7 +125,7 @@ class Init(Stage):
             "random": "random points",
             "sweep": "a sweep over the photographs",
             "hull": "the hull of the silhouettes",
-            "both": "the scene's points and a sweep over the photographs",
+            "points+sweep": "the scene's points and a sweep over the photographs",
         }
         has_own = scene.points is not None or source in MODEL_SOURCES
         return names.get(source, source) + ("" if has_own else ": the scene has no points")
@@ -138,12 +142,18 @@ class Init(Stage):
         source = self._source(run.scene)
         if source in MODEL_SOURCES:
             return with_motion(with_degree(self._read(), degree), run.model_settings.time, str(self.file)), source
-        found = {"sweep": self._swept, "hull": self._on_hull, "points": self._points}
-        points = found[source](run) if source in found else None
+        chance = CHANCES[self.detail]
+        found: dict[str, Callable[[], PointCloud | None]] = {
+            "sweep": lambda: enough_swept(run, self.swept, chance),
+            "hull": lambda: on_hull(run, self.count),
+            "points": lambda: own_points(run.scene),
+            "points+sweep": lambda: points_and_sweep(run, self.swept, chance),
+        }
+        points = found[source]() if source in found else None
         if points is None:
             points, source = self._random(run), "random"
         if source == "points" and self._is_joined(run.scene):
-            points, source = points.joined(self._sweep(run)), "both"
+            points, source = points.joined(swept(run, self.swept, chance)), "points+sweep"
         self._require_memory(run, len(points))
         parameters = from_points(points, self.opacity, degree, self.scale)
         seen = points.times if self.times == "per_frame" else None
@@ -157,14 +167,6 @@ class Init(Stage):
         return parameters
 
     @staticmethod
-    def _points(run: Run) -> PointCloud:
-        scene = run.scene
-        if scene.points is None:
-            raise DataError(f"{scene.path}: has no points to start from; use init: {{source: sweep}}")
-        require_ahead(scene.points, scene)
-        return scene.points
-
-    @staticmethod
     def _require_memory(run: Run, count: int) -> None:
         """Raise MemoryLimitError where so many Gaussians do not fit."""
         motion = run.model_settings.time
@@ -176,44 +178,14 @@ class Init(Stage):
         self._require_memory(run, self.count)
         return random_points(run.scene, self.count, run.seed)
 
-    def _sweep(self, run: Run) -> PointCloud:
-        views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
-        return swept_points(views, centre_of(views), load_image, self.swept, run.seed)
-
-    def _swept(self, run: Run) -> PointCloud | None:
-        points = self._sweep(run)
-        if len(points) < MIN_POINTS:
-            remedy = "photographs from places that lie closer together agree on more"
-            LOG.warning("the photographs agree on %d points only; starting from random ones; %s", len(points), remedy)
-            return None
-        return points
-
-    def _on_hull(self, run: Run) -> PointCloud | None:
-        views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
-        points = hull_points(views, *looked_at_box(run.scene), load_rgba, self.count, run.seed)
-        if len(points) < MIN_POINTS:
-            remedy = "they need transparency around what they show, and no masks; or use init: {source: sweep}"
-            LOG.warning(
-                "the photographs' silhouettes give %d points only; starting from random ones; %s", len(points), remedy
-            )
-            return None
-        return points
-
-
-def require_ahead(points: PointCloud, scene: Scene) -> None:
-    """Raise DataError when every point lies behind every training camera."""
-    poses = np.stack([view.world_to_camera for view in scene.split("train")])
-    if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):
-        raise DataError(
-            f"{scene.path}: all {len(points):,} points lie behind all training cameras; poses and points follow "
-            "different conventions: export both again, or use init: {source: sweep}"
-        )
-
 
 def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0) -> Parameters:
-    """Return one Gaussian for each point, `scale` times as large as the distance to its neighbours."""
+    """Return one Gaussian for each point, `scale` times as large as the point, or as the distance to its neighbours."""
     count = len(points)
-    log_scales = 0.5 * np.log(neighbour_distance2(points.positions)) + math.log(scale)
+    log_scales = 0.5 * np.log(neighbour_distance2(points.positions))
+    if points.sizes is not None:
+        log_scales = np.where(np.isnan(points.sizes), log_scales, np.log(points.sizes))
+    log_scales = log_scales + math.log(scale)
     quats = np.zeros((count, 4))
     quats[:, 0] = 1
     return {
