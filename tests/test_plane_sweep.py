@@ -195,6 +195,7 @@ def test_points_of_detail_are_the_same_every_time(table):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     some = swept_points(table[0], LOOK_AT, before_a_sky, 700, 0, laplacian_chance)
     assert len(some) == len(some.sizes) == 700 < len(first)
+    assert np.median(some.sizes) > 1.5 * np.median(first.sizes), "fewer points are larger"
 
 
 def test_sizes_that_are_known_are_those_of_gaussians():
@@ -245,6 +246,14 @@ def test_points_and_sweep(tiny_scene, tmp_path, caplog, detail):
     assert found
     expected = Init(source="points+sweep", swept=60).expected_count(scene)
     assert len(scene.points) < int(found[1].replace(",", "")) <= expected == len(scene.points) + 60
+
+
+def test_a_sweep_that_adds_nothing_is_told(tiny_scene, tmp_path, monkeypatch, caplog):
+    nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+    monkeypatch.setattr("clsplat.stages.first_points.swept_points", lambda *arguments: nothing)
+    run = train(tiny_scene, tmp_path / "run", "init.source=points+sweep", "optimize.steps=1")
+    assert "agree on no points beside the scene's" in caplog.text
+    assert run.model.gaussians.count == len(read_scene(tiny_scene).points)
 
 
 def test_points_and_sweep_need_points(tiny_scene, tmp_path):

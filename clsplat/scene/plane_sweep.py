@@ -79,7 +79,10 @@ def swept_points(
         sizes.append(depth / view.camera.fx * spacing(chances[taken], view.camera.width))
     everywhere, everything = np.concatenate(positions), np.concatenate(colours)
     chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(everywhere))[:count])
-    size = None if chance is None else np.concatenate(sizes)[chosen].astype(np.float32)
+    if chance is None:
+        return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen])
+    apart = np.sqrt(max(1.0, len(everywhere) / count))  # what is left out makes the others' distances larger
+    size = (apart * np.concatenate(sizes)[chosen]).astype(np.float32)
     return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen], sizes=size)
 
 

@@ -52,6 +52,8 @@ def points_and_sweep(run: Run, count: int, chance: Chance | None) -> PointCloud:
     own, views = own_points(run.scene), _views(run)
     beside = own.positions.astype(np.float64)
     new = swept_points(views, centre_of(views), load_image, count, run.seed, chance, beside, opaque_pixels)
+    if not len(new):
+        LOG.warning("the photographs agree on no points beside the scene's; starting from these alone")
     return own.joined(new)
 
 
