@@ -83,6 +83,7 @@ class PruneInaccurate(ByWrongPixels):
     """Remove Gaussians with a large score, that of `prune_sampled`."""
 
     type: Literal["prune_inaccurate"] = "prune_inaccurate"
+    grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"score_above"})
 
     score_above: Share = 0.9
