@@ -22,17 +22,13 @@ from data_tools.pycolmap_import import require_pycolmap
 from data_tools.reasons import Matched, diagnosis, reasons
 from data_tools.told import warn_of
 from data_tools.triangulation import PAIR, with_pairs
-from data_tools.turning import only_turned
+from data_tools.turning import without_depth
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
 ENOUGH = 0.9  # share of the photographs: with more, no more features are looked for
 DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
 DENSER = Sought(long_side=2400, count=16384, contrast=0.01)
-TURNED = (
-    "match like those of a camera that only turned on the spot, which tell no depth; walk around the scene, a step "
-    "between photographs"
-)
 NOT_DENSER = "denser features would not help: there are enough, and most photographs have nothing in common"
 LOOSE = {  # COLMAP's own values: 100 matches, 16 and 1.5 degrees, 30 matches, a quarter of them
     "init_min_num_inliers": 50,
@@ -81,8 +77,8 @@ def map_cameras(
     link(source / IMAGES, out / IMAGES)
     names = image_names(pycolmap, source / DATABASE)
     matched = Matched.of(pycolmap, source / DATABASE, source / IMAGES)
-    if only_turned(pycolmap, source / DATABASE):
-        raise DataError(f"{source / IMAGES}: the photographs {TURNED}")
+    if why := without_depth(pycolmap, source / DATABASE):
+        raise DataError(f"{source / IMAGES}: the photographs {why}")
     models, used, more = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]]()
     for attempt in (first, *LATER)[:attempts]:
         placed = models[0].num_reg_images() if models else 0
@@ -111,14 +107,14 @@ def map_cameras(
     if not models:
         raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnosis(matched)}")
     database = used.database(source, out)
-    if only_turned(pycolmap, database, placed_names := _names(models[0])):
-        told = f"the {len(placed_names)} of {len(names)} photographs that could be placed"
-        raise DataError(f"{source / IMAGES}: {told} {TURNED}")
+    if why := without_depth(pycolmap, database, _names(models[0])):
+        placed = models[0].num_reg_images()
+        raise DataError(f"{source / IMAGES}: the {placed} of {len(names)} photographs that could be placed {why}")
     if used.dense:
         matched = Matched.of(pycolmap, database, source / IMAGES)
     if fewest == PAIR:
         models[0] = with_pairs(models[0], database, out, threads)
-    figures = {**_written(models, out, names), "attempt": used.told}
+    figures = {**_written(models, out, names), "attempt": used.told, "denser_tried": (out / DENSE).exists()}
     figures["reasons"] = reasons(matched, [_names(model) for model in models])
     for left in out.glob(".*"):
         shutil.rmtree(left) if left.is_dir() else left.unlink()
@@ -187,11 +183,14 @@ def _written(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[str
     best = models[0]
     (out / MODEL / "0").mkdir(parents=True, exist_ok=True)
     best.write(str(out / MODEL / "0"))
-    placed = _names(best)
+    placed, others, seen = _names(best), list[int](), set[str]()
+    for model in models:
+        others.append(len(_names(model) - seen))
+        seen |= _names(model)
     return {
         "registered": len(placed),
         "not_registered": [name for name in names if name not in placed],
-        "other_models": [model.num_reg_images() for model in models[1:]],
+        "other_models": [count for count in others[1:] if count],  # photographs that are in no larger one
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
     }

@@ -71,9 +71,10 @@ def diagnosis(matched: Matched) -> str:
     """Return the likely reason why photographs give no model, with a remedy."""
     middle = round(median(matched.features.values()))
     if middle < FEW_FEATURES:
+        few = f"half of them have {f'at most {middle}' if middle else 'no'} features"
         return (
-            f"half of them have at most {middle} features, where thousands are usual: they are blurred, or show plain "
-            "surfaces; take sharp ones, of things with texture"
+            f"{few if any(matched.features.values()) else 'none has features'}, where thousands are usual: they are "
+            "blurred, dark, or show plain surfaces; take sharp ones, of things with texture"
         )
     if not matched.pairs:
         return "no two of them show the same features; take some with more overlap, of a scene in which nothing moves"
@@ -114,13 +115,13 @@ def _reason(matched: Matched, name: str, placed: set[str], sharp: float) -> str:
     among = {other: count for other, count in matches.items() if other in placed}
     if matched.features[name] < FEW_FEATURES:
         return f"only {amount(matched.features[name], 'feature')}: blurred, dark, or of a plain surface"
-    if not matches:  # however soft: one of broad shapes is as soft as a blurred one, and a blurred one has few features
-        return "shows nothing that another photograph shows"
+    is_soft = matched.sharpness_of(name) < BLURRED * sharp
+    may_be = "; it may be blurred" if is_soft else ""
+    if not matches:  # no more is known: one of broad shapes is as soft as a blurred one
+        return f"shows nothing that another photograph shows{may_be}"
     best = max(matches, key=lambda other: (matches[other], other))
     if not among:
         return f"matches {best} alone, which is not placed either"
-    is_soft = matched.sharpness_of(name) < BLURRED * sharp
     if max(among.values()) < FEW_MATCHES:
-        found = f"few matches, at most {max(among.values())}, with {max(among, key=lambda o: (among[o], o))}"
-        return f"{found}; it may be blurred" if is_soft else found
+        return f"few matches, at most {max(among.values())}, with {max(among, key=lambda o: (among[o], o))}{may_be}"
     return "blurred" if is_soft else f"{matches[best]} matches with {best}, but too few on points of the model"

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-from clsplat.errors import first_few
+from clsplat.errors import amount, first_few
 
 LOG = logging.getLogger("clsplat")
 
@@ -25,14 +25,16 @@ def left_out(figures: Mapping[str, Any]) -> list[str]:
     if missing := figures.get("not_registered"):
         reasons = figures.get("reasons", {})
         named = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])
+        more = "" if figures.get("denser_tried") else ", or find more features (find_features.long_side)"
         texts.append(
             f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed: {named}; "
-            "the scene is made of the others: for more, add photographs from places between, or find more features "
-            "(find_features.long_side)"
+            f"the scene is made of the others: for more, add photographs from places between{more}"
         )
     if others := figures.get("other_models"):
+        are = "is" if len(others) == 1 else "are"
+        sizes = ", ".join([*map(str, others[:-1]), amount(others[-1], "photograph")])
         texts.append(
-            f"{len(others)} smaller models, of {', '.join(map(str, others))} photographs, are left out: add "
-            "photographs that join them to the largest"
+            f"{amount(len(others), 'smaller model')}, of {sizes}, {are} left out: add photographs that join "
+            f"{'it' if len(others) == 1 else 'them'} to the largest"
         )
     return texts

@@ -6,6 +6,7 @@ too, but R + t nᵀ/d is no rotation.
 """
 
 from collections.abc import Sequence, Set
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,59 +19,68 @@ from data_tools.database import opened
 from data_tools.reasons import FEW_MATCHES
 
 PHOTOGRAPHS = 60  # that are looked at, evenly spaced, each with the one that it has the most matches with
-NEAR = 3.0  # px: of a match that a homography explains
+NEAR = 3.0  # px: of a match that a homography explains, and of a point that has not moved
 EXPLAINED = 0.9  # share of the matches of a pair
 FOCALS = np.geomspace(0.4, 4.0, 47)  # of the longer side
 MADE_UP = 0.1  # how far K⁻¹ H K may be from a rotation, by how far that is from no turn at all
+WALK = "which tells no depth; walk around the scene, a step between photographs"
+TURNED = f"match like those of a camera that only turned on the spot, {WALK}"
+SAME = f"are all the same: nothing moves from one to the next, {WALK}"
 Floats = NDArray[np.float64]
 
 
-def only_turned(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> bool:
-    """Return whether nearly all of the named photographs match another one as those of a camera that turned.
+def without_depth(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
+    """Return in words why the photographs, or the named ones of them, tell no depth; "" where they may.
 
-    Without names: of those that match another one well, where these are half of the photographs at least.  A stranger
-    among them tells nothing; of fewer, further attempts may find more matches.
+    Those that match another one well are looked at, where these are half of them at least: a stranger among them tells
+    nothing, and of fewer, further attempts may find more matches.
     """
     with opened(pycolmap, database) as rows:
         images = {image.image_id: image for image in rows.read_all_images()}
-        sizes = {camera.camera_id: (camera.width, camera.height) for camera in rows.read_all_cameras()}
         chosen = {number for number, image in images.items() if names is None or image.name in names}
-        best = _best_pairs(pycolmap, rows, chosen)
-        known = sorted(best) if names is None else sorted(chosen)
-        if 2 * len(known) < len(chosen):
-            return False
-        sample = known[:: max(1, -(-len(known) // PHOTOGRAPHS))]
-        pairs = [best[number] for number in sample if number in best]
-        points = {}
-        for number in {one for pair, _ in pairs for one in pycolmap.pair_id_to_image_pair(pair)}:
-            size = np.array(sizes[images[number].camera_id])
-            points[number] = (rows.read_keypoints(number)[:, :2] - size / 2) / size.max(), float(size.max())
-    found = []
-    for pair, geometry in pairs:
+        moved, still = _best_pairs(pycolmap, rows, chosen)
+    if 2 * len(moved.keys() | still) < len(chosen) or not chosen:
+        return ""
+    if not moved:
+        return SAME
+    sample = sorted(moved)[:: -(-len(moved) // PHOTOGRAPHS)]
+    found = [matrix for number in sample if (matrix := _homography(*moved[number])) is not None]
+    is_most = len(found) > 1 and len(found) >= EXPLAINED * len(sample)
+    return TURNED if is_most and min(_from_turns(found, focal) for focal in FOCALS) < MADE_UP else ""
+
+
+def _best_pairs(
+    pycolmap: ModuleType, rows: Any, chosen: Set[int]
+) -> tuple[dict[int, tuple[Floats, Floats, float]], set[int]]:
+    """By photograph, the matched points of its pair of the most matches between which something moves, and a pixel; and
+    the photographs of pairs between which nothing moves, such as copies, which tell nothing of a camera."""
+    moved, still = dict[int, tuple[Floats, Floats, float]](), set[int]()
+    sizes = {camera.camera_id: np.array([camera.width, camera.height]) for camera in rows.read_all_cameras()}
+
+    @cache
+    def points(number: int) -> tuple[Floats, float]:
+        size = sizes[rows.read_image(number).camera_id]
+        return (rows.read_keypoints(number)[:, :2] - size / 2) / size.max(), 1 / float(size.max())
+
+    pairs = zip(*rows.read_two_view_geometries(), strict=True)
+    for pair, geometry in sorted(pairs, key=lambda one: -len(one[1].inlier_matches)):
         a, b = pycolmap.pair_id_to_image_pair(pair)
         matches = np.asarray(geometry.inlier_matches)
-        matrix = _homography(points[a][0][matches[:, 0]], points[b][0][matches[:, 1]], NEAR / points[b][1])
-        if matrix is not None:
-            found.append(matrix)
-    is_most = len(found) > 1 and len(found) >= EXPLAINED * len(sample)
-    return is_most and min(_from_turns(found, focal) for focal in FOCALS) < MADE_UP
+        if len(matches) < FEW_MATCHES or not {a, b} <= chosen or (a in moved and b in moved):
+            continue
+        (first, _), (second, pixel) = points(a), points(b)
+        first, second = first[matches[:, 0]], second[matches[:, 1]]
+        if np.median(np.linalg.norm(second - first, axis=1)) < NEAR * pixel:
+            still |= {a, b}
+            continue
+        for number in (a, b):
+            moved.setdefault(number, (first, second, pixel))
+    return moved, still
 
 
-def _best_pairs(pycolmap: ModuleType, rows: Any, chosen: Set[int]) -> dict[int, tuple[int, Any]]:
-    """The pair of the most matches between photographs of these, with its geometry, by photograph that matches well."""
-    found: dict[int, tuple[int, Any]] = {}
-    for pair, geometry in zip(*rows.read_two_view_geometries(), strict=True):
-        both = pycolmap.pair_id_to_image_pair(pair)
-        if len(geometry.inlier_matches) >= FEW_MATCHES and set(both) <= chosen:
-            for number in both:
-                if number not in found or len(geometry.inlier_matches) > len(found[number][1].inlier_matches):
-                    found[number] = pair, geometry
-    return found
-
-
-def _homography(first: Floats, second: Floats, near: float) -> Floats | None:
+def _homography(first: Floats, second: Floats, pixel: float) -> Floats | None:
     """The homography that explains nearly all matches of a pair, in units of the longer side from the middle."""
-    matrix, explained = cv2.findHomography(first, second, cv2.RANSAC, near)
+    matrix, explained = cv2.findHomography(first, second, cv2.RANSAC, NEAR * pixel)
     if matrix is None or explained.mean() < EXPLAINED:
         return None
     return np.asarray(matrix, np.float64)

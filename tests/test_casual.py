@@ -4,6 +4,7 @@ import math
 import struct
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from data_tools.mapping import map_cameras
 from data_tools.matching import match_features
 from data_tools.reasons import Matched, diagnosis, reasons
 from data_tools.told import left_out
+from data_tools.turning import without_depth
 from tests.refusals import refusal
 
 # ---- lenses
@@ -181,7 +183,7 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     assert found == {
         "blurred": "blurred",
         "soft": "few matches, at most 20, with a; it may be blurred",
-        "elsewhere": "shows nothing that another photograph shows",
+        "elsewhere": "shows nothing that another photograph shows; it may be blurred",
         "plain": "only 40 features: blurred, dark, or of a plain surface",
         "alone": "shows nothing that another photograph shows",
         "pair": "matches other alone, which is not placed either",
@@ -191,7 +193,13 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     }
     assert reasons(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"] == "in another model, with other"
     figures = {"registered": 3, "not_registered": ["plain"], "reasons": found, "other_models": [2]}
-    assert "1 of 4 photographs could not be placed: plain (only 40 features: blurred" in left_out(figures)[0]
+    missing, others = left_out(figures)
+    assert "1 of 4 photographs could not be placed: plain (only 40 features: blurred" in missing
+    assert missing.endswith("places between, or find more features (find_features.long_side)")
+    assert others == "1 smaller model, of 2 photographs, is left out: add photographs that join it to the largest"
+    missing, others = left_out({**figures, "other_models": [3, 1], "denser_tried": True})
+    assert missing.endswith("places between")
+    assert others.startswith("2 smaller models, of 3, 1 photograph, are left out: add photographs that join them")
 
 
 def test_a_set_that_gives_no_model_is_told_by_what_belongs_together(tmp_path):
@@ -233,7 +241,7 @@ def test_a_blurred_photograph_is_told_from_one_of_another_place_that_is_as_soft(
     found = Matched.of(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
     assert reasons(found, [{"0.png", "1.png", "2.png"}]) == {
         "blurred.png": "blurred",
-        "elsewhere.png": "shows nothing that another photograph shows",
+        "elsewhere.png": "shows nothing that another photograph shows; it may be blurred",
     }
 
 
@@ -276,14 +284,48 @@ def dense(monkeypatch: pytest.MonkeyPatch) -> None:
         (turned, "match like those of a camera that only turned on the spot"),
         (lambda number: (turned if number else stranger)(number), "match like those of a camera that only turned"),
         (stranger, "no two of them show the same features"),
-        (lambda number: np.full((180, 240, 3), 180 + number, np.uint8), "half of them have at most 0 features"),
+        (lambda number: turned(1), "photographs are all the same: nothing moves from one to the next"),
+        (lambda number: np.full((180, 240, 3), 180 + number, np.uint8), "none has features, where thousands"),
+        (lambda number: np.full((180, 240, 3), 9, np.uint8) if number else turned(1), "half of them have no features"),
     ],
-    ids=["turned", "turned, with a stranger", "other places", "a wall"],
+    ids=["turned", "turned, with a stranger", "other places", "copies", "a wall", "a wall, with one of texture"],
 )
 def test_sets_that_cannot_work_end_in_a_sentence(tmp_path, dense, pixels, sentence):
     matches, cameras = prepared(tmp_path, [pixels(number) for number in range(6)])
     with pytest.raises(DataError, match=sentence):
         map_cameras(matches, cameras)
+
+
+def test_copies_among_photographs_tell_nothing_of_the_camera(tmp_path, dense):
+    """Three neighbours that shift before a wall, each with two copies, which match it best: it has not turned."""
+    wide = blocks(1, 400, 180)
+    matches, _ = prepared(tmp_path, [wide[:, 30 * (number // 3) :][:, :240] for number in range(9)])
+    pycolmap = pytest.importorskip("pycolmap")
+    assert without_depth(pycolmap, matches / "database.db") == ""
+    assert "all the same" in without_depth(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
+
+
+def test_a_model_counts_only_photographs_that_are_in_no_larger_one(tmp_path):
+    class Model:
+        def __init__(self, *numbers: int) -> None:
+            self.numbers = numbers
+            self.images = {number: SimpleNamespace(name=f"{number}.jpg") for number in numbers}
+
+        def reg_image_ids(self) -> tuple[int, ...]:
+            return self.numbers
+
+        def write(self, path: str) -> None: ...
+
+        def num_points3D(self) -> int:
+            return 9
+
+        def compute_mean_reprojection_error(self) -> float:
+            return 0.5
+
+    models = [Model(1, 2, 3, 4), Model(3, 4, 5), Model(2, 4, 5)]
+    figures = mapping._written(models, tmp_path, [f"{number}.jpg" for number in range(1, 7)])
+    assert figures["other_models"] == [1]
+    assert figures["not_registered"] == ["5.jpg", "6.jpg"]
 
 
 def test_a_model_of_a_camera_that_only_turned_is_refused_where_most_photographs_are_strangers(tmp_path, dense):

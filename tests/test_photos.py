@@ -131,7 +131,7 @@ def test_photographs_that_show_nothing(tmp_path):
     pytest.importorskip("pycolmap")
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64, 3), 80, np.uint8))
-    with pytest.raises(DataError, match="half of them have at most 0 features"):
+    with pytest.raises(DataError, match="none has features"):
         place(tmp_path, tmp_path / "out")
 
 
@@ -160,11 +160,14 @@ def test_further_attempts_match_as_the_first_and_can_be_turned_off(photos, tmp_p
     with pytest.raises(DataError, match="could not be placed"):
         map_cameras(tmp_path / "matches", tmp_path / "once", attempts=1)
     assert "another attempt" not in caplog.text
-    used = list[Pairing]()
+    used, more = list[Pairing](), list[int]()
     monkeypatch.setattr(mapping_tool, "match_within", lambda database, pairing: used.append(pairing))
+    monkeypatch.setattr(mapping_tool, "match_pairs", lambda database, pairs, threads: more.append(len(pairs)))
     with pytest.raises(DataError):
         map_cameras(tmp_path / "matches", tmp_path / "cameras")
     assert set(used) == {Pairing("sequential", 2)}
+    assert len(more) == 3, "with more pairs first, and twice with denser features"
+    assert len(set(more)) == 1
 
 
 # ---- interrupted and gone on with

@@ -112,6 +112,21 @@ def test_a_step_that_fails_leaves_nothing(photos, tmp_path):
     assert do([Copy(letter="a"), Copy(letter="b")], photos, root) == ("pab", ["b"])
 
 
+def test_an_error_names_the_photographs_where_the_user_has_them(photos, tmp_path, monkeypatch):
+    """A step after the first one has links to them."""
+
+    def refuse(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        raise DataError(f"{source / 'images' / 'p.txt'}: broken; {source / 'x.txt'} too")
+
+    root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), prepare_steps.MapCameras()]
+    monkeypatch.setattr(prepare_steps.MapCameras, "make", refuse)
+    text = refusal(prepare, plan(steps, photos, root), photos, root)
+    first = plan(steps, photos, root)[0].folder
+    assert text == f"{photos / 'p.txt'}: broken; {first / 'x.txt'} too"
+    text = refusal(prepare, plan(steps[1:], photos, root), photos, root)
+    assert text == f"{photos / 'images' / 'p.txt'}: broken; {photos / 'x.txt'} too", "the first one reads them itself"
+
+
 @pytest.mark.parametrize("fault", ["no record", "no JSON", "a list", "a file less", "an empty file", "a folder"])
 def test_a_damaged_result_is_made_again(photos, tmp_path, fault, caplog):
     caplog.set_level("INFO")

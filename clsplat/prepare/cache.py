@@ -19,6 +19,7 @@ from clsplat.names import NOTE
 from clsplat.prepare.steps import Step
 from clsplat.progress import Count
 from clsplat.reading import read_json, sha256
+from data_tools.names import IMAGES
 
 LOG = logging.getLogger("clsplat")
 RECORD = "record.json"
@@ -156,6 +157,8 @@ def _do(one: Planned, source: Path, root: Path) -> None:
             shutil.rmtree(temporary, ignore_errors=True)
         if isinstance(error, OSError):
             raise unwritable(one.folder, error) from error
+        if isinstance(error, DataError) and str(source.resolve()) != one.origin:  # it is the result of a step before
+            raise DataError(str(error).replace(str(source.resolve() / IMAGES), one.origin)) from error
         raise
     LOG.info("%s: %s  %.0f s", one.step.stage, one.step.told(summary), seconds)
 
