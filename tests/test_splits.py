@@ -189,6 +189,24 @@ def test_a_run_knows_a_scene_whose_fold_is_another(folder):
     assert Identity.from_data(before) == whole, "a record of an earlier version"
 
 
+def test_listed_names_whose_photographs_are_missing_are_skipped_with_them(folder, caplog):
+    caplog.set_level(logging.INFO)
+    for letter in "cx":
+        (folder / f"images/{letter}.png").unlink()
+    (folder / "names.txt").write_text("a\nc\nimages/x.jpg\nd\n")
+    for choice in (Choice(names=["a", "c", "x.png", "d"]), Choice(file="names.txt")):
+        caplog.clear()
+        scene = read_scene(folder, Split(choice, missing="skip"))
+        assert letters(scene, "test") == "ad"
+        assert "skipped 2 names whose photograph is missing" in caplog.text
+        assert letters(read_scene(folder, Split(0, validation=choice, missing="skip")), "validation") == "ad"
+        assert letters(read_scene(folder, Split(0, train=choice, missing="skip")), "train") == "ad"
+    with pytest.raises(DataError, match="no photograph is called 'z'"):
+        read_scene(folder, Split(Choice(names=["a", "c", "z"]), missing="skip"))
+    with pytest.raises(DataError, match=r"scene\.train leaves no photograph"):
+        read_scene(folder, Split(0, train=Choice(names=["c"]), missing="skip"))
+
+
 def test_missing_photographs_are_refused_with_the_setting_that_skips_them(folder, caplog):
     for letter in "bc":
         (folder / "images" / f"{letter}.png").unlink()

@@ -1,5 +1,6 @@
 """Read the Blender datasets of NeRF and D-NeRF: transforms_train.json and transforms_test.json."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from clsplat.scene.parts import Parts
@@ -31,7 +32,8 @@ class BlenderReader(Reader):
         test = held.views(self.missing, clock) if held else []
         held_out = set(range(len(train), len(train) + len(test)))
         # NeRF and later papers render these scenes on white.
-        return make_scene(path, train + test, held_out, transforms.points(clock), background="white")
+        scene = make_scene(path, train + test, held_out, transforms.points(clock), background="white")
+        return replace(scene, skipped=transforms.skipped + (held.skipped if held else ()))
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, TRAIN_FILE, TEST_FILE)

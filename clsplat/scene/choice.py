@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from clsplat.errors import DataError, quoted
+from clsplat.errors import DataError, amount, quoted
 from clsplat.reading import read_text
 from clsplat.scene.images import is_image
 from clsplat.scene.scene import every_nth
@@ -16,8 +16,8 @@ from clsplat.settings import ReadPath, Settings, in_one_sentence
 
 LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
-TakenBy = Literal["holdout", "train"]
-Taken = Mapping[TakenBy, Sequence[str]]  # names that are no training views, by the key that says so
+TakenBy = Literal["holdout", "train", "missing"]
+Taken = Mapping[TakenBy, Sequence[str]]  # names that are no training views, by the key that says so, or their files
 NONE: Taken = {}
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
@@ -66,8 +66,8 @@ class Choice(Settings):
     def of(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
         """Return the indices of the chosen ones of `names`.
 
-        folders: where a relative file is looked for, in order; others: names that may not be chosen.
-        Raises DataError for a name that no view has, or several have.
+        folders: where a relative file is looked for, in order; others: names that may not be chosen, and those whose
+        photographs are missing, which are skipped.  Raises DataError for a name that no view has, or several have.
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
@@ -76,7 +76,11 @@ class Choice(Settings):
         found_at = {name: own.indices_of(name) for name in listed}
         for name in (one for one in listed if not found_at[one]):
             for key in (key for key, taken in of_others.items() if taken.indices_of(name)):
-                raise _taken(place, name, key)
+                if key != "missing":
+                    raise _taken(place, name, key)
+                del found_at[name]
+        if lost := len({*listed}) - len(found_at):
+            LOG.info("%s: skipped %s whose photograph is missing", place, amount(lost, "name"))
         chosen = {name: _only(name, found, names, place) for name, found in found_at.items()}
         for name, i in chosen.items():
             _tell_of_another(name, names[i], place)

@@ -47,11 +47,12 @@ class ColmapReader(Reader):
         folder = image_folder(path)
         views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
         there = present(path, [view.image_path for view in views], self.missing)
+        skipped = tuple(view.name for view, found in zip(views, there, strict=True) if not found)
         views = timed([view for view, found in zip(views, there, strict=True) if found], folder)
         table = read_point_table(model)
         points, tracks = (table.cloud(), tracks_of(images, table, views)) if table else (None, None)
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
-        return replace(scene, tracks=tracks)
+        return replace(scene, tracks=tracks, skipped=skipped)
 
     def list_parts(self, parts: Parts) -> None:
         found = [(folder, parts.attempt(read_images, folder) or []) for folder in find_models(parts.path)]

@@ -1,5 +1,6 @@
 """Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, every photograph at several sizes."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,13 @@ class MultiscaleReader(Reader):
         splits = read_json(path / FILE, limit=MAX_BYTES)
         train, test = (_views(path / FILE, splits, name) for name in ("train", "test"))
         there = present(path, [view.image_path for view in train + test], self.missing)
+        skipped = tuple(view.name for view, found in zip(train + test, there, strict=True) if not found)
         test = [view for view, found in zip(test, there[len(train) :], strict=True) if found]
         train = [view for view, found in zip(train, there[: len(train)], strict=True) if found]
         points = path / POINTS
         held_out = set(range(len(train), len(train) + len(test)))
         cloud = read_points_ply(points) if points.is_file() else None
-        return make_scene(path, train + test, held_out, cloud, background="white")
+        return replace(make_scene(path, train + test, held_out, cloud, background="white"), skipped=skipped)
 
     def list_parts(self, parts: Parts) -> None:
         super().list_parts(parts)

@@ -1,6 +1,7 @@
 """Read nerfstudio and instant-ngp datasets: one transforms.json."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 from clsplat.errors import DataError, quoted
@@ -33,13 +34,14 @@ class NerfstudioReader(Reader):
         views = sorted(transforms.views(self.missing, clock), key=lambda view: view.name)
         train, test = (_listed(transforms, key) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
-            return make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points(clock))
+            scene = make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points(clock))
+            return replace(scene, skipped=transforms.skipped)
         test = test or set()
         kept = views if train is None else [view for view in views if view.name in train | test]
         if len(kept) < len(views):
             logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(kept))
         held_out = {i for i, view in enumerate(kept) if view.name in test}
-        return make_scene(path, kept, held_out, transforms.points(clock))
+        return replace(make_scene(path, kept, held_out, transforms.points(clock)), skipped=transforms.skipped)
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, FILE)

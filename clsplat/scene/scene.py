@@ -69,6 +69,7 @@ class Scene:
     background: Background = "black"  # on which papers show the photographs
     validation: tuple[int, ...] = ()  # kept out of the training, to choose by
     tracks: Tracks | None = None  # which points the photographs show, where the dataset has that
+    skipped: tuple[str, ...] = ()  # names of views that the dataset names and whose photographs are missing
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of `train`, `test`, `validation` or `all`.  Raises ValueError for another name."""

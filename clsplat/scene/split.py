@@ -39,7 +39,7 @@ class Split:
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if isinstance(self.holdout, Choice) and not (self.holdout.every and scene.test):  # the dataset says which
             names = [view.name for view in scene.views]
-            test = _chosen(scene, "holdout", self.holdout, names, folders)
+            test = _chosen(scene, "holdout", self.holdout, names, folders, {"missing": scene.skipped})
             if len(test) == len(names):
                 raise DataError(
                     f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; expected some to "
@@ -112,7 +112,8 @@ def _of(
 ) -> set[int]:
     """The indices of the chosen ones of the training views; key: the setting that chooses."""
     names = [scene.views[i].name for i in scene.train]
-    others: Taken = {"holdout": [scene.views[i].name for i in scene.test], "train": left_out}
+    tested = [scene.views[i].name for i in scene.test]
+    others: Taken = {"holdout": tested, "train": left_out, "missing": scene.skipped}
     return {scene.train[i] for i in _chosen(scene, key, choice, names, folders, others)}
 
 

@@ -86,6 +86,8 @@ class Transforms:
         images = [image_path_of(frame) for frame in self.frames]
         there = present(self.path, images, missing)
         frames = [frame for frame, found in zip(self.frames, there, strict=True) if found]
+        lost = [frame for frame, found in zip(self.frames, there, strict=True) if not found]
+        self.skipped = tuple(view_name(str(frame.value("file_path"))) for frame in lost)
         require_files(self.path, filter(None, (frame.file("mask_path") for frame in frames)))
         has_sizes = all(frame.number("w") and frame.number("h") for frame in frames)
         size = None if has_sizes else image_size(images[there.index(True)])
