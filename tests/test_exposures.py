@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.colmap import tracks_of
 from clsplat.scene.colmap_files import read_images, read_point_table
 from clsplat.scene.detect import read_scene
+from clsplat.scene.exif import CameraExposure, write_exposures
 from clsplat.scene.images import write_image
 from clsplat.scene.scene import PointCloud, View
 from clsplat.scene.tracks import Tracks
 from clsplat.scene.view import load_image
-from clsplat.views.exposures import Exposures, _fitted, measured, samples
+from clsplat.training.colours import exposures_of
+from clsplat.views.exposures import UNKNOWN, Exposures, _fitted, measured, samples, with_noted
 from data_tools.colmap_writer import write_model
 from data_tools.undistort import undistort_scene
 
@@ -68,6 +71,64 @@ def test_gains_are_found_again(rng):
     assert found.spread == pytest.approx(np.std(wall.log_gains @ [0.299, 0.587, 0.114]), abs=2e-3)
     assert found.explained > 0.95
     assert f"exposures of 8 photographs differ by {found.spread:.1%} at 400 points" in found.text
+
+
+def test_what_cameras_noted_fills_in_for_photographs_without_tracks(rng):
+    """Two of eight show too few points; cameras noted those, and two others, from another middle."""
+    wall = Wall(rng)
+    seen = {name: rows[:19] if name in ("2.png", "5.png") else rows for name, rows in wall.tracks.seen.items()}
+    wall.tracks = replace(wall.tracks, seen=seen)
+    shown = wall.measured()
+    assert shown.log_gains.keys() == {f"{i}.png" for i in (0, 1, 3, 4, 6, 7)}
+    truth = dict(zip(seen, wall.log_gains, strict=True))
+    told = Exposures({name: truth[name] + 0.7 for name in ("0.png", "2.png", "3.png", "5.png")}, "as noted")
+    found = with_noted(shown, told)
+    assert found.log_gains.keys() == truth.keys()
+    for name, gains in truth.items():
+        assert found.log_gains[name] == pytest.approx(gains, abs=3e-3)
+    assert table(found).mean(axis=0) == pytest.approx(0, abs=1e-12)
+    assert found.text.startswith("exposures of 8 photographs differ by")
+    assert found.text.endswith(", those of 2 as noted")
+    assert found.explained == shown.explained
+
+
+class Photograph:
+    """A photograph that counts whole."""
+
+    def __init__(self, pixels: np.ndarray) -> None:
+        self.pixels = pixels
+
+    def image(self) -> np.ndarray:
+        return self.pixels
+
+    def counted(self) -> None:
+        return None
+
+
+def test_a_run_begins_with_both(rng, tmp_path):
+    wall = Wall(rng)
+    wall.tracks = replace(wall.tracks, seen={**wall.tracks.seen, "2.png": np.arange(19)})
+    wall.write(tmp_path)
+    light = {view.name: float(np.exp(2.2 * wall.log_gains[i].mean())) for i, view in enumerate(wall.views)}
+    write_exposures(tmp_path / "images", {name: CameraExposure(one, 1.0, 1.0) for name, one in light.items()})
+    scene = read_scene(tmp_path, 0)
+    run = SimpleNamespace(
+        scene=scene,
+        exposures={},
+        photographs=SimpleNamespace(get=lambda view: Photograph(load_image(view)[..., :3])),
+        status=SimpleNamespace(counted=lambda views, *_: views),
+    )
+    found = exposures_of(run)
+    assert found.text.endswith("those of 1 as their cameras noted")
+    assert found.log_gains["2.png"].mean() == pytest.approx(wall.log_gains[2].mean(), abs=0.01)
+
+
+def test_tracks_stand_alone_where_nothing_can_be_added(rng):
+    shown = Wall(rng).measured()
+    apart = Exposures({"other.png": np.zeros(3)}, "as noted")
+    for told in (UNKNOWN, Exposures(dict(shown.log_gains), "as noted"), apart):
+        assert with_noted(shown, told) is shown
+    assert with_noted(Exposures({}, "at 0 points"), apart) is apart
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.25])

@@ -16,7 +16,7 @@ from clsplat.scene.view import View
 from clsplat.settings import variants
 from clsplat.training.run import Run
 from clsplat.views.colours import Auto, Colours, OwnColours
-from clsplat.views.exposures import UNKNOWN, Exposures, measured, noted
+from clsplat.views.exposures import UNKNOWN, Exposures, measured, noted, with_noted
 from clsplat.views.photographs import Mask
 from clsplat.views.view_colours import TABLE, ViewColours
 
@@ -48,7 +48,7 @@ def photograph_colours(colours: Colours | None, run: Run, last: int) -> ViewColo
 
 
 def exposures_of(run: Run) -> Exposures:
-    """Return what the training photographs show of their exposures, or else what cameras noted; measured once."""
+    """Return what the training photographs show of their exposures, or else what their cameras noted; measured once."""
     views = run.scene.split("train")
     names = tuple(view.name for view in views)
     if names not in run.exposures:
@@ -59,7 +59,8 @@ def exposures_of(run: Run) -> Exposures:
 
         counted = run.status.counted(views, "photographs", len(views))
         shown = measured(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
-        run.exposures[names] = shown if shown.log_gains else noted(views)
+        told = len(shown.log_gains) == len(set(names))
+        run.exposures[names] = shown if told else with_noted(shown, noted(views))
     return run.exposures[names]
 
 

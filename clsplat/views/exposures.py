@@ -69,6 +69,24 @@ def noted(views: Sequence[View]) -> Exposures:
     return Exposures(gains, "as their cameras noted")
 
 
+def with_noted(shown: Exposures, noted: Exposures) -> Exposures:
+    """Return what tracks show, and what cameras noted of the photographs of which tracks do not tell it.
+
+    What was noted is moved by the mean difference from what is shown, over the photographs that have both; without
+    any, nothing is added.
+    """
+    if not shown.log_gains:
+        return noted
+    both, more = ([name for name in noted.log_gains if (name in shown.log_gains) is known] for known in (True, False))
+    if not both or not more:
+        return shown
+    apart = np.mean([shown.log_gains[name] - noted.log_gains[name] for name in both], axis=0)
+    found = {**shown.log_gains, **{name: noted.log_gains[name] + apart for name in more}}
+    mean = np.mean(list(found.values()), axis=0)
+    source = f"{shown.source}, those of {len(more)} {noted.source}"
+    return Exposures({name: gains - mean for name, gains in found.items()}, source, shown.explained)
+
+
 def measured(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
     """Return what `views` show of the exposures of their photographs; a name that comes again is left out.
 
