@@ -72,7 +72,11 @@ def sky_bytes(out: Path) -> bytes:
 
 
 def test_a_painted_sky_is_found_again(yard, learned):
-    """From places that no photograph was taken from, where no Gaussian covers it."""
+    """From places that no photograph was taken from, where no Gaussian covers it.
+
+    The sky is infinitely far: there is no distance that Gaussians could be nearer than. Alpha finds those before it at
+    any distance, and each as much as it shows.
+    """
     capture, model = yard[0], clsplat.load(learned)
     renderer = clsplat.Renderer(model)
     view = capture.views[4]  # held out
@@ -272,6 +276,21 @@ def test_gaussians_of_a_sky_have_its_colours_in_all_directions(rng, learned):
     expected = np.clip(sampled(model.sky.texels, directions), 0, 1)
     np.testing.assert_allclose(added.colours, expected, atol=2e-3)
     assert with_sky_splats(baked) is baked
+
+
+def test_what_a_sky_cannot_be_is_said(tiny_scene, yard, tmp_path, caplog):
+    """Of transparent photographs, and as splats of a model that has none."""
+    transparent = "the photographs have transparency: what is learned and exported as a sky is the colour that"
+    nothing = "export.sky: splats changes nothing: the model has no sky"
+    few = ("optimize.steps=2", "init.count=60", "optimize.during=[]")
+    for scene, key, said in (
+        (tiny_scene, "model.background={type: directions, side: 8}", [True, False]),
+        (yard[1], "model.background={type: directions, side: 8}", [False, False]),
+        (yard[1], "model.background=null", [False, True]),
+    ):
+        caplog.clear()
+        train(scene, tmp_path / f"run{said}", *few, key, "export.sky=splats")
+        assert [text in caplog.text for text in (transparent, nothing)] == said
 
 
 def test_a_turned_model_has_a_turned_sky(rng, learned):

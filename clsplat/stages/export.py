@@ -54,7 +54,11 @@ class Export(Scheduled):
         return [path, path.with_name(f"{path.stem}_raw.ply"), sky_file(path)]
 
     def run(self, run: Run) -> None:
-        model = with_sky_splats(host_model(run)) if self.sky == "splats" else host_model(run)
+        model = host_model(run)
+        if self.sky == "splats":
+            if model.sky is None:
+                LOG.warning("export.sky: splats changes nothing: the model has no sky; model.background gives it one")
+            model = with_sky_splats(model)
         path, raw, behind = self.outputs(run.out)
         if _name(behind, run) not in run.written:
             behind.unlink(missing_ok=True)

@@ -31,6 +31,11 @@ def begin_sky(run: Run, own: Sky | None = None) -> None:
         if own:
             LOG.warning("the sky of the model is left out; model.background: directions keeps it")
         return
+    if is_transparent(run.scene):
+        LOG.warning(
+            "model.background: the photographs have transparency: what is learned and exported as a sky is the colour "
+            "that clsplat puts behind them; leave model.background out"
+        )
     texels, free = _first(run, background.side)
     sky = own if own and own.side == background.side else Sky(texels)
     run.sky = LearnedSky(background, sky.upload(run.device), free)
