@@ -49,8 +49,8 @@ class PruneWide(Rule):
     """Remove Gaussians that are large on the screen, in one training photograph or more: some are haze before its
     camera.
 
-    Half the photograph is the limit of on-the-fly-nvs (Meuleman et al. 2025).  Plain walls and skies are made of large
-    ones, too: it belongs before steps that close the holes.
+    Half the photograph is the limit of on-the-fly-nvs (Meuleman et al. 2025).  Plain walls and skies may be made of
+    large ones, too: it belongs before steps that close the holes.
     """
 
     type: Literal["prune_wide"] = "prune_wide"

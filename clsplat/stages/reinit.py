@@ -1,0 +1,130 @@
+"""New Gaussians on the surfaces that a model shows, in the place of its own."""
+
+import logging
+from dataclasses import asdict
+from typing import Annotated, ClassVar, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from clsplat.density.control import Change
+from clsplat.density.sampling import drawn_order
+from clsplat.errors import ConfigError, NumericError
+from clsplat.gaussians.tables import Gaussians
+from clsplat.scene.scene import PointCloud, View
+from clsplat.stages.base import Stage
+from clsplat.stages.init import from_points
+from clsplat.training.memory import first_tables, last_place
+from clsplat.training.placing import more_room
+from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
+Floats = NDArray[np.float64]
+
+
+class Drawn(NamedTuple):
+    """What was drawn of one photograph."""
+
+    positions: Floats  # [n, 3] scene units
+    colours: Floats  # [n, 3] in [0, 1]
+    pixel: Floats  # [n] side of a pixel at its depth, scene units
+    apart: Floats  # [n] distance to the next that was drawn, about, scene units
+
+
+class ReinitFromDepth(Stage):
+    """Replace all Gaussians by new ones on the surfaces that the training photographs show, between two trainings
+    (Mini-Splatting2, Fang and Wang 2024).  Clusters become even, and floaters behind and before surfaces go.
+
+    Each photograph has the same number of them, at pixels that are drawn, none twice, by the share alpha of a pixel
+    that the model covers: what nothing covers has no depth.  That is what is published as 1 − accum_alpha, an array
+    that holds the transmittance, 1 − alpha, as in the code of 3DGS.  Pixels that a mask leaves out are not drawn.
+
+    A Gaussian lies at the mean depth of what covers its pixel, weighted by alpha T, which at an edge falls between
+    two surfaces; published is the middle of the ray's way through the Gaussian of the largest weight.  It has the
+    photograph's colour.  Its standard deviation is the mean distance to the three nearest neighbours, as `init` has
+    it, but at least a pixel and at most the distance to the next drawn pixel.  Adam's moments, statistics and averages
+    begin anew; the active degree of the harmonics stays, with zeros.
+    """
+
+    stage: Literal["reinit_from_depth"] = "reinit_from_depth"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette"})
+    edits: ClassVar[bool] = True
+
+    count: Annotated[int, Field(gt=0)] | None = None
+    """Number of new Gaussians, at most; without it, as many as there are.  Photographs of which little is
+    covered give fewer."""
+    opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    """Opacity of the new Gaussians."""
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    """Factor of the new sizes."""
+
+    def check_in(self, run: Run) -> None:
+        if run.model_settings.time is not None:
+            raise ConfigError(
+                "reinit_from_depth: a depth is of one moment; expected Gaussians that stand still: remove the stage, "
+                "or leave model.time out"
+            )
+
+    def run(self, run: Run) -> None:
+        before, degree, width = run.model.gaussians.count, run.model.degree, run.model.gaussians.sh_degree
+        count = self.count or before
+        run.memory_plan(first_tables(width), last_place(run.harmonics, run.device.info)).check(count, more_room(run))
+        drawn = self._drawn(run, count)
+        positions, colours, pixel, apart = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        if not len(positions):
+            raise NumericError(
+                "reinit_from_depth: the model covers no pixel of the training photographs; train longer before it"
+            )
+        points = PointCloud(positions.astype(np.float32), colours.astype(np.float32))
+        parameters = from_points(points, self.opacity, width)
+        size = np.clip(np.exp(parameters["log_scales"][:, 0].astype(np.float64)), pixel, apart)
+        parameters["log_scales"][:] = np.log(self.scale * size)[:, None]
+        run.adam = run.stats = None
+        run.model = run.model_settings.model(Gaussians(run.device, parameters), degree)
+        run.refresh_filter()
+        change = Change(before, len(points), {self.stage: before}, {})
+        run.records.add(run.step, "densify", **asdict(change))
+        LOG.info("%s Gaussians from depths in the place of %s", f"{change.after:,}", f"{before:,}")
+
+    @staticmethod
+    def _drawn(run: Run, count: int) -> list[Drawn]:
+        """What is drawn of each training photograph; random numbers are of the seed, the step and its place."""
+        views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
+        painter, found = run.painter(), []
+        for number, view in enumerate(run.status.counted(views, "photographs", len(views))):
+            photograph = run.photographs.get(view)
+            layers = painter.layers(photograph.camera, depth=True)
+            assert layers.depth is not None  # as it was asked for
+            mask, own = photograph.counted(), count // len(views) + (number < count % len(views))
+            alpha = np.where(layers.depth > 0, layers.alpha, 0) * (1 if mask is None else mask)
+            random = np.random.default_rng([run.seed, run.step, number])
+            found.append(drawn_of(view, alpha, layers.depth, photograph.image(), own, random))
+        return found
+
+
+def drawn_of(
+    view: View,
+    alpha: NDArray[np.floating],
+    depth: NDArray[np.floating],
+    image: NDArray[np.uint8],
+    count: int,
+    random: np.random.Generator,
+) -> Drawn:
+    """Draw `count` pixels of a view by alpha, none twice, and return what lies there; all where fewer have any.
+
+    alpha, depth: [height, width], in [0, 1] and in scene units along the axis; image: [height, width, 3].
+    """
+    weights = alpha.astype(np.float64).ravel()
+    places = np.sort(drawn_order(weights > 0, weights, random)[:count])
+    camera, (rows, columns) = view.camera, np.divmod(places, alpha.shape[1])
+    z = depth[rows, columns].astype(np.float64)
+    rays = np.stack(
+        [(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(z))], axis=1
+    )
+    rotation, translation = view.world_to_camera[:, :3], view.world_to_camera[:, 3]
+    pixel = z / np.sqrt(camera.fx * camera.fy)
+    share = np.minimum(1, len(places) * weights[places] / (weights.sum() or 1))  # of the pixels there that are drawn
+    positions = (rays * z[:, None] - translation) @ rotation
+    return Drawn(positions, image[rows, columns] / 255.0, pixel, pixel / np.sqrt(share))
