@@ -24,6 +24,7 @@ from clsplat.runs.unprepared import check_preparation, known, listed
 from clsplat.settings import Settings
 from clsplat.stages.optimize import Optimize
 from data_tools.matching import MAX_EXHAUSTIVE, most_pairs
+from tests.refusals import refusal
 
 COUNT = 23
 SKY = "of the training photographs show a sky"
@@ -200,6 +201,37 @@ def test_three_photographs_that_follow_each_other_are_tried(photos, tmp_path):
     assert set(module._tried(steps, photos, names)) == {"list"}
     assert List.tried == [["10.png", "11.png", "12.png"], []]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
+
+
+def test_damaged_photographs_are_passed_over(photos, tmp_path):
+    List.tried.clear()
+    steps = plan([List()], photos, tmp_path / "runs" / "prepared")
+    names = sorted(path.name for path in photos.iterdir())
+    (photos / "11.png").write_bytes(b"")
+    module._tried(steps, photos, names)
+    for name in names[10:21]:
+        (photos / name).write_text("hello")
+    module._tried(steps, photos, names)
+    assert List.tried == [["10.png", "12.png", "13.png"], ["09.png", "21.png", "22.png"]]
+    for name in names[2:]:
+        (photos / name).write_bytes(b"")
+    assert refusal(module._tried, steps, photos, names) == f"{photos}: 2 of 23 photographs can be read, 3 are needed"
+
+
+def test_an_estimate_without_the_preparation_says_so_and_names_no_temporary_path(photos, monkeypatch, caplog):
+    def make(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        raise DataError(f"{source / '11.png'}: broken by {out / 'database.db'}: no space")
+
+    monkeypatch.setattr(FindFeatures, "make", make)
+    monkeypatch.setattr(module, "_step", lambda device, size, count, settings: count / 1e6)
+    asked = load("photos", [f"scene.path='{photos}'"])
+    out = photos.parent / "runs" / "a"
+    planned = asked.preparation(out)
+    names = listed(asked, planned, out)
+    lines = module.expected(asked, planned, names, known(asked, names), None, None)
+    assert "without the preparation, measurements, pictures and pages" in lines[0]
+    assert f"is not in what is expected: find_features: {photos / '11.png'}: broken by no space" in caplog.text
+    assert "database.db" not in caplog.text
 
 
 @pytest.mark.parametrize("count", [2, 11, MAX_EXHAUSTIVE, MAX_EXHAUSTIVE + 1])

@@ -7,11 +7,13 @@ Gaussians grow, and at which step photographs for validation end the training.
 
 import logging
 import math
+import re
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from statistics import median
 
@@ -31,7 +33,7 @@ from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
 from clsplat.training.run import Run
-from data_tools.gather import link
+from data_tools.gather import is_readable, link
 
 LOG = logging.getLogger("clsplat")
 TRIED = 3  # photographs, the fewest of which features are found
@@ -79,6 +81,7 @@ def expected(
     Photographs are read and the device is used for some seconds; nothing is written but a temporary folder.
     """
     parts = list(_of_preparation(planned, pipeline.settings.scene.folder, names))
+    without = "measurements" if parts or not any(one.why for one in planned) else "the preparation, measurements"
     if (capture := _capture(pipeline, planned, names, run)) is not None:
         settings = choose(pipeline.settings, measures) if run is None else pipeline.settings
         parts += [_of_training(training, settings, capture, device) for training in _trainings(settings)]
@@ -87,7 +90,7 @@ def expected(
     if not parts:
         return []
     low, high = (sum(one.seconds[end] for one in parts) for end in (0, 1))
-    told = "without measurements, pictures and pages; by what small parts take on this machine as it is now"
+    told = f"without {without}, pictures and pages; by what small parts take on this machine as it is now"
     return [f"expected: {minutes_text((low, high))}, {told}", *(one.text for one in parts)]
 
 
@@ -98,7 +101,7 @@ def _of_preparation(planned: Sequence[Planned], folder: Path, names: Sequence[st
     try:
         tried = _tried(planned, folder, names)
     except ClsplatError as error:
-        LOG.info("the preparation cannot be tried on %d photographs: %s", TRIED, error)
+        LOG.warning("the preparation cannot be tried, and is not in what is expected: %s", error)
         return
     whole = next(iter(tried.values()), 0.0) * len(names) / TRIED
     for one in planned:
@@ -114,11 +117,17 @@ def _of_preparation(planned: Sequence[Planned], folder: Path, names: Sequence[st
 
 
 def _tried(planned: Sequence[Planned], folder: Path, names: Sequence[str]) -> dict[str, float]:
-    """What the first steps take for some photographs that follow each other, s, by step.  Raises ClsplatError."""
-    first, found = (len(names) - TRIED) // 2, dict[str, float]()
+    """What the first steps take for some photographs that follow each other, s, by step; damaged ones are passed over.
+
+    Raises DataError.
+    """
+    middle, found = (len(names) - TRIED) // 2, dict[str, float]()
+    in_turn = (name for name in [*names[middle:], *reversed(names[:middle])] if is_readable(folder / name))
+    if len(chosen := list(islice(in_turn, TRIED))) < TRIED:
+        raise DataError(f"{folder}: {len(chosen)} of {len(names)} photographs can be read, {TRIED} are needed")
     with tempfile.TemporaryDirectory() as made, only(logging.ERROR):
-        source = Path(made, "photographs")
-        for name in names[first : first + TRIED]:
+        source = photographs = Path(made, "photographs")
+        for name in chosen:
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             link(folder.resolve() / name, source / name)
         for number, one in enumerate(planned):
@@ -127,7 +136,11 @@ def _tried(planned: Sequence[Planned], folder: Path, names: Sequence[str]) -> di
             target = Path(made, str(number))
             target.mkdir()
             began = time.perf_counter()
-            one.step.make(source, target, target)
+            try:
+                one.step.make(source, target, target)
+            except ClsplatError as error:  # names files that are gone when it is read
+                told = re.sub(f"{re.escape(made)}.*?: ", "", str(error).replace(str(photographs), str(folder)))
+                raise DataError(f"{one.step.stage}: {told}") from error
             found[one.step.stage], source = time.perf_counter() - began, target
     return found
 
