@@ -3,18 +3,21 @@
 import logging
 import os
 import shutil
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from clsplat.errors import DataError, amount
+from clsplat.errors import DataError, amount, first_few
 from clsplat.files import atomic
 from clsplat.progress import Count
 from clsplat.reading import read_file
 from clsplat.scene.exif import copied, exposure_of, write_exposures
 from clsplat.scene.image_headers import JPEG, TAIL_SIZE, parse_header
 from clsplat.scene.images import IMAGE_SUFFIXES, MAX_BYTES, decode_image, read_grey
+from clsplat.scene.multicamera import VIDEO_SUFFIXES
 from clsplat.scene.times_file import read_times, write_times
 
 LOG = logging.getLogger("clsplat")
@@ -24,7 +27,12 @@ CONVERTED = {  # photographs that OpenCV cannot read, and what makes JPEG files 
     "DNG": ({".dng"}, "darktable-cli d.dng d.jpg"),
     "raw": ({".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}, "darktable-cli d.nef d.jpg"),
 }
+BRANDS = {  # at byte 8, behind `ftyp`: of HEIF (ISO/IEC 23008-12) and of the AV1 Image File Format
+    "HEIC": {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"},
+    "AVIF": {b"avif", b"avis"},
+}
 UNREADABLE_SUFFIXES = {suffix for suffixes, _ in CONVERTED.values() for suffix in suffixes}
+NAMED_OTHERWISE = "{} by its content"  # why a photograph is damaged
 MIN_PHOTOGRAPHS = 3  # in a folder, and in a model
 CHECKED_SIDE = 64  # px: a photograph that is linked is decoded as small as it can be, to know that it is one
 
@@ -39,6 +47,17 @@ def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
         LOG.warning("%s: %s", folder, text)
     require_photographs(folder, without)
     return names
+
+
+def require_folder(folder: Path) -> None:
+    """Raise DataError where there is no such folder of photographs; of a video, with what makes one."""
+    if folder.suffix.lower() in VIDEO_SUFFIXES and folder.is_file():
+        raise DataError(
+            f"{folder}: is a video; `clsplat data video {folder} FOLDER` makes a folder of photographs of it"
+        )
+    if not folder.is_dir():
+        found = "is a file" if folder.is_file() else "no such folder"
+        raise DataError(f"{folder}: {found}; expected a folder with photographs")
 
 
 def require_photographs(folder: Path, without: Path | None = None) -> None:
@@ -65,8 +84,7 @@ def _how_to_convert(unreadable: list[str]) -> list[str]:
 
 def _found(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
     """The names of photographs, sorted, and of those that cannot be read."""
-    if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; expected one with photographs")
+    require_folder(folder)
     names: list[str] = []
     unreadable: list[str] = []
     for base, folders, files in os.walk(folder):
@@ -93,15 +111,38 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
         try:
             _gather_one(photographs / name, images / name)
         except DataError as error:
-            damaged[name] = str(error).removeprefix(f"{photographs / name}: ").partition(";")[0]
+            told = str(error).removeprefix(f"{photographs / name}: ").partition(";")[0]
+            damaged[name] = _misnamed(photographs / name) or told
             continue
         kept.append(name)
     write_exposures(images, {name: exposure_of(photographs / name) for name in kept})  # a copy of a PNG has none
     if times := read_times(photographs):
         write_times(images, {name: times[name] for name in kept if name in times})
     if len(kept) < MIN_PHOTOGRAPHS:
-        raise DataError(f"{photographs}: only {len(kept)} of {len(names)} photographs can be read; export them again")
+        faults = first_few([f"{name} ({reason})" for name, reason in damaged.items()])
+        raise DataError(
+            f"{photographs}: only {len(kept)} of {len(names)} photographs can be read: {faults}; {remedy(damaged)}"
+        )
     return kept, damaged
+
+
+def _misnamed(photograph: Path) -> str:
+    """What a file that OpenCV does not read is by its content, where it has the name of another kind; "" else."""
+    with suppress(OSError), photograph.open("rb") as file:
+        head = file.read(12)
+        for kind, brands in BRANDS.items():
+            if head[4:8] == b"ftyp" and head[8:] in brands:
+                return NAMED_OTHERWISE.format(kind)
+    return ""
+
+
+def remedy(damaged: Mapping[str, str]) -> str:
+    """Return what makes damaged photographs readable, by the reasons that `gather` gives."""
+    kinds = [kind for kind in BRANDS if NAMED_OTHERWISE.format(kind) in damaged.values()]
+    texts = [f"name {kind} files so, and make JPEG files of them, such as by {CONVERTED[kind][1]}" for kind in kinds]
+    if {NAMED_OTHERWISE.format(kind) for kind in kinds} != set(damaged.values()):
+        texts.append("export the others again" if kinds else "export them again")
+    return "; ".join(texts)
 
 
 def _gather_one(source: Path, target: Path) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from clsplat.errors import amount, first_few
+from data_tools.gather import remedy
 
 LOG = logging.getLogger("clsplat")
 
@@ -21,7 +22,7 @@ def left_out(figures: Mapping[str, Any]) -> list[str]:
     if damaged := figures.get("damaged"):
         names = [f"{name} ({reason})" for name, reason in damaged.items()]
         count = figures["photographs"] + len(names)
-        texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; export them again")
+        texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; {remedy(damaged)}")
     if missing := figures.get("not_registered"):
         reasons = figures.get("reasons", {})
         named = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])

@@ -33,13 +33,16 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     The format is PNG because a second lossy coding changes features and colours.  An interrupted call goes on: frames
     of the same video and settings stay unchanged.  times: also write times.json, of a scene that moves: the number of
     each frame in the video.
-    Raises DataError when the video cannot be decoded, and when `out` holds other images, which would mix with frames.
+    Raises DataError when the video cannot be decoded, or has one frame, as a picture has, and when `out` holds other
+    images, which would mix with frames.
     """
     settings: dict[str, Any] = {"video": sha256(video, "a video"), "frames": frames, "long_side": long_side}
     chosen = _begun(out, settings)
     if chosen is None:
         LOG.info("%s: looking for sharp frames", video)
         sharp, moved = _measured(video)
+        if len(sharp) == 1:
+            raise DataError(f"{video}: has one frame; expected a video, and photographs need no such step")
         chosen = sharpest(sharp, moved, frames)
         LOG.info("%d frames, of which %d are written", len(sharp), len(chosen))
         write_text(out / RECORD, json.dumps({**settings, "chosen": chosen}) + "\n")

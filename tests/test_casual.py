@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from clsplat.errors import DataError
+from clsplat.prepare.cache import fingerprint
 from clsplat.scene.exif import copied, exposure_of, optics_of
 from clsplat.scene.images import read_grey, read_header, read_image
 from data_tools import mapping
@@ -163,6 +164,40 @@ def test_files_that_cannot_be_read_come_with_how_to_convert_them(tmp_path, caplo
     text = refusal(list_photographs, tmp_path)
     assert "found 2 photographs" in text
     assert "heif-convert" in text
+
+
+def test_files_with_the_name_of_another_kind_come_with_how_to_convert_them(tmp_path):
+    for i in range(3):
+        take(tmp_path / "p" / f"{i}.jpg", (64, 48), seed=i)
+    for name, brand in (("h.jpg", b"heic"), ("m.JPG", b"mif1"), ("v.png", b"avif"), ("o.jpg", b"isom")):
+        (tmp_path / "p" / name).write_bytes(b"\0\0\0\x18ftyp" + brand + bytes(40))
+    (tmp_path / "images").mkdir()
+    kept, damaged = gather(tmp_path / "p", tmp_path / "images", list_photographs(tmp_path / "p"))
+    assert kept == ["0.jpg", "1.jpg", "2.jpg"]
+    assert damaged == {
+        "h.jpg": "HEIC by its content",
+        "m.JPG": "HEIC by its content",
+        "v.png": "AVIF by its content",
+        "o.jpg": "not an image, or a damaged one",
+    }
+    (told,) = left_out({"photographs": 3, "damaged": damaged})
+    assert "name HEIC files so, and make JPEG files of them, such as by heif-convert" in told
+    assert "such as by ffmpeg" in told
+    assert told.endswith("; export the others again")
+    assert left_out({"photographs": 3, "damaged": {"a": "cut"}})[0].endswith("(cut); export them again")
+    (tmp_path / "p" / "0.jpg").unlink()
+    text = refusal(gather, tmp_path / "p", tmp_path / "images", ["1.jpg", "2.jpg", "h.jpg"])
+    assert "only 2 of 3 photographs can be read: h.jpg (HEIC by its content); name HEIC files so" in text
+
+
+@pytest.mark.parametrize("read", [list_photographs, lambda path: fingerprint(path, path)])
+def test_a_video_in_the_place_of_a_folder_comes_with_what_makes_one(tmp_path, read):
+    (tmp_path / "walk.AVI").write_bytes(b"RIFF")
+    (tmp_path / "notes").touch()
+    command = f"`clsplat data video {tmp_path / 'walk.AVI'} FOLDER`"
+    assert command in refusal(read, tmp_path / "walk.AVI")
+    assert "is a file; expected a folder with photographs" in refusal(read, tmp_path / "notes")
+    assert "no such folder" in refusal(read, tmp_path / "none.avi")
 
 
 def matched(tmp_path: Path) -> Matched:

@@ -165,6 +165,13 @@ def test_not_a_video(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_picture_is_no_video(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((60, 80, 3), np.uint8))
+    text = refusal(write_frames, tmp_path / "a.jpg", tmp_path / "out")
+    assert text.startswith(f"{tmp_path / 'a.jpg'}: has one frame; expected a video")
+    assert not list(tmp_path.glob("out/*.png"))
+
+
 @pytest.mark.parametrize(("values", "parts", "chosen"), [([1, 3, 2], 9, [0, 1, 2]), ([2, 2, 1, 5], 2, [0, 3])])
 def test_sharpest(values, parts, chosen):
     assert sharpest(values, [0.0] * len(values), parts) == chosen

@@ -19,6 +19,7 @@ from clsplat.names import NOTE
 from clsplat.prepare.steps import Step
 from clsplat.progress import Count
 from clsplat.reading import read_json, sha256
+from data_tools.gather import require_folder
 from data_tools.names import IMAGES
 
 LOG = logging.getLogger("clsplat")
@@ -98,8 +99,7 @@ def fingerprint(folder: Path, without: Path) -> str:
 
     Raises DataError when there is no such folder, or a file in it cannot be read.
     """
-    if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; expected one with photographs")
+    require_folder(folder)
     parts = []
     for base, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if name[0] != "." and not _same(Path(base) / name, without))
