@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from clsplat.errors import ConfigError, DataError
+from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load
+from clsplat.runs.scenes import RunScene
 from clsplat.scene.choice import Choice
 from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
@@ -244,3 +246,12 @@ def test_a_choice_that_is_wrong_is_explained(setting, fault):
     with pytest.raises(ConfigError) as raised:
         load("splat_7k", [f"scene.{setting}"])
     assert fault in str(raised.value)
+
+
+@pytest.mark.parametrize(("count", "warned"), [(1, "is trained on 1 photograph:"), (2, "on 2 photographs:"), (3, "")])
+def test_fewer_than_three_training_photographs_are_warned_of_before_the_run(tiny_scene, caplog, count, warned):
+    scene = read_scene(tiny_scene, Split(0))
+    RunScene.of(SceneSettings(path=str(tiny_scene)), replace(scene, train=scene.train[:count]))
+    told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(told) == bool(warned)
+    assert all(f"{warned} a model of fewer than 3 fits these" in text for text in told)

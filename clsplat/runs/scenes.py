@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from clsplat.errors import amount
 from clsplat.pipeline.file import SceneSettings
 from clsplat.scene.decoding import decode_all, require_whole
 from clsplat.scene.detect import read_scene
@@ -12,6 +13,7 @@ from clsplat.scene.identity import Identity
 from clsplat.scene.scene import SPLITS, Background, Scene
 
 LOG = logging.getLogger("clsplat")
+FEWEST = 3  # training photographs without a warning at the start
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,12 @@ class RunScene:
                 downscaled.extent,
             ),
         )
+        if len(original.train) < FEWEST:
+            LOG.warning(
+                "%s: is trained on %s: a model of fewer than %d fits these and shows little else; add photographs, or "
+                "put back those that are missing",
+                *(scene.path, amount(len(original.train), "photograph"), FEWEST),
+            )
         files = decode_all(view for one in (original, downscaled) for split in SPLITS for view in one.split(split))
         require_whole(scene.path, files)
         return cls(original, downscaled, background, Identity.of(original, files))
