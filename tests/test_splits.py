@@ -11,6 +11,7 @@ import pytest
 from clsplat.errors import ConfigError, DataError
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load
+from clsplat.runs.description import describe
 from clsplat.runs.scenes import RunScene
 from clsplat.scene.choice import Choice
 from clsplat.scene.detect import read_scene
@@ -234,6 +235,10 @@ def test_a_dataset_without_any_photograph_is_refused(folder):
     [
         ("holdout=-1", "expected a number, {every, offset}, {names: […]} or {file: …}, got -1"),
         ("holdout={every: 8, offset: 8}", "expected an offset below every, 8"),
+        ("holdout={every:8,offset:4}", "or {file: …} (YAML needs a blank after each colon)"),
+        ("validation={every:8}", "or {file: …} (YAML needs a blank after each colon)"),
+        ("holdout={every: 8, offset: -1}", "expected an offset of 0 or more, not -1"),
+        ("holdout={offset: 4}", "expected every beside offset, as in {every: 8, offset: 4}"),
         ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
         ("holdout={names: [42]}", "expected names of photographs as text: put numbers in quotes, as in '0042'"),
         ("holdout={names: [a, '']}", "expected names of photographs that are not empty"),
@@ -255,3 +260,20 @@ def test_fewer_than_three_training_photographs_are_warned_of_before_the_run(tiny
     told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(told) == bool(warned)
     assert all(f"{warned} a model of fewer than 3 fits these" in text for text in told)
+
+
+def test_every_nth_that_takes_none_for_testing_is_refused(folder):
+    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of 24 photographs .* lower its offset, or set"):
+        read_scene(folder, Split(Choice(every=100, offset=99)))
+
+
+def test_without_test_views_a_dry_run_has_no_lines_of_them(folder, tmp_path):
+    def described(holdout: int) -> str:
+        return describe(
+            load("splat_7k", [f"scene.path={folder}", f"scene.holdout={holdout}"]), tmp_path / "r", None, "new"
+        )
+
+    assert "evaluate       1 test view at 1/1" in described(24)
+    without = described(0)
+    assert "  evaluate " not in without
+    assert "  render" not in without

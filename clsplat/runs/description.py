@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from clsplat import lock
-from clsplat.errors import DataError
+from clsplat.errors import DataError, amount
 from clsplat.opencl.device import Device
 from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.loading import Pipeline
@@ -22,6 +22,7 @@ from clsplat.scene.capture import Measures
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.init import Init
+from clsplat.stages.render import Render
 from clsplat.stages.training import Training
 from clsplat.training.memory import first_tables, last_place
 from clsplat.training.run import Run
@@ -69,7 +70,7 @@ def describe(
     measures, head = _known(pipeline, names)
     choices = _choices(pipeline, measures)
     lines += [*(head if choices or not measures else []), *choices]
-    lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
+    lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages if _does(stage, run)]
     lines += _on_host(pipeline, run) if run else []
     if expect and start != "resume":
         lines += expect(pipeline, planned, names, measures, opened, run)
@@ -114,13 +115,18 @@ def _on_host(pipeline: Pipeline, run: Run) -> list[str]:
     return [f"  {planned.text(count)}"] if planned.host else []
 
 
+def _does(stage: Stage, run: Run | None) -> bool:
+    """Whether a stage does something: those of the views of a split do not where there are none."""
+    return not (isinstance(stage, Evaluate | Render) and run) or bool(run.original.split(stage.split))
+
+
 def _detail(stage: Stage, run: Run | None) -> str:
     if isinstance(stage, Training):
         return f"{stage.steps} steps; " + ", ".join(map(_cadence, stage.during))
     if isinstance(stage, Evaluate) and run:
         views = run.original.downscaled(run.downscale).split(stage.split)
         sizes = ", ".join(f"1/{downscale:g}" for downscale in stage.downscales or [run.downscale])
-        return f"{len(views)} {stage.split} views at {sizes}"
+        return f"{amount(len(views), f'{stage.split} view')} at {sizes}"
     return ""
 
 

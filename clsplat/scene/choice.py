@@ -50,6 +50,21 @@ class Choice(Settings):
     file: ReadPath | None = None
     """Text file with a name a line; a relative path is one in the folder of the dataset."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _as_meant(cls, value: Any) -> Any:
+        """Say what is wrong with tables that are nearly right."""
+        if not isinstance(value, dict):
+            return value
+        if any(isinstance(key, str) and ":" in key and given is None for key, given in value.items()):
+            raise ValueError(f"{NOTATIONS} (YAML needs a blank after each colon)")
+        offset = value.get("offset")
+        if isinstance(offset, int) and offset < 0:
+            raise ValueError(f"expected an offset of 0 or more, not {quoted(offset)}")
+        if "offset" in value and len(value) == 1:
+            raise ValueError("expected every beside offset, as in {every: 8, offset: 4}")
+        return value
+
     @model_validator(mode="after")
     def _of_one_kind(self) -> "Choice":
         given = [self.every, self.names, self.file]

@@ -41,7 +41,8 @@ class Render(Stage):
         for path, view in counted:
             camera = upload_camera(run.device, view)
             write_image(path, render_view(run.painter(), camera))
-        LOG.info("%s written to %s", amount(len(views), "image"), run.out / self.folder)
+        if views:
+            LOG.info("%s written to %s", amount(len(views), "image"), run.out / self.folder)
 
     def verify(self, run: Run) -> None:
         for path, view in self._views(run).items():
