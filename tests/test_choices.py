@@ -18,6 +18,7 @@ from clsplat.runs.description import describe
 from clsplat.runs.found import has_ended
 from clsplat.runs.single import run_pipeline
 from clsplat.scene.capture import measured, nearest_points
+from clsplat.scene.capture import told as text_of
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Tracks
 from clsplat.schedule import at_step
@@ -179,10 +180,12 @@ def test_a_run_writes_what_it_chose_and_repeats_without_choosing(tiny_scene, tmp
     assert digest(tmp_path / "again") == digest(tmp_path / "run")
 
 
-def test_a_description_tells_choices_and_reasons(tiny_scene, tmp_path):
+def test_a_description_tells_choices_and_reasons_once(tiny_scene, tmp_path, caplog):
+    caplog.set_level("INFO")
     asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, BOTH])
     text = describe(asked, tmp_path / "run", None, "new")
     assert "model.sh_degree=1, since 8 training photographs; few say little" in text
+    assert "few say little" not in caplog.text
     assert not (tmp_path / "run").exists()
 
 
@@ -444,3 +447,11 @@ def test_an_override_inside_of_one_that_was_given_wins(tmp_path):
 def test_of_several_measures_those_that_are_missing_are_told():
     reason = choose(load("photos").settings, {"photographs": 20}).choices[2].reason
     assert reason.startswith("20 training photographs, the dataset does not tell sky; few do not hold up")
+
+
+def test_a_number_of_photographs_agrees_with_its_noun():
+    assert [text_of("photographs", count) for count in (1, 2.0, 1200)] == [
+        "1 training photograph",
+        "2 training photographs",
+        "1,200 training photographs",
+    ]

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from clsplat.scene.capture import TOLD, Measure, Measures
+from clsplat.scene.capture import Measure, Measures, told
 from clsplat.settings import Settings
 
 WRITTEN = ("chosen", "reason")  # keys of a choice
@@ -103,7 +103,7 @@ class CaptureChoice(Settings):
 
         others: whether what stands beside `given` values is of the row that the measure reaches, or of the file.
         """
-        found = [TOLD[name].format(measures[name]) for name in self.measures if name in measures]
+        found = [told(name, measures[name]) for name in self.measures if name in measures]
         missing = [name for name in self.measures if name not in measures and self.depends(name, measures)]
         untold = [f"the dataset does not tell {name}" for name in missing]
         if not found:
@@ -153,7 +153,7 @@ class CaptureChoice(Settings):
     def _condition(self, number: int, known: Measures) -> str:
         """The bounds of a row, of measures that are not known."""
         bounds = zip(self.measures, self.bounds(self.values[number]), strict=True)
-        least = " and ".join(TOLD[name].format(bound) for name, bound in bounds if bound and name not in known)
+        least = " and ".join(told(name, bound) for name, bound in bounds if bound and name not in known)
         return f" if at least {least}" if least else ""
 
     def _text(self, values: list[Any]) -> str:

@@ -1,6 +1,7 @@
 """Choices that follow from the photographs, made before the first step and written into the run's pipeline."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 
 from clsplat.pipeline.choosing import choose
@@ -23,14 +24,14 @@ WITH_DRAWN = "optimize.background is drawn, which a sky does not go with"
 LOG = logging.getLogger("clsplat")
 
 
-def settle(pipeline: Pipeline, run: Run) -> Pipeline:
+def settle(pipeline: Pipeline, run: Run, tell: Callable[[str], None] = LOG.info) -> Pipeline:
     """Return the pipeline with what its `choices` and its keys `auto` choose by the photographs of a run, which takes
-    it; log reasons.
+    it; log reasons, those of `choices` by `tell`.
 
     Choices that are made already stay.
     """
     with run.status.stage("choose"):
-        settled_pipeline = _taken(_with_colours(_by_capture(pipeline, run), run), run)
+        settled_pipeline = _taken(_with_colours(_by_capture(pipeline, run, tell), run), run)
         if any(isinstance(stage, Optimize) for stage in pipeline.stages):
             _warn_of_near(settled_pipeline.settings.model.near, nearest_points(run.scene))
         return settled_pipeline
@@ -46,7 +47,7 @@ def _warn_of_near(near: float, nearest: float | None) -> None:
         )
 
 
-def _by_capture(pipeline: Pipeline, run: Run) -> Pipeline:
+def _by_capture(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pipeline:
     """The pipeline with what its `choices` choose."""
     still_open = [one for one in pipeline.settings.choices if not one.reason]
     if not still_open:
@@ -59,7 +60,7 @@ def _by_capture(pipeline: Pipeline, run: Run) -> Pipeline:
         run.divide(chosen.settings.scene.split.with_validation(run.original.with_fold()))
         run.identity = run.identity and run.identity.divided(run.original)  # as of a run that begins with that split
     for one in chosen.settings.choices:
-        LOG.info("%s", one.told)
+        tell(one.told)
     return chosen
 
 

@@ -61,7 +61,7 @@ def describe(
     else:
         run = open_run(pipeline, out, device, start, read=read)
         opened = run.device
-        pipeline = settle(pipeline, run)
+        pipeline = settle(pipeline, run, tell=LOG.debug)  # the description has them
         if start == "resume":
             resumed = restore(pipeline, run)
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"

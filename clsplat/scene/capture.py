@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from clsplat.errors import amount
 from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import Scene
 
@@ -12,7 +13,6 @@ Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "r
 Measures = dict[Measure, float]
 NEAREST = 0.01  # share of the points that photographs show which may lie nearer: some of them are mistaken
 TOLD: dict[Measure, str] = {
-    "photographs": "{:,.4g} training photographs",
     "photographs_per_point": "{:,.4g} training photographs show a point, in the mean",
     "pixels": "{:,.4g} pixels has a training photograph, in the median",
     "points": "{:,.4g} points",
@@ -20,6 +20,11 @@ TOLD: dict[Measure, str] = {
     "training",
     "sky": "{:.0%} of the training photographs show a sky",
 }
+
+
+def told(measure: Measure, value: float) -> str:
+    """Return a measure in words."""
+    return amount(round(value), "training photograph") if measure == "photographs" else TOLD[measure].format(value)
 
 
 def measured(scene: Scene) -> Measures:
