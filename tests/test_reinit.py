@@ -145,6 +145,14 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tiny_scene, pi
     assert digest(run.out) == digest(finished.out)
 
 
+def test_an_init_in_its_place_begins_anew_too(tiny_scene, tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_text(PIPELINE.replace("reinit_from_depth: {count: 301}", "init: {source: random, count: 700}"))
+    run = train(tiny_scene, tmp_path / "run", pipeline=str(path))
+    assert run.model.gaussians.count == 700
+    assert set(run.adam.updates.values()) == {4}
+
+
 def test_averages_end_with_it(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text(PIPELINE.replace("  - export", "  - take_average"))

@@ -97,6 +97,7 @@ class Init(Stage):
         require_times(run.scene, run.model_settings.time)
         parameters, source = self._parameters(run, degree)
         gaussians = Gaussians(run.device, parameters)
+        run.adam = run.stats = None  # which were of an earlier model
         run.model = run.model_settings.model(gaussians, degree if self.source in MODEL_SOURCES else 0)
         run.refresh_filter()
         begin_sky(run, load(Path(self.file)).sky if source in MODEL_SOURCES and self.file else None)
