@@ -2,9 +2,11 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from clsplat.errors import ConfigError, DataError
+from tests.test_reprojection import missing
 from tests.test_training import digest, train
 from tests.yards import Yard
 
@@ -40,3 +42,10 @@ def test_a_scene_must_tell_which_photographs_show_a_point(tiny_scene, tmp_path):
 def test_poses_are_not_learned_beside_it(rng, tmp_path):
     with pytest.raises(ConfigError, match=r"the loss 'inverse_depth' does not go with optimize\.poses"):
         train(Yard(rng).write(tmp_path / "scene"), tmp_path / "run", *FEW, LOSSES, "optimize.poses={start: 5}")
+
+
+def test_photographs_that_show_all_points_elsewhere_tell_no_depths(rng, tmp_path):
+    """The bits are those without the loss."""
+    scene = missing(tmp_path / "scene", np.array([1.2, -0.9]), rng)
+    with_loss, plain = train(scene, tmp_path / "loss", *FEW, LOSSES), train(scene, tmp_path / "plain", *FEW)
+    assert digest(with_loss.out) == digest(plain.out)

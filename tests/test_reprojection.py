@@ -17,7 +17,7 @@ from clsplat.runs.single import run_pipeline
 from clsplat.scene.capture import measured
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
-from clsplat.scene.reprojection import misses, reprojection_errors
+from clsplat.scene.reprojection import misses, reprojection_errors, within
 from clsplat.scene.tracks import Tracks
 from clsplat.scene.view import View
 from clsplat.views.colours import Auto
@@ -75,6 +75,18 @@ def test_the_mean_is_over_points_and_then_over_their_photographs():
     assert reprojection_errors(tracks, [replace(view, name="c")]) is None
     assert reprojection_errors(replace(tracks, misses={}), [view]) is None
     assert reprojection_errors(None, [view]) is None
+
+
+def test_points_a_pixel_away_or_more_tell_no_depth():
+    """At the size of training; what is not known stays, and so do other photographs."""
+    view, rows = View("a", STRONG.pinhole, np.eye(3, 4)), np.array([1, 3, 5, 6])
+    missed = {"a": np.array([[0.6, 0.8], [0.5, 0], [np.nan, 0], [0, 2.1]]), "b": np.array([[9.0, 9]])}
+    tracks = Tracks(np.zeros((7, 3)), {"a": rows, "b": rows[:1], "c": rows}, missed)
+    found = within(tracks, [view, replace(view, name="c")])
+    assert {name: seen.tolist() for name, seen in found.seen.items()} == {"a": [3, 5], "b": [1], "c": [1, 3, 5, 6]}
+    np.testing.assert_array_equal(found.misses["a"], missed["a"][1:3])
+    assert within(tracks, [view.resized(2)]).seen["a"].tolist() == [1, 3, 5]
+    assert within(tracks, [view.resized(2), view, view.resized(4)]).seen["a"].tolist() == [3, 5], "in several sizes"
 
 
 def test_it_is_told_at_the_size_of_training_and_without_test_views(tmp_path, rng):

@@ -15,9 +15,10 @@ class InverseDepth(ImageLoss):
     """Mean over a photograph's points of q |D - 1/z|, times the scene's extent: D = Σ w / z is the blended inverse
     depth of the pixel that a point falls on, z the point's depth.
 
-    q is 1 for points that four photographs show, and less for others.  D counts nothing behind the splats, so that
-    they also become opaque where a point is.  A weight of 0.02 that falls to 0 over the first half of the steps is
-    ours.  It needs points with tracks, as those of COLMAP; no poses are learned with it.
+    q is 1 for points that four photographs show, and less for others.  It is 0 in a photograph that shows the point a
+    pixel or more from where its camera does, at the size of training, where the dataset tells that.  D counts nothing
+    behind the splats, so that they also become opaque where a point is.  A weight of 0.02 that falls to 0 over the
+    first half of the steps is ours.  It needs points with tracks, as those of COLMAP; no poses are learned with it.
     """
 
     type: Literal["inverse_depth"] = "inverse_depth"

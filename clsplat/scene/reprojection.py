@@ -12,6 +12,7 @@ from clsplat.scene.view import View
 from clsplat.scene.zoom import lens_of
 
 Floats = NDArray[np.float64]
+NEAR = 1.0  # px at the size of training, ours: beyond it a pixel does not show the point
 EXACT = 1e-3  # px: below it places were computed from the cameras, and tell nothing of them
 
 
@@ -64,3 +65,15 @@ def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats 
             np.add.at(counts, tracks.seen[view.name][known], 1)
     errors = sums[counts > 0] / counts[counts > 0]
     return errors if len(errors) and errors.mean() > EXACT else None
+
+
+def within(tracks: Tracks, views: Iterable[View], limit: float = NEAR) -> Tracks:
+    """Return the tracks without the points that views show `limit` px or more, at their sizes, from where the cameras
+    do; a view without known places keeps all of its points, and so do other views than these."""
+    seen, missed = dict(tracks.seen), dict(tracks.misses)
+    for view in sorted(views, key=lambda view: -view.downscale):  # of a photograph in several sizes the largest one
+        if view.name in tracks.misses:
+            found = tracks.misses[view.name]
+            kept = ~(np.linalg.norm(found, axis=1) / view.downscale >= limit)  # NaN: not known
+            seen[view.name], missed[view.name] = tracks.seen[view.name][kept], found[kept]
+    return Tracks(tracks.positions, seen, missed)

@@ -6,6 +6,7 @@ from pathlib import Path
 from clsplat.errors import ConfigError, DataError
 from clsplat.losses.base import Loss
 from clsplat.losses.depth import InverseDepth
+from clsplat.scene.reprojection import within
 from clsplat.scene.scene import Scene
 from clsplat.training.run import Run
 from clsplat.views.depth_maps import DepthMaps
@@ -22,8 +23,9 @@ def known_depths(losses: Sequence[Loss], run: Run, poses: PhotographPoses | None
     folders = _folders(losses)
     if not folders or run.scene.tracks is None:
         return None
-    names = [view.name for view in run.scene.split("train")]
-    return PointDepths(run.device, run.scene.tracks, names, run.scene.extent, _maps(folders))
+    views = run.scene.split("train")
+    tracks, names = within(run.scene.tracks, views), [view.name for view in views]
+    return PointDepths(run.device, tracks, names, run.scene.extent, _maps(folders))
 
 
 def require_depths(losses: Sequence[Loss], scene: Scene, poses: bool) -> None:
