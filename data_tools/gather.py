@@ -67,7 +67,8 @@ def require_photographs(folder: Path, without: Path | None = None) -> None:
         suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
         more = "".join(f"; {text}" for text in _how_to_convert(unreadable))
         raise DataError(
-            f"{folder}: found {amount(len(names), 'photograph')}; expected at least {MIN_PHOTOGRAPHS}, of {suffixes}{more}"
+            f"{folder}: found {amount(len(names), 'photograph')}; expected at least {MIN_PHOTOGRAPHS}, "
+            f"of {suffixes}{more}"
         )
 
 

@@ -7,8 +7,11 @@ from pathlib import Path
 from statistics import median
 from types import ModuleType
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clsplat.errors import amount, first_few
-from clsplat.scene.sharpness import BLURRED, sharpness_of
+from clsplat.scene.sharpness import is_blurred, sharpness_of
 from data_tools.database import feature_counts, verified
 from data_tools.gather import MIN_PHOTOGRAPHS
 
@@ -25,7 +28,7 @@ class Matched:
     images: Path
     features: dict[str, int]
     pairs: dict[tuple[str, str], int]  # matches that pass verification
-    sharpness: dict[str, float] = field(default_factory=dict)
+    sharpness: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, pycolmap: ModuleType, database: Path, images: Path) -> "Matched":
@@ -60,8 +63,8 @@ class Matched:
         is_textured = median(self.features.values()) >= TEXTURED
         return is_textured and len(self.groups(1)[0]) < max(MIN_PHOTOGRAPHS, len(self.features) / 2)
 
-    def sharpness_of(self, name: str) -> float:
-        """The sharpness of a photograph, measured once."""
+    def sharpness_of(self, name: str) -> NDArray[np.float64]:
+        """Both sharpnesses of a photograph, measured once."""
         if name not in self.sharpness:
             self.sharpness[name] = sharpness_of(self.images / name)
         return self.sharpness[name]
@@ -105,17 +108,17 @@ def reasons(matched: Matched, models: Sequence[set[str]]) -> dict[str, str]:
         found[name] = (
             f"in another model, with {first_few(sorted(other - {name}))}"
             if other
-            else _reason(matched, name, placed, median(compared))
+            else _reason(matched, name, placed, compared)
         )
     return found
 
 
-def _reason(matched: Matched, name: str, placed: set[str], sharp: float) -> str:
+def _reason(matched: Matched, name: str, placed: set[str], compared: Sequence[NDArray[np.float64]]) -> str:
     matches = matched.matches[name]
     among = {other: count for other, count in matches.items() if other in placed}
     if matched.features[name] < FEW_FEATURES:
         return f"only {amount(matched.features[name], 'feature')}: blurred, dark, or of a plain surface"
-    is_soft = matched.sharpness_of(name) < BLURRED * sharp
+    is_soft = is_blurred(matched.sharpness_of(name), compared)
     may_be = "; it may be blurred" if is_soft else ""
     if not matches:  # no more is known: one of broad shapes is as soft as a blurred one
         return f"shows nothing that another photograph shows{may_be}"

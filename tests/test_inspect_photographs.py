@@ -81,6 +81,15 @@ def test_a_dark_photograph_is_not_blurred_and_a_dark_blurred_one_is(tmp_path):
     assert looks(files).blurred == ["3.png"]
 
 
+def test_a_close_photograph_among_those_of_a_thing_before_black_is_not_blurred(tmp_path):
+    files = shown(tmp_path, [1] * 9)
+    for name in [*files][:6]:
+        pixels = cv2.imread(str(files[name]))
+        pixels[:, 10:] = 0
+        cv2.imwrite(str(files[name]), pixels)
+    assert looks(files).blurred == []
+
+
 def test_where_exif_tells_no_exposure_a_step_of_the_brightness_is_a_hint(tmp_path):
     files = shown(tmp_path, [1, 0.9, 0.4, 0.6, 0.7, 1])
     ((a, b, ratio),) = looks(files).steps
@@ -91,6 +100,7 @@ def test_where_exif_tells_no_exposure_a_step_of_the_brightness_is_a_hint(tmp_pat
     found = looks(files, dict.fromkeys(files, told) | {"2.png": replace(told, seconds=0.001)})
     assert not found.steps
     assert [(a, b) for a, b, _ in found.jumps] == [("1.png", "2.png"), ("2.png", "3.png")]
+    assert [(a, b) for a, b, _ in looks(files, {"1.png": told}).steps] == [("1.png", "2.png")], "one alone tells none"
 
 
 def test_a_thing_before_black_that_is_larger_in_one_photograph_is_no_step_of_the_brightness(tmp_path):

@@ -197,7 +197,7 @@ def test_listed_names_whose_photographs_are_missing_are_skipped_with_them(folder
     for letter in "cx":
         (folder / f"images/{letter}.png").unlink()
     (folder / "names.txt").write_text("a\nc\nimages/x.jpg\nd\n")
-    for choice in (Choice(names=["a", "c", "x.png", "d"]), Choice(file="names.txt")):
+    for choice in (Choice(names=["a", "c", "c", "x.png", "d"]), Choice(file="names.txt")):
         caplog.clear()
         scene = read_scene(folder, Split(choice, missing="skip"))
         assert letters(scene, "test") == "ad"
@@ -206,6 +206,8 @@ def test_listed_names_whose_photographs_are_missing_are_skipped_with_them(folder
         assert letters(read_scene(folder, Split(0, train=choice, missing="skip")), "train") == "ad"
     with pytest.raises(DataError, match="no photograph is called 'z'"):
         read_scene(folder, Split(Choice(names=["a", "c", "z"]), missing="skip"))
+    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of .* name others, whose photographs are there"):
+        read_scene(folder, Split(Choice(names=["c"]), missing="skip"))
     with pytest.raises(DataError, match=r"scene\.train leaves no photograph"):
         read_scene(folder, Split(0, train=Choice(names=["c"]), missing="skip"))
 

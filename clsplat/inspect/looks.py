@@ -19,7 +19,7 @@ from clsplat.scene.exif import CameraExposure, exposure_of
 from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.images import read_grey
 from clsplat.scene.parts import Parts
-from clsplat.scene.sharpness import BLURRED, SIDE, relative_sharpness
+from clsplat.scene.sharpness import SIDE, both_sharpnesses, is_blurred
 from clsplat.scene.view import NO_FILE
 
 THUMBNAIL = 32  # px, of each side
@@ -32,7 +32,7 @@ STEP = 2.0  # brightness of a photograph by that of the one before: at most 1.4 
 class Look:
     """What is measured of one photograph."""
 
-    sharpness: float  # relative
+    sharpness: NDArray[np.float64]  # both
     brightness: NDArray[np.float64]  # mean and median, grey levels
     thumbnail: NDArray[np.float32]  # [THUMBNAIL²], grey levels
 
@@ -72,12 +72,12 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
         exposures = {name: exposure_of(files[name]) for name in found}
     values = [(name, exposure.value) for name in names if (exposure := exposures.get(name))]
     steps = [(a, b, round(abs(y - x), 2)) for (a, x), (b, y) in pairwise(values)]
-    middle = float(np.median([look.sharpness for look in found.values()])) if found else 0.0
+    sharp = [look.sharpness for look in found.values()]
     return LookFacts(
-        blurred=[name for name, look in found.items() if look.sharpness < BLURRED * middle],
+        blurred=[name for name, look in found.items() if is_blurred(look.sharpness, sharp)],
         same=_same(list(found), [look.thumbnail for look in found.values()]),
         jumps=[step for step in steps if step[2] > JUMP],
-        steps=[] if values else _steps({name: look.brightness for name, look in found.items()}),
+        steps=_steps({name: look.brightness for name, look in found.items()}, {name for name, _ in values}),
         unreadable={
             name: str(error).removeprefix(f"{files[name]}: ").partition(";")[0]
             for name, error in looked.items()
@@ -95,14 +95,19 @@ def _look(file: Path) -> Look | DataError:
         return error
     small = cv2.resize(grey, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
     brightness = np.maximum([grey.mean(), np.median(grey)], 1.0)
-    return Look(relative_sharpness(grey), brightness, small.astype(np.float32).ravel())
+    return Look(both_sharpnesses(grey), brightness, small.astype(np.float32).ravel())
 
 
-def _steps(brightness: Mapping[str, NDArray[np.float64]]) -> list[tuple[str, str, float]]:
-    """Neighbours of which mean and median both differ by more than STEP times: one of them follows what is shown."""
+def _steps(brightness: Mapping[str, NDArray[np.float64]], told: Container[str]) -> list[tuple[str, str, float]]:
+    """Neighbours of which mean and median both differ by more than STEP times: one of them follows what is shown.
+
+    told: photographs whose exposures are known; two of them make no step.
+    """
     found = []
     for (a, x), (b, y) in pairwise(brightness.items()):
         ratios = y / x
+        if a in told and b in told:
+            continue
         if min(ratios) > STEP or max(ratios) < 1 / STEP:
             found.append((a, b, round(float(ratios[0]), 2)))
     return found

@@ -201,10 +201,10 @@ def _late(stages: Sequence[Stage], need: str) -> str:
         for inner in training.during:
             if need in inner.makes and inner.every:
                 cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
-                remedy = f"set {inner.stage}.start earlier"
-                if not any(is_act(inner.every, one) for one in range(step + 1, step + training.steps)):
-                    remedy = f"set {inner.stage}.every below {training.steps}"
-                return f"{cadence}; the training ends before: {remedy}, or use --minutes"
+                acts = any(is_act(inner.every, one) for one in range(step + 1, step + training.steps))
+                remedies = [] if acts else [f"set {inner.stage}.every below {training.steps}"]
+                remedies += [f"set {inner.stage}.start earlier"] if acts or inner.start >= step + training.steps else []
+                return f"{cadence}; the training ends before: {' and '.join(remedies)}, or use --minutes"
         step += training.steps
     return ""
 

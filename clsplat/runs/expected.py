@@ -7,7 +7,6 @@ Gaussians grow, and at which step photographs for validation end the training.
 
 import logging
 import math
-import re
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -139,7 +138,9 @@ def _tried(planned: Sequence[Planned], folder: Path, names: Sequence[str]) -> di
             try:
                 one.step.make(source, target, target)
             except ClsplatError as error:  # names files that are gone when it is read
-                told = re.sub(f"{re.escape(made)}.*?: ", "", str(error).replace(str(photographs), str(folder)))
+                told = str(error).replace(str(photographs), str(folder))
+                for k, other in enumerate(planned):
+                    told = told.replace(str(Path(made, str(k))), other.step.stage)
                 raise DataError(f"{one.step.stage}: {told}") from error
             found[one.step.stage], source = time.perf_counter() - began, target
     return found

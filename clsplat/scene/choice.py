@@ -89,7 +89,7 @@ class Choice(Settings):
         place, listed = self._listed(folders)
         own, of_others = _Ends(names), {key: _Ends(taken) for key, taken in others.items()}
         found_at = {name: own.indices_of(name) for name in listed}
-        for name in (one for one in listed if not found_at[one]):
+        for name in [name for name, found in found_at.items() if not found]:
             for key in (key for key, taken in of_others.items() if taken.indices_of(name)):
                 if key != "missing":
                     raise _taken(place, name, key)

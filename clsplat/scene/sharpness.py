@@ -1,5 +1,6 @@
 """How sharp a photograph is, by its small details."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -17,11 +18,20 @@ def sharpness(grey: NDArray[np.uint8]) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
-def relative_sharpness(grey: NDArray[np.uint8]) -> float:
-    """Return the sharpness of an image [H, W] by the square of its mean: that of a darker copy is the same."""
-    return sharpness(grey) / max(float(grey.mean()), 1.0) ** 2
+def both_sharpnesses(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return the sharpness of an image [H, W], and it by the square of its mean, which a darker copy has too, [2]."""
+    found = sharpness(grey)
+    return np.array([found, found / max(float(grey.mean()), 1.0) ** 2])
 
 
-def sharpness_of(path: Path) -> float:
-    """Return the relative sharpness of a photograph, reduced to SIDE px.  Raises DataError when it cannot be read."""
-    return relative_sharpness(read_grey(path, SIDE)[0])
+def sharpness_of(path: Path) -> NDArray[np.float64]:
+    """Return both sharpnesses of a photograph, reduced to SIDE px.  Raises DataError when it cannot be read."""
+    return both_sharpnesses(read_grey(path, SIDE)[0])
+
+
+def is_blurred(own: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> bool:
+    """Return whether both sharpnesses of a photograph are far below the medians of a set.
+
+    The first alone is small of a dark photograph, the second of a bright one among dark ones.
+    """
+    return bool((own < BLURRED * np.median(others, axis=0)).all())

@@ -45,10 +45,11 @@ class Split:
                     f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; expected some to "
                     "train with: name fewer of them, or raise `every`"
                 )
-            if self.holdout.every and not test:
+            if not test:
+                remedy = "lower its offset" if self.holdout.every else "name others, whose photographs are there"
                 raise DataError(
                     f"{scene.path}: scene.holdout takes 0 of {len(names)} photographs for testing; expected some: "
-                    "lower its offset, or set scene.holdout to 0 for none"
+                    f"{remedy}, or set scene.holdout to 0 for none"
                 )
             scene = _with_test(scene, test)
         left_out: list[str] = []
