@@ -55,7 +55,7 @@ def of_training_views(found: Sequence[ViewMetrics], has_colours: bool) -> Iterat
     if not has_colours and gained >= GAINED:
         yield (
             f"exposures or colours differ: in their own colours photographs would be {gained:.1f} dB nearer; "
-            "try `--set optimize.colours=auto`"
+            "try `--set optimize.colours=gain`"
         )
 
 
@@ -78,7 +78,7 @@ def of_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
 def of_sky(background: Backdrop | None) -> Iterator[str]:
     """What a sky means that was chosen by the photographs."""
     if isinstance(background, Auto) and background.in_use is not None:
-        yield f"a sky was added, since {background.reason}; other viewers show it after `--set export.sky=splats`"
+        yield f"a sky was added, since {background.reason}; other viewers show it where `export` has `sky: splats`"
 
 
 def far_below(psnr: Mapping[str, float]) -> list[str]:
