@@ -42,7 +42,7 @@ BOTH = f"choices=[{DEGREE}, {RESET}]"
 
 def test_the_last_row_that_a_measure_reaches_decides():
     settings = load("smoke", [BOTH]).settings
-    for count, degree, stop in ((1, 0, 1), (7.9, 0, 1), (8, 1, 1), (23, 1, None), (500, 2, None)):
+    for count, degree, stop in ((1, 0, 1), (7, 0, 1), (8, 1, 1), (23, 1, None), (500, 2, None)):
         chosen = choose(settings, {"photographs": count})
         reset = next(stage for stage in chosen.training.during if stage.stage == "reset_opacity")
         assert (chosen.model.sh_degree, reset.stop) == (degree, stop)
