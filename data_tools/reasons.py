@@ -1,6 +1,6 @@
 """Why photographs could not be placed: what their features and matches tell."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -45,13 +45,7 @@ class Matched:
 
     def groups(self, fewest: int) -> list[list[str]]:
         """The photographs that pairs with so many matches join, each group sorted, the largest first."""
-        group_of = {name: {name} for name in self.features}
-        for (a, b), count in self.pairs.items():
-            if count >= fewest and group_of[a] is not group_of[b]:
-                group_of[a] |= group_of[b]
-                group_of.update(dict.fromkeys(group_of[b], group_of[a]))
-        groups = {id(group): sorted(group) for group in group_of.values()}
-        return sorted(groups.values(), key=lambda group: (-len(group), group))
+        return joined(self.features, [pair for pair, count in self.pairs.items() if count >= fewest])
 
     def have_nothing_in_common(self) -> bool:
         """Whether denser features are without a chance: most photographs are in no group of pairs, however few matches
@@ -68,6 +62,17 @@ class Matched:
         if name not in self.sharpness:
             self.sharpness[name] = sharpness_of(self.images / name)
         return self.sharpness[name]
+
+
+def joined(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> list[list[str]]:
+    """Return the groups of names that pairs join, each sorted, the largest first."""
+    group_of = {name: {name} for name in names}
+    for a, b in pairs:
+        if group_of[a] is not group_of[b]:
+            group_of[a] |= group_of[b]
+            group_of.update(dict.fromkeys(group_of[b], group_of[a]))
+    groups = {id(group): sorted(group) for group in group_of.values()}
+    return sorted(groups.values(), key=lambda group: (-len(group), group))
 
 
 def diagnosis(matched: Matched) -> str:
