@@ -116,8 +116,8 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
 def more_pairs(database: Path, left_out: Set[str]) -> list[tuple[str, str]]:
     """Return pairs of photographs that are left out with any others, which `match_within` has not looked at.
 
-    They are no more than it has looked at, so that the matching takes twice as long at most: all, or those of each
-    photograph with the most similar ones.
+    They are all, where these are no more than it has looked at, so that the matching takes twice as long at most; else
+    those of each photograph that is left out with the most similar ones to it: as many, but with one at least.
     """
     pycolmap = require_pycolmap()
     with opened(pycolmap, database) as rows:

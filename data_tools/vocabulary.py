@@ -23,12 +23,14 @@ def likeness(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
     """Return how alike photographs are, 0 to 1, [N, N].
 
     tables: descriptors [M, 128] of each photograph.  A word is a cell of k-means over a sample of the descriptors;
-    photographs are compared by the cosine of their TF-IDF vectors.
+    photographs are compared by the cosine of their TF-IDF vectors.  Photographs without descriptors are like none.
     """
     rng = np.random.default_rng(0)
     sample = np.concatenate(
         [table[rng.permutation(len(table))[: SAMPLES * WORDS // len(tables) + 1]] for table in tables]
     )
+    if not len(sample):
+        return np.zeros((len(tables), len(tables)))
     counts = np.zeros((len(tables), WORDS))
     words = _words(sample)
     for row, table in enumerate(tables):

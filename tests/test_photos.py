@@ -399,6 +399,7 @@ def test_alike_photographs(rng):
     tables = [np.concatenate([halves[i], halves[(i + 1) % 6]]) for i in range(6)]
     assert alike(tables, 2) == [(0, 1), (0, 5), (1, 2), (2, 3), (3, 4), (4, 5)]
     assert alike([*tables[:2], np.empty((0, 128), np.float32)], 1)[0] == (0, 1)
+    assert alike([np.empty((0, 128), np.float32)] * 3, 1) == [(0, 1), (0, 2)], "of plain ones, the first"
 
 
 # ---- the scene written
