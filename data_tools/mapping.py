@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
+
 from clsplat.errors import DataError
 from clsplat.progress import Count
 from data_tools.database import clear_features, explained, image_names, verified
@@ -30,6 +32,7 @@ ENOUGH = 0.9  # share of the photographs: with more, no more features are looked
 DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
 DENSER = Sought(long_side=2400, count=16384, contrast=0.01)
 NOT_DENSER = "denser features would not help: there are enough, and most photographs have nothing in common"
+FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap's are of the middle two
 LOOSE = {  # COLMAP's own values: 100 matches, 16 and 1.5 degrees, 30 matches, a quarter of them
     "init_min_num_inliers": 50,
     "init_min_tri_angle": 5.0,
@@ -70,7 +73,7 @@ def map_cameras(
     """Place cameras and points, in so many attempts at most; keep the largest model as sparse/0, tell of the others.
 
     `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
-    fewest: photographs that show a point, 2 or 3.
+    An attempt with nothing to try, such as no more pairs, does not count.  fewest: photographs that show a point, 2 or 3.
     Raises DataError, with the likely reason, when no attempt gives a model of three images.
     """
     pycolmap = require_pycolmap()
@@ -79,29 +82,32 @@ def map_cameras(
     matched = Matched.of(pycolmap, source / DATABASE, source / IMAGES)
     if why := without_depth(pycolmap, source / DATABASE):
         raise DataError(f"{source / IMAGES}: the photographs {why}")
-    models, used, more = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]]()
-    for attempt in (first, *LATER)[:attempts]:
+    models, used, more, made = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
+    for attempt in (first, *LATER):
         placed = models[0].num_reg_images() if models else 0
-        if placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
+        if made == attempts or placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
             break
-        if attempt.wider:
-            more = more_pairs(source / DATABASE, set(names) - _names(*models[:1]))
-            if not more:
-                continue
         if attempt.dense and not models and matched.have_nothing_in_common():
             LOG.info("%s", NOT_DENSER)
             break
-        if attempt is not first:
-            LOG.info("%d of %d photographs are placed; another attempt: %s", placed, len(names), attempt.told)
         try:
+            if attempt.wider and not (more := more_pairs(source / DATABASE, set(names) - _names(*models[:1]))):
+                continue
+            if attempt is not first:
+                LOG.info("%d of %d photographs are placed; another attempt: %s", placed, len(names), attempt.told)
+            made += 1
             found = _attempt(source, out, attempt, threads, models[:1], more)
-        except (DataError, RuntimeError, ValueError) as error:  # pycolmap's are of the last two
+            if attempt.wider:
+                matched = Matched.of(pycolmap, attempt.database(source, out), source / IMAGES)
+        except FAILURES as error:
+            if attempt.wider:
+                LOG.warning("the attempt failed (%s); it is passed over", error)
+                more = []
+                continue
             if not models:
                 raise
             LOG.warning("the attempt failed (%s); the model from before stays", error)
             break
-        if attempt.wider:
-            matched = Matched.of(pycolmap, attempt.database(source, out), source / IMAGES)
         if found and found[0].num_reg_images() > placed:
             models, used = found, attempt
     if not models:

@@ -55,7 +55,7 @@ class Matched:
         no features, until more are looked for.
         """
         is_textured = median(self.features.values()) >= TEXTURED
-        return is_textured and len(self.groups(1)[0]) < max(MIN_PHOTOGRAPHS, len(self.features) / 2)
+        return is_textured and len(self.groups(1)[0]) < len(self.features) / 2
 
     def sharpness_of(self, name: str) -> NDArray[np.float64]:
         """Both sharpnesses of a photograph, measured once."""

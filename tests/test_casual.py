@@ -331,6 +331,24 @@ def test_sets_that_cannot_work_end_in_a_sentence(tmp_path, dense, pixels, senten
         map_cameras(matches, cameras)
 
 
+def test_plain_photographs_of_which_not_all_pairs_were_matched_end_in_a_sentence(tmp_path, dense):
+    """More pairs are looked for among photographs without features."""
+    plain = [np.full((180, 240, 3), 100 + number, np.uint8) for number in range(12)]
+    matches, cameras = prepared(tmp_path, plain, matching="sequential", neighbours=2)
+    with pytest.raises(DataError, match="none has features, where thousands"):
+        map_cameras(matches, cameras)
+
+
+def test_only_attempts_that_are_made_count(tmp_path, dense, caplog):
+    """All pairs were matched, so that there are no more of them to try."""
+    caplog.set_level("INFO")
+    matches, cameras = prepared(tmp_path, [stranger(number) for number in range(4)])
+    with pytest.raises(DataError, match="no two of them show the same features"):
+        map_cameras(matches, cameras, attempts=3)
+    tried = [text.rpartition(": ")[2] for text in caplog.messages if "another attempt" in text]
+    assert tried == ["smaller angles and fewer matches", "denser features"]
+
+
 def test_copies_among_photographs_tell_nothing_of_the_camera(tmp_path, dense):
     """Three neighbours that shift before a wall, each with two copies, which match it best: it has not turned."""
     wide = blocks(1, 400, 180)
@@ -397,3 +415,9 @@ def test_when_photographs_have_nothing_in_common(tmp_path, features, pairs, expe
     """Ten photographs; however few matches a pair has."""
     found = Matched(tmp_path, dict.fromkeys("abcdefghij", features), {(a, b): 15 for a, b in pairs.split()})
     assert found.have_nothing_in_common() == expected
+
+
+@pytest.mark.parametrize(("names", "pairs"), [("abc", "ab"), ("abcd", "ab cd")], ids=["one is loose", "two pairs"])
+def test_few_photographs_have_something_in_common_where_two_match(tmp_path, names, pairs):
+    found = Matched(tmp_path, dict.fromkeys(names, 3000), {(a, b): 200 for a, b in pairs.split()})
+    assert not found.have_nothing_in_common()

@@ -9,7 +9,9 @@ from pathlib import Path
 import cv2
 import pytest
 
+from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
+from data_tools import mapping
 from data_tools.features import Sought, find_features
 from data_tools.mapping import map_cameras
 from data_tools.matching import match_features, match_pairs, more_pairs
@@ -70,6 +72,27 @@ def test_a_name_with_spaces_has_no_more_pairs(matches, tmp_path, caplog):
         f"{number}.jpg" for number in range(7) if number != 3
     ]
     assert "'3 .5.jpg': a name with spaces" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("step", "error"),
+    [("more_pairs", cv2.error("K > 0")), ("match_pairs", DataError("cannot match"))],
+    ids=["looking for pairs", "matching them"],
+)
+def test_a_failure_of_more_pairs_loses_neither_the_model_nor_denser_features(
+    matches, tmp_path, monkeypatch, caplog, step, error
+):
+    def fail(_: Path, pairs: list[tuple[str, str]] | set[str], *threads: int) -> None:
+        if pairs:
+            raise error
+
+    caplog.set_level("INFO")
+    monkeypatch.setattr(mapping, step, fail)
+    monkeypatch.setattr(mapping, "DENSER", Sought(480, 1400))
+    figures = map_cameras(matches, tmp_path, attempts=3 if step == "more_pairs" else 4)
+    assert figures["registered"] >= 7
+    assert f"the attempt failed ({error}); it is passed over" in caplog.text
+    assert [text for text in caplog.messages if text.endswith("another attempt: denser features")]
 
 
 def test_a_photograph_that_is_left_out_is_placed_by_more_pairs_also_after_a_kill(matches, tmp_path, caplog):
