@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from clsplat.errors import DataError, amount, first_few
+from clsplat.errors import DataError, amount, first_few, in_shell
 from clsplat.files import atomic
 from clsplat.progress import Count
 from clsplat.reading import read_file
@@ -53,7 +53,7 @@ def require_folder(folder: Path) -> None:
     """Raise DataError where there is no such folder of photographs; of a video, with what makes one."""
     if folder.suffix.lower() in VIDEO_SUFFIXES and folder.is_file():
         raise DataError(
-            f"{folder}: is a video; `clsplat data video {folder} FOLDER` makes a folder of photographs of it"
+            f"{folder}: is a video; `clsplat data video {in_shell(folder)} FOLDER` makes a folder of photographs of it"
         )
     if not folder.is_dir():
         found = "is a file" if folder.is_file() else "no such folder"
@@ -112,8 +112,7 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
         try:
             _gather_one(photographs / name, images / name)
         except DataError as error:
-            told = str(error).removeprefix(f"{photographs / name}: ").partition(";")[0]
-            damaged[name] = _misnamed(photographs / name) or told
+            damaged[name] = why_unreadable(photographs / name, error)
             continue
         kept.append(name)
     write_exposures(images, {name: exposure_of(photographs / name) for name in kept})  # a copy of a PNG has none
@@ -127,14 +126,17 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
     return kept, damaged
 
 
-def _misnamed(photograph: Path) -> str:
-    """What a file that OpenCV does not read is by its content, where it has the name of another kind; "" else."""
+def why_unreadable(photograph: Path, error: DataError) -> str:
+    """Return why a photograph cannot be read, in a few words: what it is by its content, or what its decoder says.
+
+    error: what reading it raised.
+    """
     with suppress(OSError), photograph.open("rb") as file:
         head = file.read(12)
         for kind, brands in BRANDS.items():
             if head[4:8] == b"ftyp" and head[8:] in brands:
                 return NAMED_OTHERWISE.format(kind)
-    return ""
+    return str(error).removeprefix(f"{photograph}: ").partition(";")[0]
 
 
 def remedy(damaged: Mapping[str, str]) -> str:

@@ -73,7 +73,8 @@ def map_cameras(
     """Place cameras and points, in so many attempts at most; keep the largest model as sparse/0, tell of the others.
 
     `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
-    An attempt with nothing to try, such as no more pairs, does not count.  fewest: photographs that show a point, 2 or 3.
+    An attempt with nothing to try, such as no more pairs, does not count.
+    fewest: photographs that show a point, 2 or 3.
     Raises DataError, with the likely reason, when no attempt gives a model of three images.
     """
     pycolmap = require_pycolmap()

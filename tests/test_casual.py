@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, in_shell
 from clsplat.prepare.cache import fingerprint
 from clsplat.scene.exif import copied, exposure_of, optics_of
 from clsplat.scene.images import read_grey, read_header, read_image
@@ -192,10 +192,10 @@ def test_files_with_the_name_of_another_kind_come_with_how_to_convert_them(tmp_p
 
 @pytest.mark.parametrize("read", [list_photographs, lambda path: fingerprint(path, path)])
 def test_a_video_in_the_place_of_a_folder_comes_with_what_makes_one(tmp_path, read):
-    (tmp_path / "walk.AVI").write_bytes(b"RIFF")
+    (tmp_path / "my walk.AVI").write_bytes(b"RIFF")
     (tmp_path / "notes").touch()
-    command = f"`clsplat data video {tmp_path / 'walk.AVI'} FOLDER`"
-    assert command in refusal(read, tmp_path / "walk.AVI")
+    command = f"`clsplat data video {in_shell(tmp_path / 'my walk.AVI')} FOLDER`"
+    assert command in refusal(read, tmp_path / "my walk.AVI")
     assert "is a file; expected a folder with photographs" in refusal(read, tmp_path / "notes")
     assert "no such folder" in refusal(read, tmp_path / "none.avi")
 
