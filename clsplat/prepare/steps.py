@@ -142,8 +142,9 @@ class MapCameras(Step):
     threads: Positive = 1
     """Number of threads; more than one are faster, and the result does not repeat to the bit."""
     attempts: Annotated[int, Field(ge=1, le=MOST)] = MOST
-    """Largest number of attempts; 1: none but the first.  2 takes smaller angles and fewer matches, 3 more pairs of
-    photographs that are left out, where not all were matched; 4 and 5 find denser features, and match as before."""
+    """Largest number of attempts that are made; 1: none but the first.  The next takes smaller angles and fewer
+    matches; one more pairs of photographs that are left out, where not all were matched; two find denser features, and
+    match as before."""
     fewest_views: Literal[2, 3] = 3
     """Number of photographs that must show a point; COLMAP leaves out those of two.  On one scene
     there are 2.5 times as many points with them."""
