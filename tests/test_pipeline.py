@@ -345,6 +345,14 @@ REFUSED = {
         replaced("  - init\n", ""),
         r"stages\[0\] optimize needs 'model', which no earlier stage makes \(init makes it\)",
     ),
+    "statistics that a cleanup has dropped": (
+        replaced("- evaluate", "- cleanup\n  - densify: {rules: [clone]}"),
+        r"stages\[3\] densify needs 'stats', which no earlier stage makes",
+    ),
+    "statistics of a model that was replaced": (
+        replaced("- evaluate", "- init\n  - densify: {rules: [clone]}"),
+        r"stages\[3\] densify needs 'stats', which no earlier stage makes",
+    ),
     "stage not for during": (replaced("checkpoint: {every: 5}", "init: {every: 5}"), "no stage named 'init'"),
     "duplicate key": (replaced("steps: 10", "steps: 10\n      steps: 20"), r"x.yaml:6: found duplicate key"),
     "two keys in a stage": (

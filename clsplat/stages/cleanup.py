@@ -29,6 +29,7 @@ class Cleanup(Stage):
 
     stage: Literal["cleanup"] = "cleanup"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    takes: ClassVar[frozenset[str]] = frozenset({"stats"})
     edits: ClassVar[bool] = True
 
     rules: list[OneOf[Rule]] = Field(

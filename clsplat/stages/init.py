@@ -46,7 +46,7 @@ class Init(Stage):
 
     stage: Literal["init"] = "init"
     makes: ClassVar[frozenset[str]] = frozenset({"model", "painter"})
-    takes: ClassVar[frozenset[str]] = frozenset({"average", "palette", "field"})
+    takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette", "field"})
     edits: ClassVar[bool] = True
 
     source: Literal["auto", "points", "points+sweep", "sweep", "hull", "random", "model", "ply"] = "auto"
