@@ -15,7 +15,9 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.stages.reinit import ReinitFromDepth, drawn_of
 from clsplat.training import checkpoint
+from clsplat.training.poses import refined
 from clsplat.training.run import Progress, Run
+from clsplat.views.photograph_poses import SHIFTS, PhotographPoses
 from tests.test_training import digest, train
 
 pytestmark = pytest.mark.slow
@@ -76,6 +78,37 @@ def test_they_lie_on_the_surface_that_is_seen(tiny_scene, tmp_path):
     assert np.exp(found["log_scales"]).max() < 0.5, "and no larger than what they stand for"
     assert not found["sh_rest"].any()
     assert (run.adam, run.stats, run.model.degree) == (None, None, 1)
+
+
+def test_its_colours_are_of_the_model_where_photographs_have_their_own(tiny_scene, tmp_path):
+    grey = opened(tiny_scene, plane(), tmp_path / "model")
+    stages = [
+        {"init": {"source": "model", "file": str(tmp_path / "model.ply")}},
+        {"optimize": {"steps": 2, "losses": ["l1"], "colours": "gain", "update": "seen"}},
+        {"reinit_from_depth": {"opacity": 0.2}},
+        "export",
+    ]
+    (tmp_path / "x.yaml").write_text(json.dumps({"name": "x", "model": {"sh_degree": 1}, "stages": stages}))
+    run = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "x.yaml"))
+    ReinitFromDepth(stage="reinit_from_depth").act(grey)
+    of_photographs, of_model = (np.median(np.abs(one.model.gaussians.get("sh_base"))) for one in (grey, run))
+    assert of_model < 0.1 < 0.3 < of_photographs, "the model is grey"
+
+
+def test_they_lie_where_the_cameras_were_learnt_to_be(tiny_scene, tmp_path):
+    """All cameras were learnt to be a shift beside their places; the depths that they see are those of the model."""
+    run, moved = opened(tiny_scene, plane(), tmp_path / "run"), opened(tiny_scene, plane(), tmp_path / "moved")
+    poses = PhotographPoses(moved.scene.split("train"))
+    poses.begin(moved.numbers, {view.name: 1.0 for view in poses.views})
+    for view in poses.views:
+        moved.numbers[f"{SHIFTS}/{view.name}/z"] = 0.3
+    expected = [view.position for view in refined(moved.numbers, moved.original).split("train")]
+    assert np.abs(np.array(expected) - [view.position for view in run.scene.split("train")]).max() > 0.1
+    for one in (run, moved):
+        ReinitFromDepth(stage="reinit_from_depth").act(one)
+    heights = moved.model.gaussians.get("means")[:, 2]
+    assert np.median(np.abs(heights - HEIGHT)) < SPACING, "the plane stays where the model has it"
+    assert not np.array_equal(moved.model.gaussians.get("means"), run.model.gaussians.get("means"))
 
 
 def test_a_pixel_is_drawn_once_by_what_covers_it_and_has_its_place_and_colour(rng):

@@ -12,11 +12,14 @@ from clsplat.density.control import Change
 from clsplat.density.sampling import drawn_order
 from clsplat.errors import ConfigError, NumericError
 from clsplat.gaussians.tables import Gaussians
+from clsplat.metrics.images import to_8_bits
 from clsplat.scene.scene import PointCloud, View
 from clsplat.stages.base import Stage
 from clsplat.stages.init import from_points
+from clsplat.training.colours import colours_of
 from clsplat.training.memory import first_tables, last_place
 from clsplat.training.placing import more_room
+from clsplat.training.poses import refined
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -42,9 +45,10 @@ class ReinitFromDepth(Stage):
 
     A Gaussian lies at the mean depth of what covers its pixel, weighted by alpha T, which at an edge falls between
     two surfaces; published is the middle of the ray's way through the Gaussian of the largest weight.  It has the
-    photograph's colour.  Its standard deviation is the mean distance to the three nearest neighbours, as `init` has
-    it, but at least a pixel and at most the distance to the next drawn pixel.  Adam's moments, statistics and averages
-    begin anew; the active degree of the harmonics stays, with zeros.
+    photograph's colour; where photographs have learnt colours of their own, that of the model's picture, which has none
+    of them.  A learnt camera counts where it was learnt to be.  The Gaussian's standard deviation is the mean distance
+    to the three nearest neighbours, as `init` has it, but at least a pixel and at most the distance to the next drawn
+    pixel.  Adam's moments, statistics and averages begin anew; the active degree of the harmonics stays, with zeros.
     """
 
     stage: Literal["reinit_from_depth"] = "reinit_from_depth"
@@ -91,8 +95,8 @@ class ReinitFromDepth(Stage):
     @staticmethod
     def _drawn(run: Run, count: int) -> list[Drawn]:
         """What is drawn of each training photograph; random numbers are of the seed, the step and its place."""
-        views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
-        painter, found = run.painter(), []
+        views = refined(run.numbers, run.original).downscaled(run.downscale).split("train")
+        painter, found, own_colours = run.painter(), list[Drawn](), colours_of(run) is not None
         for number, view in enumerate(run.status.counted(views, "photographs", len(views))):
             photograph = run.photographs.get(view)
             layers = painter.layers(photograph.camera, depth=True)
@@ -100,7 +104,8 @@ class ReinitFromDepth(Stage):
             mask, own = photograph.counted(), count // len(views) + (number < count % len(views))
             alpha = np.where(layers.depth > 0, layers.alpha, 0) * (1 if mask is None else mask)
             random = np.random.default_rng([run.seed, run.step, number])
-            found.append(drawn_of(view, alpha, layers.depth, photograph.image(), own, random))
+            image = to_8_bits(layers.image) if own_colours else photograph.image()
+            found.append(drawn_of(view, alpha, layers.depth, image, own, random))
         return found
 
 
