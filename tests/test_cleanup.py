@@ -117,6 +117,7 @@ def test_a_model_of_which_nothing_would_be_left_is_refused(tiny_scene, spoilt, t
     with pytest.raises(NumericError, match="cleanup: its rules would remove every Gaussian; weaken them"):
         Cleanup(stage="cleanup", rules=[PruneFaint(opacity_below=0.9)]).act(run)
     np.testing.assert_array_equal(run.model.gaussians.get("means"), before)
+    assert run.whole
 
 
 @pytest.fixture(scope="module")
@@ -155,13 +156,15 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tiny_scene, en
     assert (run.out / "point_cloud.ply").read_bytes() == (finished.out / "point_cloud.ply").read_bytes()
 
 
-def test_a_failure_leaves_the_last_good_state(tiny_scene, ending, tmp_path, caplog):
-    out = tmp_path / "run"
+def test_a_refusal_keeps_what_was_trained_without_a_checkpoint_before(finished, tiny_scene, tmp_path, caplog):
+    out, path = tmp_path / "run", tmp_path / "ending.yaml"
+    path.write_text(ENDING.replace(", {checkpoint: {every: 1}}", "").replace("{checkpoint: {every: 1}}", ""))
     with pytest.raises(NumericError, match="would remove every Gaussian"):
-        train(tiny_scene, out, "cleanup.rules.0.opacity_below=1", pipeline=ending)
-    assert "the last good state is" in caplog.text
-    assert [path.name for path in checkpoint.saved(out)][-1] == "step_000004.npz"
-    train(tiny_scene, out, pipeline=ending, resume=True)
+        train(tiny_scene, out, "cleanup.rules.0.opacity_below=1", pipeline=str(path))
+    assert "the state of step 4 is saved in" in caplog.text
+    assert [path.name for path in checkpoint.saved(out)] == ["step_000004.npz"]
+    train(tiny_scene, out, pipeline=str(path), resume=True)
+    assert (out / "point_cloud.ply").read_bytes() == (finished.out / "point_cloud.ply").read_bytes()
 
 
 @pytest.mark.parametrize(

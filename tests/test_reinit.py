@@ -138,6 +138,7 @@ def test_a_model_that_covers_nothing_is_refused(tiny_scene, tmp_path):
     with pytest.raises(NumericError, match="covers no pixel of the training photographs; train longer before it"):
         ReinitFromDepth(stage="reinit_from_depth").act(run)
     assert run.model.gaussians.count == 3
+    assert run.whole, "so that it can be saved"
 
 
 @pytest.fixture(scope="module")

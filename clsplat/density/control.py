@@ -32,9 +32,25 @@ def densify(
 ) -> Change:
     """Apply the rules in their order, as one rearrangement of all tables, and set the statistics to zero.
 
+    limit, inside: as for `mark`.  make_room: is told how many there will be, before any is added.
+    """
+    change = mark(edit, rules, limit, inside)
+    make_room(change.after)
+    apply_marks(edit, tiler)
+    return change
+
+
+def apply_marks(edit: Edit, tiler: Tiler) -> None:
+    """Rearrange all tables as an edit was marked, and set the statistics to zero."""
+    apply_edit(edit, tiler)
+    edit.stats.clear()
+
+
+def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Box | None = None) -> Change:
+    """Let the rules mark an edit, in their order; return what it will change.
+
     inside: the part of space in which Gaussians grow.  Growth stops at `limit` Gaussians: those with the largest mean
-    of the first column grow first.  Rules read in `edit.room` how many they may add.  make_room: is told how many
-    there will be, before any is added.
+    of the first column grow first.  Rules read in `edit.room` how many they may add.
     """
     edit.max_rows = limit
     gaussians = edit.gaussians
@@ -57,10 +73,7 @@ def densify(
         name = getattr(rule, "type", "rule")
         causes[name] = causes.get(name, 0) + int((decided_by == number).sum())
         grown[name] = grown.get(name, 0) + int(((decided_by == number) & (rows > 1)).sum())
-    make_room(int(rows.sum(dtype=np.int64)))
-    apply_edit(edit, tiler)
-    edit.stats.clear()
-    return Change(before, gaussians.count, causes, grown)
+    return Change(before, int(rows.sum(dtype=np.int64)), causes, grown)
 
 
 def cap_opacity(gaussians: Gaussians, limit: float) -> None:

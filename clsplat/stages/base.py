@@ -51,6 +51,7 @@ class Stage(Settings):
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
     takes: ClassVar[frozenset[str]] = frozenset()  # parts that do not exist afterwards
     edits: ClassVar[bool] = False  # changes the model; inside `during` it acts between two steps
+    changes_last: ClassVar[bool] = False  # says by run.changing() where its edit begins; else all of it is an edit
     reads_harmonics: ClassVar[bool] = False  # of all Gaussians, with a kernel
 
     stage: str
@@ -85,7 +86,8 @@ class Stage(Settings):
 
         A stage that fails is repeated from its beginning when the run goes on, so that its records do not stay.
         """
-        with run.status.stage(self.stage), run.changing() if self.edits else nullcontext(), run.records.of_a_stage():
+        changing = run.changing() if self.edits and not self.changes_last else nullcontext()
+        with run.status.stage(self.stage), changing, run.records.of_a_stage():
             self.run(run)
 
 

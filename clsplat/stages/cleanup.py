@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field, field_validator
 
 from clsplat.density.basic import PruneFaint
-from clsplat.density.control import densify
+from clsplat.density.control import apply_marks, mark
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import PruneUseless
 from clsplat.density.outliers import PruneFar
@@ -31,6 +31,7 @@ class Cleanup(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     takes: ClassVar[frozenset[str]] = frozenset({"stats"})
     edits: ClassVar[bool] = True
+    changes_last: ClassVar[bool] = True
 
     rules: list[OneOf[Rule]] = Field(
         [PruneFaint(opacity_below=0.02), PruneFar(), PruneUseless(views_below=0)], min_length=1
@@ -56,17 +57,15 @@ class Cleanup(Stage):
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         step = max(run.step, 1)  # rules act after step 0
         edit = Edit(gaussians, run.stats, scale, step, run.seed, run.survey())
-        change = densify(edit, self.rules, run.rasterizer.tiler, make_room=_require_some)
-        run.refresh_filter()
+        change = mark(edit, self.rules)
+        if change.after == 0:
+            raise NumericError(
+                "cleanup: its rules would remove every Gaussian; weaken them, as with a smaller "
+                "prune_faint.opacity_below, or remove the stage"
+            )
+        with run.changing():
+            apply_marks(edit, run.rasterizer.tiler)
+            run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
         removed = ", ".join(f"{name} {number:,}" for name, number in change.causes.items())
         LOG.info("%s Gaussians kept; removed: %s", f"{change.after:,} of {change.before:,}", removed)
-
-
-def _require_some(count: int) -> None:
-    """Raise NumericError where an edit would leave no Gaussian, before it does."""
-    if count == 0:
-        raise NumericError(
-            "cleanup: its rules would remove every Gaussian; weaken them, as with a smaller prune_faint.opacity_below, "
-            "or remove the stage"
-        )

@@ -55,6 +55,7 @@ class ReinitFromDepth(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette"})
     edits: ClassVar[bool] = True
+    changes_last: ClassVar[bool] = True
 
     count: Annotated[int, Field(gt=0)] | None = None
     """Number of new Gaussians, at most; without it, as many as there are.  Photographs of which little is
@@ -85,9 +86,11 @@ class ReinitFromDepth(Stage):
         parameters = from_points(points, self.opacity, width)
         size = np.clip(np.exp(parameters["log_scales"][:, 0].astype(np.float64)), pixel, apart)
         parameters["log_scales"][:] = np.log(self.scale * size)[:, None]
-        run.adam = run.stats = None
-        run.model = run.model_settings.model(Gaussians(run.device, parameters), degree)
-        run.refresh_filter()
+        model = run.model_settings.model(Gaussians(run.device, parameters), degree)
+        with run.changing():
+            run.adam = run.stats = None
+            run.model = model
+            run.refresh_filter()
         change = Change(before, len(points), {self.stage: before}, {})
         run.records.add(run.step, "densify", **asdict(change))
         LOG.info("%s Gaussians from depths in the place of %s", f"{change.after:,}", f"{before:,}")
