@@ -68,6 +68,24 @@ def test_a_half_with_too_few_pixels_gives_no_figure_in_the_photographs_colours(i
         assert "psnr_affine" in found
 
 
+@pytest.mark.parametrize("model", [Gain(), Affine()])
+def test_which_views_have_the_figure_does_not_depend_on_the_model(image, model):
+    """Else two steps are compared on different views.  A picture that is white everywhere is bad in any colours."""
+    photograph = to_8_bits(0.5 * image)
+    for step in (image, image + 2, np.ones_like(image), np.full_like(image, np.inf), np.full_like(image, np.nan)):
+        assert "psnr_colour" in colour_figures(step, photograph, None, model)
+    assert colour_figures(np.ones_like(image), photograph, None, model)["psnr_colour"] < 22, "one colour"
+    bright = colour_figures(image / 0.05, to_8_bits(image), None, model)
+    assert bright["psnr_colour"] > 50, "beyond white a picture still says which colours it asks for"
+
+
+def test_pixels_beyond_white_are_left_out_where_enough_others_are_left(image):
+    photograph, bright = to_8_bits(0.5 * image), image.astype(np.float64)
+    bright[:5] = 3
+    changed = in_colours_of(bright, photograph, everywhere(image), Gain())
+    assert changed[5:] == pytest.approx(0.5 * image[5:], abs=0.01)
+
+
 def test_a_mean_says_of_how_many_views_it_is():
     both, one = {"psnr_colour": 30.0, "psnr_affine": 32.0}, {"psnr_affine": 20.0}
     assert mean_figures([both, both]) == both
@@ -106,6 +124,17 @@ def test_the_best_model_is_chosen_by_psnr_where_no_view_has_colours():
     assert compared([fitted, fitted]) == [24.0, 24.0]
     assert compared([fitted, bare]) == compared([fitted, {"psnr": 21.0}]) == [20.0, 21.0]
     assert compared([fitted, {}]) == [20.0, None]
+
+
+def test_two_steps_are_compared_by_psnr_where_some_views_have_no_colours():
+    """30 dB of one view is no better than 31 and 22 dB of two."""
+    first = {"psnr": 20.0, **mean_figures([{"psnr_colour": 30.0}, {"psnr_affine": 20.0}])}
+    second = {"psnr": 21.0, **mean_figures([{"psnr_colour": 31.0}, {"psnr_colour": 22.0}])}
+    assert (first["psnr_colour"], second["psnr_colour"]) == (30.0, 26.5)
+    whole = {"psnr": 22.0, "psnr_colour": 29.0}
+    assert compared([whole, first]) == [22.0, 20.0]
+    assert compared([first, whole]) == [20.0, 22.0]
+    assert compared([whole, second]) == [29.0, 26.5]
 
 
 def test_the_regression_is_of_the_image_on_the_photograph(rng):

@@ -27,11 +27,12 @@ def colour_figures(
     """Return `psnr_colour` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
 
     mask: pixels that count, [height, width].  Without `psnr_colour` where a half has too few pixels to fit colours to.
+    Values of the image that are not finite count as black.
     """
-    truth = photograph / 255.0
+    truth, finite = photograph / 255.0, np.where(np.isfinite(image), image, 0).astype(np.float64)
     counted = np.ones(truth.shape[:2], bool) if mask is None else mask
-    changed = in_colours_of(image.astype(np.float64), photograph, counted, model)
-    corrected = corrected_by_regression(image.astype(np.float64), truth, counted)
+    changed = in_colours_of(finite, photograph, counted, model)
+    corrected = corrected_by_regression(finite, truth, counted)
     own = {} if changed is None else {"psnr_colour": psnr(changed, photograph, counted)}
     return {**own, "psnr_affine": psnr(corrected, photograph, counted)}
 
@@ -54,16 +55,21 @@ def in_colours_of(
 ) -> NDArray[np.float64] | None:
     """Return the image with each half, left and right, in the colours that the other half of the photograph asks for.
 
-    Pixels that are black or white in the photograph, or beyond white in the image, say nothing of its colours.  None
-    where a half has fewer than PIXELS others for each number that is fitted to a channel.
+    Pixels that are black or white in the photograph say nothing of its colours.  None where a half has fewer than
+    PIXELS others for each number that is fitted to a channel: that depends on the photograph and the mask alone, so
+    that models are compared on the same views.  Those beyond white in the image are left out of the fit where enough
+    others are left; else all count.
     """
-    usable = counted & ((photograph > 0) & (photograph < 255) & (image < 1)).all(axis=2)
+    usable = counted & ((photograph > 0) & (photograph < 255)).all(axis=2)
     middle, truth, changed = image.shape[1] // 2, photograph / 255.0, image.copy()
     left, right = np.s_[:, :middle], np.s_[:, middle:]
-    if min(np.count_nonzero(usable[half]) for half in (left, right)) < PIXELS * model.fitted_to_a_channel:
+    fewest = PIXELS * model.fitted_to_a_channel
+    if min(np.count_nonzero(usable[half]) for half in (left, right)) < fewest:
         return None
     for half, other in ((left, right), (right, left)):
-        matrix = model.fitted(image[other][usable[other]], truth[other][usable[other]])
+        below = usable[other] & (image[other] < 1).all(axis=2)
+        fitted_to = below if np.count_nonzero(below) >= fewest else usable[other]
+        matrix = model.fitted(image[other][fitted_to], truth[other][fitted_to])
         changed[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
     return changed
 

@@ -32,7 +32,7 @@ class Keeping(Training):
 
     keep: Literal["last", "best"] = "last"
     """Model that the training leaves: that of its last step, or the one with the best PSNR at the validation views, in
-    the photographs' colours where they have colours of their own."""
+    the photographs' colours where all measured views have that figure."""
     patience: Annotated[int, Field(gt=0)] | None = None
     """Measurements of the validation views without a better one after which the training ends; without it, none."""
     refit: bool = False
@@ -156,9 +156,9 @@ class Keeping(Training):
 
 def compared(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
     """Return the PSNR of averages of metrics, dB, None where there is none: in the photographs' colours where all have
-    it."""
-    figure = "psnr" if any(one.get("psnr_colour") is None for one in measured) else "psnr_colour"
-    return [one.get(figure) for one in measured]
+    it of all their views."""
+    whole = all(one.get("psnr_colour") is not None and "psnr_colour_reason" not in one for one in measured)
+    return [one.get("psnr_colour" if whole else "psnr") for one in measured]
 
 
 def _validates(stage: Scheduled) -> bool:
