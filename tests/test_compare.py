@@ -1,6 +1,7 @@
 """Comparisons of constructed run folders: what is one row, what differs, what is shown, what is refused."""
 
 import base64
+import html
 import json
 import re
 import shutil
@@ -304,6 +305,19 @@ def test_lpips_of_different_ranges_is_marked(make_run, tmp_path):
     page = page_of(tmp_path, one, two)
     assert "0.2500" in page
     assert "The input range of LPIPS is not the same in all runs (-1..1, 0..1)." in page
+
+
+@pytest.mark.parametrize(("size", "words"), [("1", "test views"), ("2", "test views at 1/2")])
+def test_means_over_other_numbers_of_views_are_marked(make_run, tmp_path, size, words):
+    def averages(size: str, **figures: object) -> dict[str, object]:
+        return {size: {"psnr": 20, "ssim": 0.5, "views": 7, **figures}}
+
+    few = {"psnr_colour": 30.0, "psnr_colour_views": 1, "psnr_colour_reason": "why"}
+    one, two = make_run("one", test=averages(size, **few)), make_run("two", "init.opacity=0.3", test=averages(size))
+    three = make_run("three", "init.opacity=0.4", test=averages(size, psnr_colour=25.0))
+    said = f"The number of {words} with a PSNR in the photographs' colours is not the same in all runs (1, 7)."
+    assert said in html.unescape(page_of(tmp_path, one, two, three))
+    assert "not the same" not in page_of(tmp_path, two, three), "what has no figure is not compared"
 
 
 def broken(make_run, how: str) -> Path:

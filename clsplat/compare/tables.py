@@ -82,8 +82,7 @@ def _cost(rows: Sequence[Row], heading: str, cost: Callable[[RunMetrics], float 
 
 def other_table(rows: Sequence[Row]) -> Table | None:
     """Return the metrics of all other sizes and views; None when there are none."""
-    others = [(split, downscale) for split in ("test", "train") for downscale in downscales(rows, split)]
-    groups = [_group(rows, *one) for one in others if one != ("test", rows[0].downscale)]
+    groups = [_group(rows, *one) for one in _measured(rows) if one != ("test", rows[0].downscale)]
     return _table(rows, groups) if groups else None
 
 
@@ -122,6 +121,17 @@ def differing_conditions(rows: Sequence[Row]) -> Iterable[str]:
         values = {str(value) for one in averages if (value := getattr(one, key, None)) is not None}
         if len(values) > 1:
             yield f"The {name} is not the same in all runs ({', '.join(sorted(values))})."
+    for split, downscale in _measured(rows):
+        found = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
+        counts = {one.colour_views for one in found if one is not None and one.figure("psnr_colour") is not None}
+        if len(counts) > 1:
+            name = f"number of {_title(rows, split, downscale)} with a PSNR in the photographs' colours"
+            yield f"The {name} is not the same in all runs ({', '.join(map(str, sorted(counts)))})."
+
+
+def _measured(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    """The splits and the divisors of the image sizes that any row was measured at."""
+    return [(split, downscale) for split in ("test", "train") for downscale in downscales(rows, split)]
 
 
 def _trained_on(rows: Sequence[Row]) -> list[Group]:
@@ -136,8 +146,12 @@ def _group(rows: Sequence[Row], split: str, downscale: str) -> Group:
         for name, (heading, digits, best) in METRICS.items()
         if any(row.figures(split, downscale, name) for row in rows)
     ]
+    return Group(_title(rows, split, downscale), columns)
+
+
+def _title(rows: Sequence[Row], split: str, downscale: str) -> str:
     size = "full size" if downscale == "1" else f"1/{downscale}"
-    return Group(f"{split} views" + ("" if downscale == rows[0].downscale == "1" else f" at {size}"), columns)
+    return f"{split} views" + ("" if downscale == rows[0].downscale == "1" else f" at {size}")
 
 
 def _table(rows: Sequence[Row], groups: list[Group]) -> Table:
