@@ -41,7 +41,7 @@ def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None
         "filenames": list(files.rows),
         "tree": shape,
     }
-    weights = [log_weights(level.parameters) for level in levels]
+    weights = [log_weights(level.parameters, level.has_sky) for level in levels]
     for name, (number, parts) in files.rows.items():
         rows = np.concatenate(parts)
         write_as_ordered(folder / name, levels[number].rows(rows), weights[number][rows], options or Writing())

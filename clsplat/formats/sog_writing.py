@@ -55,7 +55,7 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
     require_some(path, splats)
     require_moderate(path, splats, "SOG")
     ordered = splats.rows(morton_order(splats.parameters["means"]))
-    return write_as_ordered(path, ordered, log_weights(ordered.parameters), options)
+    return write_as_ordered(path, ordered, log_weights(ordered.parameters, ordered.has_sky), options)
 
 
 def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: Writing) -> str:

@@ -55,6 +55,11 @@ class SplatFile:
         """Highest degree of the spherical harmonics."""
         return degree_of(self.parameters["sh_rest"].shape[1])
 
+    @property
+    def has_sky(self) -> bool:
+        """Whether some Gaussians are a sky, as clsplat/gaussians/sky_splats.py notes in the comment."""
+        return bool(self.rendering.get("sky") == "splats")
+
     def rows(self, chosen: Any) -> "SplatFile":
         """Return some of the Gaussians, in the order that is given."""
         return replace(self, parameters={name: table[chosen] for name, table in self.parameters.items()})

@@ -34,6 +34,7 @@ from clsplat.formats.splats import (
     require_some,
 )
 from clsplat.formats.spz_planes import EXTENSIONS, HEADER, MAGIC, MIP, Header, fraction_of, packed, unpacked
+from clsplat.formats.weights import log_weights
 from clsplat.reading import read_file
 
 LOG = logging.getLogger("clsplat")
@@ -69,8 +70,9 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     require_some(path, splats)
     require_moderate(path, splats, "SPZ")  # one value that is not finite would spoil the harmonics of all
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
+    weights = log_weights(p, splats.has_sky)
     fraction = fraction_of(path, p["means"], options.quality == "high")
-    planes = packed(path, flipped(p) if options.axes == "spz" else p, fraction, options)
+    planes = packed(path, flipped(p) if options.axes == "spz" else p, weights, fraction, options)
     numbers = (options.spz_version, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
     start = MAGIC + struct.pack("<2I3B", *numbers)
     if options.spz_version == 3:

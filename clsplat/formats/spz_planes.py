@@ -14,7 +14,6 @@ from clsplat.errors import DataError
 from clsplat.formats.packing import beyond_bytes, from_smallest_three, smallest_three, tell_cut
 from clsplat.formats.sh_rounding import base_for, rounded_rows, steps, usual_step, visible_form
 from clsplat.formats.splats import MAX_DEGREE, PARAMETERS, Parameters, Writing, logits, opacities, sh_coefficients, unit
-from clsplat.formats.weights import log_weights
 
 LOG = logging.getLogger("clsplat")
 MAGIC = b"NGSP"
@@ -136,12 +135,12 @@ def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
     return bits
 
 
-def packed(path: Path, p: Parameters, fraction: int, options: Writing) -> list[bytes]:
+def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: int, options: Writing) -> list[bytes]:
     """Return the bytes of each plane; values beyond its range are cut.
 
-    Gaussians whose harmonics have fine steps come first, and keep their order among themselves: alike bytes compress.
+    weights: binary logarithms, [N], of weights.py.  Gaussians whose harmonics have fine steps come first, and keep
+    their order among themselves: alike bytes compress.
     """
-    weights = log_weights(p)
     sh_steps = _sh_steps(p["sh_rest"], weights, options)
     order = np.argsort(sh_steps, kind="stable")
     p, weights = {name: table[order] for name, table in p.items()}, weights[order]

@@ -8,8 +8,8 @@ with its size in the picture, and fall with what lies before it, which no table 
 The distance is to the middle of the model, for cameras are not known.  A root of the area, not the area: large
 Gaussians are covered more often, and with a larger power fox and lego lose more at the same size.
 
-Medians are over the scene.  Gaussians that are a sky, thousands on a far sphere, are weighed but not counted in them:
-they would decide how finely the scene is rounded.
+Medians are over the scene.  Where the model's file notes that Gaussians are a sky, thousands on a far sphere, these are
+weighed but not counted in them: they would decide how finely the scene is rounded.
 """
 
 import numpy as np
@@ -19,21 +19,23 @@ from clsplat.formats.splats import Parameters
 
 LARGEST = 10.0  # of the logarithms, on both sides of 0
 # A sky is behind a gap: a distance within which are all but a few, and behind it many.  The spheres of
-# gaussians/sky_splats.py are 10 times as far as 97 % of the scene; no scene that we know has half of such a gap.
+# gaussians/sky_splats.py are 10 times as far as 97 % of the scene.  Their rows are found by it, not by their number:
+# models are cropped, merged to fewer Gaussians, sorted and rounded afterwards.
 GAP, INSIDE = 5.0, 0.97
 FEWEST_INSIDE, FEWEST_BEHIND = 0.01, 0.05  # of all
 
 
-def log_weights(p: Parameters) -> NDArray[np.float64]:
+def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
     """Return the binary logarithms of the weights, [N], of which the scene's median is 0; from -LARGEST to LARGEST.
 
-    Scale-free: a model that is twice as large has the same.
+    Scale-free: a model that is twice as large has the same.  has_sky: whether some Gaussians are a sky, which the
+    median leaves out.
     """
     if not len(p["means"]):
         return np.zeros(0)
     means, scales = p["means"].astype(np.float64), np.sort(p["log_scales"].astype(np.float64), axis=1)
     squares = np.square(means - np.median(means, axis=0)).sum(axis=1)
-    counted = before_a_gap(np.sqrt(squares))
+    counted = before_a_gap(np.sqrt(squares)) if has_sky else np.ones(len(squares), np.bool_)
     squares += np.maximum(np.median(squares[counted]), 1e-30)
     opacity = -np.logaddexp(0, -p["logit_opacity"][:, 0].astype(np.float64))
     found = (opacity + (scales[:, 1] + scales[:, 2] - np.log(squares)) / 2) / np.log(2)

@@ -1,6 +1,7 @@
 """Harmonics rounded by weights and visible errors: against a slow reference, in SPZ and in SOG."""
 
 import gzip
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from clsplat.formats.sh_tree import LEVELS, tree_palette
 from clsplat.formats.splats import SH_C0, SplatFile, Writing, unit
 from clsplat.formats.table import write
 from clsplat.formats.weights import LARGEST, before_a_gap, log_weights
-from clsplat.gaussians.model import Model
+from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import Sky
 from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.harmonics import basis, mean_basis
@@ -70,8 +71,9 @@ def test_a_sky_of_gaussians_does_not_decide_how_the_scene_is_rounded(count, rng,
     source, texels = splats(rng, count), rng.uniform(0, 1, (64, 3)).astype(np.float32)
     source.parameters["log_scales"] = rng.uniform(-3.5, -3, (count, 3)).astype(np.float32)
     baked = with_sky_splats(Model(**source.parameters, sky=Sky(texels)), 5000)
-    behind = SplatFile({name: getattr(baked, name) for name in source.parameters})
-    alone, beside = log_weights(source.parameters), log_weights(behind.parameters)[:count]
+    behind = baked.as_file()
+    assert behind.has_sky
+    alone, beside = log_weights(source.parameters), log_weights(behind.parameters, has_sky=True)[:count]
     np.testing.assert_allclose(beside, alone, atol=0.15)
     for name in ("a.spz", "a.sog"):
         errors = []
@@ -79,6 +81,28 @@ def test_a_sky_of_gaussians_does_not_decide_how_the_scene_is_rounded(count, rng,
             found = there_and_back(tmp_path / name, one).parameters["means"]
             errors.append(np.median(cKDTree(found).query(source.parameters["means"])[0]))
         assert errors[1] < 1.3 * errors[0], name
+
+
+def test_a_model_without_a_sky_counts_all_whatever_its_shape(rng, tmp_path):
+    """Most Gaussians in a small object, the others far around it: no sky, where the file notes none."""
+    source = splats(rng, 2300, 0)
+    directions, radii = rng.normal(size=(2300, 3)), np.append(rng.uniform(0, 0.1, 2000), rng.uniform(2, 3, 300))
+    source.parameters["means"] = unit(np.pad(directions, ((0, 0), (1, 0))))[:, 1:] * radii[:, None].astype(np.float32)
+    source.parameters["means"] = source.parameters["means"].astype(np.float32)
+    assert not before_a_gap(radii).all()
+    assert abs(np.median(log_weights(source.parameters))) < 1e-9
+    noted = replace(source, rendering={"sky": "splats"})
+    for name in ("a.spz", "a.sog"):
+        found = [there_and_back(tmp_path / name, one).parameters["means"] for one in (source, noted)]
+        assert (found[0] != found[1]).any(), name
+
+
+def test_a_sky_is_known_again_in_a_ply_that_is_converted(rng, tmp_path):
+    source, texels = splats(rng, 300, 1), rng.uniform(0, 1, (64, 3)).astype(np.float32)
+    baked = with_sky_splats(Model(**source.parameters, sky=Sky(texels)), 5000)
+    baked.save(tmp_path / "a.ply")
+    for name in ("a.spz", "a.sog"):
+        assert load(tmp_path / "a.ply").save(tmp_path / name) == baked.save(tmp_path / f"direct_{name}")
 
 
 def test_without_a_gap_all_gaussians_count(rng):
