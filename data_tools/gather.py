@@ -13,7 +13,7 @@ import numpy as np
 from clsplat.errors import DataError, amount, first_few, in_shell
 from clsplat.files import atomic
 from clsplat.progress import Count
-from clsplat.reading import read_file
+from clsplat.reading import read_file, regular
 from clsplat.scene.exif import copied, exposure_of, write_exposures
 from clsplat.scene.image_headers import JPEG, TAIL_SIZE, parse_header
 from clsplat.scene.images import IMAGE_SUFFIXES, MAX_BYTES, decode_image, read_grey
@@ -131,7 +131,7 @@ def why_unreadable(photograph: Path, error: DataError) -> str:
 
     error: what reading it raised.
     """
-    with suppress(OSError), photograph.open("rb") as file:
+    with suppress(OSError), regular(photograph) as file:
         head = file.read(12)
         for kind, brands in BRANDS.items():
             if head[4:8] == b"ftyp" and head[8:] in brands:

@@ -115,6 +115,7 @@ mapping.map_cameras(Path({str(matches)!r}), out, attempts=3)
 """
     assert subprocess.run([sys.executable, "-c", killed], cwd=ROOT).returncode == -signal.SIGKILL
     caplog.set_level("INFO")
+    caplog.clear()
     map_cameras(matches, tmp_path / "half", attempts=3)
     more = len(more_pairs(matches / "database.db", {"7.jpg", "8.jpg", LAST}))
     (told,) = [text for text in caplog.messages if "more, of photographs that are left out" in text]

@@ -21,6 +21,7 @@ from clsplat.scene.images import read_grey
 from clsplat.scene.parts import Parts
 from clsplat.scene.sharpness import SIDE, both_sharpnesses, is_blurred
 from clsplat.scene.view import NO_FILE
+from data_tools.gather import why_unreadable
 
 THUMBNAIL = 32  # px, of each side
 SAME = 1.0  # grey levels between thumbnails: frames of a video are 9 apart, two codings of one photograph 0.3
@@ -79,9 +80,7 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
         jumps=[step for step in steps if step[2] > JUMP],
         steps=_steps({name: look.brightness for name, look in found.items()}, {name for name, _ in values}),
         unreadable={
-            name: str(error).removeprefix(f"{files[name]}: ").partition(";")[0]
-            for name, error in looked.items()
-            if isinstance(error, DataError)
+            name: why_unreadable(files[name], error) for name, error in looked.items() if isinstance(error, DataError)
         },
         padded=padding(files[name] for name in found),
     )

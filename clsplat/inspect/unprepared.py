@@ -6,6 +6,7 @@ from clsplat.errors import amount, in_shell
 from clsplat.inspect.finding import Finding
 from clsplat.inspect.survey import Facts
 from data_tools.gather import MIN_PHOTOGRAPHS
+from data_tools.gather import remedy as remedy_of
 from data_tools.told import left_out
 
 
@@ -21,7 +22,7 @@ def unprepared(facts: Facts) -> Iterator[Finding]:
     else:
         remedy, texts = f"`clsplat run photos --scene {in_shell(facts.path)}` finds the cameras", facts.left_out
         if readable < MIN_PHOTOGRAPHS:
-            remedy = f"only {readable} of {count} photographs can be read; export them again"
+            remedy = f"only {readable} of {count} photographs can be read; {remedy_of(damaged)}"
     yield Finding("error", f"{facts.path} holds {held} no camera poses", remedy)
     for text in texts + left_out({"damaged": damaged, "photographs": readable}):
         yield Finding("warning", text.removeprefix(f"{facts.path}: "))

@@ -22,7 +22,7 @@ WORDS = ['"camera_path"', '"camera_to_world"', '"fov"', '"fisheye"', "179.9", '"
 @pytest.fixture(scope="module")
 def seeds(folder):
     camera_path.write(folder / "a.json", VIEWS, 24)
-    inria.write(folder, posed(make_scene(folder, VIEWS, set(), None)), None)
+    inria.write(folder, posed(make_scene(folder, VIEWS, set(), None)), None, None)
     moved = json.loads((folder / "a.json").read_text())
     del moved["world"], moved["keyframes"]
     return [(folder / "a.json").read_bytes(), (folder / "cameras.json").read_bytes(), json.dumps(moved).encode()]

@@ -104,7 +104,7 @@ def oblique(tmp_path):
     """A cameras.json with two lenses off the middle, and its path."""
     cameras = [Camera(640, 480, 500.0, 400.0, cx, 200.0) for cx in (300.0, 350.0)]
     views = [View(f"{i}.png", camera, np.eye(3, 4)) for i, camera in enumerate(cameras)]
-    inria.write(tmp_path, [Posed(view.name, view, False) for view in views], None)
+    inria.write(tmp_path, [Posed(view.name, view, False) for view in views], None, None)
     return camera_path.read(tmp_path / "cameras.json")
 
 
