@@ -353,6 +353,10 @@ REFUSED = {
         replaced("- evaluate", "- init\n  - densify: {rules: [clone]}"),
         r"stages\[3\] densify needs 'stats', which no earlier stage makes",
     ),
+    "figures of a model that was replaced": (
+        replaced("- export", "- init\n  - report"),
+        r"stages\[4\] report needs 'metrics', which no earlier stage makes",
+    ),
     "stage not for during": (replaced("checkpoint: {every: 5}", "init: {every: 5}"), "no stage named 'init'"),
     "duplicate key": (replaced("steps: 10", "steps: 10\n      steps: 20"), r"x.yaml:6: found duplicate key"),
     "two keys in a stage": (

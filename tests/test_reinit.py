@@ -69,7 +69,9 @@ def test_they_lie_on_the_surface_that_is_seen(tiny_scene, tmp_path):
     """A plane, of which every photograph sees a part."""
     run = opened(tiny_scene, plane(), tmp_path / "run")
     before = run.model.gaussians.count
+    run.metrics = {"test": {"1": {"psnr": 30.0}}}
     ReinitFromDepth(stage="reinit_from_depth", opacity=0.2, scale=0.5).act(run)
+    assert not run.metrics, "which are of the model that it replaces"
     found = {name: run.model.gaussians.get(name) for name in run.model.gaussians.tables}
     assert len(found["means"]) == before
     assert np.median(np.abs(found["means"][:, 2] - HEIGHT)) < SPACING

@@ -46,7 +46,7 @@ class Init(Stage):
 
     stage: Literal["init"] = "init"
     makes: ClassVar[frozenset[str]] = frozenset({"model", "painter"})
-    takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette", "field"})
+    takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette", "field", "metrics"})
     edits: ClassVar[bool] = True
 
     source: Literal["auto", "points", "points+sweep", "sweep", "hull", "random", "model", "ply"] = "auto"
@@ -97,7 +97,7 @@ class Init(Stage):
         require_times(run.scene, run.model_settings.time)
         parameters, source = self._parameters(run, degree)
         gaussians = Gaussians(run.device, parameters)
-        run.adam = run.stats = None  # which were of an earlier model
+        run.adam, run.stats, run.metrics = None, None, {}  # which were of an earlier model
         run.model = run.model_settings.model(gaussians, degree if self.source in MODEL_SOURCES else 0)
         run.refresh_filter()
         begin_sky(run, load(Path(self.file)).sky if source in MODEL_SOURCES and self.file else None)

@@ -53,7 +53,7 @@ class ReinitFromDepth(Stage):
 
     stage: Literal["reinit_from_depth"] = "reinit_from_depth"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette"})
+    takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette", "metrics"})
     edits: ClassVar[bool] = True
     changes_last: ClassVar[bool] = True
 
@@ -88,7 +88,7 @@ class ReinitFromDepth(Stage):
         parameters["log_scales"][:] = np.log(self.scale * size)[:, None]
         model = run.model_settings.model(Gaussians(run.device, parameters), degree)
         with run.changing():
-            run.adam = run.stats = None
+            run.adam, run.stats, run.metrics = None, None, {}  # which were of the earlier model
             run.model = model
             run.refresh_filter()
         change = Change(before, len(points), {self.stage: before}, {})
