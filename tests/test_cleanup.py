@@ -172,6 +172,8 @@ def test_a_refusal_keeps_what_was_trained_without_a_checkpoint_before(finished, 
     [
         ("[]", "expected a list of at least 1"),
         ("[clone]", "the rule 'clone' is of growth; expected rules that remove"),
+        ("[merge_neighbours]", "the rule 'merge_neighbours' changes Gaussians that stay; use it in densify"),
+        ("[{type: prune_faint, start: 9}]", "the rule 'prune_faint' has a start, and cleanup applies it once; leave"),
         ("[{type: prune_scored}]", "the rule 'prune_scored' reads screen_grad of training steps; use it in densify"),
     ],
 )

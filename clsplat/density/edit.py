@@ -205,6 +205,7 @@ class Rule(Settings):
     training_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     grows: ClassVar[bool] = True  # whether it may add Gaussians
+    rewrites: ClassVar[bool] = False  # changes tables as it marks, with edit.set_rows: later rules see that
     reads_means: ClassVar[bool] = False  # as the places of Gaussians, which those that move have at no view's time
 
     start: Annotated[int, Field(ge=0)] = 0

@@ -46,6 +46,7 @@ class MergeNeighbours(Rule):
 
     type: Literal["merge_neighbours"] = "merge_neighbours"
     grows: ClassVar[bool] = False
+    rewrites: ClassVar[bool] = True
     reads_means: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "colour_below"})
 

@@ -47,6 +47,10 @@ class Cleanup(Stage):
             name = getattr(rule, "type", "rule")
             if rule.grows:
                 raise ValueError(f"the rule '{name}' is of growth; expected rules that remove, such as prune_faint")
+            if rule.rewrites:
+                raise ValueError(f"the rule '{name}' changes Gaussians that stay; use it in densify")
+            if rule.start:
+                raise ValueError(f"the rule '{name}' has a start, and cleanup applies it once; leave start out")
             if read := sorted(rule.statistics | rule.tables):
                 raise ValueError(f"the rule '{name}' reads {', '.join(read)} of training steps; use it in densify")
         return rules
