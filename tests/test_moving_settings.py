@@ -18,7 +18,11 @@ PIXELS = "optimize.losses=[l1, {type: covariance_trace, pixels: 2.0}]"
             "model.world_filter.type 'smoothing'",
             "set `world_filter: {type: none}`",
         ),
-        ("densify.rules=[merge_neighbours]", "stages[1] optimize: the rule 'merge_neighbours'", "remove the rule"),
+        (
+            "densify.rules=[merge_neighbours]",
+            "stages[1] optimize: the rule 'merge_neighbours'",
+            "give densify.rules without merge_neighbours",
+        ),
         (PIXELS, "stages[1] optimize: the loss 'covariance_trace' with `pixels`", "remove the loss"),
     ],
 )
@@ -26,6 +30,26 @@ def test_what_reads_places_at_rest_is_refused_beside_motion(override, what, reme
     with pytest.raises(ConfigError, match=f"{re.escape(what)} reads .* beside model.time: {re.escape(remedy)}, or"):
         load("dynamic_7k", [override])
     load("splat_7k", [override])
+
+
+@pytest.mark.parametrize(
+    ("stage", "words"),
+    [
+        ("cleanup", r"the rule 'prune_far', which it has by default, reads .*: give cleanup.rules without prune_far"),
+        ("cleanup: {rules: [prune_far]}", r"the rule 'prune_far' reads .*: give cleanup.rules without prune_far"),
+        ("reinit_from_depth", "a depth is of one moment; expected Gaussians that stand still: remove the stage"),
+    ],
+)
+def test_stages_that_need_gaussians_at_rest_are_refused_when_the_file_is_read(tmp_path, stage, words):
+    path = tmp_path / "x.yaml"
+    text = f"name: x\nmodel: {{time: {{}}}}\nstages:\n  - init\n  - {stage}\n  - export\n"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=rf"stages\[1\] {stage.partition(':')[0]}: {words}"):
+        load(str(path))
+    path.write_text(text.replace("model: {time: {}}\n", ""))
+    load(str(path))
+    path.write_text(text.replace(stage, "cleanup: {rules: [prune_faint]}"))
+    load(str(path))
 
 
 @pytest.mark.parametrize(

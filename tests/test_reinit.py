@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -194,9 +193,3 @@ def test_averages_end_with_it(tmp_path):
     path.write_text(PIPELINE.replace("  - export", "  - take_average"))
     with pytest.raises(ConfigError, match="take_average needs 'average'"):
         load(str(path))
-
-
-def test_gaussians_that_move_have_no_one_depth():
-    moving = SimpleNamespace(model_settings=SimpleNamespace(time="linear"))
-    with pytest.raises(ConfigError, match="a depth is of one moment; expected Gaussians that stand still"):
-        ReinitFromDepth(stage="reinit_from_depth").check_in(moving)

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from clsplat.density.control import Change
 from clsplat.density.sampling import drawn_order
-from clsplat.errors import ConfigError, NumericError
+from clsplat.errors import NumericError
 from clsplat.gaussians.tables import Gaussians
 from clsplat.metrics.images import to_8_bits
 from clsplat.scene.scene import PointCloud, View
@@ -64,13 +64,6 @@ class ReinitFromDepth(Stage):
     """Opacity of the new Gaussians."""
     scale: Annotated[float, Field(gt=0)] = 1.0
     """Factor of the new sizes."""
-
-    def check_in(self, run: Run) -> None:
-        if run.model_settings.time is not None:
-            raise ConfigError(
-                "reinit_from_depth: a depth is of one moment; expected Gaussians that stand still: remove the stage, "
-                "or leave model.time out"
-            )
 
     def run(self, run: Run) -> None:
         before, degree, width = run.model.gaussians.count, run.model.degree, run.model.gaussians.sh_degree
