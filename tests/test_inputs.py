@@ -389,7 +389,7 @@ def test_a_dry_run_of_photographs_is_refused_as_the_run_is(scene, tmp_path, monk
     monkeypatch.chdir(tmp_path)
     for more in (["--dry-run"], []):
         done = command("run", "photos", "--scene", folder, *more, expect=3)
-        assert "photograph; expected at least 3" in done.stderr
+        assert "; expected at least 3, of " in done.stderr
         if more:
             assert not (tmp_path / "runs").exists()
 
