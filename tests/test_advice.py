@@ -61,7 +61,7 @@ def test_test_views_that_are_much_worse_are_named():
 
 
 def test_a_sky_that_was_added_is_said_with_its_reason():
-    added = Auto(chosen="on", reason="25 of 25 photographs show one")
+    added = Auto(chosen="on", reason="25 of 25 photographs show one; 25% of them")
     (text,) = of_sky(added)
     assert text.startswith("a sky was added, since 25 of 25 photographs show one; ")
     assert not [text for other in (None, Directions(), Auto(), Auto(chosen="off")) for text in of_sky(other)]

@@ -78,7 +78,8 @@ def of_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
 def of_sky(background: Backdrop | None) -> Iterator[str]:
     """What a sky means that was chosen by the photographs."""
     if isinstance(background, Auto) and background.in_use is not None:
-        yield f"a sky was added, since {background.reason}; other viewers show it where `export` has `sky: splats`"
+        why, _, _ = background.reason.partition(";")
+        yield f"a sky was added, since {why}; other viewers show it where `export` has `sky: splats`"
 
 
 def far_below(psnr: Mapping[str, float]) -> list[str]:
