@@ -106,24 +106,25 @@ def _parts(matched: Matched, groups: Sequence[list[str]]) -> str:
 def reasons(matched: Matched, models: Sequence[set[str]]) -> dict[str, str]:
     """Return the likely reason of each photograph that is not in the first of the models."""
     placed = models[0]
-    compared = [matched.sharpness_of(name) for name in sorted(placed)[:: max(1, len(placed) // SHARPNESS_OF)]]
+    compared = sorted(placed)[:: max(1, len(placed) // SHARPNESS_OF)]
+    middle = np.median([matched.sharpness_of(name) for name in compared], axis=0)
     found = {}
     for name in sorted(set(matched.features) - placed):
         other = next((model for model in models[1:] if name in model), None)
         found[name] = (
             f"in another model, with {first_few(sorted(other - {name}))}"
             if other
-            else _reason(matched, name, placed, compared)
+            else _reason(matched, name, placed, middle)
         )
     return found
 
 
-def _reason(matched: Matched, name: str, placed: set[str], compared: Sequence[NDArray[np.float64]]) -> str:
+def _reason(matched: Matched, name: str, placed: set[str], middle: NDArray[np.float64]) -> str:
     matches = matched.matches[name]
     among = {other: count for other, count in matches.items() if other in placed}
     if matched.features[name] < FEW_FEATURES:
         return f"only {amount(matched.features[name], 'feature')}: blurred, dark, or of a plain surface"
-    is_soft = is_blurred(matched.sharpness_of(name), compared)
+    is_soft = is_blurred(matched.sharpness_of(name), middle)
     may_be = "; it may be blurred" if is_soft else ""
     if not matches:  # no more is known: one of broad shapes is as soft as a blurred one
         return f"shows nothing that another photograph shows{may_be}"

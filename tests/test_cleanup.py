@@ -9,6 +9,7 @@ import pytest
 from clsplat.density.basic import PruneFaint
 from clsplat.density.importance import PruneUseless
 from clsplat.density.outliers import PruneFar, PruneWide
+from clsplat.density.thinning import MergeNeighbours
 from clsplat.errors import ConfigError, Interrupted, NumericError
 from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
@@ -132,6 +133,17 @@ def finished(tiny_scene: Path, ending: str, tmp_path_factory: pytest.TempPathFac
     return train(tiny_scene, tmp_path_factory.mktemp("runs") / "ending", pipeline=ending)
 
 
+def test_a_rule_that_rewrites_and_does_not_say_so_leaves_the_model_as_it_was(tiny_scene, spoilt, tmp_path, monkeypatch):
+    monkeypatch.setattr(MergeNeighbours, "rewrites", False)
+    run = opened(tiny_scene, spoilt, tmp_path / "run")
+    before = {name: run.model.gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
+    with pytest.raises(ConfigError, match=r"a rule writes .* of Gaussians that stay; expected rules that remove"):
+        Cleanup(stage="cleanup", rules=[MergeNeighbours()]).act(run)
+    for name, table in before.items():
+        np.testing.assert_array_equal(run.model.gaussians.get(name), table)
+    assert run.whole
+
+
 def test_a_training_goes_on_with_what_is_left(finished):
     (line,) = (one for one in map(json.loads, (finished.out / "metrics.jsonl").open()) if one["kind"] == "densify")
     assert line["step"] == 4
@@ -173,7 +185,10 @@ def test_a_refusal_keeps_what_was_trained_without_a_checkpoint_before(finished, 
         ("[]", "expected a list of at least 1"),
         ("[clone]", "the rule 'clone' is of growth; expected rules that remove"),
         ("[merge_neighbours]", "the rule 'merge_neighbours' changes Gaussians that stay; use it in densify"),
-        ("[{type: prune_faint, start: 9}]", "the rule 'prune_faint' has a start, and cleanup applies it once; leave"),
+        (
+            "[{type: prune_faint, start: 9}]",
+            "the rule 'prune_faint' has a start, and cleanup applies it once; expected",
+        ),
         ("[{type: prune_scored}]", "the rule 'prune_scored' reads screen_grad of training steps; use it in densify"),
     ],
 )

@@ -347,15 +347,15 @@ REFUSED = {
     ),
     "statistics that a cleanup has dropped": (
         replaced("- evaluate", "- cleanup\n  - densify: {rules: [clone]}"),
-        r"stages\[3\] densify needs 'stats', which no earlier stage makes",
+        r"stages\[3\] densify needs 'stats', which stages\[2\] cleanup takes away \(optimize makes it again\)",
     ),
     "statistics of a model that was replaced": (
         replaced("- evaluate", "- init\n  - densify: {rules: [clone]}"),
-        r"stages\[3\] densify needs 'stats', which no earlier stage makes",
+        r"stages\[3\] densify needs 'stats', which stages\[2\] init takes away",
     ),
     "figures of a model that was replaced": (
         replaced("- export", "- init\n  - report"),
-        r"stages\[4\] report needs 'metrics', which no earlier stage makes",
+        r"stages\[4\] report needs 'metrics', which stages\[3\] init takes away",
     ),
     "stage not for during": (replaced("checkpoint: {every: 5}", "init: {every: 5}"), "no stage named 'init'"),
     "duplicate key": (replaced("steps: 10", "steps: 10\n      steps: 20"), r"x.yaml:6: found duplicate key"),

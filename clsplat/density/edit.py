@@ -52,6 +52,7 @@ class Edit:
         self.shrink = device.empty(count)
         self.shared = device.empty(count, np.uint32)
         self.rule = 0  # number of the rule that acts
+        self.may_rewrite = True  # rows of tables, before they are rearranged
         self.max_rows: int | None = None  # rows at which growth stops; None: no limit
         self.children: list[tuple[str, NDArray[np.integer], NDArray[np.floating]]] = []  # what set_children was given
         self._program = device.program("density.cl")
@@ -151,7 +152,13 @@ class Edit:
         )
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Write values [n, components] into different rows, [n], of a table; fresh rows copy them."""
+        """Write values [n, components] into different rows, [n], of a table; fresh rows copy them.
+
+        Raises ConfigError in an edit that may only remove.
+        """
+        if not self.may_rewrite:
+            remedy = "expected rules that remove: use this one in densify"
+            raise ConfigError(f"a rule writes {name} of Gaussians that stay; {remedy}")
         self.gaussians.set_rows(name, rows, values)
 
     def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:

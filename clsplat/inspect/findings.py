@@ -114,11 +114,11 @@ def _looks(facts: Facts) -> Iterator[Finding]:
     if jumps:
         named = _listed([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
         fault = f"the exposure jumps by more than a stop {amount(len(jumps), 'time')} ({named})"
-        yield Finding("note", fault, "--set optimize.colours=auto gives each photograph its own")
+        yield Finding("note", fault, "--set optimize.colours=gain gives each photograph its own")
     if steps := facts.looks.steps:
         named = _listed([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
         fault = f"{_are(len(steps), 'photograph')} more than twice as bright or dark as the one before ({named})"
-        remedy = "EXIF tells no exposures; if these changed, --set optimize.colours=auto gives each its own"
+        remedy = "EXIF does not tell both exposures; if these changed, --set optimize.colours=gain gives each its own"
         yield Finding("note", fault, remedy)
     if (padded := facts.looks.padded) and not facts.photos.masks:
         where = ", ".join(f"{px} px {edge}" for edge, px in padded.items())

@@ -73,9 +73,9 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
         exposures = {name: exposure_of(files[name]) for name in found}
     values = [(name, exposure.value) for name in names if (exposure := exposures.get(name))]
     steps = [(a, b, round(abs(y - x), 2)) for (a, x), (b, y) in pairwise(values)]
-    sharp = [look.sharpness for look in found.values()]
+    middle = np.median([look.sharpness for look in found.values()], axis=0) if found else np.zeros(2)
     return LookFacts(
-        blurred=[name for name, look in found.items() if is_blurred(look.sharpness, sharp)],
+        blurred=[name for name, look in found.items() if is_blurred(look.sharpness, middle)],
         same=_same(list(found), [look.thumbnail for look in found.values()]),
         jumps=[step for step in steps if step[2] > JUMP],
         steps=_steps({name: look.brightness for name, look in found.items()}, {name for name, _ in values}),

@@ -27,9 +27,9 @@ def colour_figures(
     """Return `psnr_colour` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
 
     mask: pixels that count, [height, width].  Without `psnr_colour` where a half has too few pixels to fit colours to.
-    Values of the image that are not finite count as black.
+    Of the image NaN counts as black, and what is infinite as white or black.
     """
-    truth, finite = photograph / 255.0, np.where(np.isfinite(image), image, 0).astype(np.float64)
+    truth, finite = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
     counted = np.ones(truth.shape[:2], bool) if mask is None else mask
     changed = in_colours_of(finite, photograph, counted, model)
     corrected = corrected_by_regression(finite, truth, counted)

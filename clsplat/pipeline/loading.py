@@ -211,18 +211,22 @@ def _late(stages: Sequence[Stage], need: str) -> str:
 
 def _check_order(path: Path, settings: PipelineFile) -> None:
     """Raise ConfigError where a stage needs a part of the run that no earlier stage makes."""
-    made, step = {"scene"}, 0
+    made, taken, step = {"scene"}, dict[str, str](), 0
     for i, stage in enumerate(settings.stages):
         for key in CADENCE if isinstance(stage, Scheduled) else ():
             if getattr(stage, key) != type(stage).model_fields[key].default:
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage}: '{key}' belongs inside optimize.during")
         for need in sorted(stage.needs - made):
+            makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
+            if need in taken:
+                gone = f"which {taken[need]} takes away ({makers} makes it again)"
+                raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', {gone}")
             if late := _late(settings.stages[:i], need):
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', which {late}")
-            makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
             raise ConfigError(
                 f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
             )
+        taken |= dict.fromkeys(made & stage.takes, f"stages[{i}] {stage.stage}")
         made = (made - stage.takes) | stage.makes
         if isinstance(stage, Training):
             made.update(part for inner in stage.acting(step) for part in inner.makes)

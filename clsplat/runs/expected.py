@@ -139,7 +139,7 @@ def _tried(planned: Sequence[Planned], folder: Path, names: Sequence[str]) -> di
                 one.step.make(source, target, target)
             except ClsplatError as error:  # names files that are gone when it is read
                 told = str(error).replace(str(photographs), str(folder))
-                for k, other in enumerate(planned):
+                for k, other in reversed([*enumerate(planned)]):  # 10 before 1
                     told = told.replace(str(Path(made, str(k))), other.step.stage)
                 raise DataError(f"{one.step.stage}: {told}") from error
             found[one.step.stage], source = time.perf_counter() - began, target

@@ -1,6 +1,5 @@
 """How sharp a photograph is, by its small details."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -29,9 +28,9 @@ def sharpness_of(path: Path) -> NDArray[np.float64]:
     return both_sharpnesses(read_grey(path, SIDE)[0])
 
 
-def is_blurred(own: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> bool:
-    """Return whether both sharpnesses of a photograph are far below the medians of a set.
+def is_blurred(own: NDArray[np.float64], middle: NDArray[np.float64]) -> bool:
+    """Return whether both sharpnesses of a photograph are far below the medians of a set, [2].
 
     The first alone is small of a dark photograph, the second of a bright one among dark ones.
     """
-    return bool((own < BLURRED * np.median(others, axis=0)).all())
+    return bool((own < BLURRED * middle).all())

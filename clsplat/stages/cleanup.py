@@ -50,7 +50,7 @@ class Cleanup(Stage):
             if rule.rewrites:
                 raise ValueError(f"the rule '{name}' changes Gaussians that stay; use it in densify")
             if rule.start:
-                raise ValueError(f"the rule '{name}' has a start, and cleanup applies it once; leave start out")
+                raise ValueError(f"the rule '{name}' has a start, and cleanup applies it once; expected start: 0")
             if read := sorted(rule.statistics | rule.tables):
                 raise ValueError(f"the rule '{name}' reads {', '.join(read)} of training steps; use it in densify")
         return rules
@@ -61,6 +61,7 @@ class Cleanup(Stage):
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         step = max(run.step, 1)  # rules act after step 0
         edit = Edit(gaussians, run.stats, scale, step, run.seed, run.survey())
+        edit.may_rewrite = False  # what refuses leaves the model as it was
         change = mark(edit, self.rules)
         if change.after == 0:
             raise NumericError(
