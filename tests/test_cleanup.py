@@ -121,6 +121,17 @@ def test_a_model_of_which_nothing_would_be_left_is_refused(tiny_scene, spoilt, t
     assert run.whole
 
 
+def test_a_rule_that_rewrites_and_does_not_say_so_leaves_the_model_as_it_was(tiny_scene, spoilt, tmp_path, monkeypatch):
+    monkeypatch.setattr(MergeNeighbours, "rewrites", False)
+    run = opened(tiny_scene, spoilt, tmp_path / "run")
+    before = {name: run.model.gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
+    with pytest.raises(ConfigError, match=r"a rule writes .* of Gaussians that stay; expected rules that remove"):
+        Cleanup(stage="cleanup", rules=[MergeNeighbours()]).act(run)
+    for name, table in before.items():
+        np.testing.assert_array_equal(run.model.gaussians.get(name), table)
+    assert run.whole
+
+
 @pytest.fixture(scope="module")
 def ending(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("pipeline") / "ending.yaml"
@@ -131,17 +142,6 @@ def ending(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture(scope="module")
 def finished(tiny_scene: Path, ending: str, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return train(tiny_scene, tmp_path_factory.mktemp("runs") / "ending", pipeline=ending)
-
-
-def test_a_rule_that_rewrites_and_does_not_say_so_leaves_the_model_as_it_was(tiny_scene, spoilt, tmp_path, monkeypatch):
-    monkeypatch.setattr(MergeNeighbours, "rewrites", False)
-    run = opened(tiny_scene, spoilt, tmp_path / "run")
-    before = {name: run.model.gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
-    with pytest.raises(ConfigError, match=r"a rule writes .* of Gaussians that stay; expected rules that remove"):
-        Cleanup(stage="cleanup", rules=[MergeNeighbours()]).act(run)
-    for name, table in before.items():
-        np.testing.assert_array_equal(run.model.gaussians.get(name), table)
-    assert run.whole
 
 
 def test_a_training_goes_on_with_what_is_left(finished):
