@@ -18,8 +18,11 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 
+import clsplat.pipeline.file  # noqa: F401  defines all settings of the package
 from clsplat.errors import PLUGIN_MARK, ClsplatError, ConfigError
 from clsplat.reading import read_file
+from clsplat.scene.detect import readers
+from clsplat.scene.readers import Reader
 from clsplat.settings import Settings, fault_of, rebuild
 
 GROUP = "clsplat.plugins"
@@ -148,9 +151,10 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
     try:
         with redirect_stdout(sys.stderr):  # standard output is for results
             yield kinds
-        kinds += [kind for known, old in zip(lists, before, strict=True) for kind in known if kind not in old]
+        added = [kind for known, old in zip(lists, before, strict=True) for kind in known if kind not in old]
+        kinds += [kind for kind in added if not _within(kind.__module__, "clsplat")]
         rebuild()
-        importlib.import_module("clsplat.scene.detect").readers()
+        readers()
         for kind in kinds:
             setattr(sys.modules[kind.__module__], PLUGIN_MARK, True)
             if issubclass(kind, Settings) and (fault := fault_of(kind)):
@@ -162,7 +166,7 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
             if name in new or _within(name, module.partition(".")[0]):
                 del sys.modules[name]
         for known, old in zip(lists, before, strict=True):
-            known[:] = old
+            known[:] = [kind for kind in known if kind in old or _within(kind.__module__, "clsplat")]
         rebuild()
         if isinstance(error, KeyboardInterrupt):
             raise
@@ -170,9 +174,8 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
 
 
 def _lists() -> tuple[list[type], list[type]]:
-    """The lists of all settings and of all readers, which the upper layers fill."""
-    importlib.import_module("clsplat.pipeline.schema")
-    return Settings.defined, importlib.import_module("clsplat.scene.detect").Reader.defined
+    """The lists of all settings and of all readers; importing `clsplat.pipeline.file` has filled them."""
+    return Settings.defined, Reader.defined
 
 
 def _defined() -> list[type]:

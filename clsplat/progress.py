@@ -7,7 +7,10 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
+
+from clsplat.errors import Interrupted
 
 LOG = logging.getLogger("clsplat")
 Item = TypeVar("Item")
@@ -151,3 +154,21 @@ def clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class Stopped(Interrupted):
+    """A stage has ended before its end, since the run is to stop; it is repeated when the run goes on."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The state of training, for the terminal."""
+
+    step: int
+    steps: int
+    loss: float
+    psnr: float  # dB, the mean over the training views of the last reports, before 8 bits
+    gaussians: int | None  # None: what is trained are none
+    milliseconds: float  # per step
+    seconds_left: float
+    growth_known: bool = True  # False: rules will make steps slower, and it is not known yet how much

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.live import Live
@@ -17,18 +17,20 @@ from rich.progress import BarColumn, Progress, TextColumn
 from clsplat import __version__, streams
 from clsplat.errors import OutputError
 from clsplat.files import told_as
+from clsplat.progress import Progress as TrainingProgress
 from clsplat.progress import clock, counts_shown, heard_by
 
-if TYPE_CHECKING:  # the command line starts without OpenCL
-    from clsplat.training import run as training
-    from clsplat.training.status import StatusFile
-
 LOG = logging.getLogger("clsplat")
-
-
 CONSOLE = Console(file=streams.STDOUT, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
 ERRORS = Console(file=streams.STDERR, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
 _bars: list[Live] = []  # that are drawn
+
+
+class WatchedStatus(Protocol):
+    """The status of a run: `now` holds stage, progress (done, total, unit), step and steps."""
+
+    @property
+    def now(self) -> Any: ...
 
 
 class _TerminalHandler(logging.Handler):
@@ -131,7 +133,7 @@ def logging_to(path: Path) -> Iterator[None]:
         handler.close()
 
 
-def line(progress: "training.Progress") -> str:
+def line(progress: TrainingProgress) -> str:
     """Return the progress at a step as text."""
     p = progress
     least = "" if p.growth_known else "at least "
@@ -157,7 +159,7 @@ def device_text(device: dict[str, Any]) -> str:
 
 
 @contextmanager
-def progress_bar(status: "StatusFile") -> Iterator[Callable[["training.Progress"], None]]:
+def progress_bar(status: WatchedStatus) -> Iterator[Callable[[TrainingProgress], None]]:
     """Yield a function that shows reports; between them a terminal shows what `status` counts."""
     if not CONSOLE.is_terminal:
         yield lambda progress: LOG.info(line(progress))
@@ -187,13 +189,13 @@ def counted() -> Iterator[None]:
 class _RunBar:
     """The bar of a run, made of its status as often as it is drawn: the training waits for nothing."""
 
-    def __init__(self, status: "StatusFile") -> None:
+    def __init__(self, status: WatchedStatus) -> None:
         self.status, self.bar = status, _new_bar()
         self.task = self.bar.add_task("", total=None)
-        self.last: tuple[float, training.Progress] | None = None  # report, and when
+        self.last: tuple[float, TrainingProgress] | None = None  # report, and when
         self.first: tuple[float, int, int] | None = None  # when, step and last step of a training, as first seen
 
-    def report(self, progress: "training.Progress") -> None:
+    def report(self, progress: TrainingProgress) -> None:
         self.last = time.monotonic(), progress
         LOG.debug(line(progress))
 

@@ -13,11 +13,12 @@ from clsplat.density.thinning import MergeNeighbours
 from clsplat.errors import ConfigError, Interrupted, NumericError
 from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
+from clsplat.progress import Progress
 from clsplat.runs import opening, runner
 from clsplat.scene.detect import read_scene
 from clsplat.stages.cleanup import Cleanup
 from clsplat.training import checkpoint
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 from tests.test_training import train
 
 pytestmark = pytest.mark.slow

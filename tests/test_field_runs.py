@@ -34,6 +34,7 @@ from clsplat.scene.images import read_image
 from clsplat.scene.view import View
 from clsplat.stages.train_field import TrainField
 from clsplat.training import archive, checkpoint
+from clsplat.training.field import LearnedField
 from clsplat.views.order import ViewPool
 from tests.commands import clsplat as clsplat_command
 from tests.test_training import ONE_CORE, train
@@ -299,7 +300,7 @@ def test_a_checkpoint_of_another_shape_is_refused(finished):
     """What a file says of its shape, and the tables that it holds, belong together."""
     state, tables = checkpoint.load(checkpoint.saved(finished)[-1])
     assert state.field is not None
-    other = state.model_copy(update={"field": state.field.model_copy(update={"width": 64})})
+    other = state.model_copy(update={"field": state.field | {"shape": state.field["shape"] | {"width": 64}}})
     with pytest.raises(DataError, match="parameters of its field is not"):
         checkpoint.run_tables.check(other, tables)
     with pytest.raises(DataError, match="has not the tables"):
@@ -402,11 +403,11 @@ def test_a_field_that_is_trained_on_goes_on_with_its_moments(tiny_scene, tmp_pat
     training = stage.partition("stages:\n")[2]
     two.write_text(stage + training)
     run = train(tiny_scene, tmp_path / "same", "stages.0.steps=4", "stages.1.steps=4", pipeline=str(two))
-    assert run.learned_field is not None
+    assert isinstance(run.learned_field, LearnedField)
     assert run.learned_field.updates == 8
     two.write_text(stage + training.replace("width: 32", "width: 16"))
     run = train(tiny_scene, tmp_path / "other", "stages.0.steps=4", "stages.1.steps=4", pipeline=str(two))
-    assert run.learned_field is not None
+    assert isinstance(run.learned_field, LearnedField)
     assert (run.learned_field.updates, run.learned_field.field.shape.width) == (4, 16)
     state, _ = checkpoint.load(checkpoint.saved(tmp_path / "other")[-1])
     assert (state.step, state.updates) == (8, {"field": 4})

@@ -15,10 +15,11 @@ from clsplat.gaussians.model import Model
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.metrics.views import render_view
 from clsplat.pipeline.loading import load
+from clsplat.progress import Progress
 from clsplat.render.painter import Splats
 from clsplat.runs import opening, runner
 from clsplat.runs.model_file import ModelFile
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 from clsplat.views.order import Code
 from clsplat.views.sampling import Sampler, ViewSettings
 from tests.test_training import digest, train

@@ -22,8 +22,8 @@ from clsplat.inspect.survey import distortion
 from clsplat.scene.detect import read_scene
 from clsplat.scene.exif import CameraExposure, write_exposures
 from clsplat.scene.lens import Lens
+from clsplat.scene.reprojection import require_ahead
 from clsplat.scene.view import load_image, load_mask
-from clsplat.stages.first_points import require_ahead
 from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry, tiny_model, write_model, write_scene
 from tests.commands import clsplat
 from tests.data_sets import data_set

@@ -14,11 +14,12 @@ import pytest
 import clsplat
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.pipeline.loading import Pipeline, load
+from clsplat.progress import Progress
 from clsplat.runs import minutes, prediction, single
 from clsplat.runs.minutes import pipeline_for
 from clsplat.runs.prediction import Rehearsal, most_steps, predicted
 from clsplat.runs.rehearsing import Limit
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 
 
 def rehearsal(steps: int, step: float) -> Rehearsal:

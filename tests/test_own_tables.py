@@ -8,9 +8,9 @@ from clsplat.density.edit import Edit, Rule
 from clsplat.errors import Interrupted
 from clsplat.gaussians.tables import Gaussians
 from clsplat.pipeline.loading import load
+from clsplat.progress import Progress
 from clsplat.runs import opening, runner
 from clsplat.settings import rebuild
-from clsplat.training.run import Progress
 from tests.test_training import train
 
 pytestmark = pytest.mark.slow

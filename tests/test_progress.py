@@ -9,10 +9,9 @@ import pytest
 from clsplat import progress, terminal
 from clsplat.prepare.cache import Planned, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras
-from clsplat.progress import Count, clock, heard_by, watched
+from clsplat.progress import Count, Progress, clock, heard_by, watched
 from clsplat.runs.opening import READ_SCENE, counts_of
 from clsplat.training.found import photographs_text
-from clsplat.training.run import Progress
 from clsplat.training.status import StatusFile
 
 

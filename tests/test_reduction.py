@@ -13,9 +13,10 @@ from clsplat.formats.packing import morton_order
 from clsplat.formats.table import read
 from clsplat.gaussians.model import Model, load
 from clsplat.pipeline.loading import load as load_pipeline
+from clsplat.progress import Progress
 from clsplat.runs import opening, runner
 from clsplat.stages.reduction import PruneLeast, band_energy, columns_of, scores
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 from tests.test_training import train
 
 pytestmark = pytest.mark.slow

@@ -8,10 +8,10 @@ import clsplat
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import in_steps
+from clsplat.progress import Progress
 from clsplat.runs import minutes, prediction, rehearsing
 from clsplat.runs.prediction import Rehearsal
 from clsplat.runs.rehearsing import Limit
-from clsplat.training.run import Progress
 
 
 @pytest.mark.slow

@@ -9,13 +9,14 @@ import pytest
 from clsplat.errors import ConfigError, Interrupted, NumericError
 from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
+from clsplat.progress import Progress
 from clsplat.runs import opening, runner
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.stages.reinit import ReinitFromDepth, drawn_of
 from clsplat.training import checkpoint
 from clsplat.training.poses import refined
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 from clsplat.views.photograph_poses import SHIFTS, PhotographPoses
 from tests.test_training import digest, train
 

@@ -17,10 +17,11 @@ from clsplat.errors import ConfigError, DataError, Interrupted, NumericError
 from clsplat.formats.ply import write_ply
 from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
+from clsplat.progress import Progress
 from clsplat.runs import folders, opening, runner
 from clsplat.runs.failures import failures_recorded
 from clsplat.training import checkpoint
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 from clsplat.views.sampling import Sampler
 from tests.onnx_writer import distance_network
 

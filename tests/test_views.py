@@ -10,9 +10,9 @@ import pytest
 
 from clsplat.errors import DataError, Interrupted
 from clsplat.pipeline.loading import load
+from clsplat.progress import Progress
 from clsplat.runs import opening, runner
 from clsplat.scene.detect import read_scene
-from clsplat.training.run import Progress
 from clsplat.views.order import Paper, ViewPool
 from clsplat.views.sampling import Sampler, ViewSettings
 from clsplat.views.transforms import Blur

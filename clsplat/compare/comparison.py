@@ -14,8 +14,8 @@ from clsplat.compare.differences import differing, flat
 from clsplat.compare.run_folder import RunFolder, read_settings
 from clsplat.errors import ConfigError, DataError
 from clsplat.names import PIPELINE
-from clsplat.pages.page import scene_name
 from clsplat.pages.svg import COLOURS
+from clsplat.scene.scene import scene_name
 
 MAX_SETTINGS = 3  # differing ones in a variant's name
 

@@ -10,7 +10,7 @@ from clsplat.progress import kept, only
 from clsplat.scene.detect import read_scene, reader_of
 from clsplat.scene.images import is_image
 from clsplat.scene.parts import Parts
-from clsplat.stages.first_points import require_ahead
+from clsplat.scene.reprojection import require_ahead
 from data_tools.gather import list_photographs
 
 LOG = logging.getLogger("clsplat")

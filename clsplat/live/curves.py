@@ -1,6 +1,6 @@
 """What the reports of a run say, as points of curves."""
 
-from clsplat.training.run import Progress
+from clsplat.progress import Progress
 
 MOST = 600  # points that are kept: of more, every second one goes
 Point = tuple[int, float, float, int | None]  # step, loss, PSNR in dB, Gaussians

@@ -17,8 +17,9 @@ from clsplat.live.page import scene_data
 from clsplat.live.pictures import Pictures
 from clsplat.live.preview import Preview
 from clsplat.live.server import LOOPBACK, Server
+from clsplat.progress import Progress
 from clsplat.scene.stand import Stand
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 from clsplat.views.photographs import BACKGROUNDS
 

@@ -68,11 +68,6 @@ def _safe(text: str) -> Markup:
     return Markup(text)
 
 
-def scene_name(folder: str | Path) -> str:
-    """Return what pages call a scene: the user's folder, not that of what was prepared of it, which is a hash."""
-    return Path(folder).resolve().name
-
-
 def duration(seconds: float) -> str:
     """Return a time in words: `1 h 2 min`, `3 min 4 s`, `5 s`."""
     minutes, rest = divmod(round(seconds), 60)

@@ -64,7 +64,7 @@ def checkpoint_file(written: dict[str, str], path: Path) -> str:
     if not any("optimize" in stage for stage in state.pipeline["stages"][state.cursor :]):
         written.update(state.written)
     gaussians = None if state.field else len(tables["gaussians/means"])
-    return f"step {state.step}, {size_text(gaussians, state.field.learned if state.field else None)}"
+    return f"step {state.step}, {size_text(gaussians, state.field['parameters'] if state.field else None)}"
 
 
 def failed_state(path: Path) -> str:

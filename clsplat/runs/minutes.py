@@ -14,6 +14,7 @@ from fractions import Fraction
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import fewest_steps, last_edit, stretched, with_steps
+from clsplat.progress import Progress
 from clsplat.runs.folders import Start
 from clsplat.runs.prediction import Rehearsal, most_steps, predicted
 from clsplat.runs.rehearsing import Limit, new_run, rehearse, reporting, too_little
@@ -21,7 +22,7 @@ from clsplat.runs.runner import check_in, write_pipeline
 from clsplat.signals import stop_if_signalled
 from clsplat.stages.keeping import Keeping
 from clsplat.stages.training import Training
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 FIRST = 200  # steps of the first rehearsal at most; a training says how many of its own are enough

@@ -32,7 +32,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         **({"kept": run.best.figures()} if run.best else {}),
         **({"by_heart": True} if is_by_heart(run) else {}),
         "gaussians": run.gaussians,
-        **({"parameters": run.learned_field.field.shape.learned} if run.learned_field else {}),
+        **({"parameters": run.learned_field.parameters} if run.learned_field else {}),
         "steps": run.step,
         "train_seconds": round(run.train_seconds, 3),
         "cpu_seconds": round(run.cpu_seconds, 3),

@@ -12,11 +12,11 @@ from clsplat.files import scratch_folder
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import of_trainings, stretched
-from clsplat.progress import only
+from clsplat.progress import Progress, only
 from clsplat.runs.prediction import Rehearsal
 from clsplat.runs.runner import run_stages
 from clsplat.stages.training import Training
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")

@@ -11,6 +11,7 @@ from clsplat.files import write_text
 from clsplat.inspect.findings import few_views
 from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
+from clsplat.progress import Progress, Stopped
 from clsplat.report.parting import parting
 from clsplat.runs.course import Course, is_below
 from clsplat.runs.folders import RESOLVED, Start, clear
@@ -21,7 +22,7 @@ from clsplat.runs.signals import finishing_on_interrupt
 from clsplat.stages.training import Training
 from clsplat.training import checkpoint
 from clsplat.training.rescue import saved_on_failure
-from clsplat.training.run import Progress, Run, Stopped
+from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 

@@ -13,14 +13,13 @@ from clsplat.formats.model_files import located
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL, model_at, model_of_run
 from clsplat.names import METRICS, PIPELINE
-from clsplat.pages.page import scene_name
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import noted
 from clsplat.runs.found import has_pipeline
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import is_image
-from clsplat.scene.scene import Alpha, Scene
+from clsplat.scene.scene import Alpha, Scene, scene_name
 from clsplat.stages.export import Export
 from clsplat.stages.export_field import ExportField
 from clsplat.training.field_file import FieldModel, field_of_run, is_field

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.scene.scene import Scene
+from clsplat.errors import DataError
+from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.tracks import Tracks
 from clsplat.scene.view import View
 from clsplat.scene.zoom import lens_of
@@ -77,3 +78,13 @@ def within(tracks: Tracks, views: Iterable[View], limit: float = NEAR) -> Tracks
             kept = ~(np.linalg.norm(found, axis=1) / view.downscale >= limit)  # NaN: not known
             seen[view.name], missed[view.name] = tracks.seen[view.name][kept], found[kept]
     return Tracks(tracks.positions, seen, missed)
+
+
+def require_ahead(points: PointCloud, scene: Scene) -> None:
+    """Raise DataError when every point lies behind every training camera."""
+    poses = np.stack([view.world_to_camera for view in scene.split("train")])
+    if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):
+        raise DataError(
+            f"{scene.path}: all {len(points):,} points lie behind all training cameras; poses and points follow "
+            "different conventions: export both again, or use init: {source: sweep}"
+        )

@@ -199,3 +199,8 @@ def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
         return set()
     order = sorted(range(len(names)), key=lambda i: names[i])
     return set(order[offset::holdout])
+
+
+def scene_name(folder: str | Path) -> str:
+    """Return what pages call a scene: the user's folder, not that of what was prepared of it, which is a hash."""
+    return Path(folder).resolve().name

@@ -8,6 +8,7 @@ from clsplat.errors import DataError, OutputError
 from clsplat.gaussians.model import Rendering
 from clsplat.reading import sha256
 from clsplat.stages.base import Stage, path_in_run
+from clsplat.training.field import LearnedField
 from clsplat.training.field_file import ENDING, FILE, FieldModel, load_field
 from clsplat.training.run import Run
 
@@ -28,7 +29,7 @@ class ExportField(Stage):
     """Path inside the run folder; .npz."""
 
     def run(self, run: Run) -> None:
-        assert run.learned_field is not None
+        assert isinstance(run.learned_field, LearnedField)
         field, file = run.learned_field.field, run.out / self.file
         rendering = Rendering(background=run.photographs.background_name, alpha=run.original.views[0].alpha)
         run.written[self.file] = FieldModel(field.shape, field.parameters.get(), rendering).save(file)

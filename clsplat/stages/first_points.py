@@ -10,6 +10,7 @@ from clsplat.errors import DataError
 from clsplat.scene.hull import hull_points
 from clsplat.scene.middle import centre_of, looked_at_box
 from clsplat.scene.plane_sweep import swept_points
+from clsplat.scene.reprojection import require_ahead
 from clsplat.scene.scene import PointCloud, Scene, View
 from clsplat.scene.transparency import opaque_pixels
 from clsplat.scene.view import load_image, load_rgba
@@ -26,16 +27,6 @@ def own_points(scene: Scene) -> PointCloud:
         raise DataError(f"{scene.path}: has no points to start from; use init: {{source: sweep}}")
     require_ahead(scene.points, scene)
     return scene.points
-
-
-def require_ahead(points: PointCloud, scene: Scene) -> None:
-    """Raise DataError when every point lies behind every training camera."""
-    poses = np.stack([view.world_to_camera for view in scene.split("train")])
-    if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):
-        raise DataError(
-            f"{scene.path}: all {len(points):,} points lie behind all training cameras; poses and points follow "
-            "different conventions: export both again, or use init: {source: sweep}"
-        )
 
 
 def swept(run: Run, count: int, chance: Chance | None) -> PointCloud:

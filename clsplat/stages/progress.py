@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from statistics import fmean, median
 
 from clsplat.metrics.distribution import distribution
+from clsplat.progress import Progress
 from clsplat.training.forecast import Forecast
 from clsplat.training.profile import stage_milliseconds
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 
 
 def report(

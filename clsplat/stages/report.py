@@ -89,7 +89,7 @@ def _main(run: Run) -> str:
 
 
 def _size(run: Run) -> str:
-    return size_text(run.gaussians, run.learned_field.field.shape.learned if run.learned_field else None)
+    return size_text(run.gaussians, run.learned_field.parameters if run.learned_field else None)
 
 
 def _figures(run: Run) -> dict[str, str]:

@@ -122,7 +122,7 @@ class TrainField(Training):
 
     def _begun(self, run: Run) -> LearnedField:
         """The field of the run, where an earlier step has trained one of this shape; else a new one."""
-        if run.learned_field and run.learned_field.field.shape == self.field:
+        if isinstance(run.learned_field, LearnedField) and run.learned_field.field.shape == self.field:
             return run.learned_field
         field = LearnedField.first(self.field, run.seed, run.photographs.background)
         LOG.info("a field of %s parameters", f"{self.field.learned:,}")

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from pydantic import Field, field_validator
 
 from clsplat.errors import Interrupted, in_shell
+from clsplat.progress import Stopped
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.training import checkpoint
-from clsplat.training.run import Run, Stopped
+from clsplat.training.run import Run
 
 
 class Training(Stage):

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -159,7 +160,7 @@ def _write(run: Run, kind: str) -> Path:
         stage_step=run.stage_step,
         acted=run.acted,
         edited=run.edited,
-        field=run.learned_field.field.shape if run.learned_field else None,
+        field=_field_of(run),
         degree=0 if run.learned_field else run.model.degree,
         zero_fresh=[] if run.learned_field else run.model.gaussians.zero_fresh,
         updates=run_tables.updates_of(run),
@@ -180,6 +181,11 @@ def _write(run: Run, kind: str) -> Path:
     with atomic(path) as file:
         archive.write(file, state.model_dump(), run_tables.tables_of(run))
     return path
+
+
+def _field_of(run: Run) -> dict[str, Any] | None:
+    field = run.learned_field
+    return {"kind": field.kind, "shape": field.shape_as_data(), "parameters": field.parameters} if field else None
 
 
 def _take_changes(run: Run, path: Path, state: State) -> list[str]:

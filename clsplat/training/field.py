@@ -1,25 +1,27 @@
 """A field while it is trained: the losses of a step's rays, Adam, and its tables in a checkpoint."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from clsplat.errors import DataError
 from clsplat.fields.field import Field
 from clsplat.fields.levels import Draw, Target
-from clsplat.fields.shape import FieldShape
+from clsplat.fields.shape import FieldShape, WrittenShape
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.camera import DeviceCamera
+from clsplat.training.trained_field import Tables, TrainedField
 from clsplat.views.photographs import Photograph
 
-FOLDER = "field/"  # before the names of its tables in a checkpoint
 TABLES = ("parameters", "moment1", "moment2")
 CHANNELS = 3
-Tables = dict[str, NDArray[np.float32]]
+_WRITTEN: TypeAdapter[FieldShape] = TypeAdapter(WrittenShape)
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,10 @@ class AdamStep:
     epsilon: float = 1e-8  # added to the root of the second moment: the default of Adam's paper, which Mip-NeRF keeps
 
 
-class LearnedField:
+class LearnedField(TrainedField):
     """A field with Adam's moments, in tables that a checkpoint holds."""
+
+    kind = "nerf"
 
     def __init__(self, field: Field) -> None:
         self.field = field
@@ -60,12 +64,41 @@ class LearnedField:
         return cls(Field.first(shape, seed, background))
 
     @classmethod
-    def of_tables(cls, shape: FieldShape, tables: Mapping[str, NDArray[np.float32]], background: Array) -> Self:
+    def of_tables(cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array) -> Self:
         """Return the field of a checkpoint, by what `tables` has returned."""
-        found = cls(Field(shape, background.device.zeros(shape.parameters), background))
+        own = _shape_of(shape)
+        found = cls(Field(own, background.device.zeros(own.parameters), background))
         for name, array in found._arrays.items():
             array.set(tables[name][:, 0])
         return found
+
+    @classmethod
+    def check_tables(cls, shape: Mapping[str, Any], tables: Tables, others: Tables) -> None:
+        """Raise DataError for tables that are not those of a field of a shape."""
+        if others:
+            raise DataError(f"it holds {next(iter(others))} beside a field")
+        if tables.keys() != set(TABLES):
+            raise DataError(f"its field has not the tables {', '.join(TABLES)}")
+        parameters = _shape_of(shape).parameters
+        for name, table in tables.items():
+            if table.dtype != np.float32 or table.shape != (parameters, 1):
+                raise DataError(f"{name} of its field is not [{parameters}, 1] of float32")
+            if not np.isfinite(table).all():
+                raise DataError(f"{name} of its field holds values that are not finite")
+
+    @property
+    def painter(self) -> Field:
+        """What renders views of it."""
+        return self.field
+
+    @property
+    def parameters(self) -> int:
+        """The number of parameters that are learned."""
+        return self.field.shape.learned
+
+    def shape_as_data(self) -> dict[str, Any]:
+        """Return its shape as JSON holds it."""
+        return self.field.shape.model_dump()
 
     def tables(self) -> Tables:
         """Copy its tables to the host, each [P, 1]."""
@@ -144,14 +177,9 @@ class LearnedField:
                 levels.differentiate(self.field.parameters, level, target, self._gradient)
 
 
-def check_tables(shape: FieldShape, tables: Tables, others: Tables) -> None:
-    """Raise DataError for tables that are not those of a field of a shape."""
-    if others:
-        raise DataError(f"it holds {next(iter(others))} beside a field")
-    if tables.keys() != set(TABLES):
-        raise DataError(f"its field has not the tables {', '.join(TABLES)}")
-    for name, table in tables.items():
-        if table.dtype != np.float32 or table.shape != (shape.parameters, 1):
-            raise DataError(f"{name} of its field is not [{shape.parameters}, 1] of float32")
-        if not np.isfinite(table).all():
-            raise DataError(f"{name} of its field holds values that are not finite")
+def _shape_of(written: Mapping[str, Any]) -> FieldShape:
+    """The shape of a field in a checkpoint.  Raises DataError where it is none."""
+    try:
+        return _WRITTEN.validate_json(json.dumps(written))
+    except ValidationError as error:
+        raise DataError(f"the shape of its field: {error.errors()[0]['msg']}") from None

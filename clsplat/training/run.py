@@ -16,24 +16,22 @@ from clsplat.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.gaussians.tables import HIDDEN, INTERVAL2, DeviceModel
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
-from clsplat.pages.page import scene_name
+from clsplat.progress import Progress, Stopped
 from clsplat.render.painter import Painter, Splats
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.identity import Identity
-from clsplat.scene.scene import Scene
+from clsplat.scene.scene import Scene, scene_name
 from clsplat.settings import Settings
 from clsplat.training.adam import Adam
 from clsplat.training.colour_grids import GridTables, bytes_needed
-from clsplat.training.field import LearnedField
 from clsplat.training.kept import Best, Tables
 from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, plan
 from clsplat.training.own_gaussians import OwnGaussians, distractor_bytes
 from clsplat.training.profile import clocks
-from clsplat.training.progress import Progress as Progress
-from clsplat.training.progress import Stopped as Stopped
 from clsplat.training.records import Records
 from clsplat.training.sky import LearnedSky
 from clsplat.training.status import StatusFile
+from clsplat.training.trained_field import TrainedField
 from clsplat.views.exposures import Exposures
 from clsplat.views.photographs import Photographs
 from clsplat.views.texture import texture_quantile
@@ -68,7 +66,7 @@ class Run:
     sky: LearnedSky | None = None  # of the model, where it has one
     colour_grids: GridTables | None = None  # of the photographs' colours, where they have such
     distractors: OwnGaussians | None = None  # of the photographs, while a training has such
-    learned_field: LearnedField | None = None  # in the place of a model
+    learned_field: TrainedField | None = None  # in the place of a model
     step: int = 0  # updates done, or in progress
     cursor: int = 0  # stage in progress
     stage_step: int = 0  # steps done in it
@@ -111,7 +109,7 @@ class Run:
     def painter(self, rasterizer: Rasterizer | None = None) -> Painter:
         """Return what renders views, with another rasterizer than the training's.  Raises ConfigError as `model`."""
         if self.learned_field:
-            return self.learned_field.field
+            return self.learned_field.painter
         return Splats(rasterizer or self.rasterizer, self.model, self.photographs.background)
 
     @property

@@ -9,10 +9,9 @@ from clsplat.density.statistics import FOLDER as STATS_FOLDER
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.errors import DataError
 from clsplat.gaussians.tables import Gaussians
-from clsplat.training import colour_grids, field, kept, own_gaussians, sky
+from clsplat.training import colour_grids, kept, own_gaussians, sky, trained_field
 from clsplat.training.adam import Adam
 from clsplat.training.archive import Arrays, split
-from clsplat.training.field import LearnedField
 from clsplat.training.kept_tables import restore_sky
 from clsplat.training.placing import make_room
 from clsplat.training.run import Run
@@ -24,7 +23,7 @@ UPDATES = "field"  # name of their number
 def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
     """Yield the tables by their keys in the file, each copied to the host when it is its turn."""
     if run.learned_field:
-        yield from ((field.FOLDER + name, table) for name, table in run.learned_field.tables().items())
+        yield from ((trained_field.FOLDER + name, table) for name, table in run.learned_field.tables().items())
         return
     gaussians = run.model.gaussians
     yield from ((_key(name), gaussians.get(name)) for name in gaussians.tables)
@@ -48,7 +47,8 @@ def check(state: State, tables: Arrays) -> None:
     if state.field:
         if state.updates.keys() != {UPDATES}:
             raise DataError("it counts updates of other parameters than those of its field")
-        field.check_tables(state.field, *split(tables, field.FOLDER))
+        kind = trained_field.kind_of(state.field)
+        kind.check_tables(state.field["shape"], *split(tables, trained_field.FOLDER))
         return
     best, own = split(tables, kept.FOLDER)
     kept.check(state.best, best)
@@ -65,8 +65,9 @@ def check(state: State, tables: Arrays) -> None:
 def restore(run: Run, state: State, tables: Arrays) -> None:
     """Put the tables of a state into a run."""
     if state.field:
-        own, _ = split(tables, field.FOLDER)
-        run.learned_field = LearnedField.of_tables(state.field, own, run.photographs.background)
+        own, _ = split(tables, trained_field.FOLDER)
+        kind = trained_field.kind_of(state.field)
+        run.learned_field = kind.of_tables(state.field["shape"], own, run.photographs.background)
         run.learned_field.updates = state.updates[UPDATES]
         return
     run.best_tables, tables = split(tables, kept.FOLDER)

@@ -6,7 +6,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from clsplat.errors import DataError
-from clsplat.fields.shape import WrittenShape
 from clsplat.formats.motion import MOTION
 from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.tables import PARAMETERS, moment_tables, sh_coefficients
@@ -28,7 +27,7 @@ class State(BaseModel):
     stage_step: Count
     acted: Count
     edited: bool
-    field: WrittenShape | None = None  # that is trained in the place of Gaussians; older files have none
+    field: dict[str, Any] | None = None  # kind, shape and parameters of the field that is trained instead of Gaussians
     degree: Annotated[int, Field(ge=0, le=3)]
     zero_fresh: list[str]
     updates: dict[str, Count]

@@ -24,12 +24,13 @@ from clsplat.live.orders import Order
 from clsplat.live.preview import AIMS, QUALITY, SIDES, Preview
 from clsplat.metrics.views import render_view
 from clsplat.pipeline.loading import load
+from clsplat.progress import Progress
 from clsplat.render.painter import Splats
 from clsplat.runs import folders, opening, runner
 from clsplat.runs.experiment import Job
 from clsplat.runs.failures import failures_recorded
 from clsplat.scene.detect import read_scene
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Run
 from tests.few_steps import FEW
 from tests.test_training import digest
 
