@@ -25,7 +25,7 @@ from clsplat.gaussians.model import Rendering, load
 from clsplat.harmonics import basis
 from clsplat.results import check_no_file_of_a_run
 from clsplat.viewer.packing import pack
-from tests.formats.models import splats
+from tests.support.models import splats
 
 
 @pytest.fixture

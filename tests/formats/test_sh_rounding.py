@@ -18,7 +18,7 @@ from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import Sky
 from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.harmonics import basis, mean_basis
-from tests.formats.models import splats, there_and_back
+from tests.support.models import splats, there_and_back
 
 
 def seen_from_one_side(rng: np.random.Generator, count: int, degree: int = 3) -> SplatFile:

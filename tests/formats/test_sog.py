@@ -21,8 +21,8 @@ from clsplat.formats.packing import morton_order
 from clsplat.formats.palette import ENTRIES, codebook, nearest, palette
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import detect, read, write
-from tests.data_sets import data_set
-from tests.formats.models import assert_close, interop, splats, there_and_back
+from tests.support.data_sets import data_set
+from tests.support.models import assert_close, interop, splats, there_and_back
 
 
 def test_the_published_bytes_of_a_sog():

@@ -11,7 +11,7 @@ from clsplat.formats.palette import ENTRIES, codebook
 from clsplat.formats.sog_steps import LEVELS, rounded, rounded_means, rounded_opacities, rounded_quats, weighed_means
 from clsplat.formats.splats import Writing, opacities, unit
 from clsplat.formats.table import write
-from tests.formats.models import splats, there_and_back
+from tests.support.models import splats, there_and_back
 
 
 def covariances(quats, log_scales):

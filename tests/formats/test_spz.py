@@ -15,7 +15,7 @@ from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import Reading, Writing
 from clsplat.formats.table import detect, read, write
 from clsplat.formats.weights import log_weights
-from tests.formats.models import angles, assert_close, interop, splats, there_and_back
+from tests.support.models import angles, assert_close, interop, splats, there_and_back
 
 UNTURNED = Reading(axes="ply")
 STEPS = {"means": 2**-13, "log_scales": 1 / 32, "opacity": 0.501 / 255, "sh_base": 0.501 / 255 / 0.15}

@@ -16,9 +16,9 @@ from clsplat.scene.stand import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
 from clsplat.viewer.photographs import described
-from tests.html_page import HOSTILE
-from tests.viewer.browser import CHROMIUM, Browser
-from tests.viewer.scenes import MIP, PLAIN, cloud, scene
+from tests.support.browser import CHROMIUM, Browser
+from tests.support.html_page import HOSTILE
+from tests.support.viewer_pages import MIP, PLAIN, cloud, scene
 
 pytestmark = [
     pytest.mark.slow,

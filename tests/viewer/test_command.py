@@ -18,8 +18,8 @@ from clsplat.runs.viewing import names
 from clsplat.scene.detect import read_scene
 from clsplat.stages.viewer import Viewer
 from clsplat.viewer import page as module
-from tests.commands import process
-from tests.html_page import Page
+from tests.support.commands import process
+from tests.support.html_page import Page
 
 pytestmark = pytest.mark.slow
 SHORT = {"optimize.steps": 20}

@@ -1,0 +1,30 @@
+"""The checks of `clsplat doctor` hold on the devices of the tests, and their process tells what they found."""
+
+import io
+import queue
+from dataclasses import replace
+
+import pytest
+
+from clsplat.conformance import supervision, worker
+from clsplat.conformance.check import Note
+from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS
+from tests.support.figures import hold
+
+
+@pytest.mark.parametrize("check", [*KERNELS, *ESSENTIAL, *BITONIC], ids=lambda check: check.name.replace(" ", "_"))
+def test_the_figures_of_a_check_hold(device, check):
+    found = list(check.figures(device))
+    hold(one for one in found if not isinstance(one, Note))
+    out, lines = io.StringIO(), queue.Queue()
+    worker._run(out, replace(check, run=lambda *_: iter(found)), lambda: device)
+    worker._print(out, end=check.name, seconds=0.0)
+    for line in out.getvalue().splitlines():
+        lines.put(line)
+    told = supervision.Result(check.name, check.kernels)
+    assert supervision._fill(told, lines, 1) is None
+    assert told.failures == []
+    assert (len(told.figures), len(told.notes)) == (
+        sum(not isinstance(one, Note) for one in found),
+        len(found) - len(told.figures),
+    )
