@@ -91,7 +91,7 @@ def test_settings_are_those_of_the_command_line():
         overrides({"a": np.zeros(3)})
 
 
-def test_a_view_that_looks_at_a_point_shows_it_in_the_middle_with_up_upwards(rng):
+def test_view_looking_at_a_point_centers_it_with_up_upwards(rng):
     position, target, up = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3)
     view = clsplat.View.looking_at(position, target, up, CAMERA, "by hand")
     rotation, translation = view.world_to_camera[:, :3], view.world_to_camera[:, 3]
@@ -177,7 +177,7 @@ def test_a_device_is_given_by_name_or_open_everywhere(device, rng, tiny_scene, t
 
 
 @pytest.mark.parametrize("function", [clsplat.Trainer, clsplat.describe_run])
-def test_an_open_device_of_another_schedule_than_the_pipelines_is_refused(function, device, tiny_scene):
+def test_open_device_of_another_schedule_is_refused(function, device, tiny_scene):
     arguments = {"Trainer": (tiny_scene, "smoke"), "describe_run": ("smoke", tiny_scene)}[function.__name__]
     other = "simt" if device.schedule == "wide" else "wide"
     with pytest.raises(ConfigError, match=f"expected the {other} schedule, as the settings say"):

@@ -145,7 +145,7 @@ def test_renderers_on_one_device_do_not_disturb_each_other(device, rng):
             np.testing.assert_array_equal(getattr(expected, name), getattr(gradients, name))
 
 
-def test_threads_that_share_a_device_keep_the_arguments_of_their_kernels(device, monkeypatch):
+def test_threads_sharing_a_device_keep_their_kernel_arguments(device, monkeypatch):
     enqueue = program.cl.enqueue_nd_range_kernel
 
     def delayed(*arguments):
@@ -166,7 +166,7 @@ def test_threads_that_share_a_device_keep_the_arguments_of_their_kernels(device,
         assert all(pool.map(filled, range(1, 5)))
 
 
-def test_threads_build_a_program_once_and_open_the_default_device_once(device, monkeypatch):
+def test_threads_build_a_program_and_open_the_device_once(device, monkeypatch):
     built, opened = [], []
 
     def slowly(seen: list):
@@ -204,7 +204,7 @@ def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
         np.testing.assert_array_equal(getattr(expected, name), getattr(again, name))
 
 
-def test_gradients_are_those_of_what_was_rendered_after_the_model_was_changed_in_place(device, rng):
+def test_gradients_are_of_the_render_before_in_place_changes(device, rng):
     case = random_case(rng, 20, *SIZE)
     model, by_image = model_of(case), np.ones((SIZE[1], SIZE[0], 3))
     renderer = Renderer(model, device)

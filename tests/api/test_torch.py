@@ -82,7 +82,7 @@ def test_an_optimiser_lowers_a_loss(device, rng):
     assert losses[-1] < 0.6 * losses[0]
 
 
-def test_a_table_that_was_changed_in_place_before_backward_is_refused(device, rng):
+def test_table_changed_in_place_before_backward_is_refused(device, rng):
     case = random_case(rng, 5, *SIZE)
     parameters = parameters_of(model_of(case))
     image, _ = clsplat.torch.render(Renderer(model_of(case), device), case.view, parameters)
@@ -101,7 +101,7 @@ def test_a_second_derivative_is_refused(device, rng):
         first.square().sum().backward()
 
 
-def test_another_number_of_gaussians_than_the_world_filter_has_is_refused(device, rng):
+def test_count_that_differs_from_the_world_filter_is_refused(device, rng):
     case = with_world_filter(random_case(rng, 5, *SIZE), rng)
     renderer = Renderer(model_of(case), device)
     clsplat.torch.render(renderer, case.view, parameters_of(model_of(case)))

@@ -76,7 +76,7 @@ def test_steps_are_counted_and_end(tiny_scene):
         trainer.evaluate("tset")
 
 
-def test_a_trainer_goes_on_from_its_checkpoint_or_that_of_the_command(tiny_scene, tmp_path):
+def test_trainer_resumes_its_checkpoint_or_the_commands(tiny_scene, tmp_path):
     whole = clsplat.Trainer(tiny_scene, "smoke")
     whole.run()
     part = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a")

@@ -24,7 +24,7 @@ def status_of(out: Path) -> dict:
     return json.loads((out / "status.json").read_text())
 
 
-def test_a_trainer_that_is_closed_or_let_go_before_its_end_was_interrupted(tiny_scene, tmp_path):
+def test_trainer_closed_or_released_early_was_interrupted(tiny_scene, tmp_path):
     trainer = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 4}, out=tmp_path / "run")
     trainer.run(2)
     trainer.checkpoint()
@@ -59,7 +59,7 @@ def test_a_trainer_writes_over_no_file_of_others(tiny_scene, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
-def test_after_an_error_inside_of_a_step_the_trainer_says_that_it_has_ended(tiny_scene):
+def test_trainer_has_ended_after_an_error_inside_a_step(tiny_scene):
     trainer = clsplat.Trainer(tiny_scene, "smoke")
     trainer.add_loss(lambda image, photograph: (0.0, np.zeros(3)))
     with pytest.raises(ValueError, match=r"the loss returned a derivative of \(3,\); expected \(40, 40, 3\)"):
@@ -69,7 +69,7 @@ def test_after_an_error_inside_of_a_step_the_trainer_says_that_it_has_ended(tiny
 
 
 @pytest.mark.parametrize("broken", ["value", "derivative"])
-def test_a_loss_that_is_not_finite_stops_the_step_before_the_model_changes(tiny_scene, broken):
+def test_nonfinite_loss_stops_before_the_model_changes(tiny_scene, broken):
     def odd(image, photograph):
         factor = np.float32(np.nan)
         return (factor, image) if broken == "value" else (0.0, image * factor)
@@ -82,7 +82,7 @@ def test_a_loss_that_is_not_finite_stops_the_step_before_the_model_changes(tiny_
     assert equal(trainer.model, before)
 
 
-def test_the_error_of_a_step_is_in_the_status_and_is_raised_as_it_is(tiny_scene, tmp_path):
+def test_error_of_a_step_is_in_the_status_and_raised(tiny_scene, tmp_path):
     def broken(image, photograph):
         raise RuntimeError("no such teapot")
 
@@ -96,7 +96,7 @@ def test_the_error_of_a_step_is_in_the_status_and_is_raised_as_it_is(tiny_scene,
     assert "no such teapot" in status["message"]
 
 
-def test_an_edit_that_fails_between_two_trainings_leaves_nothing_to_save(tiny_scene, tmp_path, monkeypatch):
+def test_edit_failing_between_trainings_leaves_nothing_to_save(tiny_scene, tmp_path, monkeypatch):
     two = tmp_path / "two.yaml"
     part = "  - optimize: {steps: 2, losses: [l1]}\n"
     two.write_text(f"name: two\nstages:\n  - init\n{part}  - raise_sh\n{part}")
@@ -141,7 +141,7 @@ def test_an_interrupt_lets_the_step_finish_and_training_go_on(tiny_scene):
     assert equal(trainer.model, whole.model)
 
 
-def test_a_second_interrupt_leaves_the_step_before_or_nothing_to_save(tiny_scene, tmp_path, monkeypatch):
+def test_second_interrupt_keeps_the_step_before_or_nothing(tiny_scene, tmp_path, monkeypatch):
     few = {"optimize.steps": 4}
     for place, step in ((Photographs, 2), (SplatStats, 3)):
         out = tmp_path / place.__name__

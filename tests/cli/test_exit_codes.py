@@ -132,7 +132,7 @@ class Stopping(Scheduled):
 
 
 @pytest.mark.parametrize("error", ["StopIteration", "SystemExit(0)", "GeneratorExit"])
-def test_a_stage_of_a_plugin_that_stops_training_is_code_2_and_loses_no_step(error, tiny_scene, tmp_path):
+def test_plugin_stage_that_stops_is_code_2_and_loses_no_step(error, tiny_scene, tmp_path):
     plugin, out = tmp_path / "stopping.py", tmp_path / "run"
     plugin.write_text(STOPPING_PLUGIN.replace("ERROR", error))
     sets = ["--set", "optimize.during=[{stage: stopping, every: 3}]", "optimize.steps=5"]

@@ -58,7 +58,7 @@ def test_a_case_that_moves_changes_nothing(device, rng):
     np.testing.assert_array_equal(timed.trainer.model.gaussians.get(MOTION), parameters[MOTION])
 
 
-def test_a_case_starts_without_edits_due_and_is_timed_after_a_warm_up(device):
+def test_case_has_no_edits_due_and_is_timed_after_warm_up(device):
     timed = case(device, *SIZE, load("smoke").settings)
     assert not timed.clock
     assert not timed.stages

@@ -15,7 +15,7 @@ def measurement(**changes):
     return {"device": "a chip", "pipeline": "splat", "peaks": PEAKS, "scenes": {"A": TIMES}, **changes}
 
 
-def test_a_measurement_is_read_without_the_one_that_it_was_compared_with(tmp_path):
+def test_measurement_is_read_without_its_own_baseline(tmp_path):
     (tmp_path / "x.json").write_text(json.dumps(measurement(against=measurement())))
     assert read_measurement(tmp_path / "x.json", "splat") == measurement()
 

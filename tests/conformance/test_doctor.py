@@ -116,7 +116,7 @@ def test_a_process_is_given_time_for_its_code(monkeypatch, info, end, fault):
     assert [one.fault for one in supervised(info, "simt", checks("rows"))] == [fault]
 
 
-def test_a_device_that_does_not_open_for_want_of_memory_is_told_so(monkeypatch, info):
+def test_device_that_cannot_open_for_lack_of_memory_is_reported(monkeypatch, info):
     script = (
         "import sys; from clsplat.conformance import worker; from clsplat.errors import MemoryLimitError\n"
         "def refuse(*_): raise MemoryLimitError('opening it: no memory')\n"
@@ -141,7 +141,7 @@ def test_a_fault_that_empty_caches_mend_is_one_of_the_caches(monkeypatch, info):
     assert not judge("simt", {"simt": results}, []).usable
 
 
-def test_the_process_of_a_check_ends_with_the_one_that_waits_for_it(info, tmp_path):
+def test_process_of_a_check_ends_with_its_parent(info, tmp_path):
     """Killed, it can say nothing to the other, which may hang in a check."""
     note = tmp_path / "process"
     hangs = (
@@ -255,7 +255,7 @@ def memory_of(monkeypatch, largest: int, figure: Figure = RIGHT) -> tuple[list[s
         (0, "wrote and read 0.00 GiB of the 1.00 GiB that one buffer may have; a buffer of 128 MiB is refused: other"),
     ],
 )  # fmt: skip
-def test_memory_that_other_programs_may_hold_is_no_fault_of_the_device(monkeypatch, largest, words):
+def test_memory_held_by_other_programs_is_no_device_fault(monkeypatch, largest, words):
     failures, report = memory_of(monkeypatch, largest)
     assert failures == []
     assert report.memory().startswith(words)
@@ -294,7 +294,7 @@ def test_the_command_ends_with_4_where_a_device_computes_wrongly(monkeypatch, ca
         ("null", ConfigError, "ends in .html"),
     ],
 )
-def test_a_page_that_cannot_be_written_is_refused_before_the_work(monkeypatch, info, tmp_path, name, error, words):
+def test_page_that_cannot_be_written_is_refused_first(monkeypatch, info, tmp_path, name, error, words):
     (tmp_path / "a folder.html").mkdir()
     (tmp_path / "a file").write_text("")
     monkeypatch.setattr(doctor, "supervised", lambda *_: pytest.fail("the work began"))

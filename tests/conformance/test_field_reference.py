@@ -20,7 +20,7 @@ def some_cones(rng: np.random.Generator, count: int = 3) -> np.ndarray:
     return cones.cones(Camera(pose, 20.0, 24.0, 7.5, 5.0, 16, 12), rng.integers(0, 192, count))
 
 
-def test_a_ray_meets_the_centre_of_its_pixel_and_its_cone_the_width(rng):
+def test_ray_meets_pixel_center_and_cone_has_its_width(rng):
     camera = Camera(np.eye(3, 4), 20.0, 24.0, 8.0, 6.0, 16, 12)
     (ray,) = cones.cones(camera, np.array([3 * 16 + 5]))
     np.testing.assert_allclose(ray[3:6], [(5.5 - 8) / 20, (3.5 - 6) / 24, 1])
@@ -46,7 +46,7 @@ def test_the_moments_of_a_frustum_are_those_of_points_in_it(rng):
     np.testing.assert_allclose(points.var(axis=0), variances[0, 0], atol=5e-3)
 
 
-def test_features_are_the_means_of_sines_under_a_normal_distribution(rng):
+def test_features_are_mean_sines_of_a_normal_distribution(rng):
     mean, variance = rng.normal(size=(1, 1, 3)), rng.random((1, 1, 3))
     nodes, weights = np.polynomial.hermite_e.hermegauss(60)
     points = mean[0, 0, :, None] + np.sqrt(variance[0, 0])[:, None] * nodes

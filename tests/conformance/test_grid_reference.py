@@ -20,7 +20,7 @@ def rng() -> np.random.Generator:
 
 
 @pytest.mark.parametrize("level", [Level(3, 64), Level(7, 16)], ids=["dense", "shared"])
-def test_the_gradient_of_a_grid_and_of_the_network_behind_it_is_that_of_finite_differences(rng, level):
+def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
     """Through a network that reads the position twice, for samples inside and outside of the cube."""
     samples, network = 12, field.Network(2, 0)
     at, variances = rng.uniform(-0.2, 1.2, (samples, 3)), rng.uniform(1e-3, 1e-1, samples)
@@ -75,14 +75,14 @@ def test_the_weight_of_a_level_is_nearly_that_of_the_paper():
     np.testing.assert_allclose(Level(16, 16).weights(variances), expected, atol=0.0071)
 
 
-def test_levels_are_dense_while_their_corners_fit_and_lie_one_after_the_other():
+def test_levels_are_dense_while_corners_fit_and_are_contiguous():
     grid = GridShape(levels=4, coarsest=4, finest=32, entries=1024)
     assert grid.table.tolist() == [[4, 0, 125, 0], [8, 125, 729, 0], [16, 854, 1024, 1], [32, 1878, 1024, 1]]
     assert grid.learned == FEATURES * (125 + 729 + 1024 + 1024)
     assert GridShape(levels=1, coarsest=3, finest=3).table.tolist() == [[3, 0, 64, 0]]
 
 
-def test_the_parameters_of_a_grid_follow_those_of_the_network_and_begin_nearly_at_zero():
+def test_grid_parameters_follow_the_networks_and_start_near_zero():
     plain, gridded = (FieldShape(degrees=2, grid=one) for one in (None, GridShape(levels=2, entries=16)))
     assert gridded.position_rows == plain.position_rows + 2 * FEATURES
     first = gridded.first_parameters(3)

@@ -106,7 +106,7 @@ if sys.argv[1] == "suddenly":
 
 
 @pytest.mark.parametrize("end", ["suddenly", "in order"])
-def test_a_device_is_checked_again_after_a_process_that_ended_without_a_word(monkeypatch, info, empty_cache, end):
+def test_device_is_rechecked_after_a_process_ends_silently(monkeypatch, info, empty_cache, end):
     worker(monkeypatch)
     device = Device(info)
     quick.ensure_correct(device)
@@ -206,7 +206,7 @@ def test_a_device_is_checked_again_with_other_build_options(monkeypatch, info, e
         quick.ensure_correct(device)
 
 
-def test_where_the_cache_cannot_be_written_a_device_is_checked_each_time(monkeypatch, info, tmp_path):
+def test_device_is_checked_each_time_without_a_writable_cache(monkeypatch, info, tmp_path):
     blocked = tmp_path / "a file"
     blocked.write_text("")
     monkeypatch.setattr(quick, "cache_folder", lambda: blocked)

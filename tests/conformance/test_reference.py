@@ -700,7 +700,7 @@ def test_gradients_of_a_grid_of_colours(rng, nodes):
     assert relative_error(slope, five_point(lambda: ref.grid_smoothness(grid)[0], grid)) < FD_TOLERANCE
 
 
-def test_a_grid_of_one_matrix_is_that_matrix_and_corners_of_a_grid_are_its_nodes(rng):
+def test_grid_of_one_matrix_is_it_and_corners_are_nodes(rng):
     image, grid = rng.uniform(0, 1, (3, 6, 7)), rng.normal(0, 0.2, (3, 4, 1, 1, 1))
     expected = ref.coloured(image, np.eye(3, 4) + grid[:, :, 0, 0, 0])
     np.testing.assert_allclose(ref.gridded(image, np.tile(grid, (1, 1, 4, 3, 2))), expected)
@@ -710,7 +710,7 @@ def test_a_grid_of_one_matrix_is_that_matrix_and_corners_of_a_grid_are_its_nodes
     np.testing.assert_allclose(ref.gridded(grey, grid), ref.coloured(grey, matrix))
 
 
-def test_the_mean_of_grids_at_a_level_goes_and_what_differs_by_place_stays(rng):
+def test_mean_of_grids_is_removed_and_local_differences_stay(rng):
     vignette = np.zeros((4, 3, 4, 2, 3, 3))
     vignette[..., 1, 1] = 0.3  # in the middle of all photographs
     found = ref.centred_grids(vignette + rng.normal(size=(1, 3, 4, 2, 1, 1)))

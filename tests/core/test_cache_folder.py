@@ -65,7 +65,7 @@ def put_file(machine: Path, place: str) -> None:
 
 @linux
 @pytest.mark.parametrize("place", ["home", "home/.cache", "home/.cache/pocl", "home/.cache/pytools"])
-def test_caches_move_where_the_home_or_a_librarys_cache_cannot_be_written(machine, own, place, caplog):
+def test_caches_move_where_home_or_library_cache_is_read_only(machine, own, place, caplog):
     put_file(machine, place)
     assert cache_folder() == own / "clsplat"
     assert os.environ["XDG_CACHE_HOME"] == str(own)
@@ -87,7 +87,7 @@ def test_caches_move_where_the_user_has_no_home(machine, own, monkeypatch, caplo
 
 
 @linux
-def test_caches_move_where_the_named_folder_of_pocl_cannot_be_written(machine, own, monkeypatch):
+def test_caches_move_where_the_named_pocl_folder_is_read_only(machine, own, monkeypatch):
     put_file(machine, "kernels")
     monkeypatch.setenv("POCL_CACHE_DIR", str(machine / "kernels"))
     cache_folder()
@@ -122,7 +122,7 @@ def test_a_temporary_folder_that_others_can_write_is_not_used(machine, own, trap
 
 
 @linux
-def test_without_any_folder_that_can_be_written_the_error_says_what_to_set(machine, monkeypatch):
+def test_without_a_writable_folder_the_error_says_what_to_set(machine, monkeypatch):
     put_file(machine, "home")
     put_file(machine, "tmp")
     with pytest.raises(OutputError, match=r"no folder for caches .*; let XDG_CACHE_HOME or TMPDIR name"):
@@ -205,7 +205,7 @@ def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
 
 
 @linux
-def test_kernels_are_looked_at_once_after_each_start_of_the_machine(machine, monkeypatch):
+def test_kernels_are_examined_once_after_each_boot(machine, monkeypatch):
     """Also where another folder is used than before."""
     first, second = (machine / folder / kernel("", "empty") for folder in ("first", "second"))
     start = {"now": "1"}
@@ -231,7 +231,7 @@ def test_kernels_are_looked_at_once_after_each_start_of_the_machine(machine, mon
 
 @linux
 @pytest.mark.parametrize("page", [512, 65536])
-def test_a_database_that_is_cut_off_is_removed_but_not_one_that_is_written_now(page, machine):
+def test_truncated_database_is_removed_unless_being_written(page, machine):
     pytools = machine / "home" / ".cache" / "pytools"
     pytools.mkdir(parents=True)
     whole = pytools / "pdict-v5-pyopencl-whole.sqlite"
@@ -274,7 +274,7 @@ def test_a_device_is_tested_without_the_kernels_that_are_cut_off(broken, monkeyp
 
 @linux
 @pytest.mark.slow
-def test_a_device_that_was_tested_before_is_opened_without_the_kernels_that_are_cut_off(broken, info):
+def test_known_device_opens_without_its_truncated_kernels(broken, info):
     Device(info)
     assert not broken.exists()
 

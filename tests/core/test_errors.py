@@ -63,7 +63,7 @@ def test_text_is_cut_in_the_middle_to_the_limit():
     assert shortened("a" * 80) == "a" * 80
 
 
-def test_a_message_is_one_line_without_characters_that_a_terminal_obeys():
+def test_message_is_one_line_without_control_characters():
     error = DataError("\x1b[31mred\x1b[0m\n\udcff \x00\u202e" + "x" * 5000)
     line = one_line(error)
     assert line.startswith(r"\x1b[31mred\x1b[0m \udcff \x00\u202exx")

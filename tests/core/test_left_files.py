@@ -28,7 +28,7 @@ from tests.support.runs import NO_PROCESS
 pytestmark = pytest.mark.slow
 
 
-def test_temporary_files_of_killed_runs_are_swept_and_nothing_else(tiny_scene, tmp_path):
+def test_only_temporary_files_of_killed_runs_are_swept(tiny_scene, tmp_path):
     out = tmp_path / "run"
     left = [
         f".status.json.{NO_PROCESS}-3.partial",
@@ -62,7 +62,7 @@ def test_what_a_process_still_writes_is_not_swept(tmp_path):
     assert not old.exists(), "left by an earlier process of this number, as in a container"
 
 
-def test_a_process_killed_at_any_write_leaves_what_the_next_one_sweeps(tmp_path):
+def test_process_killed_at_any_write_leaves_what_is_swept_next(tmp_path):
     code = (
         "import os, signal, sys; from pathlib import Path; from clsplat.files import atomic\n"
         "with atomic(Path(sys.argv[1]) / 'a.txt') as file:\n"
@@ -107,9 +107,7 @@ has_proc = pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="the na
 
 
 @has_proc
-def test_a_checkpoint_and_the_records_that_it_counts_are_on_the_disk_before_an_older_one_goes(
-    tiny_scene, tmp_path, calls
-):
+def test_checkpoint_and_records_are_synced_before_old_ones_go(tiny_scene, tmp_path, calls):
     few = {"optimize.steps": 4, "init.count": 20, "checkpoint.every": 100, "optimize.log_every": 100}
     trainer = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run")
     trainer.step()
@@ -151,7 +149,7 @@ def test_a_folder_that_is_made_is_on_the_disk_with_its_file(tmp_path, calls):
 
 
 @has_proc
-def test_a_result_of_the_preparation_is_on_the_disk_before_it_is_trusted(tmp_path, calls):
+def test_preparation_result_is_synced_before_it_is_trusted(tmp_path, calls):
     class Write(Step):
         def make(self, source: Path, out: Path, without: Path) -> dict:
             (out / "deep").mkdir()
@@ -169,7 +167,7 @@ def test_a_result_of_the_preparation_is_on_the_disk_before_it_is_trusted(tmp_pat
 
 
 @has_proc
-def test_a_model_of_photographs_is_on_the_disk_before_it_has_its_name(tmp_path, calls):
+def test_photograph_model_is_synced_before_it_is_renamed(tmp_path, calls):
     result = tmp_path / "result"
     for name in ("sparse", "images"):
         (result / name).mkdir(parents=True)

@@ -40,7 +40,7 @@ def holder(folder: Path) -> subprocess.Popen:
     return process
 
 
-def test_another_process_is_refused_and_told_who_holds_the_folder(tmp_path):
+def test_another_process_is_refused_and_learns_the_owner(tmp_path):
     process = holder(tmp_path)
     try:
         with pytest.raises(OutputError, match="is in use by process") as refused, lock.held(tmp_path):
@@ -190,7 +190,7 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
     assert not (tmp_path / "run" / LOCK).exists()
 
 
-def test_a_run_that_is_just_starting_in_the_default_folder_is_not_joined(tmp_path):
+def test_run_just_starting_in_the_default_folder_is_not_joined(tmp_path):
     assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
     (tmp_path / "splat").mkdir()
     with lock.held(tmp_path / "splat"):
@@ -242,7 +242,7 @@ known_boot = pytest.mark.skipif(Owner.this().boot is None, reason="the system do
 
 @pytest.mark.parametrize("name", ["another", pytest.param(platform.node(), marks=known_boot)])
 @pytest.mark.parametrize("status", [FRESH, {"state": "starting", "time": -30.0}, {"state": "running", "time": -3600.0}])
-def test_a_run_on_another_machine_is_not_joined_where_locks_count_here_alone(name, status, tmp_path, monkeypatch):
+def test_remote_run_is_not_joined_where_locks_are_local(name, status, tmp_path, monkeypatch):
     """As with NFS and `local_lock`: the lock is free here.  A negative age is that of a clock that is ahead."""
     (tmp_path / LOCK).write_text(json.dumps({**ELSEWHERE, "host": name}))
     before = (tmp_path / LOCK).read_text()
@@ -265,7 +265,7 @@ def test_a_run_on_another_machine_is_not_joined_where_locks_count_here_alone(nam
 
 
 @pytest.mark.parametrize("ahead", [-2, 86400])
-def test_a_run_that_gives_no_sign_of_life_for_a_minute_is_taken_over_by_any_clock(ahead, tmp_path, monkeypatch, caplog):
+def test_run_silent_for_a_minute_is_taken_over_by_any_clock(ahead, tmp_path, monkeypatch, caplog):
     """As a job that is started again on another machine right after the first was killed."""
     caplog.set_level("INFO", "clsplat")
     start = time.time()
@@ -293,7 +293,7 @@ def test_a_run_that_gives_no_sign_of_life_for_a_minute_is_taken_over_by_any_cloc
     ],
     ids=["ended", "silent", "without a time", "damaged", "no status", "in a container here"],
 )
-def test_the_lock_of_a_run_that_has_ended_elsewhere_is_taken_over(owner, status, tmp_path, caplog):
+def test_lock_of_a_run_that_ended_elsewhere_is_taken_over(owner, status, tmp_path, caplog):
     caplog.set_level("INFO", "clsplat")
     (tmp_path / LOCK).write_text(json.dumps({**ELSEWHERE, **owner}))
     if isinstance(status, dict) and "time" in status:

@@ -161,7 +161,7 @@ def test_a_missing_file_and_a_taken_name_are_refused(tmp_path):
         plugins.load_file(write(tmp_path / "b", "mine", ""))
 
 
-def test_entry_points_are_loaded_and_recorded_where_they_are_used(tmp_path, monkeypatch):
+def test_entry_points_are_loaded_and_recorded_where_used(tmp_path, monkeypatch):
     write(tmp_path, "installed_rule", RULE.format(name="installed"))
     monkeypatch.syspath_prepend(str(tmp_path))
     entry = EntryPoint("a_package", "installed_rule", plugins.GROUP)
@@ -214,7 +214,7 @@ def install(tmp_path, monkeypatch):
         del sys.modules[name]
 
 
-def test_an_installed_plugin_is_recorded_where_a_class_that_it_imports_is_used(install):
+def test_installed_plugin_is_recorded_where_its_import_is_used(install):
     install(
         {
             "my/__init__.py": "",
@@ -313,7 +313,7 @@ clsplat.check("splat")
     assert done.stdout.startswith(f"{file}: two variants of Rule have the name 'clone'")
 
 
-def test_a_pipeline_whose_plugin_is_missing_or_changed_is_refused(tmp_path):
+def test_pipeline_with_a_missing_or_changed_plugin_is_refused(tmp_path):
     file = write(tmp_path, "mine", RULE.format(name="mine"))
     plugins.load_file(file)
     saved = tmp_path / "pipeline.yaml"

@@ -90,7 +90,7 @@ def test_work_that_does_not_count_is_watched(monkeypatch):
     assert not [thread for thread in threading.enumerate() if thread.name == "count"]
 
 
-def test_status_json_has_no_time_left_while_later_steps_of_a_preparation_are_to_come(tmp_path):
+def test_no_time_left_is_shown_while_preparation_steps_remain(tmp_path):
     status = StatusFile(tmp_path)
     listen = counts_of(status)
     for stage, left in (("match_features", None), (READ_SCENE, 4), ("undistort", None)):

@@ -67,14 +67,14 @@ def test_what_is_no_regular_file_is_data_that_cannot_be_read(reader, what, tmp_p
 
 @pytest.mark.parametrize("what", ["a pipe", "a socket", "a device"])
 @pytest.mark.parametrize("name", ["x.yaml", "x"])
-def test_a_pipeline_that_is_no_regular_file_is_a_wrong_configuration(name, what, tmp_path):
+def test_pipeline_that_is_not_a_regular_file_is_a_config_error(name, what, tmp_path):
     NOT_FILES[what](tmp_path / name)
     with pytest.raises(ConfigError, match=rf"cannot be read \(it is {what}\); expected a pipeline file"):
         load(str(tmp_path / name))
 
 
 @pytest.mark.parametrize("what", NOT_FILES)
-def test_an_earlier_benchmark_that_is_no_regular_file_is_a_wrong_configuration(what, tmp_path):
+def test_benchmark_that_is_not_a_regular_file_is_a_config_error(what, tmp_path):
     NOT_FILES[what](tmp_path / "x")
     with pytest.raises(ConfigError, match=rf"cannot be read \(it is {what}\); expected the JSON"):
         read_measurement(tmp_path / "x", "splat")

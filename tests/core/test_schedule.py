@@ -202,7 +202,7 @@ def test_bounds_hold_for_every_value_of_a_schedule(recipe, places, refused, acce
         ("rms_above", "many", ", or {quantile}"),
     ],
 )
-def test_thresholds_that_are_neither_a_schedule_nor_a_quantile_are_explained(recipe, place, value, more):
+def test_threshold_neither_schedule_nor_quantile_is_explained(recipe, place, value, more):
     with pytest.raises(ConfigError) as error:
         load(recipe(**{place: value}))
     assert f".{place}: expected a number, points [[step, value], …] with growing steps" in str(error.value)

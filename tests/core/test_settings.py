@@ -89,7 +89,7 @@ def test_a_variant_defined_later_is_known_after_a_rebuild(loaded):
 
 
 @pytest.mark.usefixtures("own")
-def test_variants_inside_a_variant_are_known_in_any_order_of_definition(tmp_path):
+def test_nested_variants_are_known_in_any_definition_order(tmp_path):
     class Apply(Stage):
         """Apply a rule."""
 
@@ -174,7 +174,7 @@ def test_every_variant_says_what_it_is():
 
 
 @pytest.mark.parametrize("key", ["screen_filter.variance", "near"])
-def test_a_number_that_no_model_file_may_say_is_refused_before_training(key):
+def test_number_no_model_file_holds_is_refused_before_training(key):
     with pytest.raises(ConfigError, match=key.rpartition(".")[2]):
         load("smoke", [f"model.{key}=1e38"])
     load("smoke", [f"model.{key}=1e14"])

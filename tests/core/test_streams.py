@@ -43,7 +43,7 @@ def test_a_run_goes_on_with_its_log_where_the_screen_is_full(tiny_scene, tmp_pat
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs terminals of POSIX")
 @pytest.mark.parametrize("nohup", [True, False])
-def test_a_run_outlives_its_terminal_under_nohup_and_saves_its_state_without(nohup, tiny_scene, tmp_path):
+def test_run_outlives_its_terminal_with_nohup_or_saves_its_state(nohup, tiny_scene, tmp_path):
     ours, theirs = os.openpty()
     steps = 200 if nohup else 1_000_000
     process = subprocess.Popen(
@@ -72,7 +72,7 @@ def test_a_reader_that_closes_the_pipe_has_what_it_wanted():
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="descriptors of POSIX")
-def test_no_file_takes_the_place_of_a_descriptor_that_was_closed_before_the_start(tmp_path):
+def test_no_file_takes_a_descriptor_closed_before_the_start(tmp_path):
     code = f"""if True:
         import os
         for number in (0, 1, 2):
@@ -214,7 +214,7 @@ def test_a_log_that_is_no_file_is_refused(tmp_path):
 
 
 @full
-def test_a_log_on_a_disk_that_is_full_from_the_beginning_is_refused(tmp_path, monkeypatch):
+def test_log_on_a_disk_full_from_the_start_is_refused(tmp_path, monkeypatch):
     (tmp_path / "log.txt").symlink_to("/dev/full")
     monkeypatch.setattr(Path, "is_file", lambda path: True)
     with (

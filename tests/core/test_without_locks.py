@@ -33,7 +33,7 @@ def owned_by(folder: Path, **values) -> None:
     (folder / LOCK).write_text(json.dumps({**owner, **values}))
 
 
-def test_a_file_system_without_locks_is_warned_of_and_a_dead_owner_replaced(tmp_path, without_locks, caplog):
+def test_missing_locks_are_warned_of_and_a_dead_owner_replaced(tmp_path, without_locks, caplog):
     caplog.set_level("INFO", "clsplat")
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
@@ -64,7 +64,7 @@ def test_a_lock_that_is_just_being_made_is_somebodys(tmp_path, without_locks):
     assert (tmp_path / LOCK).exists()
 
 
-def test_a_lock_that_was_made_since_is_not_removed_with_a_dead_one(tmp_path, without_locks, monkeypatch):
+def test_newer_lock_is_not_removed_with_a_dead_one(tmp_path, without_locks, monkeypatch):
     """Two processes find the same dead owner; the slower one finds the file of the other in its place."""
     owned_by(tmp_path, process=NONE)
     has_ended = lock._has_ended
@@ -93,7 +93,7 @@ def test_a_lock_that_was_made_since_is_not_removed_with_a_dead_one(tmp_path, wit
         pytest.param({"process": NONE, "host": "another", "boot": "before"}, id="on another host, since its start"),
     ],
 )
-def test_a_file_system_without_locks_keeps_the_owner_that_may_live(values, tmp_path, without_locks):
+def test_without_locks_an_owner_that_may_live_keeps_the_folder(values, tmp_path, without_locks):
     owned_by(tmp_path, **values)
     with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"), lock.held(tmp_path):
         pass

@@ -67,7 +67,7 @@ def test_schedules_agree(device, rng):
 
 
 @pytest.mark.parametrize("name", ["means", "logit_opacity"])
-def test_a_gaussian_that_is_not_a_number_contributes_nothing_and_hides_nothing(device, rng, name):
+def test_nan_gaussian_contributes_nothing_and_hides_nothing(device, rng, name):
     case = safe_case(rng, 17, 33, 31, MARGIN)
     without = {key: table.copy() for key, table in case.parameters.items()}
     case.parameters[name][3] = np.nan

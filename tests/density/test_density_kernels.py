@@ -85,7 +85,7 @@ def test_adaptive_density_control(device, rng, count, step):
 
 @pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 300])
 @pytest.mark.parametrize("children", [2, 3, 8])
-def test_rows_that_share_an_opacity_let_through_as_much_as_one_did(device, rng, count, children):
+def test_rows_sharing_an_opacity_transmit_as_much_as_one_did(device, rng, count, children):
     case = random_case(rng, count)
     logits = np.resize([-30.0, -5.0, 0.0, 2.0, 9.0, 40.0, 90.0], (count, 1)) + rng.normal(0, 0.1, (count, 1))
     case.parameters["logit_opacity"][:] = logits

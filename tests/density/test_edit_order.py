@@ -37,7 +37,7 @@ def known(name: str) -> tuple[PipelineFile, list[tuple[int, int]]]:
 @pytest.mark.parametrize("name", TRAINING)
 @settings(max_examples=3)
 @given(data=st.data())
-def test_edits_keep_their_order_and_stay_apart_in_any_number_of_steps(name, data):
+def test_edits_keep_order_and_distance_in_any_number_of_steps(name, data):
     """As many of each kind, in the same order; those at one step stay at one, no others come to be."""
     recipe, old = known(name)
     fewest, steps = fewest_steps(recipe.training), recipe.training.steps
@@ -50,7 +50,7 @@ def test_edits_keep_their_order_and_stay_apart_in_any_number_of_steps(name, data
 @pytest.mark.parametrize("name", ["fast", "splat_7k", "dash_7k", "mini_7k", "smoke"])
 @settings(max_examples=3)
 @given(data=st.data())
-def test_a_pipeline_that_was_stretched_is_stretched_again_with_the_edits_that_it_had(name, data):
+def test_stretched_pipeline_stretches_again_with_its_own_edits(name, data):
     """Also that of a run in minutes, whose cadences are not whole."""
     recipe, old = known(name)
     fewest, steps = fewest_steps(recipe.training), recipe.training.steps
@@ -62,7 +62,7 @@ def test_a_pipeline_that_was_stretched_is_stretched_again_with_the_edits_that_it
 @pytest.mark.parametrize("name", ["fast", "splat", "dash", "mini", "smoke"])
 @settings(max_examples=3)
 @given(data=st.data())
-def test_in_fewer_steps_edits_fall_together_but_none_before_another(name, data):
+def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
     recipe, old = known(name)
     steps = data.draw(st.integers(1, fewest_steps(recipe.training)))
     factor = Axis.by(Fraction(steps, recipe.training.steps)).factor
@@ -84,7 +84,7 @@ def test_an_average_begins_after_growth_in_the_fewest_steps_too(steps):
     )
 
 
-def test_acts_of_a_cadence_that_is_not_whole_are_at_the_steps_at_or_below_its_multiples():
+def test_fractional_cadence_fires_at_or_below_its_multiples():
     assert places(2.5, 0, 13) == [2, 5, 7, 10, 12] == [step for step in range(1, 13) if is_act(2.5, step)]
     assert places(2.5, 5, 12) == [7, 10]
     assert places(5.8824, 90, 101) == [94, 100]
@@ -100,7 +100,7 @@ def test_a_cadence_below_a_step_is_refused():
 @pytest.mark.parametrize("name", TRAINING)
 @settings(max_examples=3)
 @given(data=st.data())
-def test_a_number_of_steps_that_is_corrected_leaves_all_up_to_the_last_edit_as_it_is(name, data):
+def test_corrected_step_count_keeps_all_up_to_the_last_edit(name, data):
     """Whatever begins behind the last edit, such as an average, still does."""
     recipe, old = known(name)
     last = last_edit(recipe.training)

@@ -56,7 +56,7 @@ def test_the_base_colour_takes_up_the_mean_of_an_error(seen, rng):
     np.testing.assert_allclose(change[7] * 0.28209479177387814, mean, rtol=1e-6)
 
 
-def test_a_palette_shows_less_of_its_error_than_the_one_it_began_with(seen, rng):
+def test_palette_shows_less_error_than_the_one_it_began_with(seen, rng):
     found, rest = error_of(seen, 15), rng.normal(0, 0.1, (60, 45)).astype(np.float32)
 
     def error_with(vectors: np.ndarray) -> float:

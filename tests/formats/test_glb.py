@@ -91,7 +91,7 @@ def moved(tmp_path, rng, **node):
     return tmp_path / "a.glb", tmp_path / "b.glb"
 
 
-def test_a_node_that_is_moved_turned_and_scaled_moves_its_gaussians(tmp_path, rng):
+def test_moved_turned_and_scaled_node_moves_its_gaussians(tmp_path, rng):
     """A quarter about glTF's y, up, is a quarter about ours the other way."""
     rotation = [0, 0.5**0.5, 0, 0.5**0.5]
     plain, other = moved(tmp_path, rng, rotation=rotation, scale=[2, 2, 2], translation=[1, 0, 0])

@@ -149,7 +149,7 @@ def test_refusals(tmp_path, rng):
 
 
 @pytest.mark.parametrize("text", [b"[" * 50_000, b'{"background": ["x"]}', b'{"near": null}', b"[1]", b"was here"])
-def test_a_comment_that_says_nothing_about_rendering_is_passed_over(text, tmp_path, rng):
+def test_comment_unrelated_to_rendering_is_ignored(text, tmp_path, rng):
     path = tmp_path / "model.ply"
     write_ply(path, parameters(rng), {})
     path.write_bytes(path.read_bytes().replace(b"comment clsplat {}", b"comment clsplat " + text))
@@ -157,7 +157,7 @@ def test_a_comment_that_says_nothing_about_rendering_is_passed_over(text, tmp_pa
     assert load(path).rendering.background is None
 
 
-def test_a_filter_whose_square_is_beyond_floats_is_refused_without_a_warning(tmp_path, rng, recwarn):
+def test_filter_whose_square_overflows_is_refused_silently(tmp_path, rng, recwarn):
     write_ply(tmp_path / "a.ply", parameters(rng) | {"filter_variance": np.ones((20, 1), np.float32)}, {})
     data = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(data[:-4] + np.float32(1e30).tobytes())

@@ -60,7 +60,7 @@ def test_a_file_has_the_keys_of_the_specification(written):
         assert all(number == float(f"{number:.7g}") for number in numbers)
 
 
-def test_each_leaf_is_a_run_along_a_morton_curve_inside_of_its_box(written):
+def test_each_leaf_is_a_morton_run_inside_its_box(written):
     """Runs fill their files without gaps, and the union of the leaves is the level."""
     folder, made = written
     meta = json.loads((folder / "lod-meta.json").read_text())
@@ -178,7 +178,7 @@ def test_a_folder_that_cannot_be_is_refused_before_the_work(name, tmp_path):
         pytest.fail("the work begins")
 
 
-def test_an_empty_folder_is_replaced_also_where_a_rename_replaces_none(tmp_path, monkeypatch):
+def test_empty_folder_is_replaced_where_rename_cannot_replace(tmp_path, monkeypatch):
     """As on Windows."""
 
     def replace(old: Path, new: Path) -> None:
@@ -214,7 +214,7 @@ def test_an_empty_level_is_refused(written, tmp_path):
         write(tmp_path / "lod-meta.json", made[0])
 
 
-def test_values_beyond_those_that_sog_holds_are_refused_and_boxes_stay_finite(tmp_path, rng):
+def test_values_beyond_sog_are_refused_and_boxes_stay_finite(tmp_path, rng):
     large = splats(rng, 50)
     large.parameters["log_scales"][7] = 1000
     write_lod(tmp_path / "a", [large])
@@ -318,7 +318,7 @@ def test_a_coarser_level_that_is_missing_is_damage_of_the_model(written, tmp_pat
     assert not (tmp_path / "a.ply").exists()
 
 
-def test_a_check_names_each_file_of_the_levels_that_is_missing_or_damaged(written):
+def test_check_names_each_missing_or_damaged_level_file(written):
     folder, _ = written
     assert examine(folder)["valid"]
     path = folder / "lod-meta.json"

@@ -69,7 +69,7 @@ def test_vectors_of_several_launches(device, rng):
 
 
 @pytest.mark.parametrize(("count", "entries"), [(1, 1), (17, 9), (130, 40)])
-def test_the_vector_with_the_largest_product_is_found_in_blocks_too(device, rng, count, entries, monkeypatch):
+def test_vector_with_the_largest_product_is_found_in_blocks(device, rng, count, entries, monkeypatch):
     points, vectors = (rng.normal(size=(rows, 165)).astype(np.float32) for rows in (count, entries))
     products = points.astype(np.float64) @ vectors.T.astype(np.float64)
     whole = most_alike(device, points, vectors)
@@ -88,7 +88,7 @@ def test_a_palette_is_the_same_bits_with_and_without_a_device(device, rng, count
 
 
 @pytest.mark.large
-def test_harmonics_of_a_sog_are_the_same_with_and_without_a_device(device, rng):
+def test_sog_harmonics_are_equal_with_and_without_a_device(device, rng):
     rest = splats(rng, 1100, 3).parameters["sh_rest"]
     host, other = Harmonics.of(rest, "balanced"), Harmonics.of(rest, "balanced", partial(DeviceClusters, device))
     for name in ("numbers", "palette", "labels"):

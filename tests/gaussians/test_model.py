@@ -74,7 +74,7 @@ def test_a_model_shares_no_memory_with_arrays_or_other_models(rng):
 
 
 @pytest.mark.parametrize("degree", WIDTHS)
-def test_a_moved_model_looks_the_same_to_a_camera_that_moves_along(device, rng, degree):
+def test_moved_model_looks_the_same_to_a_moved_camera(device, rng, degree):
     case = with_world_filter(random_case(rng, 40, compensate=1.0), rng)
     model, scale, turn, shift = model_of(case, degree), 2.5, random_rotation(rng), rng.normal(size=3)
     pose = case.view.world_to_camera
@@ -96,7 +96,7 @@ def test_nothing_moves_without_a_movement(rng):
         np.testing.assert_allclose(getattr(model, name), table, atol=1e-6, err_msg=name)
 
 
-def test_turned_harmonics_are_the_old_ones_seen_from_the_turned_side(rng):
+def test_turned_harmonics_are_the_old_from_the_turned_side(rng):
     turn = random_rotation(rng)
     directions = rng.normal(size=(20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -43,7 +43,7 @@ def test_schedules_agree(device, rng):
             same_of_schedules(device, two, one)
 
 
-def test_the_gradient_of_the_reference_is_that_of_finite_differences(rng):
+def test_reference_gradient_is_that_of_finite_differences(rng):
     """By parameters, so that depths move too."""
     case = random_case(rng, 5, 24, 20)
     gaussians, camera, weights = case.gaussians(), case.camera(), rng.normal(size=(20, 24))
@@ -87,7 +87,7 @@ def test_the_gradient_of_the_loss_is_that_of_finite_differences(rng):
         assert (ends[0] - ends[1]) / 2e-7 == pytest.approx(gradient[place], abs=1e-6)
 
 
-def test_the_nearest_point_of_a_pixel_stays_and_what_is_outside_does_not_count(device, rng):
+def test_nearest_point_of_a_pixel_wins_and_outside_is_ignored(device, rng):
     camera = random_case(rng, 1, 40, 30).device_camera(device)
     pose = camera.values["world_to_camera"].reshape(3, 4).astype(np.float64)
     fx, fy, cx, cy = (float(camera.values[name]) for name in ("fx", "fy", "cx", "cy"))
@@ -122,7 +122,7 @@ def test_points_that_more_photographs_show_weigh_more(device, rng):
     assert found.at(photograph.camera) is None, "a view that is not trained on"
 
 
-def test_steps_with_the_loss_bring_depths_to_those_that_are_known(device, rng):
+def test_steps_with_the_loss_bring_depths_to_the_known_ones(device, rng):
     """Of Gaussians that were moved along their rays; without weight the bits are those of a training without it."""
     values = []
     for weight in (0.0, 0.3):

@@ -68,7 +68,7 @@ def test_the_reference_is_the_entropy_of_shares_of_a_pixel():
     assert found[0, 0] == pytest.approx(-(shares * np.log(shares)).sum(), rel=1e-12)
 
 
-def test_the_gradient_of_the_reference_is_that_of_finite_differences(rng):
+def test_reference_gradient_is_that_of_finite_differences(rng):
     case = random_case(rng, 6, 24, 20)
     splats, weights = case.project(ref.SMOOTH), rng.normal(size=(4, 20, 24))
     found = ref.blend_backward(splats, 24, 20, BACKGROUND, weights, ref.SMOOTH)
@@ -127,7 +127,7 @@ def test_schedules_sorts_and_bands_give_the_same(device, rng):
     assert relative_error(pixel_sums_of(other, case, weights), sums) < 1e-5
 
 
-def test_without_weight_on_the_entropy_the_sums_are_those_of_plain_steps(device, rng):
+def test_without_entropy_weight_sums_are_those_of_plain_steps(device, rng):
     case, weights = random_case(rng, 80), rng.normal(size=(4, 30, 40)).astype(np.float32)
     weights[3] = 0
     rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)

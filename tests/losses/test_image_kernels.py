@@ -25,7 +25,7 @@ def test_value_and_gradient(device, rng, width, height, loss, oracle, kernel):
     hold(loss_figures(device, loss(weight=0.7), 0.7, oracle, kernel, x, y))
 
 
-def test_ssim_of_more_pixels_than_nine_planes_may_have_is_refused_before_memory_is_taken(device, rng):
+def test_ssim_of_too_many_pixels_is_refused_before_allocation(device, rng):
     comparison = comparison_of(device, *images(rng, 5, 3))
     tile = comparison.camera.tile
     large = replace(comparison.camera, width=2**15, height=2**14, tiles_x=2**15 // tile, tiles_y=2**14 // tile)

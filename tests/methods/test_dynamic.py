@@ -97,7 +97,7 @@ def test_a_renderer_draws_the_moment_of_a_view(finished, scene):
     assert np.abs(gradients.motion).max() > 0
 
 
-def test_a_view_without_a_time_shows_the_first_moment_and_is_told(finished, scene, caplog):
+def test_view_without_a_time_shows_the_first_moment_and_says_so(finished, scene, caplog):
     from clsplat.render import motion
 
     motion._tell_of_the_first.cache_clear()
@@ -119,7 +119,7 @@ def test_a_static_recipe_trains_on_a_scene_that_moves(scene, tmp_path):
     assert load(tmp_path / "run").motion is None
 
 
-def test_a_moving_model_starts_a_training_of_the_same_motion_alone(finished, scene, tmp_path):
+def test_moving_model_starts_only_a_training_of_the_same_motion(finished, scene, tmp_path):
     start = ("init.source='model'", f"init.file='{finished}'", "optimize.steps=2")
     bound = "optimize.rates={motion: {shortest: 0.9}}"
     run = train_overridden(scene, tmp_path / "again", *start, "model.time={degree: 1}", bound, *GUARDED)
@@ -148,7 +148,7 @@ def test_the_plan_of_memory_counts_the_motion(info):
     assert more == 4 * (3 * 5 + 5 + 3 + 4 + 1)  # table and moments, gradient, means, quaternions and logits
 
 
-def test_points_among_others_of_all_times_begin_as_what_stands_still(rng):
+def test_points_among_those_of_all_times_begin_at_rest(rng):
     times = rng.uniform(0, 1, 400)
     positions = rng.normal(0, 0.1, (400, 3))
     positions[200:] += np.array([10, 0, 0]) + 40 * times[200:, None]

@@ -139,7 +139,7 @@ def test_growth_needs_wrong_pixels(device, rng):
     np.testing.assert_array_equal(edit.gaussians.get("log_scales")[kept], scales[[0, 1, 4]])
 
 
-def test_what_grew_no_more_is_as_large_as_before_for_rules_that_follow(device, rng):
+def test_ungrown_gaussians_keep_their_size_for_later_rules(device, rng):
     """Split and undone: its own size counts for the removal of large ones, not that of its children."""
     edit = edit_of(device, rng, 2, Wrong(np.array([0, 9]), np.zeros(2)), sizes=0.12)
     prune = PruneSampled(share=1.0, size_above=0.1)
@@ -191,7 +191,7 @@ def test_rules_without_photographs_say_so(device, rng, rule: Rule):
         rule.mark(Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3))
 
 
-def test_values_are_scaled_between_the_least_and_the_most_that_count():
+def test_values_are_scaled_between_the_valid_extremes():
     counted = np.array([True, True, False, True])
     assert scaled(np.array([2.0, 6.0, 100.0, 3.0]), counted)[counted].tolist() == [0, 1, 0.25]
     assert scaled(np.full(3, 7.0), np.ones(3, bool)).tolist() == [0, 0, 0]

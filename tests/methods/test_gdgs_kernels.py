@@ -55,7 +55,7 @@ def expected(before: dict[str, np.ndarray], cells: int, extremes: int) -> tuple[
 
 
 @pytest.mark.parametrize("count", [1, 17, 64, 65, 600])
-def test_those_in_the_fullest_cells_are_copied_in_place_and_moved(device, rng, count):
+def test_gaussians_in_the_fullest_cells_are_copied_and_moved(device, rng, count):
     gaussians = crowded(device, rng, count)
     before = {name: gaussians.get(name) for name in gaussians.tables}
     chosen, _ = expected(before, 4, 20)

@@ -46,7 +46,7 @@ def test_runs_resume_and_repeat_to_the_bit(tiny_scene, tmp_path, name):
     assert resumed.records.read("densify") == first.records.read("densify")
 
 
-def test_the_entropy_makes_opacities_sharper_and_without_weight_changes_little(tiny_scene, tmp_path):
+def test_entropy_sharpens_opacities_and_weight_0_changes_little(tiny_scene, tmp_path):
     middling, losses = {}, "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}%s]"
     for name, extra in (
         ("none", ""),
@@ -60,7 +60,7 @@ def test_the_entropy_makes_opacities_sharper_and_without_weight_changes_little(t
     assert middling["heavy"] < 0.8 * middling["none"]
 
 
-def test_growth_along_the_parabola_ends_at_the_number_and_not_above(tiny_scene, tmp_path):
+def test_parabolic_growth_ends_at_the_number_and_not_above(tiny_scene, tmp_path):
     """Every Gaussian may grow at each of the five edits, 10 to 30, of which the draws take as many as the curve has."""
     settings = [
         *(

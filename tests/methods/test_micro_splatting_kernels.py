@@ -142,7 +142,7 @@ def test_first_growing_rule_takes_it_and_pruning_overrides(device, rng):
     assert [len(case.rows_of(n)) for n in range(30)] == np.where(logits < 0, 0, 2).tolist()
 
 
-def test_growth_stops_at_the_limit_and_the_largest_gradients_grow(device, rng):
+def test_growth_stops_at_the_limit_with_the_largest_gradients(device, rng):
     gradient = rng.permutation(np.linspace(1e-3, 1, 50))
     case = Edited(device, rng, 50, screen_grad=gradient)
     change = case.apply(Clone(size_below=1e9), limit=58)
@@ -170,7 +170,7 @@ def test_least_important_ones_go(device, rng):
     assert {n for n in range(40) if len(case.rows_of(n)) == 0} == set(np.argsort(score)[:10])
 
 
-def test_neighbours_merge_into_one_with_the_mean_and_covariance_of_both(device, rng):
+def test_merged_neighbors_have_the_mean_and_covariance_of_both(device, rng):
     """Twins merge; a stranger of another colour and one far away stay."""
     case = Edited(device, rng, 4)
     means = np.array([[0, 0, 4], [0.01, 0, 4], [5, 0, 4], [5.01, 0, 4]], np.float32)

@@ -59,7 +59,7 @@ def softly(rng, opacity=(0.1, 0.7)) -> tuple[Case, ref.Splats, np.ndarray, np.nd
     return case, splats, weights, ref.screen_splitting(splats, 24, 20, BACKGROUND, weights, ref.SMOOTH)
 
 
-def test_the_mean_of_two_moved_by_a_little_changes_the_loss_by_the_splitting_matrix(rng):
+def test_mean_of_two_shifted_changes_the_loss_by_the_matrix(rng):
     """ε²/2 vᵀ S v, and the error is of the fourth order."""
     _, splats, weights, matrices = softly(rng)
     alpha = alphas(splats, 24, 20)
@@ -76,7 +76,7 @@ def test_the_mean_of_two_moved_by_a_little_changes_the_loss_by_the_splitting_mat
         assert errors[1] == pytest.approx(errors[0] / 4, rel=0.1, abs=1e-9 * scale)
 
 
-def test_two_of_half_the_opacity_are_such_a_mean_up_to_the_product_of_their_alphas(rng):
+def test_two_of_half_opacity_are_such_a_mean_to_second_order(rng):
     """Against the two in one place; the relative error falls with the opacity."""
     errors = []
     for opacity in (0.02, 0.01):
@@ -97,7 +97,7 @@ def test_two_of_half_the_opacity_are_such_a_mean_up_to_the_product_of_their_alph
 
 
 @pytest.mark.parametrize(("far", "bound"), [(100.0, 0.05), (1000.0, 0.005)])
-def test_the_matrix_in_the_scene_holds_where_perspective_does_not_change(rng, far, bound):
+def test_scene_matrix_holds_where_perspective_is_constant(rng, far, bound):
     """Means moved in the scene, with splats that change their form: ten times as far with such a lens, as exact."""
     case, _, weights, _ = softly(rng)
     scene, eye = case.gaussians(), case.camera()
@@ -268,7 +268,7 @@ def test_without_gaussians_nothing_happens(device, rng):
     assert Edited(device, rng, np.zeros((0, 6))).apply(SplitSaddle()).after == 0
 
 
-def test_candidates_also_reach_the_gradient_and_belong_to_no_earlier_rule(device, rng):
+def test_candidates_reach_the_gradient_and_are_not_yet_taken(device, rng):
     case = Edited(device, rng, diagonal(np.full((40, 3), -1.0)), screen_grad=np.tile([1e-4, 3e-4], 20))
     case.apply(SplitSaddle(gradient_above=2e-4))
     assert [len(case.rows_of(n)) for n in range(40)] == [1, 2] * 20
@@ -289,7 +289,7 @@ def test_the_lowest_eigenvalues_come_first_below_the_limit(device, rng):
         np.testing.assert_array_equal(case.gaussians.get("logit_opacity"), case.before["logit_opacity"])
 
 
-def test_a_split_that_is_undone_or_pruned_leaves_the_others_as_they_are(device, rng):
+def test_undone_or_pruned_split_leaves_the_others_as_they_are(device, rng):
     """A later rule grows too, beyond the limit: what is undone keeps opacity and place."""
     count = 40
     columns = diagonal((np.where(np.arange(count) % 2, -1.0, 1.0) * (1 + np.arange(count)))[:, None] * np.ones(3))

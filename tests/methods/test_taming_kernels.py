@@ -145,7 +145,7 @@ def test_the_budget_is_the_parabola_of_the_paper(first, most, edits):
     assert count == most
 
 
-def test_the_budget_makes_up_for_what_was_pruned_and_refuses_more():
+def test_budget_compensates_pruning_and_refuses_more():
     assert limit(100, 40, 2) == 85
     assert limit(100, 0, 1) == 100
     assert limit(100, 100, 3) == limit(100, 170, 3) == 100

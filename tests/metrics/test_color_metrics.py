@@ -23,7 +23,7 @@ def everywhere(image: np.ndarray) -> np.ndarray:
     return np.ones(image.shape[:2], bool)
 
 
-def test_an_exposure_costs_psnr_and_nothing_in_the_colours_of_the_photograph(image):
+def test_exposure_costs_psnr_but_nothing_in_photograph_colors(image):
     photograph = to_8_bits(image * GAINS.astype(np.float32))
     assert psnr(image, photograph) < 25
     found = colour_figures(image, photograph, None, Gain())
@@ -57,7 +57,7 @@ def test_white_black_and_masked_pixels_say_nothing_of_colours(image, rng):
 
 @pytest.mark.parametrize(("model", "numbers"), [(Gain(), 1), (Affine(), 4)])
 @pytest.mark.parametrize("half", [np.s_[:, :15], np.s_[:, 15:]])
-def test_a_half_with_too_few_pixels_gives_no_figure_in_the_photographs_colours(image, model, numbers, half):
+def test_half_with_too_few_pixels_gives_no_color_figure(image, model, numbers, half):
     photograph, counted = to_8_bits(image), everywhere(image)
     counted[half] = False
     rows, columns = np.nonzero(~counted)
@@ -69,7 +69,7 @@ def test_a_half_with_too_few_pixels_gives_no_figure_in_the_photographs_colours(i
 
 
 @pytest.mark.parametrize("model", [Gain(), Affine()])
-def test_which_views_have_the_figure_does_not_depend_on_the_model(image, model):
+def test_which_views_have_the_figure_is_independent_of_the_model(image, model):
     """Else two steps are compared on different views.  A picture that is white everywhere is bad in any colours."""
     photograph = to_8_bits(0.5 * image)
     for step in (image, image + 2, np.ones_like(image), np.full_like(image, np.inf), np.full_like(image, np.nan)):
@@ -79,7 +79,7 @@ def test_which_views_have_the_figure_does_not_depend_on_the_model(image, model):
     assert bright["psnr_colour"] > 50, "beyond white a picture still says which colours it asks for"
 
 
-def test_pixels_beyond_white_are_left_out_where_enough_others_are_left(image):
+def test_pixels_beyond_white_are_dropped_where_enough_remain(image):
     photograph, bright = to_8_bits(0.5 * image), image.astype(np.float64)
     bright[:5] = 3
     changed = in_colours_of(bright, photograph, everywhere(image), Gain())
@@ -119,14 +119,14 @@ def test_the_log_says_of_how_many_views_the_mean_is(caplog):
         assert re.search(said, message)
 
 
-def test_the_best_model_is_chosen_by_psnr_where_no_view_has_colours():
+def test_best_model_is_chosen_by_psnr_where_no_view_has_colors():
     fitted, bare = {"psnr": 20.0, "psnr_colour": 24.0}, {"psnr": 21.0, "psnr_colour": None}
     assert compared([fitted, fitted]) == [24.0, 24.0]
     assert compared([fitted, bare]) == compared([fitted, {"psnr": 21.0}]) == [20.0, 21.0]
     assert compared([fitted, {}]) == [20.0, None]
 
 
-def test_two_steps_are_compared_by_psnr_where_some_views_have_no_colours():
+def test_steps_compare_by_psnr_where_some_views_lack_colors():
     """30 dB of one view is no better than 31 and 22 dB of two."""
     first = {"psnr": 20.0, **mean_figures([{"psnr_colour": 30.0}, {"psnr_affine": 20.0}])}
     second = {"psnr": 21.0, **mean_figures([{"psnr_colour": 31.0}, {"psnr_colour": 22.0}])}

@@ -66,7 +66,7 @@ def test_averages_say_why_a_figure_is_missing(rng):
     assert "ms_ssim_reason" not in both
 
 
-def test_flip_is_zero_for_equal_images_and_takes_the_photograph_as_reference(rng):
+def test_flip_is_zero_for_equal_images_and_that_of_its_package(rng):
     package = pytest.importorskip("flip_evaluator")
     image, photograph = images(rng, 40, 60)
     assert flip(photograph, photograph) == 0

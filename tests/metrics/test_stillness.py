@@ -53,7 +53,7 @@ def test_flicker_is_the_deviation_over_the_moments_of_one_camera(rng, static):
     assert [row["psnr_static"] for row in rows] == pytest.approx(10 * np.log10(255**2 / error), rel=1e-12)
 
 
-def test_the_order_of_the_moments_and_other_cameras_make_no_difference(rng, static):
+def test_order_of_moments_and_other_cameras_do_not_matter(rng, static):
     renders, photographs = stacks(rng)
     views = [moment(f"{i}", i / (MOMENTS - 1), static_path=static) for i in range(MOMENTS)]
     other = [moment(f"o{i}", i / (MOMENTS - 1), x=1.0, static_path=static) for i in range(MOMENTS)]
@@ -64,7 +64,7 @@ def test_the_order_of_the_moments_and_other_cameras_make_no_difference(rng, stat
     assert {name: again[name] for name in figures} == figures
 
 
-def test_without_a_file_static_is_what_the_photographs_leave_alone(rng):
+def test_without_a_file_static_is_what_photographs_leave_alone(rng):
     renders, photographs = stacks(rng)
     photographs[:] = photographs[0]
     photographs[2, :, 5:] ^= 128  # something passes
@@ -93,7 +93,7 @@ def test_a_scene_that_does_not_move_has_no_such_figures(rng):
     assert gathered([moment("a", 0.5)], renders[:1], photographs[:1]) == ([{}], {}), "one moment"
 
 
-def test_a_camera_with_one_moment_takes_no_place_of_others_and_no_memory(rng, static):
+def test_camera_with_one_moment_takes_no_row_and_no_memory(rng, static):
     renders, photographs = stacks(rng)
     moving = [moment(f"m{i}", i / 19, x=1.0 + i, static_path=static) for i in range(20)]
     assert Stillness(moving).held == 0

@@ -49,7 +49,7 @@ def test_a_cube_is_seen_where_samples_of_a_view_lie_in_it(tmp_path):
     assert 15 < seen < 100
 
 
-def test_one_view_of_many_is_enough_and_points_count_where_there_are_some(tmp_path):
+def test_one_view_is_enough_and_points_count_where_present(tmp_path):
     ahead = View.looking_at([0.0, 0.0, -2.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], CAMERA, "ahead")
     away = View.looking_at([0.0, 0.0, -2.0], [0.0, 0.0, -9.0], [0.0, 1.0, 0.0], CAMERA, "away")
     assert is_seen(scene_of(tmp_path, away, ahead), [-0.5] * 3, 1.0)

@@ -102,7 +102,7 @@ def test_photographs_of_all_sizes_count_alike(finished, tiny_scene, pipeline):
     assert {(one.rays, one.weight) for one in shown} == {(32, 1600)}
 
 
-def test_a_run_that_was_killed_ends_with_the_bits_of_one_that_was_not(finished, tiny_scene, tmp_path, pipeline):
+def test_killed_run_ends_with_the_bits_of_an_unkilled_one(finished, tiny_scene, tmp_path, pipeline):
     assert bits(resumed(finished, tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
@@ -135,7 +135,7 @@ def test_commands_on_models_say_that_a_run_has_none(finished):
     assert clsplat.check(finished / "field.npz")["parameters"] == clsplat.load_field(finished).shape.learned
 
 
-def test_the_file_of_a_field_gives_the_figures_and_pictures_of_its_run(finished, tmp_path):
+def test_field_file_gives_the_metrics_and_images_of_its_run(finished, tmp_path):
     """To the bit, from the run folder and from the file, which knows its run."""
     recorded = json.loads((finished / "metrics.json").read_text())
     found = clsplat.evaluate(finished / "field.npz", downscales=[1, 2])
@@ -190,7 +190,7 @@ def test_a_field_renders_from_python(finished, tiny_scene, device):
     assert field.shape.near <= covered.min() <= covered.max() <= field.shape.far
 
 
-def test_a_field_before_another_background_is_lighter_by_what_it_does_not_cover(finished, tiny_scene, device):
+def test_field_on_another_background_is_lighter_where_uncovered(finished, tiny_scene, device):
     """Coverage and picture belong together: 1 - alpha of the background shows."""
     view = clsplat.read_scene(tiny_scene).split("test")[0]
     field = clsplat.load_field(finished)
@@ -220,7 +220,7 @@ def test_a_file_that_holds_no_such_field_is_refused_in_one_line(finished, tmp_pa
         clsplat.load_field(tmp_path / "field.npz")
 
 
-def test_a_file_of_a_field_that_is_not_there_or_not_finite_is_refused(finished, tmp_path):
+def test_missing_or_nonfinite_field_file_is_refused(finished, tmp_path):
     with pytest.raises(DataError, match="not found"):
         clsplat.load_field(tmp_path / "field.npz")
     field = clsplat.load_field(finished)
@@ -230,7 +230,7 @@ def test_a_file_of_a_field_that_is_not_there_or_not_finite_is_refused(finished, 
         clsplat.load_field(tmp_path / "field.npz")
 
 
-def test_a_field_that_is_not_finite_stops_the_run_and_is_set_aside(tiny_scene, tmp_path, pipeline):
+def test_nonfinite_field_stops_the_run_and_is_set_aside(tiny_scene, tmp_path, pipeline):
     with pytest.raises(NotFiniteError, match=r"not finite: .*train_field\.rate="):
         train(tiny_scene, tmp_path / "run", "train_field.rate=1e30", pipeline=pipeline)
     assert [path.name for path in (tmp_path / "run/checkpoints").glob("failed_*")]
@@ -277,7 +277,7 @@ def test_rays_are_divided_evenly():
         TrainField(steps=1, rays=100, photographs=3)
 
 
-def test_the_published_recipe_has_the_published_network_and_rates():
+def test_published_recipe_has_the_published_network_and_rates():
     (stage, *_) = load("mip_nerf").stages
     assert isinstance(stage, TrainField)
     assert stage.field == FieldShape()

@@ -45,7 +45,7 @@ def test_the_numbers_of_a_grid_are_trained(finished):
     assert json.loads((finished / "metrics.json").read_text())["parameters"] == field.shape.learned
 
 
-def test_a_grid_that_was_killed_ends_with_the_bits_of_one_that_was_not(finished, tiny_scene, tmp_path, pipeline):
+def test_killed_grid_run_ends_with_the_bits_of_an_unkilled_one(finished, tiny_scene, tmp_path, pipeline):
     assert bits(resumed(finished, tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
@@ -113,7 +113,7 @@ def test_a_field_that_does_not_fit_is_refused_before_it_is_made(tiny_scene, pipe
     load(pipeline).stages[0].check_in(run)
 
 
-def test_a_cube_that_no_photograph_shows_is_refused_before_a_field_is_made(tiny_scene, pipeline):
+def test_cube_no_photograph_shows_is_refused_before_allocation(tiny_scene, pipeline):
     scene = clsplat.read_scene(tiny_scene)
     for changes, fault in (
         (

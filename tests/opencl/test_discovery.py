@@ -79,7 +79,7 @@ def test_a_device_with_small_groups_does_not_work(found, info, least):
         choose()
 
 
-def test_a_device_that_fails_with_a_damaged_cache_alone_is_told_so(monkeypatch, tmp_path):
+def test_device_failing_only_with_a_damaged_cache_is_reported_so(monkeypatch, tmp_path):
     """Its second try has an empty folder for kernels; of a device that fails there, too, the first fault is told."""
     broken, folders = False, []
 
@@ -113,7 +113,7 @@ def test_a_runtime_that_does_not_know_the_processor_is_told_so(monkeypatch, tmp_
 
 
 @pytest.mark.parametrize(("width", "lanes"), [(16, 16), (8, 8), (4, 4), (1, 4)])
-def test_kernels_compiled_without_the_vectors_of_the_processor_are_not_made(monkeypatch, width, lanes):
+def test_kernels_compiled_without_vector_units_are_not_made(monkeypatch, width, lanes):
     """PoCL 3.0 on a newer processor may take minutes to make one; the warning is in the log of the build."""
     warning = f"'float{lanes}' (vector of {lanes} 'float' values) without 'avx512f' enabled changes the ABI"
     built = []
@@ -193,7 +193,7 @@ def test_a_broken_runtime_takes_no_other_down_and_is_told(monkeypatch, info, cap
 
 
 @pytest.mark.parametrize(("code", "lines"), [("PLATFORM_NOT_FOUND_KHR", 0), ("OUT_OF_HOST_MEMORY", 1)])
-def test_a_loader_that_fails_is_told_and_one_without_a_runtime_is_not(monkeypatch, caplog, code, lines):
+def test_failing_loader_is_reported_but_not_one_without_runtimes(monkeypatch, caplog, code, lines):
     def refuse():
         raise refusal(getattr(cl.status_code, code))
 
@@ -236,7 +236,7 @@ def image_of(device: Device, rng: np.random.Generator) -> np.ndarray:
     return frame.image.get()[:, :37, :50]
 
 
-def test_a_compiler_that_caps_blending_gets_smaller_tiles_and_the_same_image(info, rng, monkeypatch, caplog):
+def test_capped_blending_gets_smaller_tiles_and_the_same_image(info, rng, monkeypatch, caplog):
     image = image_of(Device(info, "simt"), np.random.default_rng(1))
     capped(monkeypatch, 255, "blend_forward")
     with caplog.at_level(logging.INFO, "clsplat"):
@@ -249,7 +249,7 @@ def test_a_compiler_that_caps_blending_gets_smaller_tiles_and_the_same_image(inf
     np.testing.assert_array_equal(image_of(device, np.random.default_rng(1)), image)
 
 
-def test_a_kernel_whose_group_is_too_large_is_refused_in_a_sentence(info, monkeypatch):
+def test_kernel_whose_group_is_too_large_is_refused(info, monkeypatch):
     capped(monkeypatch, 63, "scan_blocks")
     with pytest.raises(KernelError, match=r"scan.cl:scan_blocks has work-groups of 64 items, and .* allows it 63; use"):
         Device(info, "simt").program("scan.cl")

@@ -15,7 +15,7 @@ def test_a_missing_kernel_file_is_named(device, tmp_path):
         device.program(tmp_path / "own.cl")
 
 
-def test_a_kernel_without_a_group_size_is_refused_with_the_form_expected(device, tmp_path):
+def test_kernel_without_a_group_size_is_refused_with_the_form(device, tmp_path):
     file = tmp_path / "own.cl"
     file.write_text("kernel void fade(global float *x) { x[0] = 1; }\n")
     with pytest.raises(KernelError, match=r"own\.cl: cannot read the head of fade; expected .*reqd_work_group_size"):
@@ -30,7 +30,7 @@ def test_a_kernel_without_a_group_size_is_refused_with_the_form_expected(device,
         UnpicklingError("pickle data was truncated"),
     ],
 )
-def test_a_program_without_its_kernels_may_come_from_a_damaged_cache(device, tmp_path, monkeypatch, fault):
+def test_program_without_its_kernels_may_be_a_damaged_cache(device, tmp_path, monkeypatch, fault):
     def none(program, name):
         raise fault
 

@@ -53,7 +53,7 @@ def test_the_fitted_matrix_is_the_one_that_made_a_photograph(rng, model):
     assert model.fitted(np.zeros((9, 3)), np.zeros((9, 3))).shape == (3, 4)
 
 
-def test_a_table_changes_the_row_of_its_view_and_keeps_every_mean_at_zero(rng):
+def test_table_changes_its_views_row_and_keeps_means_at_zero(rng):
     table, numbers = ViewTable("t", ("a", "b/c", "d"), ("x", "y")), {"other": 1.0}
     assert not table.begun(numbers)
     table.begin(numbers, {"a": np.array([0.3, 0.0]), "d": np.array([0.0, 0.6])})

@@ -117,7 +117,7 @@ def test_photographs_of_one_exposure_stay_so(rng, info):
     assert rms(found @ LUMINANCE) < 0.01
 
 
-def test_white_pixels_of_a_blown_photograph_do_not_darken_the_scene(rng, info):
+def test_blown_out_white_pixels_do_not_darken_the_scene(rng, info):
     """What is cut says no more than that it is bright."""
     truth = np.zeros((VIEWS, 3))
     truth[2] = 0.6

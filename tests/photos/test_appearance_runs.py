@@ -107,7 +107,7 @@ def test_where_colours_began_is_kept_with_them(rng, tmp_path):
     assert again.numbers == run.numbers
 
 
-def test_figures_are_by_the_colours_of_the_training_that_has_begun():
+def test_figures_use_the_colors_of_the_training_that_has_begun():
     def colours(numbers: dict[str, float], *stages: object) -> object:
         run = SimpleNamespace(
             numbers=numbers, settings=SimpleNamespace(stages=[SimpleNamespace(colours=one) for one in stages])
@@ -136,7 +136,7 @@ def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_pat
     assert row[1]["exposure"] == then.numbers[f"colours/{row[0]}/exposure"]
 
 
-def test_a_choice_is_written_with_its_reason_and_off_leaves_the_bits(tiny_scene, tmp_path, few_steps):
+def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_path, few_steps):
     """The synthetic scene has points without tracks."""
     asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "optimize.colours=auto"])
     run_pipeline(asked, tmp_path / "run", None, "new")
@@ -148,7 +148,7 @@ def test_a_choice_is_written_with_its_reason_and_off_leaves_the_bits(tiny_scene,
     assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
 
 
-def test_a_run_chooses_colours_where_exposures_differ_and_begins_with_them(rng, tmp_path):
+def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
     wall = Wall(rng)
     wall.write(tmp_path / "scene")
     settings = [f"scene.path='{tmp_path / 'scene'}'", "scene.holdout=0", *FEW, "optimize.colours=auto"]

@@ -25,7 +25,7 @@ def test_colours_depend_on_the_seed_and_the_step_alone():
     assert drawn[0] == drawn[3]
 
 
-def test_a_photograph_has_the_drawn_colour_where_it_is_transparent(tiny_scene):
+def test_photograph_has_the_drawn_color_where_transparent(tiny_scene):
     device, scene = Device(choose()), read_scene(tiny_scene)
     photographs, view = Photographs(device, "white"), scene.split("train")[0]
     behind = Backgrounds(device, 0).at(3)

@@ -104,7 +104,7 @@ def test_the_key_takes_cells_of_each_axis():
             colours(f"{{type: grid, cells: {wrong}}}")
 
 
-def test_the_rate_warms_up_and_falls_as_published_or_as_far_as_unknown_exposures_need():
+def test_rate_warms_up_and_falls_as_unknown_exposures_need():
     for steps, warm_up in ((1500, 150), (30_000, 1000)):
         published = Decay(initial=2e-3, final=2e-5, over=steps)
         for known, expected in ((True, published), (False, Gain().rate_of(steps, 50, False))):
@@ -155,7 +155,7 @@ def test_one_core_gives_the_same_bits(info):
 
 
 @pytest.mark.slow
-def test_the_grids_lie_beside_the_model_and_figures_are_in_colours_of_gains(with_grids, few_steps, tmp_path):
+def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps, tmp_path):
     data = json.loads((with_grids / "view_colours.json").read_text())
     found = np.load(with_grids / data["file"], allow_pickle=False)
     assert (data["type"], data["cells"]) == ("grid", [3, 2, 4])
@@ -187,7 +187,7 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cells", [[1, 1, 1], [2, 3, 4], [4, 3, 2], [6, 1, 4]])
-def test_a_training_goes_on_with_grids_of_its_cells_and_begins_anew_with_others(ended, cells):
+def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
     """Also with as many of them."""
     run, colours = copy(ended), ended.settings.training.colours
     run.numbers = dict(ended.numbers)

@@ -67,7 +67,7 @@ def test_the_mean_filter_is_the_oracles(device, rng, share, reach, masked):
 
 
 @pytest.mark.parametrize(("recipe", "end"), [("opti3dgs", 12000), ("opti3dgs_7k", 2800)])
-def test_the_squares_of_opti3dgs_lose_a_pixel_on_each_side_until_the_end(recipe, end):
+def test_opti3dgs_squares_shrink_by_a_pixel_a_side_to_the_end(recipe, end):
     """15, 13, … 1 px at 1 237 px, the width of the paper's photographs, each as long as the others."""
     (training,) = (stage for stage in load(recipe).stages if isinstance(stage, Optimize))
     (filtering,) = training.views.transforms

@@ -41,7 +41,7 @@ def yard(rng, tmp_path) -> Yard:
 
 
 @pytest.mark.parametrize(("bits", "scale"), [(16, 1), (8, 1), (16, 2)])
-def test_a_map_has_the_inverse_depths_of_the_points_whatever_its_units(tmp_path, rng, bits, scale):
+def test_map_has_the_inverse_depths_of_the_points_in_any_unit(tmp_path, rng, bits, scale):
     inverse = cv2.GaussianBlur(rng.uniform(0.1, 1.5, (30, 40)).astype(np.float32), (0, 0), 4)
     write_map(tmp_path / "deep" / "a.png", np.kron(inverse, np.ones((scale, scale))), bits)
     rows, columns = rng.integers(0, 30, 50), rng.integers(0, 40, 50)

@@ -42,7 +42,7 @@ def test_poses_are_not_learned_beside_it(rng, tmp_path):
         train(Yard(rng).write(tmp_path / "scene"), tmp_path / "run", *TWO_DOZEN, LOSSES, "optimize.poses={start: 5}")
 
 
-def test_photographs_that_show_all_points_elsewhere_tell_no_depths(rng, tmp_path):
+def test_photographs_showing_points_elsewhere_give_no_depths(rng, tmp_path):
     """The bits are those without the loss."""
     scene = missing(tmp_path / "scene", np.array([1.2, -0.9]), rng)
     with_loss, plain = train(scene, tmp_path / "loss", *TWO_DOZEN, LOSSES), train(scene, tmp_path / "plain", *TWO_DOZEN)

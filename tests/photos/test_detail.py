@@ -36,7 +36,7 @@ def test_a_natural_spectrum_begins_with_a_sixteenth():
     )
 
 
-def test_the_largest_divisor_is_that_of_the_most_detailed_photograph_and_is_limited():
+def test_largest_divisor_is_of_the_most_detailed_and_limited():
     assert knots([NATURAL, NOISE], 6000, 8)[1][0] == pytest.approx(2, rel=2e-3)
     assert knots([NATURAL], 6000, 3)[1][0] == 3
 
@@ -60,7 +60,7 @@ def test_a_spectrum_sums_what_the_centred_window_holds(size):
         assert below * (1 - 1e-5) <= amplitudes[inside].sum() <= above * (1 + 1e-5)
 
 
-def test_the_size_changes_by_whole_numbers_after_edits_and_is_full_at_the_end():
+def test_size_changes_by_integers_after_edits_to_full_at_the_end():
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
     smooth = np.repeat(np.repeat(image[::4, ::4], 4, axis=0), 4, axis=1)
@@ -78,7 +78,7 @@ def test_the_size_changes_by_whole_numbers_after_edits_and_is_full_at_the_end():
         assert sizes.at(step + 1) == int(np.interp(step, steps, divisors**-2) ** -0.5)
 
 
-def test_settings_that_follow_detail_are_settled_before_they_are_used():
+def test_settings_that_follow_detail_are_resolved_before_use():
     views = ViewSettings(resolution={"follows": "detail", "until": 900})
     with pytest.raises(ConfigError, match="needs photographs"):
         views.divisor(1)
@@ -100,7 +100,7 @@ def test_the_rate_of_the_means_is_constant_up_to_the_full_size():
     assert rates.settled(5000).means.over == 1
 
 
-def test_rates_that_wait_for_the_full_size_are_settled_before_they_are_used():
+def test_rates_waiting_for_full_size_are_resolved_before_use():
     rates = load("dash").settings.training.rates
     with pytest.raises(ConfigError, match=r"start: full_size.* expected what `settled\(step\)` returns"):
         rates.at(1, 1.0)

@@ -121,7 +121,7 @@ def test_before_their_start_the_bits_are_those_without(tiny_scene, tmp_path, few
 
 
 @pytest.mark.slow
-def test_no_file_and_no_measurement_has_them_and_a_resumed_run_has_the_same_bits(tiny_scene, tmp_path, few_steps):
+def test_they_are_in_no_output_and_resumed_runs_keep_their_bits(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *ON)
     expected = digest(tmp_path / "run")
     assert expected != digest(few_steps)

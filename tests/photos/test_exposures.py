@@ -32,7 +32,7 @@ def test_gains_are_found_again(rng):
     assert f"exposures of 8 photographs differ by {found.spread:.1%} at 400 points" in found.text
 
 
-def test_what_cameras_noted_fills_in_for_photographs_without_tracks(rng):
+def test_exif_fills_in_for_photographs_without_tracks(rng):
     """Two of eight show too few points; cameras noted those, and two others, from another middle."""
     wall = Wall(rng)
     seen = {name: rows[:19] if name in ("2.png", "5.png") else rows for name, rows in wall.tracks.seen.items()}
@@ -100,7 +100,7 @@ def test_photographs_that_agree_but_for_their_gains_are_no_fault(rng, spread):
     assert _fitted(photograph, point, values, 8)[0] == pytest.approx(log_gains - log_gains.mean(), abs=1e-6)
 
 
-def test_photographs_that_share_points_with_their_neighbours_alone_are_compared(rng):
+def test_photographs_sharing_points_only_in_a_chain_are_compared(rng):
     wall = Wall(rng, photographs=20, overlap=60)
     assert table(wall.measured()) == pytest.approx(wall.log_gains, abs=0.01)
 
@@ -118,7 +118,7 @@ def test_a_third_of_the_points_may_be_hidden(rng):
     assert table(wall.measured()) == pytest.approx(wall.log_gains, abs=0.06)
 
 
-def test_light_that_changes_with_the_direction_of_view_is_no_exposure(rng):
+def test_light_that_changes_with_view_direction_is_no_exposure(rng):
     """Each photograph of a point differs for itself."""
     wall = Wall(rng)
     wall.log_gains[:] = 0

@@ -38,7 +38,7 @@ PARAMS = {  # after focal lengths and middle
 
 
 @pytest.mark.parametrize("model", DEGREES)
-def test_a_lens_with_another_focal_length_undistorts_to_the_same_pixels(model):
+def test_lens_of_another_focal_length_undistorts_to_same_pixels(model):
     focals = (160.0,) if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else (160.0, 165.0)
     lens = Lens(200, 150, model, (*focals, 97.0, 80.0, *PARAMS[model]))
     other = zoomed(lens, 1.03)
@@ -56,7 +56,7 @@ def test_a_fisheye_has_no_other_focal_length():
         zoomed(FISHEYE, 1.01)
 
 
-def test_a_training_does_not_learn_a_focal_length_that_cannot_be_written(tiny_scene):
+def test_focal_length_that_cannot_be_written_is_not_learned(tiny_scene):
     scene = read_scene(tiny_scene)
     with pytest.raises(DataError, match=r"optimize\.poses\.focal: the lens of .*OPENCV_FISHEYE.*undistort"):
         require_zoom(replace(scene, views=(replace(scene.views[0], lens=FISHEYE),)))
@@ -74,7 +74,7 @@ def _scene_of(views: list[View]) -> Scene:
     return Scene(Path(), tuple(views), tuple(range(len(views))), (), None, 1.0)
 
 
-def test_photographs_of_a_camera_share_a_number_and_others_do_not():
+def test_photographs_of_one_camera_share_a_number():
     one, other = Camera(64, 48, 50, 51, 32, 24), Camera(48, 64, 50, 51, 24, 32)
     views = [View(name, camera, np.eye(3, 4)) for name, camera in (("a", one), ("b", other), ("c", one))]
     focals = FocalLengths.of([*views, View("d", one, np.eye(3, 4), lens=STRONG)], 0.01)
@@ -100,7 +100,7 @@ def test_rates_follow_the_visits_of_a_camera():
     assert load("smoke", ["optimize.poses={focal: auto}"]).settings.training.poses == auto
 
 
-def test_a_camera_on_the_device_gets_its_rays_from_its_focal_length(device):
+def test_device_camera_gets_its_rays_from_its_focal_length(device):
     view = View("a", Camera(70, 50, 60.0, 62.0, 33.0, 26.0), np.eye(3, 4))
     camera = moved_camera(upload_camera(device, view), view.world_to_camera, 1.02)
     expected = camera_values(replace(view, camera=view.camera.zoomed(1.02)), camera.tile)
@@ -134,7 +134,7 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_focals, tiny_
 
 
 @pytest.mark.slow
-def test_figures_and_files_are_of_the_focal_lengths_that_were_learned(with_focals, tiny_scene, tmp_path):
+def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene, tmp_path):
     measured = json.loads((with_focals / "metrics.json").read_text())["test"]["1"]
     assert evaluate(with_focals)["test"]["1"]["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
     rows = json.loads((with_focals / "view_poses.json").read_text())["photographs"]

@@ -64,7 +64,7 @@ def test_the_oracle_is_the_closed_form(rng, share):
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_without_a_filter_squares_are_means_and_with_haars_nothing_changes(device, rng, masked):
+def test_without_a_filter_squares_are_means_and_haar_is_identity(device, rng, masked):
     image = rng.uniform(0, 1, (3, 10, 22)).astype(np.float32)
     mask = rng.random((10, 22)) < 0.6 if masked else np.ones((10, 22), bool)
     squares = np.where(mask, image, np.nan).reshape(3, 5, 2, 11, 2)

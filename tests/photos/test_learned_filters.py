@@ -30,7 +30,7 @@ def test_a_loss_that_is_not_symmetric_is_refused_before_a_run():
 
 
 @pytest.mark.parametrize("recipe", ["auto_opti3dgs", "auto_opti3dgs_7k"])
-def test_the_filter_takes_the_same_course_in_its_share_of_the_steps(recipe):
+def test_filter_follows_the_same_course_in_its_share_of_steps(recipe):
     """By its own loss: from the mean of squares to the photograph, long before the end."""
     training = load(recipe).settings.training
     (haar,) = training.views.transforms

@@ -52,7 +52,7 @@ def measured(scene: str | Path, out: Path, *overrides: str) -> float:
     return float(json.loads((out / "metrics.json").read_text())["test"]["1"]["psnr"])
 
 
-def test_pixels_that_are_left_out_regain_most_in_a_short_training(tmp_path):
+def test_left_out_pixels_regain_most_in_a_short_training(tmp_path):
     """Of a fixed number of Gaussians."""
     write_dataset(tmp_path / "clean", options(48), workers=1)
     scene, _ = occluded(tmp_path / "clean", 48, seed=1)

@@ -37,7 +37,7 @@ def test_photographs_keep_to_the_budget(device, tiny_scene, kept):
 
 
 @pytest.mark.parametrize("kept", [0, 100])
-def test_a_photograph_has_the_camera_of_the_view_that_is_asked_for(device, tiny_scene, kept):
+def test_photograph_has_the_camera_of_the_requested_view(device, tiny_scene, kept):
     """Whatever camera the same photograph had before: one of a measurement, in a training that learns cameras."""
     view = read_scene(tiny_scene).views[0]
     other = replace(
@@ -51,7 +51,7 @@ def test_a_photograph_has_the_camera_of_the_view_that_is_asked_for(device, tiny_
             np.testing.assert_array_equal(camera.array.get(), expected.array.get())
 
 
-def test_a_damaged_photograph_read_ahead_is_reported_when_it_is_asked_for(device, tiny_scene, tmp_path):
+def test_damaged_photograph_read_ahead_is_reported_on_request(device, tiny_scene, tmp_path):
     damaged = tmp_path / "damaged.png"
     damaged.write_bytes(b"not an image")
     view = replace(read_scene(tiny_scene).split("train")[0], image_path=damaged)

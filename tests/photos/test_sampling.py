@@ -26,7 +26,7 @@ HAAR = "optimize.views.transforms=[{type: haar, rate: 0.02}]"
 FRACTIONS = "optimize.views.resolution=[[1, 3.0], [40, 1.0]]"
 
 
-def test_a_sample_is_the_view_of_the_order_at_the_size_of_the_step(tiny_scene):
+def test_sample_is_the_ordered_view_at_the_size_of_the_step(tiny_scene):
     views = read_scene(tiny_scene).downscaled(1, 2).split("train")
     settings = ViewSettings(order=Paper(), resolution={"points": [[0, 2], [20, 1]], "between": "steps"})
     sampler, pool = Sampler(views, settings, seed=5), ViewPool(views, 5)
@@ -48,7 +48,7 @@ def test_transforms_come_with_every_sample(tiny_scene):
 @pytest.mark.parametrize(
     "setting", [RESOLUTION, BLUR, FRACTIONS, HAAR], ids=["resolution", "blur", "fractions", "haar"]
 )
-def test_a_run_with_changing_views_is_the_same_after_an_interruption(tiny_scene, tmp_path, setting):
+def test_run_with_changing_views_is_the_same_after_a_stop(tiny_scene, tmp_path, setting):
     whole = train(tiny_scene, tmp_path / "whole", setting)
     assert load(str(whole.out / "pipeline.yaml")).resolved() == whole.pipeline
     checked = load("smoke", [f"scene.path='{tiny_scene}'", setting])
@@ -90,7 +90,7 @@ def masked_everywhere(source: Path, out: Path, name: str) -> Path:
     return out
 
 
-def test_a_photograph_that_is_masked_everywhere_ends_the_run_with_a_sentence(tiny_scene, tmp_path):
+def test_fully_masked_photograph_ends_the_run_with_a_sentence(tiny_scene, tmp_path):
     scene = masked_everywhere(tiny_scene, tmp_path / "scene", "r_003")
     with pytest.raises(DataError, match=r"003\.png: the mask leaves out every pixel of '.*003'") as error:
         train(scene, tmp_path / "run", "scene.alpha=mask")

@@ -25,7 +25,7 @@ def test_the_threshold_is_in_units_of_the_upper_edge_of_a_bin():
     assert settings.model_copy(update={"quantile": 0.5}).threshold(numbers, 11) == 2.0**-12 * 2**5 * (1 + 1 / 8)
 
 
-def test_all_pixels_count_where_no_few_differ_much_more_than_the_rest():
+def test_all_pixels_count_where_no_few_differ_much_more():
     """Eight bins are an octave: 24 of them a factor of eight."""
     settings = Transients(start=0, tail=8)
     assert settings.threshold(distribution(_40=90, _64=10), 1) is None

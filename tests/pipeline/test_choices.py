@@ -131,7 +131,7 @@ def test_what_is_measured_of_a_scene(tiny_scene):
     assert "photographs_per_point" not in sizes
 
 
-def test_the_nearest_points_are_those_before_any_training_photograph(tiny_scene):
+def test_nearest_points_are_before_any_training_photograph(tiny_scene):
     """The depth that a hundredth of what they show is nearer than; what lies behind a camera does not count."""
     scene = read_scene(tiny_scene)
     trained, tested = scene.split("train")[:2], scene.split("test")[0]
@@ -275,7 +275,7 @@ def test_a_choice_with_a_refit_says_what_to_set_for_a_time():
         (43, 1, 0, None),
     ],
 )
-def test_the_recipe_for_photographs_chooses_by_their_number_and_by_the_sky(photographs, sky, dropout, most):
+def test_photos_recipe_chooses_by_their_number_and_the_sky(photographs, sky, dropout, most):
     settings = load("photos").settings
     chosen = choose(settings, {"photographs": photographs, **({} if sky is None else {"sky": sky})})
     training = chosen.training
@@ -292,7 +292,7 @@ def test_the_recipe_for_photographs_chooses_by_their_number_and_by_the_sky(photo
     assert (alike, many.model) == (fast.stages, fast.model), "nothing is lost where there are many"
 
 
-def test_the_recipe_for_photographs_learns_poses_where_cameras_miss_what_photographs_show():
+def test_photos_recipe_learns_poses_where_cameras_miss_points():
     training = choose(load("photos").settings, {"photographs": 20, "reprojection_error": 1}).training
     assert (training.poses.start, training.colours.above) == (500, 0.03)
 
@@ -312,7 +312,7 @@ def test_all_rows_of_the_recipe_for_photographs_go_together():
     assert all(choice.reason for one in found for choice in one.choices)
 
 
-def test_of_several_measures_the_last_row_decides_whose_bounds_all_reach():
+def test_last_row_whose_bounds_are_all_reached_decides():
     settings = load("smoke", [f"choices=[{SKY}]"]).settings
     for measures, degree in (
         ({"photographs": 4}, 0),

@@ -40,7 +40,7 @@ def test_what_reads_places_at_rest_is_refused_beside_motion(override, what, reme
         ("reinit_from_depth", "a depth is of one moment; expected Gaussians that stand still: remove the stage"),
     ],
 )
-def test_stages_that_need_gaussians_at_rest_are_refused_when_the_file_is_read(tmp_path, stage, words):
+def test_stages_that_need_rest_are_refused_on_reading(tmp_path, stage, words):
     path = tmp_path / "x.yaml"
     text = f"name: x\nmodel: {{time: {{}}}}\nstages:\n  - init\n  - {stage}\n  - export\n"
     path.write_text(text)
@@ -67,5 +67,5 @@ def test_numbers_that_no_training_survives_are_refused(pipeline, override, bound
         load(pipeline, [override])
 
 
-def test_each_shipped_filter_and_rule_that_reads_no_places_goes_together_with_motion():
+def test_filters_and_rules_that_read_no_positions_allow_motion():
     load("dynamic_7k", ["model.screen_filter=mip", "densify.rules=[clone, split_saddle, prune_unimportant]"])

@@ -9,7 +9,7 @@ from clsplat.pipeline.settable import settable
 
 
 @pytest.mark.parametrize("name", shipped())
-def test_every_key_that_is_listed_can_be_set_to_the_value_that_is_listed(name):
+def test_every_listed_key_can_be_set_to_its_listed_value(name):
     pipeline = load(name)
     keys = settable(pipeline.settings)
     assert len({key.place for key in keys}) == len(keys)
@@ -32,7 +32,7 @@ def test_listed_keys_are_those_that_change_something():
     }
 
 
-def test_a_default_that_the_file_leaves_out_can_be_changed_in_part():
+def test_default_left_out_of_the_file_can_be_changed_in_part():
     model = load("smoke", ["model.screen_filter.variance=0.5", "scene.downscale=2"]).settings.model
     assert (model.screen_filter.type, model.screen_filter.variance) == ("dilation", 0.5)
     model = load("smoke", ["model.screen_filter.type=mip"]).settings.model

@@ -466,7 +466,7 @@ def test_the_schema_accepts_what_the_loader_accepts(path, own_schema):
         ("steps: 10", "steps: 10\n      views: {order: paper}"),
     ],
 )
-def test_the_schema_accepts_names_alone_and_stages_without_settings(old, new, write):
+def test_schema_accepts_bare_names_and_stages_without_settings(old, new, write):
     load(write(replaced(old, new)))
     assert valid(replaced(old, new))
 

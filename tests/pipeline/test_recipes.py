@@ -65,7 +65,7 @@ def words(node: Any) -> list[str]:
 
 
 @pytest.mark.parametrize("name", [name for name in shipped() if f"{name}_7k" in shipped()])
-def test_a_recipe_of_7_000_steps_differs_from_its_twin_in_numbers_alone(name):
+def test_recipe_of_7000_steps_differs_from_its_twin_in_numbers(name):
     twins = [load(recipe).settings.model_dump(mode="json") for recipe in (name, f"{name}_7k")]
     assert words(twins[0]) == words(twins[1])
 
@@ -81,7 +81,7 @@ def with_one_thread(tiny_scene, tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_a_recipe_gives_the_same_bits_after_a_stop_and_with_one_thread(name, tiny_scene, tmp_path, with_one_thread):
+def test_recipe_has_the_same_bits_after_a_stop_and_on_one_thread(name, tiny_scene, tmp_path, with_one_thread):
     pipeline = short(name, tiny_scene)
     expected = train(pipeline, tmp_path / "run")
     edits = records.Records(tmp_path / "run").read("densify")

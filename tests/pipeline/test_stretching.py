@@ -71,7 +71,7 @@ def test_what_ends_acts_as_often(name, factor):
         assert counts[0] == counts[1], before
 
 
-def test_what_acts_at_each_step_ends_at_the_same_share_of_the_training():
+def test_per_step_acts_end_at_the_same_share_of_training():
     new = in_steps(load("mcmc_7k").settings, 2000).training
     (noise,) = [stage for stage in new.during if stage.stage == "add_noise"]
     assert (noise.every, noise.stop) == (1, 5000 * 2000 // 7000)
@@ -100,7 +100,7 @@ def checked_again(name: str, settings: PipelineFile, folder: Path) -> Pipeline:
 
 
 @pytest.mark.parametrize("steps", [340, 500, 1000, 5000])
-def test_a_stretched_average_begins_at_the_same_share_of_the_training(tmp_path, steps):
+def test_stretched_average_begins_at_the_same_share_of_training(tmp_path, steps):
     settings = load("fast").settings
     new = checked_again("fast", in_steps(settings, steps), tmp_path).settings.training
     assert new == in_steps(settings, steps).training
@@ -112,7 +112,7 @@ def test_a_stretched_average_begins_at_the_same_share_of_the_training(tmp_path, 
 @pytest.mark.parametrize("done", [900, 1700, 2500])
 @pytest.mark.parametrize("left", [2, 50, 900, 9000])
 @pytest.mark.parametrize("name", ["fast", "splat_7k"])
-def test_a_number_of_steps_that_is_corrected_keeps_what_comes_later(tmp_path, name, done, left):
+def test_corrected_step_count_keeps_what_comes_later(tmp_path, name, done, left):
     """And what was done: a stage that had begun acts at the same steps."""
     settings = load(name).settings
     new = checked_again(name, with_steps(settings, done + left, done), tmp_path).settings.training
@@ -124,7 +124,7 @@ def test_a_number_of_steps_that_is_corrected_keeps_what_comes_later(tmp_path, na
 
 
 @pytest.mark.parametrize("name", TRAINING)
-def test_a_number_that_is_corrected_comes_after_growth_and_small_photographs(name):
+def test_corrected_count_is_after_growth_and_small_photographs(name):
     training = load(name).settings.training
     last, resolution = last_edit(training), training.views.resolution
     assert last <= training.steps
@@ -134,11 +134,11 @@ def test_a_number_that_is_corrected_comes_after_growth_and_small_photographs(nam
     assert not any(stage.due(step) for stage in grows for step in range(last, training.steps))
 
 
-def test_a_training_that_follows_detail_is_not_cut_before_the_full_size():
+def test_training_by_detail_is_not_cut_before_the_full_size():
     assert last_edit(load("dash_7k").settings.training) == 6300
 
 
-def test_what_is_learned_in_so_many_updates_has_a_rate_that_falls_as_much():
+def test_rate_of_what_learns_in_n_updates_falls_as_much():
     (haar,) = in_steps(load("auto_opti3dgs").settings, 7000).training.views.transforms
     (short,) = load("auto_opti3dgs_7k").settings.training.views.transforms
     assert haar.rate == pytest.approx(1e-4 * 30 / 7)

@@ -71,7 +71,7 @@ def take(path: Path, size: tuple[int, int], segment: bytes = b"", seed: int = 0)
     return path
 
 
-def test_turned_photographs_keep_what_exif_tells_but_for_the_rotation(tmp_path):
+def test_turned_photographs_keep_exif_except_for_the_rotation(tmp_path):
     for i in range(3):
         take(tmp_path / "p" / f"{i}.jpg", (64, 48), exif(6), seed=i)
     (tmp_path / "images").mkdir()
@@ -167,7 +167,7 @@ def test_files_that_cannot_be_read_come_with_how_to_convert_them(tmp_path, caplo
     assert "heif-convert" in text
 
 
-def test_files_with_the_name_of_another_kind_come_with_how_to_convert_them(tmp_path):
+def test_files_named_as_another_kind_come_with_how_to_convert(tmp_path):
     for i in range(3):
         take(tmp_path / "p" / f"{i}.jpg", (64, 48), seed=i)
     for name, brand in (("h.jpg", b"heic"), ("m.JPG", b"mif1"), ("v.png", b"avif"), ("o.jpg", b"isom")):
@@ -192,7 +192,7 @@ def test_files_with_the_name_of_another_kind_come_with_how_to_convert_them(tmp_p
 
 
 @pytest.mark.parametrize("read", [list_photographs, lambda path: fingerprint(path, path)])
-def test_a_video_in_the_place_of_a_folder_comes_with_what_makes_one(tmp_path, read):
+def test_video_given_as_a_folder_comes_with_what_makes_one(tmp_path, read):
     (tmp_path / "my walk.AVI").write_bytes(b"RIFF")
     (tmp_path / "notes").touch()
     command = f"`clsplat data video {in_shell(tmp_path / 'my walk.AVI')} FOLDER`"
@@ -238,7 +238,7 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     assert others.startswith("2 smaller models, of 3, 1 photograph, are left out: add photographs that join them")
 
 
-def test_a_set_that_gives_no_model_is_told_by_what_belongs_together(tmp_path):
+def test_set_without_a_model_is_described_by_its_groups(tmp_path):
     found = matched(tmp_path)
     assert diagnosis(found) == (
         "they do not belong together: 2 groups of good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
@@ -252,7 +252,7 @@ def test_a_set_that_gives_no_model_is_told_by_what_belongs_together(tmp_path):
     assert "the largest of 2 (a, b), and 1 without a good match (c); take" in diagnosis(two)
 
 
-def test_a_blurred_photograph_is_told_from_one_of_another_place_that_is_as_soft(tmp_path):
+def test_blur_is_told_from_an_equally_soft_photograph_elsewhere(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     wide = blocks(1, 900, 600)
     pictures = {f"{i}.png": wide[:, 60 * i : 60 * i + 700] for i in range(3)}
@@ -322,7 +322,7 @@ def test_sets_that_cannot_work_end_in_a_sentence(tmp_path, dense, pixels, senten
         map_cameras(matches, cameras)
 
 
-def test_plain_photographs_of_which_not_all_pairs_were_matched_end_in_a_sentence(tmp_path, dense):
+def test_plain_photographs_not_fully_matched_end_in_a_sentence(tmp_path, dense):
     """More pairs are looked for among photographs without features."""
     plain = [np.full((180, 240, 3), 100 + number, np.uint8) for number in range(12)]
     matches, cameras = prepared(tmp_path, plain, matching="sequential", neighbours=2)
@@ -349,7 +349,7 @@ def test_copies_among_photographs_tell_nothing_of_the_camera(tmp_path, dense):
     assert "all the same" in without_depth(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
 
 
-def test_a_model_counts_only_photographs_that_are_in_no_larger_one(tmp_path):
+def test_model_counts_only_photographs_in_no_larger_model(tmp_path):
     class Model:
         def __init__(self, *numbers: int) -> None:
             self.numbers = numbers
@@ -372,7 +372,7 @@ def test_a_model_counts_only_photographs_that_are_in_no_larger_one(tmp_path):
     assert figures["not_registered"] == ["5.jpg", "6.jpg"]
 
 
-def test_a_model_of_a_camera_that_only_turned_is_refused_where_most_photographs_are_strangers(tmp_path, dense):
+def test_model_of_a_turning_camera_is_refused_among_strangers(tmp_path, dense):
     """Before there is one, too few photographs match to know."""
     matches, cameras = prepared(tmp_path, [turned(number) if number < 6 else stranger(number) for number in range(14)])
     with pytest.raises(DataError, match=r"the \d of 14 photographs that could be placed match like those"):
@@ -380,9 +380,7 @@ def test_a_model_of_a_camera_that_only_turned_is_refused_where_most_photographs_
     assert not (cameras / "sparse").exists()
 
 
-def test_features_are_not_looked_for_again_where_photographs_have_enough_and_nothing_in_common(
-    tmp_path, dense, monkeypatch, caplog
-):
+def test_features_are_not_sought_again_for_unrelated_photographs(tmp_path, dense, monkeypatch, caplog):
     monkeypatch.setattr(reasons_tool, "TEXTURED", 100)
     caplog.set_level("INFO")
     matches, cameras = prepared(tmp_path, [stranger(number) for number in range(6)])
@@ -409,6 +407,6 @@ def test_when_photographs_have_nothing_in_common(tmp_path, features, pairs, expe
 
 
 @pytest.mark.parametrize(("names", "pairs"), [("abc", "ab"), ("abcd", "ab cd")], ids=["one is loose", "two pairs"])
-def test_few_photographs_have_something_in_common_where_two_match(tmp_path, names, pairs):
+def test_few_photographs_are_related_where_two_match(tmp_path, names, pairs):
     found = Matched(tmp_path, dict.fromkeys(names, 3000), {(a, b): 200 for a, b in pairs.split()})
     assert not found.have_nothing_in_common()

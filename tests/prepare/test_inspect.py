@@ -96,7 +96,7 @@ def test_blender_and_nerfstudio(tiny_scene):
     assert facts.points.count > 0
 
 
-def test_photographs_that_are_blurred_the_same_or_exposed_otherwise_are_named(scene, tmp_path):
+def test_blurred_or_differently_exposed_photographs_are_named(scene, tmp_path):
     images = sorted((scene / "images").iterdir())
     cv2.imwrite(str(images[3]), cv2.GaussianBlur(cv2.imread(str(images[3])), (0, 0), 2))
     cv2.imwrite(str(images[9]), cv2.imread(str(images[5])) ^ 1)
@@ -131,7 +131,7 @@ def test_a_missing_image(scene):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
-def test_a_pipe_in_the_place_of_an_image_is_not_told_to_be_missing(scene):
+def test_pipe_named_as_an_image_is_not_reported_as_missing(scene):
     (scene / "images" / "03.png").unlink()
     os.mkfifo(scene / "images" / "03.png")
     inspection = Inspection.of(scene)

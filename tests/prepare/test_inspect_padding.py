@@ -31,7 +31,7 @@ def test_the_lines_that_repeat_at_an_edge_are_counted(rng, edge, px):
 
 
 @pytest.mark.parametrize("edge", EDGES)
-def test_a_border_of_one_colour_and_photographs_that_are_alike_everywhere_say_nothing(rng, edge):
+def test_plain_borders_and_uniform_photographs_give_no_finding(rng, edge):
     assert filled(bordered(photograph(rng), edge, 3, cv2.BORDER_CONSTANT)) == [0] * 4
     stripes = bordered(photograph(rng)[:, :1], edge, 60)
     assert filled(stripes)[EDGES.index(edge)] == 0

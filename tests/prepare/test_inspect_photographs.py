@@ -19,7 +19,7 @@ def texts(inspection: Inspection, level: str) -> list[str]:
     return [finding.text for finding in inspection.findings if finding.level == level]
 
 
-def test_the_folder_that_was_asked_about_is_named_as_a_shell_reads_it(tmp_path):
+def test_inspected_folder_is_named_as_a_shell_reads_it(tmp_path):
     scene = tmp_path / "my ü"
     for name in ("one/a.png", "one/b.png", "two/c.png"):
         (scene / name).parent.mkdir(parents=True, exist_ok=True)
@@ -29,7 +29,7 @@ def test_the_folder_that_was_asked_about_is_named_as_a_shell_reads_it(tmp_path):
     )
 
 
-def test_files_that_a_preparation_leaves_out_are_told_as_it_tells_them(tmp_path, caplog):
+def test_files_left_out_by_preparation_are_reported_alike(tmp_path, caplog):
     for name in ("a.png", "b.png", "c.png"):
         photograph(tmp_path / name)
     for name in ("d.heic", "e.dng", "f.cr2"):
@@ -73,7 +73,7 @@ def shown(folder: Path, factors: list[float]) -> dict[str, Path]:
     return files
 
 
-def test_a_dark_photograph_is_not_blurred_and_a_dark_blurred_one_is(tmp_path):
+def test_dark_photograph_is_not_blurred_but_a_dark_blurred_is(tmp_path):
     files = shown(tmp_path, [1, 0.3, 1, 0.3, 1, 0.3])
     assert looks(files).blurred == []
     pixels = cv2.imread(str(files["3.png"]))
@@ -81,7 +81,7 @@ def test_a_dark_photograph_is_not_blurred_and_a_dark_blurred_one_is(tmp_path):
     assert looks(files).blurred == ["3.png"]
 
 
-def test_a_close_photograph_among_those_of_a_thing_before_black_is_not_blurred(tmp_path):
+def test_close_photograph_of_a_thing_on_black_is_not_blurred(tmp_path):
     files = shown(tmp_path, [1] * 9)
     for name in [*files][:6]:
         pixels = cv2.imread(str(files[name]))
@@ -90,7 +90,7 @@ def test_a_close_photograph_among_those_of_a_thing_before_black_is_not_blurred(t
     assert looks(files).blurred == []
 
 
-def test_where_exif_tells_no_exposure_a_step_of_the_brightness_is_a_hint(tmp_path):
+def test_step_in_brightness_is_a_hint_without_exif_exposure(tmp_path):
     files = shown(tmp_path, [1, 0.9, 0.4, 0.6, 0.7, 1])
     ((a, b, ratio),) = looks(files).steps
     assert (a, b, ratio) == ("1.png", "2.png", pytest.approx(0.4 / 0.9, abs=0.02))
@@ -103,7 +103,7 @@ def test_where_exif_tells_no_exposure_a_step_of_the_brightness_is_a_hint(tmp_pat
     assert [(a, b) for a, b, _ in looks(files, {"1.png": told}).steps] == [("1.png", "2.png")], "one alone tells none"
 
 
-def test_a_thing_before_black_that_is_larger_in_one_photograph_is_no_step_of_the_brightness(tmp_path):
+def test_larger_thing_on_black_is_no_step_in_brightness(tmp_path):
     files = shown(tmp_path, [1, 1, 1])
     for name, wide in zip(files, (10, 30, 10), strict=True):
         pixels = cv2.imread(str(files[name]))

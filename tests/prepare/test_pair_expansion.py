@@ -79,9 +79,7 @@ def test_a_name_with_spaces_has_no_more_pairs(matches, tmp_path, caplog):
     [("more_pairs", cv2.error("K > 0")), ("match_pairs", DataError("cannot match"))],
     ids=["looking for pairs", "matching them"],
 )
-def test_a_failure_of_more_pairs_loses_neither_the_model_nor_denser_features(
-    matches, tmp_path, monkeypatch, caplog, step, error
-):
+def test_failing_expansion_loses_neither_model_nor_features(matches, tmp_path, monkeypatch, caplog, step, error):
     def fail(_: Path, pairs: list[tuple[str, str]] | set[str], *threads: int) -> None:
         if pairs:
             raise error
@@ -95,7 +93,7 @@ def test_a_failure_of_more_pairs_loses_neither_the_model_nor_denser_features(
     assert [text for text in caplog.messages if text.endswith("another attempt: denser features")]
 
 
-def test_a_photograph_that_is_left_out_is_placed_by_more_pairs_also_after_a_kill(matches, tmp_path, caplog):
+def test_left_out_photograph_is_placed_also_after_a_kill(matches, tmp_path, caplog):
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
     figures = map_cameras(matches, tmp_path / "whole", attempts=3)

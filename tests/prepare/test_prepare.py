@@ -148,7 +148,7 @@ def test_a_damaged_result_is_made_again(photos, tmp_path, fault, caplog):
     assert do(steps, photos, root) == ("pab", [])
 
 
-def test_a_result_of_an_earlier_version_whose_record_knows_no_sizes_is_kept(photos, tmp_path):
+def test_earlier_result_whose_record_has_no_sizes_is_kept(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a")]
     do(steps, photos, root)
     record = plan(steps, photos, root)[0].folder / "record.json"
@@ -187,7 +187,7 @@ def test_a_result_whose_images_are_gone_is_made_again(photos, tmp_path):
     assert Linked.calls == ["a", "b", "a"], "the link of the second leads to images again"
 
 
-def test_results_that_were_moved_with_their_photographs_are_whole(tmp_path):
+def test_results_moved_with_their_photographs_are_complete(tmp_path):
     photos, root = tmp_path / "work" / "photos", tmp_path / "work" / "runs" / "prepared"
     photos.mkdir(parents=True)
     (photos / "p.txt").write_text("p")
@@ -248,7 +248,7 @@ def test_a_step_that_resumes_keeps_what_an_interrupted_call_made(photos, tmp_pat
     assert [path.name for path in root.iterdir()] == [folder.name]
 
 
-def test_a_record_that_a_killed_call_left_is_not_among_the_files_of_the_result(photos, tmp_path):
+def test_record_left_by_a_killed_call_is_not_part_of_the_result(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Slow()]
     folder = plan(steps, photos, root)[0].folder
     left = folder.with_name(f".{folder.name}")
@@ -453,7 +453,7 @@ def test_photographs_are_placed_from_where_a_run_stopped(photos, tmp_path, done)
     assert (out / "images").is_dir()
 
 
-def test_photographs_are_not_placed_from_steps_with_other_settings(photos, tmp_path, done):
+def test_photographs_are_not_placed_from_other_settings(photos, tmp_path, done):
     out = tmp_path / "out"
     place_photographs(photos, out)
     assert "holds a model already" in refusal(place_photographs, photos, out)

@@ -49,7 +49,7 @@ def test_a_camera_that_turns_on_one_spot_tells_no_depth(tmp_path):
     assert "only turned on the spot" in told(tmp_path, [(0, angle) for angle in range(-20, 21, 8)])
 
 
-def test_a_camera_that_turns_on_each_of_several_spots_tells_depths(tmp_path):
+def test_camera_turning_on_each_of_several_spots_gives_depths(tmp_path):
     """Each photograph matches those of its own spot best."""
     assert told(tmp_path, [(0.6 * spot, angle) for spot in range(-3, 3) for angle in (-12, 0, 12)]) == ""
 

@@ -149,7 +149,7 @@ def test_another_attempt_places_what_the_first_does_not(photos, tmp_path, monkey
     assert not list((tmp_path / "cameras").glob(".*")), "what attempts have made is removed"
 
 
-def test_further_attempts_match_as_the_first_and_can_be_turned_off(photos, tmp_path, monkeypatch, caplog):
+def test_further_attempts_match_as_the_first_and_can_be_off(photos, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(mapping_tool, "DENSER", Sought(320, 300))
     for name in ("features", "matches", "cameras", "once"):
         (tmp_path / name).mkdir()
@@ -190,7 +190,7 @@ def few(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_features_are_found_once_for_each_photograph_also_after_a_kill(few, tmp_path, monkeypatch):
+def test_features_are_found_once_each_also_after_a_kill(few, tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()

@@ -143,7 +143,7 @@ def test_more_pairs_than_32_bits_count_are_too_many(device, sort, counts):
         )
 
 
-def test_a_frame_with_more_pairs_than_32_bits_count_is_rendered_in_bands(device, rng, monkeypatch):
+def test_frame_with_more_pairs_than_32_bits_renders_in_bands(device, rng, monkeypatch):
     """Each Gaussian of a band of several rows stands for many: the counts, which nothing but their sum reads."""
     case = random_case(rng, 300, 60, 70)
     weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
@@ -162,7 +162,7 @@ def test_a_frame_with_more_pairs_than_32_bits_count_is_rendered_in_bands(device,
     np.testing.assert_array_equal(banded_sums, pixel_sums)
 
 
-def test_one_row_of_tiles_with_too_many_pairs_is_refused_in_a_sentence(device, rng, monkeypatch):
+def test_row_of_tiles_with_too_many_pairs_is_refused(device, rng, monkeypatch):
     monkeypatch.setattr("clsplat.render.rasterizer.MAX_PAIRS", 50)
     case = random_case(rng, 300, 60, 70)
     with pytest.raises(MemoryLimitError, match=r"60x70 pixels: .*more than 50 .*; use smaller images or fewer"):

@@ -181,7 +181,7 @@ def test_without_a_world_filter_there_is_one_file(tiny_scene, tmp_path):
     assert read_ply(tmp_path / "point_cloud.ply").mode == "mip", "opacities keep the energy of the screen filter"
 
 
-def test_files_of_other_programs_that_hold_a_filter_render_with_mip(tmp_path, rng, tiny_scene):
+def test_files_of_other_programs_with_a_filter_render_with_mip(tmp_path, rng, tiny_scene):
     """Mip-Splatting's own files have `filter_3D` and no comment; other trainers write the comment alone."""
     case = with_world_filter(random_case(rng, 5), rng)
     for keep_filter in (True, False):

@@ -88,7 +88,7 @@ def test_the_gradient_by_the_sky_is_that_of_the_losses(device, rng, share):
         assert found[channel, place] == pytest.approx(expected, rel=0.01, abs=1e-6)
 
 
-def test_pixels_that_a_mask_leaves_out_are_not_asked_to_show_the_sky(device, rng):
+def test_masked_pixels_are_not_asked_to_show_the_sky(device, rng):
     scene = Scene(device, rng, Directions(side=8, cover=0.5, difference=0.5), 0.7)
     view = scene.trainer.compare(scene.photograph, 1)
     behind, mask = view.behind.get(), view.comparison.mask.get()

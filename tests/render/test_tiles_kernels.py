@@ -58,7 +58,7 @@ def test_every_visible_pixel_is_in_a_listed_tile(device, rng, count, width, heig
 
 @pytest.mark.parametrize("tile", [8, 16])
 @pytest.mark.parametrize("side", ["width", "height"])
-def test_a_picture_with_more_tiles_than_a_pair_can_name_is_refused(rng, tile, side):
+def test_image_with_more_tiles_than_a_pair_can_name_is_refused(rng, tile, side):
     """`tile_box` of tiles.h has 12 bits for each of a tile's column and row."""
     view = random_case(rng, 1).view
     largest = replace(view, camera=replace(view.camera, **{side: 4096 * tile}))
@@ -69,7 +69,7 @@ def test_a_picture_with_more_tiles_than_a_pair_can_name_is_refused(rng, tile, si
 
 @pytest.mark.parametrize("tile", [8, 16])
 @pytest.mark.parametrize(("size", "fits"), [((2**15, 2**15), True), ((2**15, 2**15 + 1), False), ((1, 2**15), True)])
-def test_a_picture_with_more_pixels_than_kernels_index_is_refused(rng, tile, size, fits):
+def test_image_with_more_pixels_than_kernels_index_is_refused(rng, tile, size, fits):
     """Four planes, of a blur, reach 2^32 values."""
     view = random_case(rng, 1).view
     width, height = size
@@ -81,7 +81,7 @@ def test_a_picture_with_more_pixels_than_kernels_index_is_refused(rng, tile, siz
             camera_values(large, tile)
 
 
-def test_what_readers_accept_has_no_more_tiles_than_any_device_can_name(rng):
+def test_readers_accept_no_more_tiles_than_devices_can_name(rng):
     view = random_case(rng, 1).view
     camera_values(replace(view, camera=replace(view.camera, width=MAX_SIDE, height=MAX_SIDE).check()), 8)
 

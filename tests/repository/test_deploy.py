@@ -36,7 +36,7 @@ def copied() -> list[str]:
     return [path for words in found for path in words[:-1]]
 
 
-def test_the_container_file_copies_what_exists_and_all_that_the_wheel_needs():
+def test_containerfile_copies_existing_files_the_wheel_needs():
     assert [path for path in copied() if not (ROOT / path).exists()] == []
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     folders = {name.split(".")[0] for name in project["tool"]["setuptools"]["packages"]}

@@ -47,7 +47,7 @@ def blocks(language: str) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("base", "kind"), NAMED, ids=[f"{base.__name__}-{tag(kind)}" for base, kind in NAMED])
-def test_what_a_pipeline_can_name_has_a_manual_and_a_valid_example(base, kind):
+def test_what_a_pipeline_names_has_a_manual_and_a_valid_example(base, kind):
     assert kind.__doc__ not in (None, base.__doc__)
     page = next(text for text in reference_pages().values() if f"{{: #{tag(kind)} }}\n\n{kind.__doc__[:20]}" in text)
     assert all(f"| `{name}` |" in page for name in kind.model_fields if name not in ("type", "stage")), page
@@ -78,7 +78,7 @@ def test_every_key_has_a_description():
     assert undescribed() == []
 
 
-def test_the_reference_lists_every_reader_and_every_notation_of_a_number():
+def test_reference_lists_every_reader_and_number_notation():
     pages = reference_pages()
     for reader in readers():
         assert f"## {reader.name}\n" in pages["reference/readers.md"]

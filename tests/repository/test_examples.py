@@ -153,7 +153,7 @@ def test_python_lines_of_the_documentation_run(page, code, tiny_scene, folder):
     assert len(list(folder.glob("*.ply"))) == code.count(".save(")
 
 
-def test_the_methods_of_growth_are_compared_at_equal_length_and_seeds():
+def test_growth_methods_are_compared_at_equal_length_and_seeds():
     experiment = load_experiment(str(EXAMPLES / "growth.yaml"))
     assert {cell.pipeline.settings.training.steps for cell in experiment.cells} == {2000}
     names = [cell.pipeline.settings.name for cell in experiment.cells]

@@ -160,7 +160,7 @@ def test_text_files_name_their_encoding(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_modules_of_some_systems_are_imported_where_they_are_used(path):
+def test_modules_of_some_systems_are_imported_where_used(path):
     for node in ast.parse(path.read_text("utf-8")).body:
         names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
         names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []

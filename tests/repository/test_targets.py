@@ -232,7 +232,7 @@ def binary(notes: str, kind: int = intel.ZE_INFO) -> bytes:
     return head + table + contents + b"what follows"
 
 
-def test_figures_are_read_from_the_notes_and_warnings_of_intels_compiler():
+def test_figures_are_read_from_notes_of_intels_compiler():
     report = "\nwarning: kernel scale  compiled SIMD16 allocated 128 regs and spilled around 681\nBuild succeeded.\n"
     assert intel.parse(binary(ZE_INFO), report, "skl").keys() == {"scale"}
     of = intel.parse(binary(ZE_INFO), report, "skl")["scale"]
@@ -253,7 +253,7 @@ def test_figures_are_read_from_the_notes_and_warnings_of_intels_compiler():
         ("dg2", 128, 64, 64, 32, 64),  # 32 groups with barriers, of two threads
     ],
 )
-def test_threads_are_limited_by_registers_local_memory_and_barriers(target, registers, local, group, width, threads):
+def test_threads_are_limited_by_registers_memory_and_barriers(target, registers, local, group, width, threads):
     assert intel.TARGETS[target].resident(registers, local, group, width) == threads
 
 
@@ -386,7 +386,7 @@ def test_a_page_with_other_figures_is_found(tmp_path, monkeypatch):
     assert re.match(r"performance.md shows '\| `blend_forward` .*40.*', expected '.*41.*': run .* --write", fault)
 
 
-def test_continuous_integration_compares_the_page_with_fresh_figures():
+def test_ci_compares_the_page_with_fresh_figures():
     jobs = YAML(typ="safe").load(ROOT / ".github" / "workflows" / "ci.yml")["jobs"]
     assert "-m tests.targets --check" in jobs["targets"]["steps"][-1]["run"]
 

@@ -86,7 +86,7 @@ def test_parts_are_continued_by_the_number_of_their_pieces(photos, monkeypatch):
     assert lines[0].startswith("expected: ")
 
 
-def test_the_number_of_photographs_tells_the_growth_that_would_be_chosen(photos, monkeypatch):
+def test_number_of_photographs_gives_the_growth_to_be_chosen(photos, monkeypatch):
     """Whether they show a sky is not known before they are prepared."""
     for path in photos.iterdir():
         cv2.imwrite(str(path), np.zeros((120, 160, 3), np.uint8))
@@ -141,14 +141,14 @@ def as_cell(asked, out, device, start):
         ("scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is held out for testing"),
     ],
 )
-def test_a_split_that_photographs_do_not_have_is_refused_before_they_are_prepared(photos, begin, sets, complaint):
+def test_split_photographs_lack_is_refused_before_preparation(photos, begin, sets, complaint):
     asked = load("photos", [sets, f"scene.path='{photos}'"])
     with pytest.raises((ConfigError, DataError), match=complaint):
         begin(asked, photos.parent / "runs" / "a", None, "new")
     assert not (photos.parent / "runs" / "prepared").exists()
 
 
-def test_a_list_is_not_refused_for_what_is_known_when_cameras_are(photos, caplog):
+def test_list_is_not_refused_for_what_cameras_will_tell(photos, caplog):
     """Which photographs a number holds out follows from those that are placed."""
     asked = load("photos", [f"scene.path='{photos}'", "scene.train={names: [00.png, '08', 01.jpg]}"])
     (photos / "left.heic").write_bytes(b"")
@@ -172,7 +172,7 @@ def test_files_that_are_left_out_are_told_once(photos, caplog):
     assert len([record for record in caplog.records if "HEIC" in record.getMessage()]) == 1
 
 
-def test_a_dry_run_says_what_can_be_chosen_before_photographs_are_prepared(photos):
+def test_dry_run_says_what_can_be_chosen_before_preparation(photos):
     asked = load("photos", [f"scene.path='{photos}'", "optimize.dropout=0.1"])
     lines = [line.strip() for line in describe(asked, photos.parent / "runs" / "a", None, "new").splitlines()]
     fixed = [line for line in lines if ", since 20 training photographs; " in line]
@@ -219,7 +219,7 @@ def test_damaged_photographs_are_passed_over(photos, tmp_path):
     assert refusal(module._tried, steps, photos, names) == f"{photos}: 2 of 23 photographs can be read, 3 are needed"
 
 
-def test_an_estimate_without_the_preparation_says_so_and_names_no_temporary_path(photos, monkeypatch, caplog):
+def test_estimate_without_preparation_names_no_temporary_path(photos, monkeypatch, caplog):
     def make(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
         raise DataError(f"{source / '11.png'}: broken by {out / 'database.db'}: no space")
 

@@ -112,7 +112,7 @@ def test_masks_are_decoded_too(tmp_path):
         require_whole(folder, decode_all(views(folder)))
 
 
-def test_a_jpeg_without_its_end_is_damaged_whatever_the_decoder_says(tmp_path, monkeypatch):
+def test_jpeg_without_its_end_is_damaged_whatever_decoders_say(tmp_path, monkeypatch):
     images = [replace(image, name=f"{image.name[:2]}.jpg") for image in orbit().images]
     folder = write(tmp_path / "scene", replace(orbit(), images=images))
     file = folder / "images" / "05.jpg"
@@ -345,7 +345,7 @@ def test_without_the_record_the_checkpoint_knows_the_inputs(scene, tmp_path, cap
     assert record.read_text() == "{}", "the new inputs do not become those of the start"
 
 
-def test_a_run_that_never_looked_at_its_inputs_goes_on_and_says_so(scene, tmp_path, caplog):
+def test_run_that_never_looked_at_its_inputs_resumes_and_says_so(scene, tmp_path, caplog):
     train(scene, tmp_path / "run")
     (tmp_path / "run" / "inputs.json").unlink()
     newest = sorted((tmp_path / "run" / "checkpoints").iterdir())[-1]

@@ -138,7 +138,7 @@ def test_a_signal_ends_a_pause_and_saves_the_state(live, tiny_scene, tmp_path):
         trained(live, tiny_scene, tmp_path / "run")
 
 
-def test_a_picture_that_cannot_be_drawn_is_told_and_the_training_goes_on(live, tiny_scene, tmp_path, monkeypatch):
+def test_undrawable_image_is_reported_and_training_continues(live, tiny_scene, tmp_path, monkeypatch):
     def refused(self, order):
         raise MemoryLimitError("no room")
 

@@ -24,7 +24,7 @@ def test_the_page_is_whole_and_its_scripts_short():
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium")
-def test_a_picture_that_was_decoded_late_does_not_replace_a_newer_one(tmp_path):
+def test_late_image_does_not_replace_a_newer_one(tmp_path):
     script = (LIVE / "link.js").read_text()
     race = """(async () => {
       const shown = [], closed = [], decoded = {};

@@ -127,7 +127,7 @@ def test_a_moment_is_from_0_to_1(text):
         moment(text)
 
 
-def test_a_page_that_was_not_told_of_the_end_does_not_count_as_told():
+def test_page_that_missed_the_end_does_not_count_as_informed():
     class Ending(Desk):
         looks = 0
 

@@ -38,14 +38,14 @@ def test_it_listens_on_the_loopback_address_alone(server):
     assert server.socket.getsockname()[0] == "127.0.0.1"
 
 
-def test_requests_of_one_connection_are_answered_one_after_the_other(server):
+def test_requests_of_one_connection_are_answered_in_order(server):
     one = b"GET /token/%s HTTP/1.1\r\nHost: localhost\r\n\r\n"
     answers = talk(server, one % b"a" + one % b"b")
     assert answers.count(b"HTTP/1.1 200 OK") == 2
     assert answers.index(b"\r\n\r\na") < answers.index(b"\r\n\r\nb")
 
 
-def test_a_request_that_is_too_long_is_refused_and_no_more_of_it_read(server):
+def test_overlong_request_is_refused_without_reading_on(server):
     data = b"GET /token/ HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * (2 * LONGEST)
     found = b""
     with suppress(OSError):  # the rest was not read
@@ -91,7 +91,7 @@ def test_a_connection_that_says_nothing_is_closed(server, monkeypatch):
         assert connection.recv(100) == b""
 
 
-def test_more_connections_than_there_are_slots_are_closed_and_the_server_goes_on(server, monkeypatch):
+def test_connections_beyond_the_slots_are_closed(server, monkeypatch):
     monkeypatch.setattr(module._Connection, "timeout", 5)
     server._slots = threading.Semaphore(2)
     address = "127.0.0.1", server.port
@@ -116,7 +116,7 @@ def test_the_end_of_the_server_ends_its_connections(server):
         assert not thread.is_alive()
 
 
-def test_the_answer_that_is_given_at_the_end_is_whole_and_the_last():
+def test_final_answer_is_complete_and_the_last():
     given, going = threading.Event(), threading.Event()
 
     def answer(request):
@@ -139,7 +139,7 @@ def test_the_answer_that_is_given_at_the_end_is_whole_and_the_last():
     assert found.count(b"HTTP/1.1 200") == 1
 
 
-def test_a_port_in_use_is_one_sentence_and_without_one_the_next_is_taken(server):
+def test_used_port_is_one_sentence_or_the_next_one_is_taken(server):
     with pytest.raises(ConfigError, match=rf"--live: port {server.port} of 127.0.0.1 cannot be used \(.*\); give ano"):
         Server(server.port, "token", server.answer)
     other = Server(0, "token", server.answer)
@@ -155,7 +155,7 @@ def test_answers_are_paced(server):
     assert waited.wait(5)
 
 
-def test_a_budget_grows_with_time_up_to_a_limit_and_owes_what_was_too_much():
+def test_budget_grows_to_a_limit_and_owes_what_was_too_much():
     now = [100.0]
     budget = Budget(0.05, 1.0, lambda: now[0])
     assert budget.credit == 0

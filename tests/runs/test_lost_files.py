@@ -87,7 +87,7 @@ def test_a_file_whose_bytes_changed_is_written_again(name, saved_late, tmp_path)
     assert b"x" * 20 not in (out / name).read_bytes()
 
 
-def test_what_cannot_be_made_again_is_named_until_it_is_there_again(saved_late, tmp_path):
+def test_irreproducible_files_are_named_until_they_return(saved_late, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(saved_late, out)
     records = out / "metrics.jsonl"
@@ -102,7 +102,7 @@ def test_what_cannot_be_made_again_is_named_until_it_is_there_again(saved_late, 
     assert "cannot be made again" not in command("resume", out).stderr
 
 
-def test_without_a_list_of_checksums_all_that_can_be_is_written_again(saved_late, tmp_path):
+def test_without_checksums_all_that_can_be_is_written_again(saved_late, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(saved_late, out)
     (out / "checksums.json").unlink()
@@ -113,7 +113,7 @@ def test_without_a_list_of_checksums_all_that_can_be_is_written_again(saved_late
     assert damaged(out) == []
 
 
-def test_a_run_without_status_and_checkpoint_is_told_to_begin_again(saved_late, tmp_path):
+def test_run_without_status_and_checkpoint_is_to_be_restarted(saved_late, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(saved_late, out)
     shutil.rmtree(out / "checkpoints")
@@ -126,7 +126,7 @@ def test_a_run_without_status_and_checkpoint_is_told_to_begin_again(saved_late, 
 
 
 @pytest.mark.parametrize("raised", [KeyboardInterrupt, ZeroDivisionError])
-def test_a_resume_that_is_stopped_takes_no_damaged_file_for_a_whole_one(raised, saved_late, tmp_path, monkeypatch):
+def test_stopped_resume_takes_no_damaged_file_as_complete(raised, saved_late, tmp_path, monkeypatch):
     out = tmp_path / "run"
     shutil.copytree(saved_late, out)
     for name in ("viewer.html", "report.html"):
@@ -146,7 +146,7 @@ def test_a_resume_that_is_stopped_takes_no_damaged_file_for_a_whole_one(raised, 
     assert (out / "report.html").read_bytes().count(b"b") < (saved_late / "report.html").read_bytes().count(b"b") + 20
 
 
-def test_a_model_of_an_earlier_stage_that_is_lost_leaves_the_run_done(tiny_scene, tmp_path):
+def test_lost_model_of_an_earlier_stage_leaves_the_run_done(tiny_scene, tmp_path):
     (tmp_path / "two.yaml").write_text(TWO_MODELS.format(scene=tiny_scene))
     out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
     (out / "a.ply").unlink()
@@ -194,7 +194,7 @@ def test_a_refused_resume_leaves_a_run_done(name, saved_late, tmp_path):
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_the_remedy_of_a_run_without_a_checkpoint_is_to_begin_again(saved_late, tmp_path):
+def test_remedy_of_a_run_without_a_checkpoint_is_to_restart(saved_late, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(saved_late, out)
     shutil.rmtree(out / "checkpoints")
@@ -209,7 +209,7 @@ def test_the_remedy_of_a_run_without_a_checkpoint_is_to_begin_again(saved_late, 
 
 
 @pytest.mark.parametrize(("name", "content"), [("metrics.json", ""), ("pipeline.yaml", ""), ("pipeline.yaml", None)])
-def test_a_cell_that_lost_its_result_does_not_stop_the_comparison(name, content, tiny_scene, tmp_path):
+def test_cell_that_lost_its_result_does_not_stop_the_comparison(name, content, tiny_scene, tmp_path):
     (tmp_path / "two.yaml").write_text(MATRIX.format(scene=tiny_scene))
     out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
     cell = out / "seed=1"
@@ -278,7 +278,7 @@ def test_a_rung_that_lost_its_model_is_trained_again(content, few_steps, info, t
     assert tuning.trained(pipeline, tmp_path / "rung").read_bytes() == whole
 
 
-def test_a_run_that_was_killed_before_it_began_is_told_how_to_begin(tmp_path):
+def test_run_killed_before_it_began_says_how_to_begin(tmp_path):
     """As by `kill -9` while the device is proved: there is no pipeline to go on with."""
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "status.json").write_text('{"state": "preparing", "process": 4194305}')

@@ -93,7 +93,7 @@ def test_a_rescue_saves_nothing_into_a_folder_that_was_lost(tiny_scene, tmp_path
     assert files(tmp_path) == before
 
 
-def test_the_heart_stops_in_a_folder_that_was_lost_and_the_run_is_told(tmp_path, monkeypatch, caplog):
+def test_heartbeat_stops_in_a_lost_folder_and_the_run_learns_it(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(writing, "BEAT", 0.002)
     with folders.opened(tmp_path / "run", "new") as status:
         before = taken(tmp_path / "run")
@@ -105,7 +105,7 @@ def test_the_heart_stops_in_a_folder_that_was_lost_and_the_run_is_told(tmp_path,
     assert "the run goes on" not in caplog.text
 
 
-def test_a_run_that_ends_before_its_first_step_removes_nothing_of_the_next_one(tmp_path):
+def test_run_ending_before_its_first_step_spares_the_next_one(tmp_path):
     before: dict[str, bytes] = {}
 
     def ends() -> None:

@@ -63,7 +63,7 @@ def text_fields() -> list[tuple[type[Settings], str]]:
     ]
 
 
-def test_every_text_in_a_pipeline_is_known_to_be_read_or_checked_as_an_output():
+def test_every_text_in_a_pipeline_is_an_input_or_checked_output():
     found = {f"{kind.__name__}.{name}" for kind, name in text_fields()}
     assert Execution in Settings.defined
     checked = {
@@ -76,7 +76,7 @@ def test_every_text_in_a_pipeline_is_known_to_be_read_or_checked_as_an_output():
 @pytest.mark.parametrize(
     "kind", [kind for kind in Settings.defined if issubclass(kind, Stage)], ids=lambda k: k.__name__
 )
-def test_no_stage_can_be_told_to_write_outside_its_folder_or_over_its_records(kind):
+def test_no_stage_can_write_outside_its_folder_or_over_records(kind):
     for field, suffixes in kind.named_outputs().items():
         suffix = next(iter(suffixes), "")
         for path in OUTSIDE:

@@ -67,7 +67,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
 
 
 @pytest.mark.slow
-def test_what_a_run_writes_itself_is_on_the_table_of_reserved_names(finished):
+def test_what_a_run_writes_is_in_the_table_of_reserved_names(finished):
     pipeline, run = finished
     chosen = {path for stage in pipeline.stages for path in stage.outputs(run.out)}
     made = {path.name for path in run.out.iterdir()} - {path.relative_to(run.out).parts[0] for path in chosen}
@@ -75,7 +75,7 @@ def test_what_a_run_writes_itself_is_on_the_table_of_reserved_names(finished):
     assert made <= names.RESERVED
 
 
-def test_names_of_files_of_a_run_stand_in_one_table_and_are_reserved():
+def test_names_of_run_files_are_in_one_table_and_reserved():
     table = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
     assert {"pipeline.yaml", "run.lock", "compare.html", "undistorted"} < table <= names.RESERVED
     package = Path(names.__file__).parent
@@ -109,7 +109,7 @@ def test_what_cannot_be_read_back_is_no_success(name, finished):
 
 
 @pytest.mark.parametrize("damage", [truncate, Path.unlink, change_a_value])
-def test_a_model_that_was_written_before_a_kill_is_the_one_that_was_written(damage, tiny_scene, tmp_path, monkeypatch):
+def test_model_written_before_a_kill_is_the_one_written(damage, tiny_scene, tmp_path, monkeypatch):
     out, few = tmp_path / "run", [*SETTINGS, "init.count=50"]
 
     def fail(*arguments):
@@ -142,12 +142,12 @@ def test_a_model_of_a_cadence_that_never_came_is_not_expected(finished):
     outputs.check_outputs(late, run)
 
 
-def test_the_checksums_are_of_models_made_during_the_training_too(finished):
+def test_checksums_include_models_made_during_training(finished):
     _, run = finished
     assert '"early.ply"' in (run.out / names.CHECKSUMS).read_text()
 
 
-def test_a_later_stage_that_damages_the_model_ends_the_run_with_an_error(tiny_scene, tmp_path, without_plugins):
+def test_later_stage_that_damages_the_model_is_an_error(tiny_scene, tmp_path, without_plugins):
     class Spoil(Stage):
         """Changes the file of another stage."""
 

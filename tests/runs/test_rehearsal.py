@@ -15,7 +15,7 @@ from clsplat.training.run import Progress
 
 
 @pytest.mark.slow
-def test_too_little_time_is_refused_before_the_rehearsal_has_ended(tiny_scene, tmp_path, monkeypatch):
+def test_too_little_time_is_refused_before_the_rehearsal_ends(tiny_scene, tmp_path, monkeypatch):
     """Each report says how long the fewest steps take; what comes before them is done twice."""
     reports = []
     show = rehearsing.Watch.show
@@ -45,7 +45,7 @@ def reported(step: int, ms: float) -> Progress:
     return Progress(step, 200, 0.0, 0.0, 0, ms, seconds_left=0.0)
 
 
-def test_a_refusal_comes_with_the_second_report_at_the_latest_that_shows_it(monkeypatch):
+def test_refusal_comes_by_the_second_report_that_shows_it(monkeypatch):
     """Set-up takes 4 s, and 20 steps 2 s: at 6 s the run needs 4 s more, and 20 s for 200 steps.  The first report may
     be of a step that builds kernels."""
     for given in (0.5, 0.4):
@@ -57,7 +57,7 @@ def test_a_refusal_comes_with_the_second_report_at_the_latest_that_shows_it(monk
         at_work.show(reported(20, 100.0))
 
 
-def test_set_up_alone_is_refused_where_it_takes_more_than_half_of_the_time(monkeypatch):
+def test_setup_that_takes_more_than_half_the_time_is_refused(monkeypatch):
     watch(0.5, {"init": 14.9}, 15.0, monkeypatch).look()
     with pytest.raises(ConfigError, match=r"expected 0\.6 or more"):
         watch(0.5, {"init": 15.1}, 15.2, monkeypatch).look()
@@ -76,9 +76,7 @@ def test_the_steps_of_a_rehearsal_end_after_a_fifth_of_the_time(clock, monkeypat
 
 
 @pytest.mark.slow
-def test_a_rehearsal_whose_steps_are_ended_runs_the_other_stages_and_goes_on_as_it_was(
-    tiny_scene, tmp_path, monkeypatch
-):
+def test_stopped_rehearsal_runs_the_other_stages_and_continues(tiny_scene, tmp_path, monkeypatch):
     """It is not known when its growth ends: the number is corrected twice.  Edits that did not come are counted."""
     found: list[Rehearsal] = []
 

@@ -61,7 +61,7 @@ def test_a_training_without_a_step_left_takes_no_other_numbers(few_steps, tiny_s
     assert len(json.loads((out / "metrics.json").read_text())["changes"]) == 2
 
 
-def test_a_training_ends_at_the_step_where_it_stopped_if_that_is_asked(killed_run):
+def test_training_ends_where_it_stopped_if_asked(killed_run):
     Job.resume(killed_run, ["optimize.steps=8"]).run()
     assert read_status(killed_run)["state"] == "done"
     assert (killed_run / "point_cloud.ply").is_file()

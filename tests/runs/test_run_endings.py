@@ -53,9 +53,7 @@ def quiet_log():
 
 @pytest.mark.parametrize("function", ["opening.open_run", "runner.execute", "runner.run_stages"])
 @pytest.mark.parametrize("name", ENDINGS)
-def test_every_exception_of_a_run_ends_in_a_sentence_and_a_status(
-    name, function, tiny_scene, tmp_path, monkeypatch, capsys
-):
+def test_every_exception_ends_in_a_sentence_and_a_status(name, function, tiny_scene, tmp_path, monkeypatch, capsys):
     raised, kind, words = ENDINGS[name]
 
     def fail(*arguments):

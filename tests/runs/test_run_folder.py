@@ -16,7 +16,7 @@ def opened(scene: Path, out: Path, *changes: str) -> None:
     outputs.check_places(load("smoke", [f"scene.path={str(scene)!r}", *changes]), out)
 
 
-def test_the_folder_of_the_photographs_and_the_root_are_no_run_folders(tiny_scene, monkeypatch):
+def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
     for out in (tiny_scene, tiny_scene / "train" / ".."):
         with pytest.raises(ConfigError, match="is the folder of the photographs"):
             opened(tiny_scene, out)
@@ -64,7 +64,7 @@ def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path
 
 
 @pytest.mark.parametrize("name", sorted(names.OF_A_RUN - {names.PIPELINE, names.CHECKPOINTS, names.UNDISTORTED}))
-def test_files_of_others_under_the_names_of_a_run_are_not_replaced(name, tiny_scene, tmp_path):
+def test_foreign_files_with_names_of_a_run_are_not_replaced(name, tiny_scene, tmp_path):
     (tmp_path / name).write_text('{"state": "mine"}')
     for start in ("new", "resume", "restart"):
         with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
@@ -74,7 +74,7 @@ def test_files_of_others_under_the_names_of_a_run_are_not_replaced(name, tiny_sc
 
 
 @pytest.mark.parametrize("name", sorted(names.OF_A_MATRIX - {names.PIPELINE}))
-def test_files_of_others_under_the_names_of_a_matrix_are_not_replaced(name, tmp_path):
+def test_foreign_files_with_names_of_a_matrix_are_not_replaced(name, tmp_path):
     (tmp_path / name).write_text("mine")
     with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
         experiment.check_matrix_folder(tmp_path)

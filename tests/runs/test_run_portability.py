@@ -73,7 +73,7 @@ def test_a_run_that_is_done_trains_longer(done, tiny_scene, tmp_path):
     assert digest_of(out) == before, "nothing is left to train"
 
 
-def test_a_run_that_is_done_and_kept_no_checkpoint_is_not_trained_again(tiny_scene, tmp_path):
+def test_finished_run_without_checkpoints_is_not_retrained(tiny_scene, tmp_path):
     pipeline = tmp_path / "plain.yaml"
     stages = ["init: {source: random, count: 50}", "optimize: {steps: 3, losses: [l1]}", "export"]
     pipeline.write_text("name: plain\nstages:\n" + "".join(f"  - {stage}\n" for stage in stages))
@@ -95,7 +95,7 @@ def test_the_summary_names_what_there_is(done, tiny_scene):
     assert {"init", "optimize", "evaluate", "export"} <= spent.keys()
 
 
-def test_the_summary_offers_no_more_steps_to_what_is_learnt_by_heart(done, tmp_path):
+def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
     folder = shutil.copytree(done, tmp_path / "run")
     metrics = json.loads((folder / "metrics.json").read_text())
     (folder / "metrics.json").write_text(json.dumps({**metrics, "by_heart": True}))

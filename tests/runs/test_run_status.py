@@ -64,7 +64,7 @@ def test_the_lines_name_the_photographs_that_are_left_out(tmp_path):
     assert "3 of 4 photographs placed, 0.50 px; left out: b.jpg (cut)" in reading.status_text(found)
 
 
-def test_a_clock_that_is_ahead_gives_no_negative_time_and_is_told(tmp_path):
+def test_clock_that_is_ahead_gives_no_negative_time_and_is_noted(tmp_path):
     found = put(tmp_path, host="a", time=time.time() + 500)
     assert found["silent"] == 0
     assert 490 < found["ahead"] <= 500

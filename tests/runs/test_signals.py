@@ -76,7 +76,7 @@ PLACES = {  # what is called for the n-th time when the signal comes -> the mess
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_a_long_stage_ends_early_with_its_state_saved_and_is_repeated(
+def test_long_stage_ends_early_with_saved_state_and_is_repeated(
     place, pipeline, undisturbed, tiny_scene, tmp_path, monkeypatch
 ):
     module, name, call, message = PLACES[place]
@@ -103,7 +103,7 @@ def test_the_second_signal_stops_at_once(pipeline, tiny_scene, tmp_path, monkeyp
     assert not list((tmp_path / "renders").rglob("*.png"))
 
 
-def test_the_first_signal_stops_at_once_where_there_is_no_model_yet(pipeline, tiny_scene, tmp_path, monkeypatch):
+def test_first_signal_stops_at_once_where_there_is_no_model(pipeline, tiny_scene, tmp_path, monkeypatch):
     run = Init.run
     monkeypatch.setattr(Init, "run", lambda stage, state: signalled(run, 1)(stage, state))
     with pytest.raises(Interrupted, match="stopped at once"):

@@ -39,7 +39,7 @@ def test_two_rehearsals_tell_how_the_time_of_a_step_grows():
 
 
 @pytest.mark.parametrize(("later", "power"), [(0.2, prediction.TREND), (0.002, -prediction.TREND)])
-def test_a_rehearsal_that_was_disturbed_does_not_tell_more_than_it_can(later, power):
+def test_disturbed_rehearsal_claims_no_more_than_it_can(later, power):
     found = [rehearsal(200, 0.02), rehearsal(600, later)]
     assert predicted(found, 1200) == pytest.approx(5 + 1200 * later * 2**power)
 
@@ -57,13 +57,13 @@ def test_too_little_time_is_refused_with_what_would_do():
         pipeline_for(load("splat_7k"), [rehearsal(200, 0.02)], seconds=0.0, minutes=1.0)
 
 
-def test_a_short_training_is_reported_often_enough_to_be_corrected():
+def test_short_training_reports_often_enough_to_be_corrected():
     training = pipeline_for(load("splat_7k"), [rehearsal(200, 0.01)], seconds=8.0, minutes=1.0).settings.training
     assert training.steps < 400
     assert training.log_every <= 0.05 * training.steps + 1
 
 
-def test_the_choice_stretches_every_schedule_and_gives_its_reason():
+def test_choice_stretches_every_schedule_and_gives_its_reason():
     found = pipeline_for(load("splat_7k"), [rehearsal(200, 0.01)], seconds=40.0, minutes=1.0)
     training = found.settings.training
     assert training.steps == 3500
@@ -73,7 +73,7 @@ def test_the_choice_stretches_every_schedule_and_gives_its_reason():
     )
 
 
-def test_less_than_a_quarter_of_the_steps_is_warned_of_with_what_all_would_take(caplog):
+def test_less_than_a_quarter_of_the_steps_is_warned_of(caplog):
     """All 7 000 steps take 5 + 70 s, and some 22 of 60 s are left."""
     pipeline_for(load("splat_7k"), [rehearsal(200, 0.01)], seconds=22.6, minutes=1.0)
     assert "coarse" not in caplog.text
@@ -133,9 +133,7 @@ def short_rehearsals(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_run_in_minutes_has_the_bits_of_the_pipeline_that_it_writes(
-    tiny_scene, tmp_path, monkeypatch, short_rehearsals
-):
+def test_run_in_minutes_has_the_bits_of_its_written_pipeline(tiny_scene, tmp_path, monkeypatch, short_rehearsals):
     """The steps are corrected while it trains, wherever the clock stands, and not again where it is stopped later and
     goes on; files of the rehearsal are gone."""
     monkeypatch.setattr(minutes, "most_steps", lambda *given: 60)
@@ -168,9 +166,7 @@ def test_a_run_in_minutes_has_the_bits_of_the_pipeline_that_it_writes(
 
 
 @pytest.mark.slow
-def test_a_run_that_dies_at_the_correction_goes_on_with_what_was_chosen(
-    tiny_scene, tmp_path, monkeypatch, short_rehearsals
-):
+def test_run_that_dies_at_the_correction_keeps_what_was_chosen(tiny_scene, tmp_path, monkeypatch, short_rehearsals):
     """The pipeline is written before the checkpoint, which is of the corrected one."""
     monkeypatch.setattr(minutes, "most_steps", lambda *given: 50)
 
@@ -214,7 +210,7 @@ def test_a_rehearsal_leaves_no_trace_in_the_run(tiny_scene, tmp_path, monkeypatc
     assert next(names) == next(names)
 
 
-def test_a_training_is_not_cut_to_fewer_steps_than_keep_its_edits_apart():
+def test_training_is_not_cut_below_what_keeps_edits_apart():
     """The 300 of splat take 5 + 6 s."""
     found = [rehearsal(200, 0.02)]
     with pytest.raises(ConfigError, match=r"expected 1\.1 or more .* 300 steps fit"):

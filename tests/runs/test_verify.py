@@ -68,7 +68,7 @@ def test_a_status_of_a_newer_version_is_not_damaged(copy):
         assert damaged(copy)["status.json"] == f"{name}: Field required"
 
 
-def test_a_whole_run_has_a_line_for_each_file_and_needs_no_device(finished, monkeypatch):
+def test_complete_run_has_a_line_per_file_and_needs_no_device(finished, monkeypatch):
     monkeypatch.setattr(device, "Device", lambda *arguments: pytest.fail("opens a device"))
     assert damaged(finished) == {}
     done = command("check", finished)
@@ -148,7 +148,7 @@ def test_what_a_run_that_is_done_must_have_is_missed(name, copy):
     assert set(damaged(copy)) == {name}
 
 
-def test_renders_are_missed_with_and_without_the_list_of_checksums(copy):
+def test_missing_renders_are_noticed_with_and_without_checksums(copy):
     shutil.rmtree(copy / "renders")
     assert all(name.startswith("renders/test/") for name in damaged(copy))
     (copy / "checksums.json").unlink()

@@ -115,7 +115,7 @@ def test_a_lens_that_nerfstudio_does_not_know_is_refused(model, scene_of, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-def test_nerfstudio_finds_its_validation_views_and_one_camera_model(scene_of, tmp_path):
+def test_nerfstudio_finds_its_validation_views_and_one_model(scene_of, tmp_path):
     """It reads `camera_model` from the top alone, and asks for the views of `val_filenames` as it trains."""
     clsplat.write_cameras(scene_of("OPENCV_FISHEYE", 3), tmp_path / "a", "nerfstudio")
     table = json.loads((tmp_path / "a/transforms.json").read_text())
@@ -134,7 +134,7 @@ def test_two_kinds_of_lenses_are_refused_for_nerfstudio(scene_of, tmp_path):
         clsplat.write_cameras(make_scene(tmp_path, views, set(), None), tmp_path / "out", "nerfstudio")
 
 
-def test_a_name_with_a_blank_is_refused_for_colmap_before_a_run_trains(tiny_scene, scene_of, tmp_path):
+def test_blank_in_a_name_is_refused_for_colmap_before_training(tiny_scene, scene_of, tmp_path):
     scene = scene_of("PINHOLE")
     views = [replace(scene.views[0], name="IMG 1.png"), *scene.views[1:]]
     blank = make_scene(scene.path, views, {0}, scene.points)
@@ -161,7 +161,7 @@ def test_cameras_json_holds_the_undistorted_cameras(model, scene_of, tmp_path, c
     np.testing.assert_allclose(np.array(first["rotation"])[:, 2], scene.views[0].world_to_camera[2, :3])
 
 
-def test_distorted_photographs_are_not_copied_beside_undistorted_cameras(scene_of, tmp_path):
+def test_distorted_photographs_do_not_join_pinhole_cameras(scene_of, tmp_path):
     with pytest.raises(DataError, match=r"inria holds cameras of undistorted photographs, .*`clsplat data undistort`"):
         clsplat.write_cameras(scene_of("OPENCV"), tmp_path / "a", "inria", images="copy")
     assert not (tmp_path / "a").exists()
@@ -236,7 +236,7 @@ def with_tracks(scene, rng):
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
-def test_colmap_keeps_which_points_the_photographs_show_and_where(model, scene_of, tmp_path, rng):
+def test_colmap_keeps_which_points_photographs_show_and_where(model, scene_of, tmp_path, rng):
     scene = with_tracks(scene_of(model), rng)
     clsplat.write_cameras(scene, tmp_path / "out", "colmap", images="copy")
     found = clsplat.read_scene(tmp_path / "out").tracks
@@ -253,7 +253,7 @@ def test_colmap_keeps_which_points_the_photographs_show_and_where(model, scene_o
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
-def test_photographs_show_points_where_they_did_also_with_learned_cameras(model, scene_of, tmp_path, rng):
+def test_learned_cameras_show_points_where_photographs_did(model, scene_of, tmp_path, rng):
     scene = with_tracks(scene_of(model), rng)
     learned = [
         replace(

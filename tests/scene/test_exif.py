@@ -48,7 +48,7 @@ def test_values_that_are_no_positive_numbers_are_none(tmp_path, change):
     assert exposure_of(tmp_path / "a.jpg") is None
 
 
-def test_every_cut_and_every_changed_byte_of_the_block_is_an_exposure_or_none(tmp_path):
+def test_every_cut_or_changed_exif_block_is_an_exposure_or_none(tmp_path):
     data = with_exposure()
     for at in range(2, 130):
         for damaged in (data[:at], data[:at] + b"\xff" + data[at + 1 :], data[:at] + b"\0" + data[at + 1 :]):
@@ -106,7 +106,7 @@ def test_what_lies_beside_comes_before_the_images_own(tmp_path):
     assert camera_exposures(views) == [CameraExposure(1, 1, 1), EXPOSURE, None]
 
 
-def test_gains_of_cameras_are_ratios_of_light_to_the_power_of_the_display(tmp_path):
+def test_camera_gains_are_light_ratios_to_the_display_power(tmp_path):
     (tmp_path / "a.jpg").write_bytes(with_exposure(iso=100))
     (tmp_path / "b.jpg").write_bytes(with_exposure(iso=400))
     found = noted([view(tmp_path, "a.jpg"), view(tmp_path, "b.jpg")])

@@ -39,7 +39,7 @@ def test_the_same_points_every_time_and_others_of_another_seed():
     assert not np.array_equal(first.positions, other.positions)
 
 
-def test_one_view_that_shows_the_body_elsewhere_leaves_nothing_of_it():
+def test_one_view_showing_the_body_elsewhere_leaves_nothing():
     """A cell that lies outside the silhouette of a single view is empty."""
     views = ring()
     points = hull_points(
@@ -116,7 +116,7 @@ def test_photographs_are_read_small_and_not_all(monkeypatch):
 
 
 @pytest.mark.parametrize("alpha", [0, 255])
-def test_photographs_that_are_all_transparent_or_all_opaque_have_no_hull(alpha):
+def test_fully_transparent_or_opaque_photographs_have_no_hull(alpha):
     image = np.full((SIZE, SIZE, 4), alpha, np.uint8)
     assert not len(hull_points(ring(), np.zeros(3), 0.3, lambda view: image, 500, 0))
 

@@ -141,7 +141,7 @@ def test_undistorted_once(tmp_path, rng, monkeypatch):
     np.testing.assert_array_equal(load_photograph(view, BLACK, folder), first)
 
 
-def test_undistorted_for_each_background_of_its_transparent_pixels(tmp_path, rng):
+def test_undistorted_for_each_background_of_transparent_pixels(tmp_path, rng):
     view, folder = distorted_view(tmp_path, rng), tmp_path / "undistorted"
     store(view.image_path, np.zeros((40, 60, 4), np.uint8))
     assert load_photograph(view, BLACK, folder).max() == 0

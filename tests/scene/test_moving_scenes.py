@@ -51,7 +51,7 @@ def tiny_colmap(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_no_training_view_has_a_camera_or_a_moment_of_those_held_out(scene):
+def test_no_training_view_shares_a_held_out_camera_or_moment(scene):
     train, test = (scene.split(name) for name in ("train", "test"))
     assert (len(train), len(test)) == (2 * 5, 6)
     assert moments_of(train) == pytest.approx([0, 0.2, 0.6, 0.8, 1])
@@ -60,7 +60,7 @@ def test_no_training_view_has_a_camera_or_a_moment_of_those_held_out(scene):
     assert [len(group) for group in by_camera(scene.views)] == [5, 5, 6]
 
 
-def test_photographs_are_equal_in_static_pixels_and_differ_in_others(folder, scene):
+def test_photographs_are_equal_in_static_pixels_only(folder, scene):
     test = scene.split("test")
     still = cv2.imread(str(test[0].static_path), cv2.IMREAD_UNCHANGED)[..., 0] == 255
     images = np.stack([cv2.imread(str(view.image_path), cv2.IMREAD_UNCHANGED) for view in test])
@@ -70,7 +70,7 @@ def test_photographs_are_equal_in_static_pixels_and_differ_in_others(folder, sce
     assert (np.ptp(images[:, ~still], axis=0).max(axis=1) > 0).sum() > 20
 
 
-def test_what_stands_is_the_same_at_every_moment_and_three_things_change():
+def test_static_parts_never_change_and_three_things_do():
     first, last = shapes_at(0.0), shapes_at(0.8)
     assert first[: len(STANDING)] == last[: len(STANDING)] == STANDING
     ball, book, lamp = (first[-3:][i] for i in range(3))
@@ -186,7 +186,7 @@ def test_times_of_points_in_another_unit_are_refused(tmp_path, caplog):
     assert fault in [finding.text for finding in Inspection.of(path).findings]
 
 
-def test_a_damaged_mask_of_what_is_static_is_found_before_training(tmp_path):
+def test_damaged_static_mask_is_found_before_training(tmp_path):
     table = timed(0, 1, 2)
     for frame in table:
         frame["static_path"] = "still.png"
@@ -197,7 +197,7 @@ def test_a_damaged_mask_of_what_is_static_is_found_before_training(tmp_path):
     assert any("static mask" in finding.text for finding in Inspection.of(path).findings)
 
 
-def test_a_folder_of_frames_for_each_camera_is_a_scene_that_moves(tmp_path):
+def test_folder_of_frames_per_camera_is_a_moving_scene(tmp_path):
     folder = several_cameras(tmp_path, {"left": 3, "right": 3})
     (folder / "static").mkdir()
     cv2.imwrite(str(folder / "static" / "left.png"), np.full((48, 64), 255, np.uint8))
@@ -249,7 +249,7 @@ def test_videos_that_do_not_fit_their_cameras_are_refused(tmp_path, counts, pose
     assert message in refusal(read_scene, several_cameras(tmp_path, counts, *posed))
 
 
-def test_a_clip_that_no_camera_has_the_name_of_leaves_the_scene_to_its_reader(tmp_path):
+def test_clip_named_after_no_camera_leaves_scene_to_its_reader(tmp_path):
     several_cameras(tmp_path, {}, "0001", "0002")
     (tmp_path / "images").mkdir()
     for name in ("0001", "0002"):

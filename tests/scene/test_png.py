@@ -56,7 +56,7 @@ def test_metadata_change_no_pixel_and_print_nothing(kind, what, wrong, tmp_path,
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_a_valid_file_shows_does_not_depend_on_the_cut_metadata():
+def test_what_a_valid_file_shows_is_independent_of_cut_metadata():
     data = with_chunk(encoded(KINDS["colour"]), chunk(*METADATA["a gamma"]) + chunk(*METADATA["primaries"]))
     whole, cut = (cv2.imdecode(np.frombuffer(one, np.uint8), -1) for one in (data, pixels_only(data)))
     np.testing.assert_array_equal(whole, cut)

@@ -145,5 +145,5 @@ def test_a_camera_that_is_impossible_is_refused_whoever_read_it(tmp_path, change
 
 
 @pytest.mark.parametrize("pose", [np.zeros((3, 4)), np.full((3, 4), np.nan), np.eye(4)])
-def test_a_pose_that_is_none_is_an_error_of_the_data_whoever_read_it(pose):
+def test_invalid_pose_is_a_data_error_whoever_read_it(pose):
     assert "the pose of 'a.png'" in refusal(View, "a.png", Camera(64, 48, 60.0, 60.0, 32.0, 24.0), pose)

@@ -71,7 +71,7 @@ def test_points_a_pixel_away_or_more_tell_no_depth():
     assert within(tracks, [view.resized(2), view, view.resized(4)]).seen["a"].tolist() == [3, 5], "in several sizes"
 
 
-def test_it_is_told_at_the_size_of_training_and_without_test_views(tmp_path, rng):
+def test_it_is_reported_at_training_size_without_test_views(tmp_path, rng):
     plain = read_scene(Yard(rng).write(tmp_path / "plain"), 6)
     tested = tuple(view.name for view in plain.split("test"))
     again = read_scene(missing(tmp_path / "again", VECTOR, rng, exact=tested), 6)
@@ -133,7 +133,7 @@ def test_inspect_says_what_the_recipe_for_photographs_does():
         ("optimize.poses={start: 1}", "optimize.poses are learned, which a sky does not go with"),
     ],
 )
-def test_a_sky_that_may_be_chosen_is_off_beside_what_it_does_not_go_with(of_step, reason, tmp_path, rng, caplog):
+def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rng, caplog):
     folder, (name, value) = missing(tmp_path / "scene", VECTOR, rng), of_step.split("=", 1)
     caplog.set_level("INFO", "clsplat")
     asked = load("smoke", [f"scene.path='{folder}'", f"{name}={value}", "model.background=auto"])

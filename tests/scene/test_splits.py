@@ -86,7 +86,7 @@ def test_a_file_lists_test_views(folder):
     assert letters(read_scene(folder, Split(Choice(file="test.txt"))), "test") == "cx"
 
 
-def test_a_file_may_lie_with_the_photographs_that_a_scene_was_prepared_from(folder, tmp_path_factory):
+def test_file_may_lie_with_the_photographs_before_preparation(folder, tmp_path_factory):
     lists = tmp_path_factory.mktemp("photographs")
     (lists / "test.txt").write_text("d\n")
     assert letters(read_scene(folder, Split(Choice(file="test.txt"), folder=lists)), "test") == "d"
@@ -125,7 +125,7 @@ def test_a_photograph_that_is_left_out_is_named_in_another_list(folder):
             read_scene(folder, Split(8, train, Choice(names=["c"])))
 
 
-def test_a_photograph_that_a_number_holds_out_is_not_called_left_out(folder):
+def test_photograph_held_out_by_number_is_not_called_left_out(folder):
     names = [f"images/{letter}.jpg" for letter in LETTERS]
     Split(8, Choice(names=["b", "d"]), Choice(names=["a"])).check(folder, names)  # the placed ones decide
     with pytest.raises(DataError, match=r"'c' is left out by scene\.train"):
@@ -158,7 +158,7 @@ def test_a_sparse_capture_is_every_nth_of_the_training_views(folder):
     [(None, "fox"), (Choice(every=4), "ft"), (Choice(names=["b", "c", "d", "e"]), "ce")],
     ids=["21 training views", "6", "4"],
 )
-def test_the_fold_is_every_8th_of_the_training_views_and_two_at_least(folder, train, fold):
+def test_fold_is_every_8th_training_view_and_at_least_two(folder, train, fold):
     scene = read_scene(folder, Split(8, train, "auto"))
     assert letters(scene, "validation") == fold
     assert not {*scene.train} & {*scene.validation}
@@ -192,7 +192,7 @@ def test_a_run_knows_a_scene_whose_fold_is_another(folder):
     assert Identity.from_data(before) == whole, "a record of an earlier version"
 
 
-def test_listed_names_whose_photographs_are_missing_are_skipped_with_them(folder, caplog):
+def test_listed_names_of_missing_photographs_are_skipped(folder, caplog):
     caplog.set_level(logging.INFO)
     for letter in "cx":
         (folder / f"images/{letter}.png").unlink()
@@ -212,7 +212,7 @@ def test_listed_names_whose_photographs_are_missing_are_skipped_with_them(folder
         read_scene(folder, Split(0, train=Choice(names=["c"]), missing="skip"))
 
 
-def test_missing_photographs_are_refused_with_the_setting_that_skips_them(folder, caplog):
+def test_missing_photographs_are_refused_with_the_skip_setting(folder, caplog):
     for letter in "bc":
         (folder / "images" / f"{letter}.png").unlink()
     with pytest.raises(DataError, match=r"2 of 24 .* missing: .*put them back, or --set scene\.missing=skip"):
@@ -256,7 +256,7 @@ def test_a_choice_that_is_wrong_is_explained(setting, fault):
 
 
 @pytest.mark.parametrize(("count", "warned"), [(1, "is trained on 1 photograph:"), (2, "on 2 photographs:"), (3, "")])
-def test_fewer_than_three_training_photographs_are_warned_of_before_the_run(tiny_scene, caplog, count, warned):
+def test_fewer_than_three_photographs_give_a_warning_first(tiny_scene, caplog, count, warned):
     scene = read_scene(tiny_scene, Split(0))
     RunScene.of(SceneSettings(path=str(tiny_scene)), replace(scene, train=scene.train[:count]))
     told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]

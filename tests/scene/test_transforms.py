@@ -186,7 +186,7 @@ def test_a_null_is_no_camera_model(tmp_path: Path) -> None:
     assert len(read_scene(tmp_path).views) == 2
 
 
-def test_more_frames_than_a_scene_has_are_refused_before_they_are_read(tmp_path: Path, monkeypatch) -> None:
+def test_too_many_frames_are_refused_before_they_are_read(tmp_path: Path, monkeypatch) -> None:
     write(tmp_path, **LENS, frames=frames("a.png", "b.png", "c.png"))
     monkeypatch.setattr("clsplat.scene.transforms.MAX_FRAMES", 2)
     assert "has 3 frames; expected at most 2: divide the scene" in refusal(read_scene, tmp_path)

@@ -121,7 +121,7 @@ def test_a_model_of_which_nothing_would_be_left_is_refused(tiny_scene, spoilt, t
     assert run.whole
 
 
-def test_a_rule_that_rewrites_and_does_not_say_so_leaves_the_model_as_it_was(tiny_scene, spoilt, tmp_path, monkeypatch):
+def test_undeclared_rewriting_rule_leaves_the_model_as_it_was(tiny_scene, spoilt, tmp_path, monkeypatch):
     monkeypatch.setattr(MergeNeighbours, "rewrites", False)
     run = opened(tiny_scene, spoilt, tmp_path / "run")
     before = {name: run.model.gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
@@ -168,7 +168,7 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tiny_scene, en
     assert (run.out / "point_cloud.ply").read_bytes() == (finished.out / "point_cloud.ply").read_bytes()
 
 
-def test_a_refusal_keeps_what_was_trained_without_a_checkpoint_before(finished, tiny_scene, tmp_path, caplog):
+def test_refusal_keeps_trained_state_without_earlier_checkpoint(finished, tiny_scene, tmp_path, caplog):
     out, path = tmp_path / "run", tmp_path / "ending.yaml"
     path.write_text(ENDING.replace(", {checkpoint: {every: 1}}", "").replace("{checkpoint: {every: 1}}", ""))
     with pytest.raises(NumericError, match="would remove every Gaussian"):

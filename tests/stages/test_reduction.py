@@ -245,7 +245,7 @@ ROUNDED = PALETTE.replace(
 ).replace("palette_sh: {quality: small}", "palette_sh: {quality: small, step: 0.01}")
 
 
-def test_rounded_tables_are_held_while_the_others_are_trained_and_written_as_they_are(many, tiny_scene, tmp_path):
+def test_rounded_tables_are_frozen_and_written_as_they_are(many, tiny_scene, tmp_path):
     (tmp_path / "rounded.yaml").write_text(ROUNDED.replace("MODEL", json.dumps(str(many))))
     out = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "rounded.yaml")).out
     before, after, back = (load(out / name).tables() for name in ("before.ply", "point_cloud.ply", "model.sog"))

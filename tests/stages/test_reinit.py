@@ -81,7 +81,7 @@ def test_they_lie_on_the_surface_that_is_seen(tiny_scene, tmp_path):
     assert (run.adam, run.stats, run.model.degree) == (None, None, 1)
 
 
-def test_its_colours_are_of_the_model_where_photographs_have_their_own(tiny_scene, tmp_path):
+def test_its_colors_are_the_models_where_photographs_have_own(tiny_scene, tmp_path):
     grey = opened(tiny_scene, plane(), tmp_path / "model")
     stages = [
         {"init": {"source": "model", "file": str(tmp_path / "model.ply")}},
@@ -112,7 +112,7 @@ def test_they_lie_where_the_cameras_were_learnt_to_be(tiny_scene, tmp_path):
     assert not np.array_equal(moved.model.gaussians.get("means"), run.model.gaussians.get("means"))
 
 
-def test_a_pixel_is_drawn_once_by_what_covers_it_and_has_its_place_and_colour(rng):
+def test_pixel_is_drawn_once_with_its_position_and_color(rng):
     view = View.looking_at([1, 2, 3], [0, 0.5, 0], [0, 0, 1], Camera(30, 20, 25.0, 27.0, 14.0, 11.0))
     alpha = np.where(np.arange(30) < 15, 0.9, 0.1) * (np.arange(20)[:, None] > 3)
     depth = rng.uniform(1, 5, (20, 30)).astype(np.float32)

@@ -49,7 +49,7 @@ def test_colours_that_differ_are_said_where_none_are_trained(gained, has_colours
     assert all("1.5 dB nearer" in text and "optimize.colours=gain" in text for text in texts)
 
 
-def test_photographs_whose_colours_cannot_be_fitted_say_nothing_of_them():
+def test_photographs_whose_colors_cannot_be_fitted_are_ignored():
     found = [*measured([30, 30], 1.5), ViewMetrics("half.jpg", 30, 0.9, {}, {"psnr_affine": 90.0})]
     assert "1.5 dB nearer" in "".join(of_training_views(found, has_colours=False))
     assert not [*of_training_views(found[2:], has_colours=False)]

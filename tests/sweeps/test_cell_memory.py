@@ -28,7 +28,7 @@ def held(gaussians: int, name: str, bits: str = "x") -> Place:
     return Place("w", name, bits, memory=memory, allocation=memory)
 
 
-def test_a_cell_runs_where_its_memory_is_and_where_nothing_holds_it_the_others_go_on(store, terms):
+def test_cell_runs_where_its_memory_is_and_others_go_on(store, terms):
     small, large, told = held(10, "small"), held(200_000, "large"), {}
     engine = Fake(*[Outcome("published")] * 3, places=(small, large))
     (grows, huge, free) = wanted(1, 3, 2)
@@ -47,9 +47,7 @@ def test_a_cell_runs_where_its_memory_is_and_where_nothing_holds_it_the_others_g
 
 
 @pytest.mark.parametrize("joins", [True, False])
-def test_where_devices_may_join_a_cell_waits_for_a_larger_one_and_is_told_once(
-    store, terms, caplog, monkeypatch, joins
-):
+def test_cell_waits_for_a_larger_device_that_may_join(store, terms, caplog, monkeypatch, joins):
     monkeypatch.setattr("clsplat.cluster.drive.LOOK", 0.0)
     engine, told, looks = Fake(Outcome("published"), places=(held(10, "small"),)), [], []
 
@@ -70,7 +68,7 @@ def test_where_devices_may_join_a_cell_waits_for_a_larger_one_and_is_told_once(
     assert looks[0] == 0 < looks[-1]
 
 
-def test_where_no_device_holds_the_end_of_growth_one_that_holds_the_beginning_takes_it(store, terms):
+def test_device_that_holds_the_start_takes_an_unholdable_cell(store, terms):
     engine = Fake(Outcome("published"), places=(held(10, "small"), held(20_000, "middle")))
     (one,) = wanted(1)
     Drive(store, engine, True, terms).run([replace(one, need=replace(NEED, first=5000))])
@@ -94,7 +92,7 @@ def test_the_need_of_a_cell_is_the_plan_of_its_training(tiny_scene, tmp_path):
     assert need.plan(held(10**5, "a")).limit >= 10**5 / 2
 
 
-def test_the_need_of_what_moves_is_the_plan_that_its_first_stage_requires(tiny_scene):
+def test_need_of_motion_is_the_plan_its_first_stage_requires(tiny_scene):
     pipeline = load("dynamic_7k", ["init.source=random", "init.count=700"])
     need, limits, asked = Need.of(pipeline, read_scene(tiny_scene)), held(10**5, "a"), []
 
@@ -109,7 +107,7 @@ def test_the_need_of_what_moves_is_the_plan_that_its_first_stage_requires(tiny_s
     assert asked == [need.plan(limits)]
 
 
-def test_a_cell_whose_harmonics_may_move_to_the_host_needs_less_of_a_device_that_has_its_own_memory():
+def test_cell_with_offloaded_sh_needs_less_device_memory():
     apart, open_one = held(10_000, "a"), replace(NEED, harmonics="auto")
     assert open_one.limit_on(apart) > NEED.limit_on(apart)
     assert open_one.limit_on(replace(apart, unified=True)) == NEED.limit_on(apart)

@@ -92,7 +92,7 @@ def test_a_result_that_was_damaged_is_run_again(store, terms):
 
 
 @pytest.mark.parametrize(("bits", "state"), [(b"bits", "published"), (b"others", "different")])
-def test_of_two_writers_the_first_is_published_and_the_second_compares(store, terms, bits, state):
+def test_first_of_two_writers_publishes_and_the_second_compares(store, terms, bits, state):
     folder = store.add(CELL)
     first = folder.begin("a", terms.since)
     (first.path / "point_cloud.ply").write_bytes(b"bits")
@@ -165,7 +165,7 @@ def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, ter
     assert told(store).count("start") == count + 2
 
 
-def test_a_failure_beside_a_newer_checkpoint_that_is_damaged_counts(few_steps, store, terms):
+def test_failure_beside_a_newer_damaged_checkpoint_counts(few_steps, store, terms):
     old = Attempt(store.add(CELL).path / ATTEMPTS / ("a" * 32))
     shutil.copytree(few_steps, old.path)
     newest = max((old.path / CHECKPOINTS).glob("step_*.npz"))
@@ -176,7 +176,7 @@ def test_a_failure_beside_a_newer_checkpoint_that_is_damaged_counts(few_steps, s
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped"])
-def test_an_attempt_goes_on_from_the_newest_checkpoint_that_is_whole(few_steps, store, terms, damage):
+def test_attempt_resumes_from_the_newest_intact_checkpoint(few_steps, store, terms, damage):
     folder = store.add(CELL)
     old = Attempt(folder.path / ATTEMPTS / ("a" * 32))
     shutil.copytree(few_steps, old.path)
@@ -194,7 +194,7 @@ def test_an_attempt_goes_on_from_the_newest_checkpoint_that_is_whole(few_steps, 
     assert not os.path.samefile(old.path / "metrics.jsonl", new.path / "metrics.jsonl"), "a run appends to it"
 
 
-def test_what_is_cancelled_saves_and_stops_and_a_later_call_goes_on(store, terms):
+def test_cancelled_cell_saves_and_stops_and_a_later_call_resumes(store, terms):
     threading.Timer(0.3, store.cancel).start()
     outcome = run_cell(CELL, store, command(WAITS), terms)
     assert (outcome.state, outcome.exit_code) == ("stopped", 130)
@@ -204,7 +204,7 @@ def test_what_is_cancelled_saves_and_stops_and_a_later_call_goes_on(store, terms
     assert run_cell(CELL, store, command(WRITES), Terms(store.now())).state == "published"
 
 
-def test_one_cell_is_cancelled_by_its_name_or_the_beginning_of_its_key(store, terms):
+def test_cell_is_cancelled_by_name_or_start_of_its_key(store, terms):
     other = replace(CELL, spec={**SPEC, "scene": "t"})
     store.add(CELL)
     store.add(other)
@@ -244,7 +244,7 @@ def test_an_attempt_that_was_removed_ends_its_run(store, terms, monkeypatch):
     assert "was removed while its run went on" in outcome.message
 
 
-def test_a_process_that_was_frozen_until_its_attempt_was_removed_takes_the_result(store, terms, monkeypatch):
+def test_process_frozen_until_its_attempt_is_gone_takes_a_result(store, terms, monkeypatch):
     monkeypatch.setattr("clsplat.cluster.attempt.BEAT", 0.0)
     folder = store.add(CELL)
     other = folder.begin("other", terms.since)
@@ -256,7 +256,7 @@ def test_a_process_that_was_frozen_until_its_attempt_was_removed_takes_the_resul
     assert told(store) == ["start", "skip"]
 
 
-def test_a_process_that_was_frozen_after_its_run_takes_the_result(store, terms, monkeypatch):
+def test_process_frozen_after_its_run_takes_the_result(store, terms, monkeypatch):
     folder = store.add(CELL)
     other = folder.begin("other", terms.since)
     (other.path / "point_cloud.ply").write_bytes(b"bits")
@@ -319,7 +319,7 @@ def test_a_store_that_moved_goes_on(few_steps, store, terms, tmp_path):
     assert moved.add(CELL).begin("b", terms.since).lease["from"] == "step_000012.npz"
 
 
-def test_what_a_cell_undistorts_is_there_for_the_others_of_its_scene(store, terms):
+def test_undistorted_photographs_are_shared_by_cells_of_a_scene(store, terms):
     cells = [CELL, replace(CELL, spec={**SPEC, "seed": 1}), replace(CELL, spec={**SPEC, "scene": "another"})]
     assert {run_cell(cell, store, command(UNDISTORTS), terms).state for cell in cells} == {"published"}
     results = [store.folder(cell.key).result for cell in cells]
@@ -358,7 +358,7 @@ def test_in_any_class_a_cell_stays_in_that_it_has_begun_in(store, terms):
 
 
 @pytest.mark.parametrize("published", ["x", "y", None])
-def test_of_classes_with_as_many_devices_that_with_most_results_is_taken(store, terms, published):
+def test_of_equal_classes_that_with_most_results_is_taken(store, terms, published):
     for one in wanted(1, 2) if published else []:
         run_cell(one.on(published), store, command(WRITES), terms)
     engine = Fake(*[Outcome("published")] * 3, places=PLACES[1::-1])
@@ -366,7 +366,7 @@ def test_of_classes_with_as_many_devices_that_with_most_results_is_taken(store, 
     assert {bits for *_, bits in engine.started} == {published or "x"}
 
 
-def test_a_sweep_whose_class_has_no_device_any_more_ends_and_names_the_others(store, terms, monkeypatch):
+def test_sweep_whose_class_has_no_device_left_names_the_others(store, terms, monkeypatch):
     monkeypatch.setattr("clsplat.cluster.drive.ALONE", 0.2)
     drive = Drive(store, Fake(places=PLACES), True, terms, bits="z")
     looks = iter(range(40))
@@ -422,7 +422,7 @@ def test_the_engine_of_this_process_runs_a_cell(store, terms, monkeypatch):
     assert ticket.outcome().state == "published"
 
 
-def test_the_page_of_a_store_shows_cells_that_run_and_have_run_and_escapes_their_names(few_steps, store, terms):
+def test_store_page_shows_all_cells_and_escapes_their_names(few_steps, store, terms):
     stages = {"stages": [{"init": {}}, {"optimize": {"steps": 12}}]}
     copies = f"import shutil, sys; shutil.copytree({str(few_steps)!r}, sys.argv[2], dirs_exist_ok=True)"
     pipeline = {**SPEC["pipeline"], **stages}

@@ -151,7 +151,7 @@ def test_what_sizes_mean_is_said_where_the_training_saw_others(make_run, tmp_pat
     assert "sizes are shares of the photographs&#39; own; trained at 1/2, 1/4" in page_of(tmp_path, halves)
 
 
-def test_lines_of_runs_with_one_seed_are_told_apart_by_their_folders(make_run, tmp_path):
+def test_curves_of_runs_with_one_seed_are_named_by_folder(make_run, tmp_path):
     names = re.findall(r">(A [^<]+)</tspan>", page_of(tmp_path, make_run("first"), make_run("second")))
     assert set(names) == {"A first", "A second (dashed)"}
     seeds = re.findall(r">(A [^<]+)</tspan>", page_of(tmp_path, make_run("third", "seed=1"), tmp_path / "first"))

@@ -111,7 +111,7 @@ def test_a_file_that_changes_while_a_cell_runs_fails_it(store, terms, tmp_path):
     assert (outcome.state, outcome.exit_code) == ("failed", 3)
 
 
-def test_a_run_goes_on_with_the_same_file_at_another_place_and_not_with_another(tiny_scene, tmp_path, caplog):
+def test_run_resumes_with_a_moved_file_but_not_another(tiny_scene, tmp_path, caplog):
     lists = [write(tmp_path / f"{name}.txt", f"train/r_00{view}\n") for name, view in zip("abc", "001", strict=True)]
     chosen = [f"scene.holdout={{file: '{path}'}}" for path in lists]
     train(tiny_scene, tmp_path / "run", *FEW, chosen[0])
@@ -125,7 +125,7 @@ def test_a_run_goes_on_with_the_same_file_at_another_place_and_not_with_another(
     assert "resumed at step 8" in caplog.text
 
 
-def test_libraries_that_compress_models_and_place_photographs_are_in_keys(tiny_scene, tmp_path, monkeypatch):
+def test_libraries_that_change_results_are_in_keys(tiny_scene, tmp_path, monkeypatch):
     before = fingerprint.code_digest.__wrapped__()
     monkeypatch.setattr("zlib.ZLIB_RUNTIME_VERSION", "0")
     assert fingerprint.code_digest.__wrapped__() != before

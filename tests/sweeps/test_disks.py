@@ -53,7 +53,7 @@ def finish(sweep: Sweep, expected: dict[str, str]) -> None:
     assert sweep.events("publish") == CELLS
 
 
-def test_a_full_disk_ends_a_sweep_which_goes_on_when_there_is_space(tiny_scene, tmp_path, expected):
+def test_full_disk_ends_a_sweep_that_resumes_when_there_is_space(tiny_scene, tmp_path, expected):
     sweep = Sweep(tmp_path, tiny_scene, CELLS, "inline")
     with mounted(sweep.store.root, "-t", "tmpfs", "-o", "size=1m", "tmpfs"):
         process = sweep.start()

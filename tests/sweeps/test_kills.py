@@ -127,7 +127,7 @@ def offer(port: int) -> "subprocess.Popen[str]":
     return subprocess.Popen(words, text=True)
 
 
-def test_cells_go_on_when_a_worker_of_a_scheduler_is_gone_and_another_comes(tiny_scene, tmp_path, expected):
+def test_cells_resume_when_a_worker_is_lost_and_another_comes(tiny_scene, tmp_path, expected):
     port, processes = free_port(), []
     sweep = Sweep(tmp_path, tiny_scene, CELLS, f"dask://127.0.0.1:{port}")
     with scheduler(port, processes):
@@ -141,7 +141,7 @@ def test_cells_go_on_when_a_worker_of_a_scheduler_is_gone_and_another_comes(tiny
         assert sweep.events("publish") == CELLS
 
 
-def test_a_scheduler_that_is_killed_ends_a_sweep_which_goes_on_with_another(tiny_scene, tmp_path, expected):
+def test_killed_scheduler_ends_a_sweep_that_resumes_with_another(tiny_scene, tmp_path, expected):
     port, processes = free_port(), []
     sweep = Sweep(tmp_path, tiny_scene, CELLS, f"dask://127.0.0.1:{port}")
     with scheduler(port, processes) as first:

@@ -39,7 +39,7 @@ def test_cores_are_shared_in_equal_parts_of_neighbours():
     assert cores.shares(range(6), 4) == [(0,), (1,), (2,), (3,)], "all have as many"
 
 
-def test_as_many_threads_as_cores_and_the_device_need_not_prove_itself_again(monkeypatch):
+def test_threads_match_cores_and_devices_need_no_second_check(monkeypatch):
     found = cores.limited((3, 4), {"a": "b"})
     assert found == {"a": "b", **dict.fromkeys(cores.LIMITS, "2")}
     before = code_variables()
@@ -65,7 +65,7 @@ def measured(monkeypatch: pytest.MonkeyPatch, own: int, rates: dict[int, float |
     ("rates", "best"),
     [({1: 10.0, 2: 10.1, 4: 9.0}, 1), ({1: 10.0, 2: 19.5, 4: 20.0}, 2), ({1: 1.0, 2: 2.0, 4: None}, 2)],
 )
-def test_the_fewest_processes_that_are_about_as_fast_are_taken_by_a_sweep(rates, best, monkeypatch, caplog):
+def test_sweep_takes_the_fewest_processes_of_about_equal_speed(rates, best, monkeypatch, caplog):
     assert known_packing(CPU) is None
     assert shares_of([CPU], "auto") == [[()]]
     found = measured(monkeypatch, 4, rates)

@@ -34,7 +34,7 @@ main()
 """
 
 
-def test_a_run_that_is_killed_goes_on_and_its_cell_has_the_bits_of_one_that_was_left_alone(
+def test_killed_run_resumes_and_its_cell_has_undisturbed_bits(
     tiny_scene: Path, few_steps: Path, store: Store, terms: Terms
 ):
     """CLSPLAT_KILLS=20 kills workers, runs, drivers and schedulers, over six cells."""

@@ -80,7 +80,7 @@ def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_
     assert [event["event"] for event in store.events()].count("start") == 2
 
 
-def test_a_run_that_went_on_in_the_folder_of_a_matrix_is_not_shown_as_its_cell(file, runs, few_steps, tmp_path):
+def test_run_continued_in_a_matrix_folder_is_not_shown_as_cell(file, runs, few_steps, tmp_path):
     out = commands.run(file, out=tmp_path / "out")
     one = out / "tiny-seed=0"
     model, expected = one / "point_cloud.ply", (few_steps / "point_cloud.ply").read_bytes()
@@ -133,7 +133,7 @@ def test_a_queue_runs_a_cell_by_its_number(file, runs, tmp_path):
     assert error.value.exit_code == 6
 
 
-def test_another_execution_takes_the_place_of_the_files_and_is_noted(file, tmp_path):
+def test_another_execution_replaces_the_files_and_is_noted(file, tmp_path):
     on = tmp_path / "lab.yaml"
     on.write_text("engine: inline\n")
     job = Job.open(str(file), out=tmp_path / "out", execution=values_of(on))
@@ -247,7 +247,7 @@ def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
         library.security(authority.model_copy(update={key: str(folder / name) for key, name in changed.items()}))
 
 
-def test_a_worker_looks_at_its_certificates_before_it_proves_a_device(authority, monkeypatch):
+def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeypatch):
     pytest.importorskip("clsplat.cluster.library")
     monkeypatch.setattr("clsplat.cluster.offer.places", lambda *words: pytest.fail("a device is proved"))
     with pytest.raises(ConfigError, match=r"tls.ca \(--tls-ca\): gone.pem"):
@@ -341,7 +341,7 @@ def listening() -> set[str]:
     return {one.laddr.ip for one in found if one.status == psutil.CONN_LISTEN}
 
 
-def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_path, monkeypatch):
+def test_local_engine_runs_cells_in_parallel_on_loopback_alone(tmp_path, monkeypatch):
     scheduler = pytest.importorskip("clsplat.cluster.scheduler")
     library = pytest.importorskip("clsplat.cluster.library")
     places = [Place("local", "one", "b"), Place("local", "two", "b")]

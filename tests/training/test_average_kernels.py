@@ -15,7 +15,7 @@ def test_the_average_of_three_steps(device, rng, count):
     hold(average_figures(device, rng, count))
 
 
-def test_rows_without_an_average_keep_their_values_and_the_tables_go(device, rng):
+def test_rows_without_an_average_keep_values_and_tables_go(device, rng):
     gaussians = random_case(rng, 20).model(device).gaussians
     before = {name: gaussians.get(name) for name in gaussians.tables}
     average.attach(gaussians)

@@ -45,7 +45,7 @@ def pipeline(tmp_path):
     return str(file)
 
 
-def test_a_run_ends_with_the_average_of_the_steps_that_were_added(tiny_scene, tmp_path, pipeline):
+def test_run_ends_with_the_average_of_the_added_steps(tiny_scene, tmp_path, pipeline):
     """Those at 18, 20, ... 28: no edit follows the last step."""
     run = train(tiny_scene, tmp_path / "run", pipeline=pipeline)
     of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.saved(run.out)}

@@ -97,7 +97,7 @@ def equal_ends(one: Path, other: Path) -> None:
 # ---- the best model
 
 
-def test_a_training_leaves_the_model_that_is_best_at_validation_views(best):
+def test_training_leaves_the_best_model_on_validation_views(best):
     measured = psnr_of(best, "validation")
     assert sorted(measured) == list(range(4, 41, 4))
     assert max(measured, key=measured.__getitem__) == BEST
@@ -196,13 +196,13 @@ def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, 
 @pytest.mark.parametrize(
     "own", ["{every: 50, split: validation, stop: 40}", "{every: 60, split: validation, start: 60}"]
 )
-def test_a_measurement_that_is_never_due_is_refused_before_the_first_step(tiny_scene, tmp_path, pipeline, own):
+def test_measurement_never_due_is_refused_before_the_first_step(tiny_scene, tmp_path, pipeline, own):
     during = f"optimize.during=[evaluate: {own}]"
     with pytest.raises(ConfigError, match="needs a measurement of the validation views before the last step"):
         train(tiny_scene, tmp_path / "run", during, pipeline=pipeline)
 
 
-def test_measurements_of_a_later_training_count_from_where_it_begins(tmp_path):
+def test_measurements_of_a_later_training_count_from_its_start(tmp_path):
     during = "during: [{evaluate: {every: 8, split: validation}}]"
     stages = "stages:\n  - {}\n  - init\n  - optimize: {{steps: {}, losses: [l1], keep: best, {}}}\n"
     for first in ("train_field: {steps: 4, during: []}", "init\n  - optimize: {steps: 4, losses: [l1]}"):
@@ -213,13 +213,13 @@ def test_measurements_of_a_later_training_count_from_where_it_begins(tmp_path):
             load(str(tmp_path / "x.yaml"))
 
 
-def test_a_measurement_at_another_size_is_not_the_one_to_choose_by(tiny_scene, tmp_path, pipeline):
+def test_measurement_at_another_size_is_not_used_to_choose(tiny_scene, tmp_path, pipeline):
     during = "optimize.during=[evaluate: {every: 4, split: validation, downscales: [2]}]"
     run = train(tiny_scene, tmp_path / "run", during, "optimize.steps=100", pipeline=pipeline)
     assert run.best.evaluations + run.best.since == 1, "every 100 steps"
 
 
-def test_a_training_that_patience_ends_has_a_checkpoint_of_its_end(tiny_scene, tmp_path, pipeline):
+def test_training_ended_by_patience_has_a_final_checkpoint(tiny_scene, tmp_path, pipeline):
     """Also where `during` names the checkpoint first."""
     during = "optimize.during=[checkpoint: {every: 40}, evaluate: {every: 4, split: validation}]"
     run = train(tiny_scene, tmp_path / "run", during, *PATIENT, pipeline=pipeline)
@@ -239,7 +239,7 @@ def test_without_a_measurement_of_ones_own_there_are_twenty(pipeline):
 # ---- training again on all
 
 
-def test_a_refit_has_the_bits_of_a_run_of_so_many_steps_without_validation(tiny_scene, tmp_path, pipeline, refit, best):
+def test_refit_has_the_bits_of_a_run_without_validation(tiny_scene, tmp_path, pipeline, refit, best):
     plain = ("scene.validation=0", "optimize.keep=last", f"optimize.steps={BEST}")
     expected = train(tiny_scene, tmp_path / "plain", *plain, pipeline=pipeline).out
     assert digest(refit) == digest(expected)
@@ -392,7 +392,7 @@ def test_six_decibels_apart_are_learnt_by_heart(train_, validation, expected):
     assert expected in Measured(step=8, train=train_, validation=validation).told("validation")
 
 
-def test_a_run_without_validation_is_told_when_it_has_learnt_by_heart(tiny_scene, tmp_path, pipeline):
+def test_run_without_validation_is_told_when_it_overfits(tiny_scene, tmp_path, pipeline):
     plain = ("scene.validation=0", "optimize.keep=last", "optimize.steps=8")
     run = train(tiny_scene, tmp_path / "run", *plain, pipeline=pipeline)
     assert parting(run) == ""

@@ -58,7 +58,7 @@ def test_every_cut_and_every_other_size_is_noticed(tmp_path):
             archive.read(file)
 
 
-def test_sizes_are_compared_with_the_file_before_anything_is_read(tmp_path, monkeypatch):
+def test_sizes_are_compared_with_the_file_before_reading(tmp_path, monkeypatch):
     data, file = written(NOTES, ARRAYS), tmp_path / "a.npz"
     at = data.rindex(b"PK\x01\x02")  # in the list of contents: both sizes of the last member
     file.write_bytes(data[: at + 20] + b"\xf0\xff\xff\x7f" * 2 + data[at + 28 :])

@@ -44,7 +44,7 @@ def names_of(run) -> list[str]:
     return sorted(path.name for path in (run.out / "checkpoints").iterdir())
 
 
-def test_an_older_checkpoint_that_cannot_be_removed_stays_and_one_line_says_so(run, stuck, caplog):
+def test_unremovable_older_checkpoint_stays_and_is_reported(run, stuck, caplog):
     stuck.add("step_000001.npz")
     for _ in range(2):
         checkpoint.save(run, keep=1)
@@ -61,7 +61,7 @@ def test_a_failed_state_that_cannot_be_removed_hides_no_advice(run, stuck):
         checkpoint.save(run)
 
 
-def test_a_damaged_later_checkpoint_that_cannot_be_renamed_takes_no_place(run, stuck, caplog):
+def test_unrenamable_damaged_checkpoint_does_not_count(run, stuck, caplog):
     later = run.out / "checkpoints" / "step_000009.npz"
     later.touch()
     stuck.add(later.name)

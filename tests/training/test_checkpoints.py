@@ -53,7 +53,7 @@ def test_a_checkpoint_that_no_run_has_saved_is_passed_over(name, killed_run, tin
 
 
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:300], lambda data: data[:-30]])
-def test_the_one_before_a_damaged_checkpoint_leads_to_the_same_bits(damage, killed_run, tiny_scene, few_steps, caplog):
+def test_checkpoint_before_a_damaged_one_gives_the_same_bits(damage, killed_run, tiny_scene, few_steps, caplog):
     newest = killed_run / "checkpoints" / "step_000008.npz"
     shutil.copy(newest, killed_run / "checkpoints" / "step_000009.npz")
     last = killed_run / "checkpoints" / "step_000009.npz"
@@ -68,9 +68,7 @@ def test_the_one_before_a_damaged_checkpoint_leads_to_the_same_bits(damage, kill
 @pytest.mark.parametrize(
     ("error", "code"), [(MemoryError(), 5), (OSError(errno.ESTALE, "stale"), 7), (OSError(errno.EACCES, "refused"), 7)]
 )
-def test_a_checkpoint_that_cannot_be_read_just_now_is_not_damaged(
-    error, code, killed_run, tiny_scene, few_steps, monkeypatch
-):
+def test_momentarily_unreadable_checkpoint_is_not_damaged(error, code, killed_run, tiny_scene, few_steps, monkeypatch):
     shutil.copy(killed_run / "checkpoints" / "step_000008.npz", killed_run / "checkpoints" / "step_000009.npz")
     before, read = steps_saved(killed_run), zipfile.ZipFile.read
 
@@ -88,9 +86,7 @@ def test_a_checkpoint_that_cannot_be_read_just_now_is_not_damaged(
     assert steps_saved(killed_run) == before
 
 
-def test_the_one_before_a_checkpoint_on_a_bad_part_of_the_disk_is_used(
-    killed_run, tiny_scene, few_steps, monkeypatch, caplog
-):
+def test_checkpoint_before_one_on_a_bad_disk_block_is_used(killed_run, tiny_scene, few_steps, monkeypatch, caplog):
     shutil.copy(killed_run / "checkpoints" / "step_000008.npz", killed_run / "checkpoints" / "step_000009.npz")
     read = zipfile.ZipFile.read
 
@@ -153,7 +149,7 @@ def test_a_run_whose_scene_has_moved_goes_on_where_it_is_now(killed_run, few_ste
     assert (killed_run / "point_cloud.ply").read_bytes() == (few_steps / "point_cloud.ply").read_bytes()
 
 
-def test_checkpoints_by_time_come_between_those_by_step_and_change_no_bits(tiny_scene, few_steps, tmp_path):
+def test_checkpoints_by_time_come_in_between_and_keep_the_bits(tiny_scene, few_steps, tmp_path):
     train(tiny_scene, tmp_path / "run", *FEW, "checkpoint.every_seconds=1e-6", "checkpoint.keep=20")
     assert steps_saved(tmp_path / "run") == [f"step_{step:06d}.npz" for step in range(1, 13)]
     assert digest(tmp_path / "run") == digest(few_steps)

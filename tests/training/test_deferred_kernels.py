@@ -167,7 +167,7 @@ def test_who_changes_rows_finds_them_on_the_host(device, rng, edit):
         np.testing.assert_array_equal(table, on_device[name], err_msg=name)
 
 
-def test_whoever_needs_all_rows_on_the_device_is_told_that_they_lie_on_the_host(device, rng):
+def test_needing_all_rows_explains_that_they_are_on_the_host(device, rng):
     model = random_case(rng, 20).model(device)
     before = model.gaussians.get("sh_rest")
     model.gaussians.move_to_host()

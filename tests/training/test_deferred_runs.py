@@ -151,7 +151,7 @@ def test_a_run_that_sees_few_goes_on_from_every_checkpoint(few_steps, tiny_scene
         assert digest(out) == expected
 
 
-def test_what_the_device_does_not_hold_at_first_begins_on_the_host(spread, tiny_scene, tmp_path, small, caplog):
+def test_what_the_device_does_not_hold_begins_on_the_host(spread, tiny_scene, tmp_path, small, caplog):
     """As where the settings say it."""
     for name, more in (("auto", ()), ("host", (HOST,))):
         with caplog.at_level("INFO", "clsplat"):
@@ -191,7 +191,7 @@ def test_a_dry_run_says_that_the_harmonics_will_lie_on_the_host(tiny_scene, tmp_
     assert "on the host" not in describe(load("smoke", own[:1]), tmp_path / "run", None, "new")
 
 
-def test_the_device_holds_what_a_view_sees_where_harmonics_lie_on_the_host(spread, tiny_scene, tmp_path):
+def test_device_holds_what_a_view_sees_of_host_harmonics(spread, tiny_scene, tmp_path):
     """Half of these Gaussians are far apart: the last view sees some of the blocks."""
     run = train(tiny_scene, tmp_path / "run", *spread, HOST)
     gaussians = run.model.gaussians
@@ -201,7 +201,7 @@ def test_the_device_holds_what_a_view_sees_where_harmonics_lie_on_the_host(sprea
     assert 0 < len(gaussians.on_host.held) <= gaussians.tables["sh_rest"].array.shape[0]
 
 
-def test_what_needs_all_harmonics_on_the_device_is_refused_before(tiny_scene):
+def test_what_needs_all_harmonics_on_the_device_is_refused(tiny_scene):
     own = f"scene.path='{tiny_scene}'", "optimize.during=[{add_to_average: {every: 2}}]"
     assert load("smoke", own)
     with pytest.raises(ConfigError, match=r"stages\[1\] optimize: add_to_average changes the harmonics of all"):

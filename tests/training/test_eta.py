@@ -49,7 +49,7 @@ def test_where_no_rule_grows_the_model_it_is_a_product():
     assert forecast.seconds_left == 25
 
 
-def test_growth_ends_with_the_last_rule_that_acts_before_the_last_step():
+def test_growth_ends_with_the_last_rule_before_the_last_step():
     assert Forecast.of(0, 1000, [lambda step: step % 100 == 0 and step < 700]).growth_end == 600
     assert Forecast.of(0, 1000, [lambda step: step % 100 == 0]).growth_end == 900, "no edit follows the last step"
     assert Forecast.of(950, 1000, [lambda step: step % 100 == 0]).growth_end == 950

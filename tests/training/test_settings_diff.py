@@ -104,7 +104,7 @@ def test_a_stage_of_a_plugin_says_what_of_it_may_change(pipeline, without_plugin
     assert set(kinds(pipeline(TRAINING), before).values()) == {None}, "another stage in the place of one"
 
 
-def test_stages_that_only_read_the_model_may_change_in_all_their_keys():
+def test_stages_that_only_read_the_model_may_change_entirely():
     for name in ("evaluate", "export", "render", "report", "checkpoint"):
         kind = variants(Stage)[name]
         assert {resumable(kind, key) for key in kind.model_fields if key != "stage"} == {"output"}, name

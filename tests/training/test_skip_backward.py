@@ -105,7 +105,7 @@ def test_a_loss_that_is_not_finite_changes_nothing():
     assert skip.decide("a", 1.0, numbers).skipped, "a loss that is the average is not above it"
 
 
-def test_a_view_has_an_average_at_each_size_and_none_up_to_the_start():
+def test_view_has_an_average_per_size_and_none_before_the_start():
     skip = Skip(start=8)
     numbers: dict[str, float] = {}
     for step, width in ((8, 40), (9, 40), (10, 20), (11, 40)):
@@ -126,7 +126,7 @@ def test_a_share_that_is_none_is_refused(least):
         load("smoke", ["optimize.skip.start=9", f"optimize.skip.least={least}"])
 
 
-def test_a_stretched_recipe_skips_from_a_later_step_with_the_same_warm_up():
+def test_stretched_recipe_skips_later_with_the_same_warm_up():
     skip = stretched(load("splat_7k", ["optimize.skip.start=4000"]).settings, 2.0).training.skip
     assert skip == Skip(start=8000, decay=0.95, warm_up=500, least="auto")
     assert load("splat_7k").settings.training.skip is None
@@ -171,7 +171,7 @@ def test_a_skipped_step_leaves_all_as_it_was(tiny_scene, tmp_path, more):
     assert run.adam.updates["means"] == run.step - sum(skipped) == 50 - sum(skipped)
 
 
-def test_each_size_of_a_resolution_by_step_has_averages_of_its_own(tiny_scene, tmp_path):
+def test_each_size_of_a_resolution_schedule_has_own_averages(tiny_scene, tmp_path):
     """Photographs are half as large up to step 19."""
     sizes = "optimize.views.resolution={points: [[0, 2], [20, 1]], between: steps}"
     run, steps = begun(tiny_scene, tmp_path, "optimize.skip={start: 2, warm_up: 40}", sizes, *NO_EDITS)

@@ -120,7 +120,7 @@ def test_a_choice_is_written_with_its_reason(learned):
     assert f"model.background: on, since {found.reason}" in (learned / "log.txt").read_text()
 
 
-def test_where_photographs_show_none_the_bits_are_those_without_the_key(tiny_scene, tmp_path, few_steps, rng):
+def test_without_visible_sky_the_bits_are_those_without_the_key(tiny_scene, tmp_path, few_steps, rng):
     asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "model.background=auto"])
     run_pipeline(asked, tmp_path / "run", None, "new")
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
@@ -177,7 +177,7 @@ def test_what_a_run_chose_is_no_setting_of_its_pipeline():
     assert without_choices(asked) == without_choices(chosen)
 
 
-def test_directions_in_which_no_photograph_shows_sky_are_left_to_gaussians(yard):
+def test_directions_without_visible_sky_are_left_to_gaussians(yard):
     """The sky begins with the colours of the photographs."""
     _, folder = yard
     scene = clsplat.read_scene(folder)

@@ -60,7 +60,7 @@ def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, tmp_path, pipeline):
     assert without[0] != whole
 
 
-def test_opacities_fall_by_the_same_share_in_each_pass_over_the_photographs(tiny_scene, tmp_path, pipeline):
+def test_opacities_decay_by_the_same_share_in_each_pass(tiny_scene, tmp_path, pipeline):
     """Where nothing else changes them: eleven steps, of which five are followed by a decay, of eight photographs."""
     still = "optimize.rates.logit_opacity=0", "densify.start=100"
     found = {}

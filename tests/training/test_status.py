@@ -82,7 +82,7 @@ def test_every_status_of_a_run_fits_the_schema(written, tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     ("failure", "state", "code"), [(OutputError("no space"), "failed", 7), (KeyboardInterrupt(), "interrupted", 130)]
 )
-def test_a_run_that_ends_early_names_the_stage_and_fits_the_schema(
+def test_run_that_ends_early_names_the_stage_and_fits_the_schema(
     failure, state, code, written, tiny_scene, tmp_path, monkeypatch
 ):
     def fail(*arguments, **settings):

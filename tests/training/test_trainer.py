@@ -86,7 +86,7 @@ def test_differentiating_updates_nothing(device, rng):
 
 
 @pytest.mark.parametrize("loss", [Loss(), print])
-def test_what_is_neither_a_loss_of_images_nor_a_penalty_is_refused(device, rng, loss):
+def test_what_is_neither_image_loss_nor_penalty_is_refused(device, rng, loss):
     trainer, photograph = trainer_of(device, rng, [L1(), loss])
     with pytest.raises(ConfigError, match=r"^the loss \w+: expected a subclass of ImageLoss or of Penalty$"):
         trainer.step(photograph, 1)

@@ -181,7 +181,7 @@ def test_the_ways_to_move(opened):
     assert radius > 1
 
 
-def test_orbiting_keeps_the_distance_and_does_not_go_over_the_top(opened):
+def test_orbiting_keeps_the_distance_and_stays_below_the_top(opened):
     before = opened.run(AWAY)
     for _ in range(6):
         opened.drag((200, 100), (205, 300))

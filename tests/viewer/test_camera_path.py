@@ -59,7 +59,7 @@ def test_a_path_of_nerfstudio_is_moved_back(views, tmp_path, rng):
     np.testing.assert_allclose(poses(camera_path.read(tmp_path / "p.json").views), poses(views), atol=1e-12)
 
 
-def test_what_nerfstudio_did_to_the_poses_of_a_dataset_is_done_to_the_path(views, tmp_path):
+def test_nerfstudios_transform_of_poses_applies_to_the_path(views, tmp_path):
     """nerfstudio tells the move from the world of COLMAP; poses of transforms.json have one of their own."""
     camera_path.write(tmp_path / "p.json", views, 24)
     applied = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 2]])

@@ -40,7 +40,7 @@ def test_ticks_of_counts_are_whole_numbers(counts, labels):
     assert rows(chart) == labels
 
 
-def test_ticks_of_steps_are_whole_numbers_and_those_of_measures_are_not():
+def test_ticks_of_steps_are_integers_and_those_of_measures_not():
     chart = curve("PSNR, dB", [Line([(1.0, 20.5), (3.0, 21.25)])])
     assert columns(chart) == ["0", "1", "2", "3"]
     assert rows(chart) == ["20.6", "20.8", "21", "21.2"]

@@ -41,7 +41,7 @@ def test_the_focus_and_the_upward_axis_are_those_of_the_cameras(rng):
 
 
 @pytest.mark.parametrize("name", ["ellipse", "orbit"])
-def test_a_ring_of_cameras_is_circled_once_at_its_distance_and_height(name, rng):
+def test_ring_of_cameras_is_circled_once_at_its_distance(name, rng):
     found = PATHS[name](rig_of(ring(np.linspace(0, 2 * np.pi, 24, endpoint=False)), rng), 36, SIZE)
     place = positions(found)
     np.testing.assert_allclose(np.hypot(place[:, 0], place[:, 1]), 3, rtol=0.05)
@@ -66,7 +66,7 @@ def test_an_ellipse_is_as_long_and_wide_as_the_cameras_stand(rng):
     assert 1.7 < np.abs(place[:, 1]).max() < 2.05
 
 
-def test_an_ellipse_before_cameras_on_one_side_swings_and_stays_there(rng):
+def test_ellipse_facing_cameras_on_one_side_swings_there(rng):
     views = ring(np.linspace(-0.8, 0.8, 15))
     found = PATHS["ellipse"](rig_of(views, rng), 60, SIZE)
     assert np.abs(turns(found)).max() < 0.9
@@ -97,7 +97,7 @@ def facing(rng, count=20):
     return [View.looking_at(p, p + AHEAD, UP, CAMERA, f"{i:03d}") for i, p in enumerate(places)]
 
 
-def test_a_spiral_sways_no_farther_than_the_cameras_and_looks_ahead(rng):
+def test_spiral_sways_no_farther_than_the_cameras(rng):
     views = facing(rng)
     rig = Rig.of(views, rng.normal(size=(500, 3)) * 0.3 + (0, 5, 0))
     found = PATHS["spiral"](rig, 50, SIZE)
@@ -128,7 +128,7 @@ def test_a_ring_has_no_front_for_a_spiral(rng):
         PATHS["spiral"](rig_of(ring(np.linspace(0, 2 * np.pi, 12, endpoint=False)), rng), 4, SIZE)
 
 
-def test_a_walk_goes_from_neighbour_to_neighbour_whatever_the_names(rng):
+def test_walk_goes_between_neighbors_whatever_their_names(rng):
     views = ring(np.linspace(0, 4, 25))
     shuffled = [replace(views[i], name=f"{k:03d}") for k, i in enumerate(rng.permutation(25))]
     way = order(rig_of(shuffled, rng))

@@ -134,7 +134,7 @@ def test_data_cannot_end_their_script():
     assert json.loads(text)["b"] == "</script>"
 
 
-def test_a_name_that_is_not_unicode_is_shown_with_a_question_mark():
+def test_name_that_is_not_unicode_shows_a_question_mark():
     page = render("inspect.html.j2", title="\udcff.png", subtitle="", state="ready", verdict="", findings=[],
                   figures={}, space=None, seen=None, lists=[])  # fmt: skip
     assert "<title>?.png</title>" in page

@@ -33,7 +33,7 @@ def test_long_sides_are_cut_and_thin_ones_are_not(rng):
         assert (cell.box.low[2], cell.box.high[2]) == (None, None)
 
 
-def test_a_cell_grows_by_half_the_share_on_each_side_that_has_a_bound():
+def test_cell_grows_by_half_the_share_on_each_bounded_side():
     left, right = cells(np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [12, 0, 0]]), np.ones(4), 2)
     assert 0 < left.box.high[0] == right.box.low[0] <= 10
     assert left.grown(0.2).high[0] == pytest.approx(left.box.high[0] + 0.1 * left.size[0])

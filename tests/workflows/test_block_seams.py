@@ -60,7 +60,7 @@ def runs(tmp_path: Path) -> tuple[list[SimpleNamespace], SimpleNamespace]:
     return found, SimpleNamespace(views=[View("a", camera, np.eye(3, 4), photograph)])
 
 
-def test_all_runs_are_measured_in_the_band_of_the_one_that_has_blocks(runs):
+def test_all_runs_are_measured_in_the_band_of_the_blocks(runs):
     own, scene = runs
     found = find_seams(own, scene, "black")
     assert found is not None

@@ -50,7 +50,7 @@ def by_owner(model: clsplat.Model, found: dict) -> clsplat.Model:
 
 
 @pytest.mark.parametrize("filters", [(), MIP], ids=["plain", "mip"])
-def test_with_every_camera_in_every_block_the_merged_model_is_the_whole(tiny_scene, few_steps, tmp_path, filters):
+def test_merged_model_is_the_whole_with_all_cameras_everywhere(tiny_scene, few_steps, tmp_path, filters):
     coarse = clsplat.load(few_steps)
     coarse.logit_opacity[::50] = -9  # in no view
     coarse.save(tmp_path / "coarse.ply")
@@ -66,7 +66,7 @@ def test_with_every_camera_in_every_block_the_merged_model_is_the_whole(tiny_sce
     assert (by_owner(coarse, parts).means != other.means[: len(coarse)]).any()  # they were trained
 
 
-def test_the_crops_of_an_untrained_partition_are_the_coarse_model(trained, few_steps):
+def test_crops_of_an_untrained_partition_are_the_coarse_model(trained, few_steps):
     out, found = trained
     starts = [clsplat.load(out / f"block_{i:02d}.ply") for i in range(COUNT)]
     own = [start[box.holds(start.means)] for start, box in zip(starts, boxes(found), strict=True)]
@@ -84,7 +84,7 @@ def test_every_camera_is_used_and_views_are_fewer_than_all(trained, tiny_scene):
     assert min(map(len, names)) < len(train_views)
 
 
-def test_a_block_trains_its_views_with_the_extent_of_the_whole_and_grows_in_its_cell(trained, tiny_scene):
+def test_block_trains_with_the_full_extent_and_grows_in_its_cell(trained, tiny_scene):
     out, found = trained
     for block in found["blocks"]:
         settings = load(str(out / block["name"] / "pipeline.yaml")).settings
@@ -200,9 +200,7 @@ def test_a_box_without_gaussians_is_told_apart(few_steps, tiny_scene, tmp_path):
         clsplat.run(file, tiny_scene, tmp_path / "out")
 
 
-def test_blocks_trained_as_cells_of_a_store_are_those_trained_here(
-    trained, tiny_scene, few_steps, tmp_path, monkeypatch
-):
+def test_blocks_trained_in_a_store_are_those_trained_here(trained, tiny_scene, few_steps, tmp_path, monkeypatch):
     on, out, here = tmp_path / "lab.yaml", tmp_path / "out", []
     run = tuning.run_pipeline
     monkeypatch.setattr(tuning, "run_pipeline", lambda *words: here.append(words[1].name) or run(*words))
@@ -250,7 +248,7 @@ def test_check_finds_what_is_damaged_in_a_folder_of_blocks(trained, tmp_path, da
     assert f"clsplat blocks … --out {out}` again" in str(shown.exception) if damaged else shown.exit_code == 0
 
 
-def test_steps_are_shared_by_views_with_rates_that_make_up_for_it(tiny_scene, few_steps, tmp_path):
+def test_steps_are_shared_by_views_with_compensating_rates(tiny_scene, few_steps, tmp_path):
     shared = {"blocks": 2, "sight": NEVER, "steps": "shared"}
     found = train(tiny_scene, few_steps, tmp_path / "out", "optimize.steps=16", **shared)
     for block in found["blocks"]:
@@ -319,7 +317,7 @@ def test_a_plan_by_points_needs_points(tiny_scene, tmp_path):
     assert "has no points to cut by; `clsplat blocks --plan` trains a coarse model first" in str(refused.exception)
 
 
-def test_inspect_shows_a_plan_by_the_points_before_anything_is_trained(tiny_scene, tmp_path, monkeypatch):
+def test_inspect_shows_a_plan_by_the_points_before_training(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shown = CliRunner().invoke(app, ["inspect", str(tiny_scene), "--blocks", "2", "--json"])
     assert shown.exit_code == 0, shown.output

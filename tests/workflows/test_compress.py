@@ -99,7 +99,7 @@ def test_the_search_goes_down_until_it_cannot_be_better():
     assert Target.of("0dB").ends(rung, 31), "none is good enough"
 
 
-def test_a_format_that_is_not_searched_is_refused_before_anything_is_opened():
+def test_unsearched_format_is_refused_before_anything_is_opened():
     with pytest.raises(ConfigError, match="--format 'glb': expected one of sog, spz"):
         clsplat.compress_model("model.ply", "scene", format="glb")
 
@@ -156,7 +156,7 @@ def test_names_of_files_are_escaped():
     assert re.findall(r'<polyline[^>]* stroke="([^"]+)"[^>]*dasharray', text) == ["var(--target)"]
 
 
-def test_the_same_search_again_trains_nothing_and_gives_the_same_bytes(searched, few_steps):
+def test_repeated_search_trains_nothing_and_gives_the_same_bytes(searched, few_steps):
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in searched.rglob("*.ply")}
     files = {path.name: path.read_bytes() for path in (searched / "trials").iterdir()}
     found = clsplat.compress_model(few_steps, target="-40dB", out=searched, keep=KEEP, steps=STEPS)
@@ -180,7 +180,7 @@ def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatc
     assert opened == [few_steps / "point_cloud.ply"]
 
 
-def test_a_search_that_is_interrupted_goes_on_when_it_is_asked_again(few_steps, tmp_path, monkeypatch):
+def test_interrupted_search_resumes_when_asked_again(few_steps, tmp_path, monkeypatch):
     def interrupted(pipeline: Pipeline, run: Run) -> None:
         run.interrupted = True
         run_stages(pipeline, run)
@@ -219,7 +219,7 @@ def test_one_process_searches_in_a_folder_at_a_time(few_steps, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_search_killed_at_any_of_its_first_writes_goes_on_and_its_leftovers_are_swept(few_steps, tmp_path):
+def test_search_killed_at_an_early_write_resumes_and_sweeps(few_steps, tmp_path):
     out, names = tmp_path / "out", [LOCK, f".compress.json.{NO_PROCESS}-0.partial"]
     out.mkdir()
     for name in names:
@@ -244,7 +244,7 @@ def test_a_damaged_record_of_a_search_is_told_with_its_remedy(text, few_steps, t
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
 
 
-def test_a_target_that_no_file_meets_leaves_page_and_nearest_file(few_steps, tmp_path):
+def test_unreachable_target_leaves_page_and_nearest_file(few_steps, tmp_path):
     with pytest.raises(ConfigError, match=r"no file meets it; the nearest, .*_degree_0_balanced\.spz") as error:
         clsplat.compress_model(few_steps, target="1B", out=tmp_path / "out", format="spz", keep=[1.0])
     assert "give a larger size" in str(error.value)
@@ -253,7 +253,7 @@ def test_a_target_that_no_file_meets_leaves_page_and_nearest_file(few_steps, tmp
     assert detect(tmp_path / "out" / "trials" / "keep_100_degree_0_balanced.spz").name == "SPZ"
 
 
-def test_the_file_of_an_earlier_target_stays_where_none_meets_the_new_one(few_steps, tmp_path):
+def test_earlier_file_stays_where_none_meets_the_new_target(few_steps, tmp_path):
     ask = {"out": tmp_path / "out", "format": "spz", "keep": [1.0]}
     clsplat.compress_model(few_steps, target="1MB", **ask)
     assert (tmp_path / "out" / "compressed.spz").is_file()
@@ -307,7 +307,7 @@ def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
 
 
 @pytest.mark.parametrize(("steps", "lengths", "starts"), [(None, (400, 200), (200, 500)), (100, (40, 20), (20, 50))])
-def test_averages_of_a_palette_begin_in_the_middle_of_its_trainings(steps, lengths, starts, few_steps, tmp_path):
+def test_averages_of_a_palette_begin_amid_its_trainings(steps, lengths, starts, few_steps, tmp_path):
     """Their steps count from the first stage that is run, not from that of the recipe."""
     model = clsplat.load(few_steps / "point_cloud.ply")
     tuning = Tuning("compress", Source.of(few_steps, None), model, steps, None)

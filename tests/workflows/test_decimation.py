@@ -103,7 +103,7 @@ def test_none_and_one_stay(rng):
             np.testing.assert_array_equal(getattr(found, name), table)
 
 
-def test_the_same_model_gives_the_same_bytes_and_rows_in_another_order_the_same_gaussians(rng):
+def test_same_model_gives_same_bytes_in_any_row_order(rng):
     source = model(rng, 300)
     found, again = decimated(source), decimated(source[:])
     for name, table in found.tables().items():
@@ -174,7 +174,7 @@ def test_colour_keeps_neighbours_apart():
     assert [rows.tolist() for rows in matched(tables)] == [[1], [2]]
 
 
-def test_extreme_values_and_zero_quaternions_merge_to_finite_ones(rng):
+def test_extreme_values_and_zero_quaternions_merge_to_finite(rng):
     source = model(rng, 24)
     source.log_scales[:6] = (-80, -80, 3)
     source.log_scales[6:9] = 60
@@ -186,7 +186,7 @@ def test_extreme_values_and_zero_quaternions_merge_to_finite_ones(rng):
     assert all(np.isfinite(table).all() for table in found.tables().values())
 
 
-def test_a_mip_model_keeps_its_numbers_and_a_world_filter_is_baked(rng):
+def test_mip_model_keeps_its_numbers_and_bakes_a_world_filter(rng):
     source = model(rng, 10, mode="mip")
     filtered = Model(**source.tables(), filter_variance=np.full((10, 1), 0.1), rendering=source.rendering)
     found = decimated(filtered)

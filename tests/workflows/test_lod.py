@@ -178,7 +178,7 @@ def test_one_level_is_not_trained(few_steps, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "steps"), [("file/site", 0), ("n" * 245, STEPS)])
-def test_a_place_that_cannot_be_written_is_refused_before_the_work(name, steps, few_steps, tmp_path, monkeypatch):
+def test_unwritable_path_is_refused_before_the_work(name, steps, few_steps, tmp_path, monkeypatch):
     def works(*_):
         raise AssertionError("the work begins")
 
