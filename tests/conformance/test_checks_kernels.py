@@ -1,4 +1,4 @@
-"""The checks of `clsplat doctor` hold on the devices of the tests, and their process tells what they found."""
+"""The checks of `clsplat doctor` hold on the devices of the tests, and every kernel has a test."""
 
 import io
 import queue
@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from clsplat import resource_dir
 from clsplat.conformance import supervision, worker
 from clsplat.conformance.check import Note
 from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS
+from clsplat.opencl.program import parse_kernels
 from tests.support.figures import hold
 
 
@@ -28,3 +30,17 @@ def test_the_figures_of_a_check_hold(device, check):
         sum(not isinstance(one, Note) for one in found),
         len(found) - len(told.figures),
     )
+
+
+def test_every_kernel_was_launched(launched):
+    """With each schedule, but for those that are written for one of them."""
+    for schedule, other in (("wide", "simt"), ("simt", "wide")):
+        kernels = {
+            f"{path.name}:{name}"
+            for path in resource_dir("cl_kernels").glob("*.cl")
+            if not path.stem.endswith(other)
+            for name in parse_kernels(path.read_text())
+        }
+        found = {label for one, label in launched if one == schedule}
+        assert not kernels - found, f"no kernel test launches {', '.join(sorted(kernels - found))}"
+        assert found == kernels

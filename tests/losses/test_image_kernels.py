@@ -1,4 +1,4 @@
-"""loss.cl: values and gradients against the oracle."""
+"""loss.cl: values and gradients against the oracle, also with a mask in an array of its own."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from clsplat.losses.base import ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, ssim_maps
 from clsplat.render.workspace import Workspace
 from clsplat.settings import variants
-from clsplat.views.photographs import unpack
+from clsplat.views.photographs import Photograph, apply_mask, unpack
 from tests.support.device_images import SIZES, gradient_of
 from tests.support.figures import hold
 
@@ -86,3 +86,28 @@ def test_ssim_against_scikit_image(device, rng):
     np.testing.assert_allclose(full[:, 5:-5, 5:-5], oracle[:, 5:-5, 5:-5], atol=1e-5)
     _, sums = ssim_maps(comparison_of(device, x, y))
     assert sums.get().sum(dtype=np.float64) / x.size == pytest.approx(oracle.mean(), rel=1e-5)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_mask_blackens_what_it_leaves_out(device, rng, width, height):
+    camera = camera_of(device, width, height)
+    colours = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
+    mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
+    photograph = Photograph(camera, device.upload(colours), device.upload(mask))
+    assert photograph.nbytes == 4 * width * height
+    np.testing.assert_array_equal(photograph.image(), colours.transpose(1, 2, 0))
+    np.testing.assert_array_equal(photograph.counted(), mask[0] > 0)
+    workspace = Workspace(device)
+    planes = photograph.planes(workspace)
+    before, counted = planes.colours.get(), planes.mask.get()
+    np.testing.assert_array_equal(counted[:, :height, :width], mask)
+    assert (counted[:, height:] == 0).all()
+    apply_mask(workspace, camera, planes.colours, planes.mask)
+    np.testing.assert_array_equal(planes.colours.get(), before * counted)
+
+
+def test_a_photograph_without_a_mask_counts_everywhere(device, rng):
+    photograph = Photograph(camera_of(device, 5, 3), device.upload(rng.integers(0, 256, (3, 3, 5)).astype(np.uint8)))
+    assert photograph.planes(Workspace(device)).mask is None
+    assert photograph.counted() is None
+    assert photograph.nbytes == 45

@@ -1,10 +1,11 @@
-"""project.cl against the float64 oracle."""
+"""project.cl and the derivatives by the pose of a camera (poses.cl) against the float64 oracle."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from clsplat.conformance.checks.poses import pose_figures, poses
 from clsplat.conformance.checks.projection import (
     beyond_the_clamp,
     gradient_figures,
@@ -122,3 +123,12 @@ def test_gradients_where_the_ray_is_clamped(device, rng):
     limits = case.device_camera(device).array.get()[0]
     assert (np.abs(in_camera[:, 0] / in_camera[:, 2]) > limits["ray_x_max"]).any()
     backward_case(device, rng, case)
+
+
+def test_derivatives_by_a_pose(device, rng):
+    hold(poses(device, rng))
+
+
+@pytest.mark.parametrize("count", [16, 64, 511, 513])
+def test_sums_over_groups(device, rng, count):
+    hold(pose_figures(device, random_case(rng, count), rng, f"{count} Gaussians"))

@@ -1,4 +1,4 @@
-"""The long form of the tests begins: a few kills of it."""
+"""A few kills of the long form, and a kill at the n-th file of a run: resumed, it ends with the same bits."""
 
 import json
 import os
@@ -79,3 +79,17 @@ def test_a_row_counts_the_cases_that_its_tests_have_tried(tmp_path):
     (tmp_path / "test_none.py").write_text("def test_none():\n    pass\n")
     assert torture.tested("a", "holds", 1, str(tmp_path / "test_three.py")).cases == 5
     assert torture.tested("a", "holds", 7, str(tmp_path / "test_none.py")).cases == 7
+
+
+CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 4  # of each moment; `make torture` tries every file
+
+
+def test_whichever_file_is_being_written_nothing_is_lost(tiny_scene, tmp_path, record_property):
+    """In a process that has opened no device: one that has cannot be forked."""
+    command = [sys.executable, "-m", "tests.torture.each_file", tiny_scene, tmp_path / "runs", str(CASES)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert len(found) >= 8
+    assert [case for case in found if case[2:] != [True, 0, True]] == []
+    record_property("cases", len(found))
