@@ -1,11 +1,12 @@
 """Devices and random numbers for tests.
 
-Kernel tests run on every device named in CLSPLAT_TEST_DEVICES (parts of names, separated by `;`; default: the device
-that clsplat would choose), each with the wide schedule at 16 and 8 lanes and with the simt schedule.
+Kernel tests are the modules `test_*_kernels.py`; `-m kernels` selects them. They run on every device named in
+CLSPLAT_TEST_DEVICES (parts of names, separated by `;`; default: the device that clsplat would choose), each with the
+wide schedule at 16 and 8 lanes and with the simt schedule. Their launches are recorded for the test that every kernel
+has a test.
 """
 
 import functools
-import os
 import signal
 import sys
 from collections.abc import Generator, Iterator
@@ -24,24 +25,29 @@ from clsplat.opencl import device as opencl_device
 from clsplat.opencl import program
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.discovery import DeviceInfo, choose
-from clsplat.opencl.program import Program
+from clsplat.opencl.program import Kernel, Program
 from clsplat.scene.readers import Reader
 from clsplat.settings import Settings, rebuild
 from data_tools.synthetic import Options, write_dataset
-from tests.few_steps import FEW, killed
+from tests.support.devices import NAMES, TUNINGS
+from tests.support.runs import FEW, killed, train
 
 hypothesis.settings.register_profile("suite", deadline=None)  # a busy machine is no fault
 hypothesis.settings.load_profile("suite")
-NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").split(";")]
-TUNINGS = {"wide16": ("wide", 16), "wide8": ("wide", 8), "simt": ("simt", 1)}
+KERNEL_TESTS = "test_*_kernels.py"
+LAST = "test_every_kernel_was_launched"
+LAUNCHED = pytest.StashKey[set[tuple[str, str]]]()
+IS_WHOLE = pytest.StashKey[bool]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--one-each", action="store_true", help="of a test's parameters take those in the middle alone")
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     Program.options += ("-Werror",)
+    config.stash[LAUNCHED] = set()
+    config.stash[IS_WHOLE] = True
 
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
@@ -51,19 +57,65 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class Scheduling(LoadFileScheduling):  # type: ignore[misc]
         def _split_scope(self, nodeid: str) -> str:
-            return "kernels" if nodeid.startswith("tests/kernels/") else str(super()._split_scope(nodeid))
+            return "kernels" if "_kernels.py::" in nodeid else str(super()._split_scope(nodeid))
 
     return Scheduling(config, log)
 
 
+def is_kernel_test(item: pytest.Item) -> bool:
+    return item.path.match(KERNEL_TESTS)
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    if is_kernel_test(item):
+        item.add_marker("kernels")
+
+
+def pytest_deselected(items: list[pytest.Item]) -> None:
+    if any(map(is_kernel_test, items)):
+        items[0].config.stash[IS_WHOLE] = False
+
+
 @pytest.hookimpl(trylast=True)  # after -m and -k
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Put the test that looks back behind all others; note whether all kernel tests are there."""
+    items.sort(key=lambda item: item.name == LAST)
+    collected = {item.path for item in items}
+    parts = any("::" in argument for argument in config.args)
+    if parts or config.getoption("--one-each") or not collected >= set(Path(__file__).parent.rglob(KERNEL_TESTS)):
+        config.stash[IS_WHOLE] = False
     if config.getoption("--one-each"):
         cases: dict[tuple[str, object], list[pytest.Item]] = {}
         for item in items:
             parameters = item.callspec.params if hasattr(item, "callspec") else {}
             cases.setdefault((item.nodeid.partition("[")[0], parameters.get("device")), []).append(item)
         items[:] = [same[len(same) // 2] for same in cases.values()]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Record (schedule, file:kernel) of every launch of a kernel test."""
+    if not is_kernel_test(item):
+        return (yield)
+    call, recorded = Kernel.__call__, item.config.stash[LAUNCHED]
+
+    def record(kernel: Kernel, **values: Any) -> None:
+        call(kernel, **values)
+        amount = values.get("items") or values.get("groups") or 0
+        if 0 not in (amount if isinstance(amount, tuple) else (amount,)):
+            recorded.add((kernel._device.schedule, kernel.label))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Kernel, "__call__", record)
+        return (yield)
+
+
+@pytest.fixture
+def launched(request: pytest.FixtureRequest) -> set[tuple[str, str]]:
+    """(schedule, file:kernel) of what was launched; skips where only a part of the tests is run."""
+    if not request.config.stash[IS_WHOLE]:
+        pytest.skip("only a part of the kernel tests is run")
+    return request.config.stash[LAUNCHED]
 
 
 @pytest.hookimpl(wrapper=True)
@@ -175,7 +227,6 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def few_steps(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of twelve steps; nothing is changed in it."""
-    from tests.test_training import train
 
     out = tmp_path_factory.mktemp("runs") / "few"
     train(tiny_scene, out, *FEW)

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # The small kernel tests under Oclgrind: data races, out-of-bounds accesses, uninitialised reads.  That takes hours;
-# arguments go to pytest: `tests/oclgrind.sh tests/kernels --one-each` takes minutes.  Oclgrind exits 0 whatever it finds, so
+# arguments go to pytest: `tests/oclgrind.sh tests/render --one-each` takes minutes.  Oclgrind exits 0 whatever it finds, so
 # its log is what counts.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-.venv/bin/python}
-arguments=("${@:-tests/kernels}")
+arguments=("${@:-tests}")
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
 export CLSPLAT_TEST_DEVICES=Oclgrind
@@ -16,7 +16,7 @@ check() {  # names of tests, as pytest's -k has them; options of Oclgrind
     shift
     echo "oclgrind $*: ${tests:-all}"
     oclgrind "$@" --global-mem-size 4000000000 --max-errors 20 --log "$log" \
-        "$python" -m pytest "${arguments[@]}" -m "not large" -k "$tests" -p no:cacheprovider
+        "$python" -m pytest "${arguments[@]}" -m "kernels and not large" -k "$tests" -p no:cacheprovider
     if [ -s "$log" ]; then
         cat "$log"
         echo "oclgrind $*: found something" >&2

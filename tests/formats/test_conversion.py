@@ -25,7 +25,7 @@ from clsplat.gaussians.model import Rendering, load
 from clsplat.harmonics import basis
 from clsplat.results import check_no_file_of_a_run
 from clsplat.viewer.packing import pack
-from tests.formats.models import splats
+from tests.support.models import splats
 
 
 @pytest.fixture
@@ -276,7 +276,7 @@ def test_gaussians_that_are_not_finite_are_dropped_or_kept(tmp_path, rng, caplog
 
 
 @pytest.mark.parametrize(("table", "value"), [("log_scales", 3e38), ("sh_base", -3e38), ("sh_rest", 1e16)])
-def test_gaussians_that_no_codebook_holds_are_refused_and_convert_drops_them(table, value, tmp_path, rng, caplog):
+def test_gaussians_beyond_any_codebook_are_refused_or_dropped(table, value, tmp_path, rng, caplog):
     large = splats(rng, 20, 1)
     large.parameters[table][3:5, 1] = value
     write_ply(tmp_path / "a.ply", large.parameters, {})
@@ -349,7 +349,7 @@ def test_check_tells_what_a_model_is(source, tmp_path):
     json.dumps(found, allow_nan=False)
 
 
-def test_a_model_that_is_missing_cannot_be_read_and_a_pipeline_is_none(tmp_path):
+def test_missing_model_cannot_be_read_and_a_pipeline_is_none(tmp_path):
     with pytest.raises(DataError, match=r"a\.spz: cannot be read \(No such file or directory\)"):
         clsplat.check(tmp_path / "a.spz")
     assert "stages" in clsplat.check("smoke")

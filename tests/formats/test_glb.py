@@ -1,6 +1,5 @@
 """glTF and OpenUSD: validity, axes, nodes, and what a file may not declare."""
 
-import json
 import struct
 
 import numpy as np
@@ -13,30 +12,10 @@ from clsplat.formats.splats import Writing, opacities, unit
 from clsplat.formats.table import detect, read, write
 from clsplat.gaussians.model import Model, load
 from clsplat.reading import sha256
-from tests.formats.models import angles, assert_close, interop, splats, there_and_back
+from tests.support.models import angles, assert_close, glued, interop, parts, splats, there_and_back
 
 KHR = "KHR_gaussian_splatting"
 SIZES = {5121: 1, 5126: 4}
-
-
-def parts(data):
-    """The JSON and the binary chunk of a .glb file, whose lengths are checked."""
-    magic, version, length = struct.unpack_from("<4s2I", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<2I", data, 12)
-    assert kind == 0x4E4F534A
-    assert size % 4 == 0
-    rest, kind = struct.unpack_from("<2I", data, 20 + size)
-    assert kind == 0x004E4942
-    assert 28 + size + rest == len(data)
-    return json.loads(data[20 : 20 + size]), data[28 + size :]
-
-
-def glued(tree, binary):
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(binary))
-    return head + struct.pack("<2I", len(text), 0x4E4F534A) + text + struct.pack("<2I", len(binary), 0x4E4942) + binary
 
 
 def attribute(tree, binary, name):
@@ -112,7 +91,7 @@ def moved(tmp_path, rng, **node):
     return tmp_path / "a.glb", tmp_path / "b.glb"
 
 
-def test_a_node_that_is_moved_turned_and_scaled_moves_its_gaussians(tmp_path, rng):
+def test_moved_turned_and_scaled_node_moves_its_gaussians(tmp_path, rng):
     """A quarter about glTF's y, up, is a quarter about ours the other way."""
     rotation = [0, 0.5**0.5, 0, 0.5**0.5]
     plain, other = moved(tmp_path, rng, rotation=rotation, scale=[2, 2, 2], translation=[1, 0, 0])

@@ -12,7 +12,7 @@ from clsplat.formats.packing import morton_order
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import FLAT_LOG_SCALE
 from clsplat.formats.table import detect, read, write
-from tests.formats.models import assert_close, interop, splats, there_and_back
+from tests.support.models import assert_close, interop, splats, there_and_back
 
 MARKS = {
     "comment SplatRenderMode: mip": "mip",

@@ -18,7 +18,7 @@ from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import Sky
 from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.harmonics import basis, mean_basis
-from tests.formats.models import splats, there_and_back
+from tests.support.models import splats, there_and_back
 
 
 def seen_from_one_side(rng: np.random.Generator, count: int, degree: int = 3) -> SplatFile:
@@ -50,7 +50,7 @@ def covariances(one: SplatFile) -> np.ndarray:
     return turned @ turned.transpose(0, 2, 1)
 
 
-def test_weights_do_not_depend_on_the_size_of_the_scene_and_grow_with_opacity_and_area(rng):
+def test_weights_ignore_scene_size_and_grow_with_opacity_area(rng):
     p = splats(rng, 200).parameters
     found = log_weights(p)
     larger = {**p, "means": 10 * p["means"], "log_scales": p["log_scales"] + np.float32(np.log(10))}
@@ -66,7 +66,7 @@ def test_weights_do_not_depend_on_the_size_of_the_scene_and_grow_with_opacity_an
 
 
 @pytest.mark.parametrize("count", [400, 3000])
-def test_a_sky_of_gaussians_does_not_decide_how_the_scene_is_rounded(count, rng, tmp_path):
+def test_sky_of_gaussians_does_not_decide_the_rounding(count, rng, tmp_path):
     """Of the scene: its weights, and the errors of its positions in files."""
     source, texels = splats(rng, count), rng.uniform(0, 1, (64, 3)).astype(np.float32)
     source.parameters["log_scales"] = rng.uniform(-3.5, -3, (count, 3)).astype(np.float32)
@@ -202,7 +202,7 @@ def test_band_0_takes_up_what_is_the_same_from_all_cameras(rng):
     np.testing.assert_allclose((found - base) * SH_C0, colours.mean(axis=1), atol=1e-5)
 
 
-def test_an_spz_has_multiples_of_a_step_that_grows_as_weights_fall(tmp_path, rng):
+def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
     source = seen_from_one_side(rng, 500)
     found = there_and_back(tmp_path / "a.spz", source).parameters
     levels = 128 * found["sh_rest"]
@@ -235,7 +235,7 @@ def test_each_gaussian_of_an_spz_has_the_steps_of_its_own_weight(tmp_path, rng):
     assert (np.abs(found["means"] - p["means"]) <= np.maximum(largest, 2**-13) * 1.0001).all()
 
 
-def test_positions_and_rotations_of_an_spz_are_within_their_steps(tmp_path, rng):
+def test_spz_positions_and_rotations_are_within_their_steps(tmp_path, rng):
     source = splats(rng, 300, 0)
     found, expected = there_and_back(tmp_path / "a.spz", source), source.rows(morton_order(source.parameters["means"]))
     smallest = np.exp(expected.parameters["log_scales"].min(axis=1, keepdims=True))
@@ -269,7 +269,7 @@ def test_a_palette_for_neighbours_has_the_means_of_its_parts(count, entries, rng
         np.testing.assert_array_equal(tree_palette(rest, weights, entries, 1.0)[1], labels)
 
 
-def test_a_palette_for_neighbours_is_nearer_to_gaussians_that_weigh_more(rng):
+def test_palette_for_neighbors_favors_heavier_gaussians(rng):
     rest = seen_from_one_side(rng, 2000).parameters["sh_rest"]
     weights = np.where(np.arange(2000) % 4 == 0, 3.0, -3.0)
     vectors, labels = tree_palette(rest, weights, 400, 2.0)
@@ -296,7 +296,7 @@ def test_small_harmonics_have_smaller_steps(rng):
     np.testing.assert_allclose(usual_step(rest / 10, 4.0, 6.0), 4 * 0.01 / sh_rounding.USUAL, rtol=0.05)
 
 
-def test_a_sog_is_the_shape_of_the_model_and_converts_again_without_loss(tmp_path, rng):
+def test_sog_has_the_models_shape_and_converts_again_losslessly(tmp_path, rng):
     source = seen_from_one_side(rng, 1500)
     found = there_and_back(tmp_path / "a.sog", source)
     order = morton_order(source.parameters["means"])

@@ -21,8 +21,8 @@ from clsplat.formats.packing import morton_order
 from clsplat.formats.palette import ENTRIES, codebook, nearest, palette
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import detect, read, write
-from tests.data_sets import data_set
-from tests.formats.models import assert_close, interop, splats, there_and_back
+from tests.support.data_sets import data_set
+from tests.support.models import assert_close, interop, splats, there_and_back
 
 
 def test_the_published_bytes_of_a_sog():
@@ -244,7 +244,7 @@ def test_a_damaged_meta_is_refused(fault, tmp_path, rng):
         read(folder_of(tmp_path, rng, **changes))
 
 
-def test_an_image_of_another_size_is_refused_before_it_is_decoded(tmp_path, rng):
+def test_image_of_another_size_is_refused_before_decoding(tmp_path, rng):
     folder = folder_of(tmp_path, rng)
     large, small = (
         cv2.imencode(".webp", np.zeros((side, side, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
@@ -300,7 +300,7 @@ def test_a_bundle_that_is_compressed_in_another_way_is_refused(kind, tmp_path, r
     assert len(read(path)) == 100
 
 
-def test_all_files_of_a_bundle_together_are_no_larger_than_they_are_packed(tmp_path, rng):
+def test_bundle_files_together_fit_their_packed_size(tmp_path, rng):
     path = tmp_path / "a.sog"
     write(path, splats(rng, 100, 0))
     with zipfile.ZipFile(path) as archive:
@@ -345,7 +345,7 @@ def sums(folder: Path, count: int = 24) -> list[str]:
     return found
 
 
-def test_processors_with_and_without_avx_512_write_the_same_bytes(tmp_path):
+def test_processors_with_and_without_avx_512_write_equal_bytes(tmp_path):
     """NumPy computes logarithms in other ways with it, whose last bit differs."""
     core = pytest.importorskip("numpy._core._multiarray_umath")
     wide = [

@@ -11,7 +11,7 @@ from clsplat.formats.palette import ENTRIES, codebook
 from clsplat.formats.sog_steps import LEVELS, rounded, rounded_means, rounded_opacities, rounded_quats, weighed_means
 from clsplat.formats.splats import Writing, opacities, unit
 from clsplat.formats.table import write
-from tests.formats.models import splats, there_and_back
+from tests.support.models import splats, there_and_back
 
 
 def covariances(quats, log_scales):
@@ -19,7 +19,7 @@ def covariances(quats, log_scales):
     return np.einsum("nij,nj,nkj->nik", turns, np.exp(2.0 * log_scales), turns)
 
 
-def test_axes_of_other_names_are_the_same_gaussian_that_is_turned_less(rng):
+def test_renamed_axes_give_the_same_gaussian_turned_less(rng):
     quats, sizes = rng.normal(size=(2000, 4)), rng.normal(size=(2000, 3))
     found, renamed = rounded_quats(quats, sizes, 1)
     assert (np.argmax(np.abs(found), axis=1) == 0).all()
@@ -42,7 +42,7 @@ def test_positions_stay_within_a_step_and_their_range_stays(rng):
     assert all(len(np.unique(column & 255)) <= 64 + 1 for column in levels.T)
 
 
-def test_positions_of_gaussians_that_weigh_little_have_larger_steps(rng):
+def test_light_gaussians_have_larger_position_steps(rng):
     means, sizes = rng.normal(size=(3000, 3)).astype(np.float32), rng.normal(-3, 0.5, (3000, 3)).astype(np.float32)
     weights = rng.uniform(-4, 4, 3000)
     found = weighed_means(means, sizes, weights, 0.25)

@@ -1,16 +1,13 @@
 """`.splat` and `.ksplat`: records without a mark."""
 
-import struct
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from clsplat.errors import ConfigError, DataError
-from clsplat.formats.ksplat import HEADER, SECTION
 from clsplat.formats.splats import opacities
 from clsplat.formats.table import detect, read, write
-from tests.formats.models import angles, assert_close, interop, splats, there_and_back
+from tests.support.models import angles, assert_close, interop, ksplat, splats, there_and_back
 
 PUBLISHED = bytes.fromhex("c2851ec15dd5db3eba33d54072ce773ee8e8ca3d8e23743e7a8d597cff80757d")
 LEVELS = {"L0": (1e-6, 1e-6, 1e-6), "L1": (2e-4, 0.002, 0.001), "L2": (2e-4, 0.002, 0.013)}
@@ -98,14 +95,6 @@ def test_a_larger_ksplat_has_buckets(level):
     for axis in range(3):
         a, b = np.sort(found.parameters["means"][:, axis]), np.sort(source.parameters["means"][:, axis])
         np.testing.assert_allclose(a, b, atol=1e-3)
-
-
-def ksplat(count=3, rows=3, degree=1, level=1, buckets=1, full=0, partial=1, held=3, sections=1):
-    header, section = bytearray(HEADER), bytearray(SECTION)
-    struct.pack_into("<BB2x4IH", header, 0, 0, 1, 1, sections, rows, count, level)
-    struct.pack_into("<4IfHxx4IH", section, 0, count, rows, 256, buckets, 5.0, 12, 32767, 0, full, partial, degree)
-    row = (24, 42, 72)[degree] if degree < 3 else 72
-    return bytes(header + section) + struct.pack("<I3f", held, 1, 2, 3) + bytes(row * rows)
 
 
 def test_positions_of_a_ksplat_are_relative_to_their_bucket(tmp_path):

@@ -15,7 +15,7 @@ from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import Reading, Writing
 from clsplat.formats.table import detect, read, write
 from clsplat.formats.weights import log_weights
-from tests.formats.models import angles, assert_close, interop, splats, there_and_back
+from tests.support.models import angles, assert_close, interop, splats, there_and_back
 
 UNTURNED = Reading(axes="ply")
 STEPS = {"means": 2**-13, "log_scales": 1 / 32, "opacity": 0.501 / 255, "sh_base": 0.501 / 255 / 0.15}
@@ -142,7 +142,7 @@ def test_older_versions_are_read(version, tmp_path):
     np.testing.assert_array_equal(found["log_scales"], np.full((2, 3), -5))
 
 
-def test_axes_and_what_is_lost_are_said_for_every_file_unless_a_caller_knows(tmp_path, rng, caplog):
+def test_axes_and_losses_are_reported_unless_the_caller_knows(tmp_path, rng, caplog):
     caplog.set_level("INFO")
     one = replace(splats(rng, 20), rendering={"background": "white"})
     for name in ("a.spz", "b.spz"):
@@ -157,7 +157,7 @@ def test_axes_and_what_is_lost_are_said_for_every_file_unless_a_caller_knows(tmp
     assert not caplog.messages
 
 
-def test_an_extension_that_turns_the_axes_is_refused_and_others_are_skipped(tmp_path):
+def test_extension_that_turns_axes_is_refused_others_skipped(tmp_path):
     path = tmp_path / "a.spz"
     other = struct.pack("<2I4s", 7, 4, b"abcd")
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other)))
@@ -277,7 +277,7 @@ def test_a_model_takes_little_more_memory_than_it_has(version, tmp_path, rng):
     assert peak / count < 1.3 * 59 * 4, f"{peak / count:.0f} bytes a splat; the model has {59 * 4}"
 
 
-def test_more_splats_than_a_file_of_version_4_may_stand_for_are_refused(tmp_path, rng):
+def test_more_splats_than_version_4_allows_are_refused(tmp_path, rng):
     """Zstandard itself has no such bound: a file of 40 kB could stand for 20 million splats."""
     pytest.importorskip("zstandard")
     count, path = 20_000_000, tmp_path / "a.spz"

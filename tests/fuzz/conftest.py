@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.alarms import failing
+from tests.support.timeouts import failing
 
 BYTES = 1 << 30  # beyond what the process has
 

@@ -12,7 +12,7 @@ from clsplat.video import camera_path
 from clsplat.video.lenses import MAX_FRAMES, SIDES
 from tests.fuzz.mutation import damaged, fuzzed
 from tests.fuzz.outcome import outcome
-from tests.video.test_paths import ring
+from tests.support.camera_rings import ring
 
 VIEWS = ring(np.linspace(0, 2, 3))
 WORLD = {"transform": np.eye(3, 4).tolist(), "scale": 0.5}

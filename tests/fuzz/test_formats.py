@@ -17,11 +17,9 @@ from clsplat.formats.model_files import bytes_of
 from clsplat.formats.splats import Reading, Writing
 from clsplat.formats.table import CODECS, detect, read, write
 from clsplat.gaussians.checkup import examine
-from tests.formats.models import splats
-from tests.formats.test_glb import glued, parts
-from tests.formats.test_splat_files import ksplat
 from tests.fuzz.mutation import damaged, fuzzed, misbuilt, one_of
 from tests.fuzz.outcome import outcome
+from tests.support.models import glued, ksplat, parts, splats
 
 RNG = np.random.default_rng(0)
 WORDS = {

@@ -11,9 +11,9 @@ import pytest
 
 from clsplat.inspect.inspection import Inspection
 from clsplat.scene.detect import read_scene
-from tests.colmap_writer import CameraEntry, ColmapModel, tiny_model, write_scene
 from tests.fuzz.mutation import damaged, fuzzed
 from tests.fuzz.outcome import outcome
+from tests.support.colmap_writer import CameraEntry, ColmapModel, tiny_model, write_scene
 
 POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 5], [0, 0, 0, 1]]
 KEYS = ["w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "camera_angle_x", "camera_model", "is_fisheye"]

@@ -116,8 +116,17 @@ def main() -> int:
             tested(f"damaged {what}", "each read or refused in one sentence", count, f"tests/fuzz/{file}", *only)
         )
     same = "nothing lost, and resumed to the same bits"
-    rows.append(tested("a write that fails, every one of a run", same, 1, "tests/test_failing_writes.py"))
-    rows.append(tested("`kill -9` at each file, on either side of its rename", same, 1, "tests/test_killed_writes.py"))
+    rows.append(tested("a write that fails, every one of a run", same, 1, "tests/runs/test_failing_writes.py"))
+    rows.append(
+        tested(
+            "`kill -9` at each file, on either side of its rename",
+            same,
+            1,
+            "tests/torture/test_torture.py",
+            "-k",
+            "whichever_file",
+        )
+    )
     table = "\n".join(["| what | cases | seen | time |", "|---|---|---|---|", *(row.text for row in rows)])
     print(table)
     if options.write:

@@ -16,9 +16,9 @@ from clsplat.scene.stand import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
 from clsplat.viewer.photographs import described
-from tests.html_page import HOSTILE
-from tests.viewer.browser import CHROMIUM, Browser
-from tests.viewer.scenes import MIP, PLAIN, cloud, scene
+from tests.support.browser import CHROMIUM, Browser
+from tests.support.html_page import HOSTILE
+from tests.support.viewer_pages import MIP, PLAIN, cloud, scene
 
 pytestmark = [
     pytest.mark.slow,
@@ -181,7 +181,7 @@ def test_the_ways_to_move(opened):
     assert radius > 1
 
 
-def test_orbiting_keeps_the_distance_and_does_not_go_over_the_top(opened):
+def test_orbiting_keeps_the_distance_and_stays_below_the_top(opened):
     before = opened.run(AWAY)
     for _ in range(6):
         opened.drag((200, 100), (205, 300))

@@ -18,8 +18,8 @@ from clsplat.runs.viewing import names
 from clsplat.scene.detect import read_scene
 from clsplat.stages.viewer import Viewer
 from clsplat.viewer import page as module
-from tests.commands import process
-from tests.html_page import Page
+from tests.support.commands import process
+from tests.support.html_page import Page
 
 pytestmark = pytest.mark.slow
 SHORT = {"optimize.steps": 20}
@@ -72,7 +72,7 @@ def test_titles_name_the_folder_that_the_user_gave(run, tiny_scene, tmp_path, mo
     assert f"<title>{tiny_scene.name}</title>" in (out / "report.html").read_text()
 
 
-def test_the_report_leads_to_files_of_one_name_in_several_folders(tiny_scene, tmp_path):
+def test_report_links_files_of_one_name_in_several_folders(tiny_scene, tmp_path):
     steps = [stage for stage in load("smoke").resolved()["stages"] if "render" not in stage]
     at = next(i for i, stage in enumerate(steps) if "export" in stage)
     steps[at : at + 1] = [{"export": {"file": f"{folder}/model.ply"}} for folder in ("a", "b")]
@@ -117,7 +117,7 @@ def test_the_link_leads_from_another_folder(tiny_scene, tmp_path):
     assert (out / "pages" / "my scene.html").is_file()
 
 
-def test_a_run_with_too_many_splats_shows_the_most_important_ones(tiny_scene, tmp_path, monkeypatch, caplog):
+def test_run_with_too_many_splats_shows_the_most_important(tiny_scene, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(module, "MAX_SIZE", 0.25)
     monkeypatch.setattr("clsplat.stages.viewer.MAX_SIZE", 0.25)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set={**SHORT, "init.count": 8000})

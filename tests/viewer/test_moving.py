@@ -14,9 +14,9 @@ from clsplat.scene.stand import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
 from clsplat.viewer.photographs import described
-from tests.viewer.browser import CHROMIUM, Browser
-from tests.viewer.scenes import cloud, moving, scene
-from tests.viewer.unpacking import unpacked
+from tests.support.browser import CHROMIUM, Browser
+from tests.support.viewer_data import unpacked
+from tests.support.viewer_pages import cloud, moving, scene
 
 WIDTHS = [width_of(1, False), width_of(3, False), width_of(2, True)]
 MOMENTS = (0.0, 0.35, 0.6, 1.0)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from clsplat.viewer.packing import BLOCK, FLATTEST, KNEE, LEAST_RANGE, LEVELS, STEPS, pack
-from tests.viewer.scenes import MIP, cloud
-from tests.viewer.unpacking import unpacked
+from tests.support.viewer_data import unpacked
+from tests.support.viewer_pages import MIP, cloud
 
 RNG = np.random.default_rng(5)
 

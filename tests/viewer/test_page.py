@@ -18,9 +18,9 @@ from clsplat.viewer.cameras import camera_data
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import FOLDER, SCRIPTS, Page, script
 from clsplat.viewer.photographs import described, left_out
-from tests.html_page import HOSTILE
-from tests.html_page import Page as Parsed
-from tests.viewer.scenes import cloud, scene, views
+from tests.support.html_page import HOSTILE
+from tests.support.html_page import Page as Parsed
+from tests.support.viewer_pages import cloud, scene, views
 
 
 def flat(view):

@@ -1,0 +1,117 @@
+"""Timed cases: whole steps with all that a pipeline names, which change nothing; and measurements compared."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.bench.cases import Case, run_bench
+from clsplat.bench.comparison import beside, read_measurement
+from clsplat.bench.peaks import Peaks
+from clsplat.bench.scenes import case, synthetic
+from clsplat.errors import ConfigError
+from clsplat.formats.motion import MOTION
+from clsplat.gaussians.tables import INTERVAL2, PARAMETERS
+from clsplat.pipeline.loading import load
+from clsplat.render.camera import upload_camera
+from clsplat.views.photographs import Photograph
+
+SIZE = (64, 48, 300)  # width, height, Gaussians
+
+
+@pytest.mark.parametrize(
+    ("pipeline", "losses", "columns"),
+    [
+        ("smoke", ["l1", "dssim"], {"screen_grad"}),
+        ("absgs", ["l1", "dssim"], {"screen_grad", "screen_grad_abs"}),
+        (
+            "micro_splatting_v2",
+            ["l1", "l2", "dssim", "covariance_trace"],
+            {"screen_grad", "texture", "blend_weight", "screen_radius"},
+        ),
+    ],
+)
+def test_a_case_does_what_its_pipeline_names_and_changes_nothing(device, pipeline, losses, columns):
+    timed = case(device, *SIZE, load(pipeline).settings)
+    trainer = timed.trainer
+    assert (INTERVAL2 in trainer.model.gaussians.tables) == (pipeline == "micro_splatting_v2")
+    before = {name: trainer.model.gaussians.get(name) for name in PARAMETERS}
+    timed.step(record=True)
+    view = trainer.step(timed.photograph, 1)
+    assert sorted(loss.name for loss in view.losses) == sorted(losses)
+    assert np.isfinite(view.loss)
+    assert set(trainer.stats.names) == columns
+    result = run_bench({"one": timed}, Peaks(100.0, 10.0, 10.0), repeats=2)["one"]
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(trainer.model.gaussians.get(name), before[name], err_msg=name)
+    assert result.work.gaussians == SIZE[2]
+    assert result.work.pairs > SIZE[2]
+    assert set(result.floors) <= set(result.stages)
+    assert "other" not in result.stages
+    assert 0 < result.memory < 2 * result.planned
+
+
+def test_a_case_that_moves_changes_nothing(device, rng):
+    parameters, view = synthetic(*SIZE)
+    parameters[MOTION] = rng.normal(0, 0.3, (SIZE[2], 5)).astype(np.float32)
+    pixels = rng.integers(0, 256, (3, SIZE[1], SIZE[0]), dtype=np.uint8)
+    photograph = Photograph(upload_camera(device, replace(view, time=0.5)), device.upload(pixels))
+    timed = Case(device, parameters, photograph, "black", load("dynamic_7k").settings)
+    np.testing.assert_array_equal(timed.trainer.model.gaussians.get(MOTION), parameters[MOTION])
+
+
+def test_case_has_no_edits_due_and_is_timed_after_warm_up(device):
+    timed = case(device, *SIZE, load("smoke").settings)
+    assert not timed.clock
+    assert not timed.stages
+    timed.step(record=True)
+    assert len(timed.clock) == 1
+    assert all(len(times) == 1 for times in timed.stages.values())
+
+
+PEAKS = {"gflops": 60.0, "gexp": 3.0, "gbytes": 10.0}
+TIMES = {"stages": {"sort": 1.0}, "host": 0.5, "step": 2.0, "densify": 9.0}
+
+
+def measurement(**changes):
+    return {"device": "a chip", "pipeline": "splat", "peaks": PEAKS, "scenes": {"A": TIMES}, **changes}
+
+
+def test_measurement_is_read_without_its_own_baseline(tmp_path):
+    (tmp_path / "x.json").write_text(json.dumps(measurement(against=measurement())))
+    assert read_measurement(tmp_path / "x.json", "splat") == measurement()
+
+
+@pytest.mark.parametrize(
+    ("data", "place"),
+    [
+        ([], "the file"),
+        ({}, "device"),
+        (measurement(peaks={**PEAKS, "gexp": "fast"}), "peaks.gexp"),
+        (measurement(scenes={"A": {**TIMES, "stages": 3}}), "scenes.A.stages"),
+        (measurement(scenes={"A": {"stages": {}}}), "scenes.A.host"),
+    ],
+)
+def test_what_is_no_measurement_is_refused_with_its_place(data, place, tmp_path):
+    (tmp_path / "x.json").write_text(json.dumps(data))
+    with pytest.raises(ConfigError, match=rf"x\.json: {place}: .*expected the JSON of an earlier"):
+        read_measurement(tmp_path / "x.json", "splat")
+
+
+def test_the_same_device_as_fast_as_before_needs_no_remark():
+    assert beside(measurement(), measurement()) == ["earlier: 60 GFLOP/s, 3.0 Gexp/s, copy 10.0 GB/s"]
+
+
+def test_another_device_is_named():
+    assert "  of another device: 'a chip'" in beside(measurement(device="another"), measurement())
+
+
+def test_a_machine_that_gives_less_is_told():
+    slower = measurement(peaks={**PEAKS, "gflops": 45.0})
+    told = "0.75 of its GFLOP/s, 1.00 of its Gexp/s, 1.00 of its GB/s"
+    assert told in "".join(beside(slower, measurement()))
+
+
+def test_a_scene_that_was_not_measured_is_told():
+    assert "  has not measured: B; there are A" in beside(measurement(scenes={"A": TIMES, "B": TIMES}), measurement())

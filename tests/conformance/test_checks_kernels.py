@@ -1,0 +1,46 @@
+"""The checks of `clsplat doctor` hold on the devices of the tests, and every kernel has a test."""
+
+import io
+import queue
+from dataclasses import replace
+
+import pytest
+
+from clsplat import resource_dir
+from clsplat.conformance import supervision, worker
+from clsplat.conformance.check import Note
+from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS
+from clsplat.opencl.program import parse_kernels
+from tests.support.figures import hold
+
+
+@pytest.mark.parametrize("check", [*KERNELS, *ESSENTIAL, *BITONIC], ids=lambda check: check.name.replace(" ", "_"))
+def test_the_figures_of_a_check_hold(device, check):
+    found = list(check.figures(device))
+    hold(one for one in found if not isinstance(one, Note))
+    out, lines = io.StringIO(), queue.Queue()
+    worker._run(out, replace(check, run=lambda *_: iter(found)), lambda: device)
+    worker._print(out, end=check.name, seconds=0.0)
+    for line in out.getvalue().splitlines():
+        lines.put(line)
+    told = supervision.Result(check.name, check.kernels)
+    assert supervision._fill(told, lines, 1) is None
+    assert told.failures == []
+    assert (len(told.figures), len(told.notes)) == (
+        sum(not isinstance(one, Note) for one in found),
+        len(found) - len(told.figures),
+    )
+
+
+def test_every_kernel_was_launched(launched):
+    """With each schedule, but for those that are written for one of them."""
+    for schedule, other in (("wide", "simt"), ("simt", "wide")):
+        kernels = {
+            f"{path.name}:{name}"
+            for path in resource_dir("cl_kernels").glob("*.cl")
+            if not path.stem.endswith(other)
+            for name in parse_kernels(path.read_text())
+        }
+        found = {label for one, label in launched if one == schedule}
+        assert not kernels - found, f"no kernel test launches {', '.join(sorted(kernels - found))}"
+        assert found == kernels

@@ -1,0 +1,342 @@
+"""`clsplat doctor`: verdicts, reports, and runtimes that die."""
+
+import json
+import re
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+import clsplat
+from clsplat import cli
+from clsplat.conformance import doctor, reference, supervision
+from clsplat.conformance.check import Check, Note
+from clsplat.conformance.checks import BY_NAME, KERNELS, SPEED, whole
+from clsplat.conformance.comparison import Figure
+from clsplat.conformance.doctor import examine
+from clsplat.conformance.page import report_page
+from clsplat.conformance.report import DeviceReport
+from clsplat.conformance.supervision import Result, supervised
+from clsplat.conformance.verdict import judge
+from clsplat.errors import ConfigError, MemoryLimitError, OutputError
+from clsplat.opencl import runtimes
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import resolve_schedule
+from clsplat.processes import is_alive
+from tests.support.doctor_worker import worker
+from tests.support.html_page import Page
+
+WRONG = Figure("blend_backward", "gradients of conics, 17 Gaussians", 3e-2, 2e-4)
+RIGHT = Figure("blend_backward", "gradients of colours", 1e-6, 2e-4)
+
+
+def checks(*names: str) -> list[Check]:
+    return [Check(name, ("blend_backward",), None) for name in names]
+
+
+def result(*figures: Figure, fault: str | None = None) -> list[Result]:
+    return [Result("a check", ("blend_backward",), 1.0, list(figures), fault=fault)]
+
+
+VERDICTS = {
+    "all is right": ({"wide": result(RIGHT), "simt": result(RIGHT)}, True, "use it"),
+    "the default is wrong": (
+        {"wide": result(WRONG), "simt": result(RIGHT)},
+        True,
+        "use it with --set rasterizer.schedule=simt: with the wide schedule, blend_backward differs by 0.03 in "
+        "gradients of conics, 17 Gaussians, bound 0.0002",
+    ),
+    "the other one is wrong": (
+        {"wide": result(RIGHT), "simt": result(WRONG)},
+        True,
+        "use it, as it is; but with the simt schedule, blend_backward differs by 0.03",
+    ),
+    "both are wrong": (
+        {"wide": result(WRONG), "simt": result(fault="the runtime ends the process with SIGABRT")},
+        False,
+        "do not use it: blend_backward differs by 0.03 in gradients of conics, 17 Gaussians, bound 0.0002; "
+        "1 more is wrong",
+    ),
+    "a sort is wrong": (
+        dict.fromkeys(("wide", "simt"), result(Figure("sort_tiles", "order of 300 pairs", 2, 0, counts=True))),
+        True,
+        "use it with --set rasterizer.sort=radix: sort_tiles gives 2 wrong values in order of 300 pairs",
+    ),
+    "not a number": (
+        {"wide": result(Figure("exp", "x", float("nan"), 1.0))},
+        False,
+        "do not use it: exp differs by nan in x",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", VERDICTS)
+def test_the_verdict_says_what_to_do(case):
+    schedules, usable, text = VERDICTS[case]
+    verdict = judge("wide", schedules, [])
+    assert verdict.usable == usable
+    assert verdict.text.startswith(text)
+    assert bool(verdict.advice) == (case != "all is right")
+
+
+def test_wrong_memory_does_not_hide_behind_right_kernels():
+    verdict = judge("wide", {"wide": result(RIGHT)}, result(Figure("fill_words", "samples", 3, 0, counts=True)))
+    assert verdict.text == "use it, as it is; but fill_words gives 3 wrong values in samples"
+
+
+def test_checks_go_on_after_a_runtime_that_ends_the_process(monkeypatch, info):
+    worker(monkeypatch)
+    results = list(supervised(info, "simt", checks("first", "dies", "second", "leaves", "third")))
+    assert [one.name for one in results] == ["first", "dies", "second", "leaves", "third"]
+    assert [one.holds for one in results] == [True, False, True, False, True]
+    assert results[1].fault == "the runtime ends the process with SIGABRT (noise of a runtime)"
+    assert results[3].fault == "the process ends with code 3 (noise of a runtime)"
+
+
+def test_a_runtime_that_hangs_is_stopped(monkeypatch, info):
+    monkeypatch.setattr(supervision, "WORKER", ("-c", "import time; time.sleep(600)"))
+    (one,) = supervised(info, "simt", checks("hangs"), 1)
+    assert one.fault == "gives no answer for 1 s"
+
+
+@pytest.mark.parametrize(
+    ("end", "fault"),
+    [
+        ("time.sleep(0.5); raise KeyError('rows')", "the process ends with code 1 (KeyError: 'rows')"),
+        ("time.sleep(600)", "closes its output, and does not end"),
+    ],
+)
+def test_a_process_is_given_time_for_its_code(monkeypatch, info, end, fault):
+    """Its output closes before it has one."""
+    monkeypatch.setattr(supervision, "END_SECONDS", 5, raising=False)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", f"import os, time; os.close(1); {end}"))
+    assert [one.fault for one in supervised(info, "simt", checks("rows"))] == [fault]
+
+
+def test_device_that_cannot_open_for_lack_of_memory_is_reported(monkeypatch, info):
+    script = (
+        "import sys; from clsplat.conformance import worker; from clsplat.errors import MemoryLimitError\n"
+        "def refuse(*_): raise MemoryLimitError('opening it: no memory')\n"
+        "worker.Device = refuse; worker.main(int(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:4], sys.argv[4:])"
+    )
+    monkeypatch.setattr(supervision, "WORKER", ("-c", script))
+    results = list(supervised(info, "simt", [BY_NAME["scans"], BY_NAME["rendering"]]))
+    assert [(one.fault, one.out_of_memory) for one in results] == [("opening it: no memory", True)] * 2
+
+
+def test_a_fault_that_empty_caches_mend_is_one_of_the_caches(monkeypatch, info):
+    worker(monkeypatch)
+    results = list(supervised(info, "simt", checks("first", "cached", "second", "cached", "leaves", "cached")))
+    assert [one.holds for one in results] == [True, True, True, True, False, False], (
+        "nobody tries again without success"
+    )
+    assert [one.damaged_cache for one in results] == [False, True, False, True, False, False]
+    verdict = judge("simt", {"simt": results[:4]}, [])
+    assert verdict.usable
+    assert verdict.text == "use it, once its cache of built kernels, which is damaged, is removed"
+    assert re.search("remove .*pyopencl", verdict.advice)
+    assert not judge("simt", {"simt": results}, []).usable
+
+
+def test_process_of_a_check_ends_with_its_parent(info, tmp_path):
+    """Killed, it can say nothing to the other, which may hang in a check."""
+    note = tmp_path / "process"
+    hangs = (
+        "import os, sys, time; from pathlib import Path; from clsplat.conformance import worker\n"
+        f"worker._run = lambda *_: Path({str(note)!r}).write_text(str(os.getpid())) and time.sleep(600)\n"
+        "worker.main(int(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:4], sys.argv[4:])"
+    )
+    waits = (
+        "from clsplat.conformance import supervision; from clsplat.conformance.checks import BY_NAME\n"
+        "from clsplat.opencl.discovery import list_devices\n"
+        f"info = next(one for one in list_devices() if one.place == {info.place})\n"
+        f"supervision.WORKER = ('-c', {hangs!r}); list(supervision.supervised(info, 'simt', [BY_NAME['scans']]))"
+    )
+    waiting = subprocess.Popen([sys.executable, "-c", waits])
+    try:
+        assert within(60, lambda: note.exists() and note.read_text())
+    finally:
+        waiting.kill()
+        waiting.wait()
+    process = int(note.read_text())
+    assert within(20, lambda: not is_alive(process))
+
+
+def within(seconds: float, condition) -> bool:
+    """Whether a condition holds before so many seconds are over."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and not condition():
+        time.sleep(0.05)
+    return bool(condition())
+
+
+def test_a_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_path, empty_cache):
+    for name in ("json.py", "hashlib.py"):
+        (tmp_path / name).write_text("raise RuntimeError('of the user')")
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (one,) = supervised(info, resolve_schedule(info, "auto"), [BY_NAME["scans"]])
+    assert one.holds, one.fault
+    assert runtimes.fault_of("key", *info.place) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "width", "value", "schedules"),
+    [
+        ("CPU", 16, "1e-6", ["simt", "wide"]),
+        ("CPU", 1, "1e-6", ["simt"]),
+        ("CPU", 1, "0.3", ["simt", "wide"]),
+        ("GPU", 1, "0.3", ["simt"]),
+    ],
+)
+def test_wide_is_tried_where_somebody_would_use_it(monkeypatch, info, empty_cache, kind, width, value, schedules):
+    worker(monkeypatch, value)
+    device = Device(info)
+    device.info = replace(info, kind=kind, float_width=width)
+    assert list(examine(device).schedules) == schedules
+
+
+def report_of(info, **schedules: list[Result]) -> DeviceReport:
+    return DeviceReport(info, "wide", schedules, seconds=2.0)
+
+
+def test_a_report_is_json_whatever_the_values_are(info):
+    report = report_of(info, wide=result(WRONG, Figure("exp", "x", float("nan"), 1.0)))
+    data = json.loads(json.dumps(report.data(), allow_nan=False))
+    assert data["schema"] == 1
+    assert data["verdict"]["usable"] is False
+    found = data["schedules"]["wide"][0]["figures"]
+    assert [one["value"] for one in found] == [0.03, None]
+    assert not any(one["holds"] for one in found)
+    assert data["device"]["name"] == info.name
+    assert "blend_backward differs by 0.03" in report.text()
+
+
+def test_the_page_shows_every_figure_and_the_head_of_a_build_log(info):
+    broken = Result("projection", ("project_forward",), fault="project.cl does not build", log="error: <unknown>")
+    page = report_page(report_of(info, wide=[*result(WRONG, RIGHT), broken], simt=result(RIGHT)))
+    assert Page(page).text
+    for text in (
+        info.platform,
+        "gradients of conics, 17 Gaussians",
+        "gradients of colours",
+        "error: &lt;unknown&gt;",
+        "<i>worst</i>: the largest error",
+    ):
+        assert text in page
+
+
+def memory_of(monkeypatch, largest: int, figure: Figure = RIGHT) -> tuple[list[str], DeviceReport]:
+    """What the memory check finds wrong on a device that gives no larger buffer, and its report."""
+
+    def buffer(device, size):
+        if -(-size // 64) * 64 > largest:
+            raise MemoryLimitError("could not allocate (MEM_OBJECT_ALLOCATION_FAILURE)")
+        yield figure
+
+    monkeypatch.setattr(whole, "_buffer_figures", buffer)
+    monkeypatch.setattr(whole, "available_memory", lambda: 2**34)
+    info = SimpleNamespace(memory=2**33, allocation=2**30 + 4)
+    found = list(whole.memory(SimpleNamespace(info=info), None))
+    figures, notes = ([one for one in found if isinstance(one, kind)] for kind in (Figure, Note))
+    once = [Result("memory", ("fill_words",), 1.0, figures, notes)]
+    return once[0].failures, DeviceReport(info, "wide", {"wide": result(RIGHT)}, once)
+
+
+@pytest.mark.parametrize(
+    ("largest", "words"),
+    [
+        (2**30 + 4, "wrote and read 1.00 GiB of the 1.00 GiB that one buffer may have; that is all"),
+        (2**28, "wrote and read 0.25 GiB of the 1.00 GiB that one buffer may have; a buffer of 512 MiB is refused: "
+         "other programs may hold memory of the device; end them and run `clsplat doctor` again to see what it gives"),
+        (0, "wrote and read 0.00 GiB of the 1.00 GiB that one buffer may have; a buffer of 128 MiB is refused: other"),
+    ],
+)  # fmt: skip
+def test_memory_held_by_other_programs_is_no_device_fault(monkeypatch, largest, words):
+    failures, report = memory_of(monkeypatch, largest)
+    assert failures == []
+    assert report.memory().startswith(words)
+    assert report.verdict.text == "use it"
+
+
+@pytest.mark.parametrize("largest", [2**30 + 4, 2**28])
+def test_a_buffer_that_was_given_and_holds_other_values_is_wrong(monkeypatch, largest):
+    failures, report = memory_of(monkeypatch, largest, Figure("fill_words", "samples", 3, 0, counts=True))
+    assert failures
+    assert report.verdict.text == "use it, as it is; but fill_words gives 3 wrong values in samples"
+
+
+@pytest.mark.parametrize(("value", "code"), [("1e-6", 0), ("0.3", 4)])
+def test_the_command_ends_with_4_where_a_device_computes_wrongly(monkeypatch, capsys, info, empty_cache, value, code):
+    worker(monkeypatch, value)
+    monkeypatch.setattr(sys, "argv", ["clsplat", "doctor", "--json", "--device", f"{info.platform} {info.name}"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    out, err = capsys.readouterr()
+    assert (ended.value.code or 0) == code
+    data = json.loads(out)
+    assert data["verdict"]["usable"] == (code == 0)
+    assert len(data["schedules"]["simt"]) == len(KERNELS)
+    assert len(data["once"]) == len(SPEED)
+    if code:
+        assert "do not use it: blend_backward differs by 0.3" in err
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "words"),
+    [
+        ("a folder.html", OutputError, "cannot be written"),
+        ("a file/page.html", OutputError, "cannot be written"),
+        ("pipeline.yaml", ConfigError, "ends in .html"),
+        ("null", ConfigError, "ends in .html"),
+    ],
+)
+def test_page_that_cannot_be_written_is_refused_first(monkeypatch, info, tmp_path, name, error, words):
+    (tmp_path / "a folder.html").mkdir()
+    (tmp_path / "a file").write_text("")
+    monkeypatch.setattr(doctor, "supervised", lambda *_: pytest.fail("the work began"))
+    with pytest.raises(error, match=f"{name}: .*{words}"):
+        clsplat.doctor(Device(info), tmp_path / name)
+
+
+def test_the_verdict_is_printed_where_the_page_fails_at_the_end(monkeypatch, capsys, info, empty_cache, tmp_path):
+    def full(*_):
+        raise OutputError("page.html: cannot be written (No space left on device)")
+
+    worker(monkeypatch)
+    monkeypatch.setattr("clsplat.conformance.page.write_page", full)
+    monkeypatch.setattr(sys, "argv", ["clsplat", "doctor", "--html", str(tmp_path / "page.html")])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 7
+    assert "verdict   use it" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_device_that_is_right_is_not_refused(info, empty_cache, monkeypatch):
+    """By some checks in processes of their own; each of them is run in tests/conformance/test_checks_kernels.py."""
+    monkeypatch.setattr(doctor, "KERNELS", [*KERNELS[::16], KERNELS[-1]])
+    monkeypatch.setattr(doctor, "SPEED", SPEED[:1])
+    report = examine(Device(info))
+    assert report.verdict.text == "use it", report.text()
+    assert set(report.schedules) == {"wide", "simt"} if report.default == "wide" else {"simt"}
+    assert report.note("training")["steps"] == 60
+
+
+PHILOX = (  # of the paper's own test vectors: counter, key, words
+    ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+    ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+    (
+        (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+        (0xA4093822, 0x299F31D0),
+        (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+    ),
+)
+
+
+@pytest.mark.parametrize(("counter", "key", "words"), PHILOX)
+def test_the_random_numbers_of_the_reference_are_philox(counter, key, words):
+    assert reference.philox(counter, key) == words

@@ -1,0 +1,110 @@
+"""Check the oracle of grids itself: finite differences, hand-made tables, and integrals; and the shape of a grid."""
+
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from clsplat.conformance.reference import field
+from clsplat.conformance.reference.grid import Level
+from clsplat.fields.grid import FEATURES, GridShape
+from clsplat.fields.shape import FieldShape
+
+STEP = 1e-6
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+@pytest.mark.parametrize("level", [Level(3, 64), Level(7, 16)], ids=["dense", "shared"])
+def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
+    """Through a network that reads the position twice, for samples inside and outside of the cube."""
+    samples, network = 12, field.Network(2, 0)
+    at, variances = rng.uniform(-0.2, 1.2, (samples, 3)), rng.uniform(1e-3, 1e-1, samples)
+    table, sines, direction = (
+        rng.normal(size=(level.entries, 2)),
+        rng.normal(size=(samples, 3)),
+        rng.normal(size=(samples, 2)),
+    )
+    shapes = [(5, 4), (4 + 5, 4), (4, 1), (4, 4), (4 + 2, 4), (4, 3)]
+    weights = [(rng.normal(0, 0.7, shape), rng.normal(0, 0.5, shape[1])) for shape in shapes]
+    by_colours, by_densities = rng.normal(size=(samples, 3)), rng.normal(size=(samples, 1))
+
+    def outputs() -> tuple[np.ndarray, np.ndarray, field.Inputs]:
+        position = np.concatenate([level.forward(table, at, variances), sines], axis=1)
+        return network.forward(weights, position, direction)
+
+    def value() -> float:
+        colours, densities, _ = outputs()
+        return float((colours * by_colours).sum() + (densities * by_densities).sum())
+
+    _, by_position = network.backward(weights, outputs()[2], by_colours, by_densities)
+    found = level.backward(by_position[:, :2], at, variances)
+    numeric = np.zeros_like(table)
+    for place in np.ndindex(table.shape):
+        before = table[place]
+        table[place] = before + STEP
+        high = value()
+        table[place] = before - STEP
+        numeric[place] = (high - value()) / (2 * STEP)
+        table[place] = before
+    assert np.abs(numeric).max() > 0.1
+    np.testing.assert_allclose(found, numeric, atol=1e-7)
+
+
+def test_a_linear_function_is_kept_by_the_mean_of_the_corners(rng):
+    """Where a level tells all: entries that are the coordinates give the place, also at the faces of the cube."""
+    level = Level(5, 6**3)
+    corners = np.stack(np.meshgrid(*3 * [np.arange(6)], indexing="ij"), axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
+    at = np.concatenate([rng.random((20, 3)), [[0, 0, 0], [1, 1, 1], [1, 0, 0.5]]])
+    np.testing.assert_allclose(level.forward(corners / 5, at, np.full(23, 1e-9)), at, atol=1e-12)
+
+
+def test_places_outside_of_the_cube_have_no_features(rng):
+    outside = np.array([[-1e-9, 0.5, 0.5], [0.5, 1 + 1e-9, 0.5], [0.5, 0.5, 7.0]])
+    np.testing.assert_array_equal(Level(4, 16).forward(rng.normal(size=(16, 4)), outside, np.ones(3)), 0.0)
+
+
+def test_the_weight_of_a_level_is_nearly_that_of_the_paper():
+    """erf(1 / sqrt(8 v n^2)), and so half of a cell's width under a normal distribution of the sample's size."""
+    variances = 10.0 ** np.linspace(-8, 2, 60)
+    expected = [math.erf(1 / math.sqrt(8 * v * 16**2)) for v in variances]
+    np.testing.assert_allclose(Level(16, 16).weights(variances), expected, atol=0.0071)
+
+
+def test_levels_are_dense_while_corners_fit_and_are_contiguous():
+    grid = GridShape(levels=4, coarsest=4, finest=32, entries=1024)
+    assert grid.table.tolist() == [[4, 0, 125, 0], [8, 125, 729, 0], [16, 854, 1024, 1], [32, 1878, 1024, 1]]
+    assert grid.learned == FEATURES * (125 + 729 + 1024 + 1024)
+    assert GridShape(levels=1, coarsest=3, finest=3).table.tolist() == [[3, 0, 64, 0]]
+
+
+def test_grid_parameters_follow_the_networks_and_start_near_zero():
+    plain, gridded = (FieldShape(degrees=2, grid=one) for one in (None, GridShape(levels=2, entries=16)))
+    assert gridded.position_rows == plain.position_rows + 2 * FEATURES
+    first = gridded.first_parameters(3)
+    own = first[gridded.of_network : gridded.of_network + gridded.grid.learned]
+    assert 0 < np.abs(own).min() < np.abs(own).max() < 1e-4
+    assert "grid" not in plain.model_dump()
+    assert FieldShape.model_validate(gridded.model_dump()) == gridded
+
+
+@pytest.mark.parametrize(
+    ("keys", "complaint"),
+    [
+        ({"entries": 100}, "power of 2"),
+        ({"coarsest": 16, "finest": 8}, "expected 'finest' from 16 on"),
+        ({"corner": [0.0, 1.0]}, "at least 3 items"),
+    ],
+)
+def test_a_grid_that_cannot_be_is_refused(keys, complaint):
+    with pytest.raises(ValidationError, match=complaint):
+        GridShape(**keys)
+
+
+def test_a_network_without_any_position_is_refused():
+    with pytest.raises(ValidationError, match="reads no position"):
+        FieldShape(degrees=0)

@@ -1,0 +1,314 @@
+"""One wrong constant or sign in any kernel is caught by the checks of `clsplat doctor`."""
+
+import re
+
+import pytest
+
+from clsplat import resource_dir
+from clsplat.conformance.check import Check, Note
+from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS, SPEED
+from clsplat.opencl import program
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import choose
+from clsplat.opencl.program import parse_kernels
+from tests.support.devices import NAMES
+
+pytestmark = pytest.mark.slow  # most programs are built anew
+
+FAULTS = {  # kernel -> file, text, wrong text
+    "adam_step": ("adam.h", "EPSILON 1.0e-15f", "EPSILON 1.0e-5f"),
+    "replay_updates": ("deferred.cl", "u = first; u < updates", "u = first + 1; u < updates"),
+    "note_update": ("deferred.cl", "done[block] = update + 1", "done[block] = update"),
+    "update_gaussians": ("adam.cl", "basis[0] * g[v].colour", "basis[1] * g[v].colour"),
+    "blend_forward wide": ("blend_wide.cl", "(p.blue + t * background[2])", "(p.blue + t * background[1])"),
+    "blend_backward wide": ("blend_wide.cl", "p.blue * VLOAD(image + 2 * plane", "p.blue * VLOAD(image + plane"),
+    "blend_forward simt": ("blend_simt.cl", "? p.red + t * background[0]", "? p.red - t * background[0]"),
+    "blend_backward simt": ("blend_simt.cl", "{m->power, m->x, m->y", "{m->power, -m->x, m->y"),
+    "blur_rows": ("blur.cl", "column <= last", "column < last"),
+    "blur_columns": ("blur.cl", "row <= last", "row < last"),
+    "nearest_vectors": ("clusters.cl", "difference < nearest", "difference <= nearest"),
+    "sum_members": ("clusters.cl", "components + k, (int)p)", "components + k, (int)p / 2)"),
+    "colours_forward": ("colours.cl", "br * r + bg * g + bb * b + b1, one", "br * r + bg * g + bb * b, one"),
+    "colours_backward": ("colours.cl", "rg * passed_r + gg * passed_g", "rg * passed_r + gr * passed_g"),
+    "colour_grid_forward": ("colour_grid.cl", "a[9] * g + a[10] * b + a[11]), one", "a[9] * g + a[10] * b), one"),
+    "colour_grid_backward": ("colour_grid.cl", "a[5] * p[1] + a[9] * p[2]", "a[4] * p[1] + a[9] * p[2]"),
+    "colour_grid_row_sums": ("colour_grid.cl", "total[4 * c + 1] += part * g", "total[4 * c + 1] += part * b"),
+    "colour_grid_gather": ("colour_grid.cl", "0.0f ? weight * sums[y]", "0.0f ? sums[y]"),
+    "colour_grid_smoothness": ("colour_grid_table.cl", "(before - after)", "(before + after)"),
+    "colour_grid_update": ("colour_grid_table.cl", "by_grid[e] + by_smoothness[e]", "by_grid[e]"),
+    "colour_grid_centre": ("colour_grid_table.cl", "((float)places * (float)photographs)", "(float)places"),
+    "sky_forward": ("sky.cl", "+ seen * colour", "- seen * colour"),
+    "sky_matches": ("sky.cl", "apart <= 3.0f * difference", "apart <= difference"),
+    "sky_cover": ("sky.cl", "-scale * (chosen * t)", "-scale * chosen"),
+    "sky_backward": ("sky.cl", "sums[k * 3 + channel] += weights[k]", "sums[k * 3 + channel] += weights[0]"),
+    "sky_gather": ("sky.cl", "run_sums[entries[k] * 3 + channel]", "run_sums[entries[k] * 3]"),
+    "sky_update": ("sky.cl", "sqrt(v / bias2)", "sqrt(v)"),
+    "share_mean": ("members.cl", "start + sum / total", "sum / total"),
+    "count_not_finite": ("check.cl", "<= FLT_MAX", "<= INFINITY"),
+    "count_seen": ("density.cl", "seen[i] += 1.0f", "seen[i] += 1.001f"),
+    "accumulate_norm": ("density.cl", "sqrt(x * x + y * y)", "sqrt(x * x - y * y * 0.5f)"),
+    "accumulate_sum": ("density.cl", "half_height * fabs(planes[(first + 1)", "half_width * fabs(planes[(first + 1)"),
+    "accumulate_error": ("density.cl", "total[i] += error[0]", "total[i] = error[0]"),
+    "accumulate_gain": ("density.cl", "- 2.0f * xy * x * y", "+ 2.0f * xy * x * y"),
+    "accumulate_pixel_sum": ("density.cl", "pixel_sums[pixel_sum * stride", "pixel_sums[(pixel_sum - 1) * stride"),
+    "accumulate_radius": ("density.cl", "total[i] += radius[i]", "total[i] = radius[i]"),
+    "start_edit": ("density.cl", "kept[i] = 1;", "kept[i] = 0;"),
+    "mark_rule": ("density.cl", "gradient >= gradient_above", "gradient <= gradient_above"),
+    "mark_chosen": ("density.cl", "copies[i] = outcome[i] - 1", "copies[i] = outcome[i]"),
+    "list_rows": ("density.cl", "copy >= kept[i] ? 1", "copy > kept[i] ? 1"),
+    "spawn_children": ("density.cl", "2.0f * (y * z - w * x) * ez", "2.0f * (y * z + w * x) * ez"),
+    "share_opacity": ("density.cl", "/ (float)copies[source[i]]", "/ (float)(copies[source[i]] + 1)"),
+    "cap_opacity": ("density.cl", "limit / sqrt(energy2)", "limit / energy2"),
+    "decay_opacity": ("density.cl", "+ fall));", "+ 1.0f));"),
+    "draw_left_out": ("dropout.cl", "(uint4)(i, step, 2, 0)", "(uint4)(i, step, 1, 0)"),
+    "paint_depth": ("depth.cl", "row[2] * means[2 * stride + i]", "row[2] * means[stride + i]"),
+    "fill_words": ("fill.cl", "(uint16)(word)", "(uint16)(word & 0xfffffffeu | 2u)"),
+    "sampling_interval": ("filter.cl", "z * (1.0f / focal[view])", "z * (1.0f / focal[0])"),
+    "filter_variance": ("filter.cl", "variance * taken * taken", "variance * taken"),
+    "sum_records": ("gather.cl", "pair < first + pairs", "pair + 1 < first + pairs"),
+    "haar_forward": ("haar.cl", "u * block.xz + v", "u * block.xz - v"),
+    "haar_backward": ("haar.cl", "const float2 before = low + u * high", "const float2 before = low - u * high"),
+    "gather_rows": ("gather.cl", "zero_fresh && fresh[i]", "zero_fresh || fresh[i]"),
+    "set_rows": ("gather.cl", "values[i * components + plane]", "values[i * components]"),
+    "zero_rows": ("gather.cl", "rows[i]] = 0.0f", "rows[i]] = 1.0f"),
+    "inverse_depth_loss": ("inverse_depth.cl", "(difference < 0.0f ? -1.0f", "(difference < 0.0f ? 1.0f"),
+    "sum_inverse_depths": ("inverse_depth.cl", "accumulate ? sums[i] : 0.0f", "0.0f"),
+    "inverse_depth_backward": ("inverse_depth.cl", "-sums[i] * inverse * inverse", "-sums[i] * inverse"),
+    "view_error": ("loss.cl", "fabs(VLOAD(gradient + row + x) * difference)", "VLOAD(gradient + row + x) * difference"),
+    "sum_errors": ("loss.cl", "total += row_errors[i]", "total = row_errors[i]"),
+    "weight_entropy": ("loss.cl", "row = (3 * rows + y)", "row = (2 * rows + y)"),
+    "unpack_pixels": ("loss.cl", "pixels + (channel * height + y)", "pixels + (channel * height)"),
+    "change_background": ("loss.cl", "(behind[channel] - background[channel])", "(behind[channel] - background[0])"),
+    "apply_mask": ("loss.cl", "mask[pixel] == 0.0f", "mask[pixel] != 0.0f"),
+    "pixel_loss": ("loss.cl", "(2.0f * l2)", "(1.99f * l2)"),
+    "ssim_maps": ("loss.cl", "SSIM_C2 9.0e-4f", "SSIM_C2 9.1e-4f"),
+    "ssim_gradient": ("loss.cl", "* covariance);", "* -covariance);"),
+    "count_large": ("large.cl", "tile_count[i] = total;", "tile_count[i] = total / 2;"),
+    "emit_large": ("large.cl", "corner + row * tiles_x", "corner + row * (tiles_x - 1)"),
+    "emit_pairs": ("pairs.cl", "tile += tiles_x;", "tile += tiles_x - 1;"),
+    "find_tile_offsets": ("pairs.cl", "sorted_tile[pair - 1] + 1", "sorted_tile[pair - 1] + 2"),
+    "peak_fma": ("peak.cl", "c = c * m + step", "c = c * m - step"),
+    "peak_exp": ("peak.cl", "y = x - 0.5f", "y = x - 0.51f"),
+    "peak_copy": ("peak.cl", "= *(__global const piece_t *)(values", "= 1.0001f * *(__global const piece_t *)(values"),
+    "covariance_trace": ("penalty.cl", "2.0f * weight", "weight"),
+    "anisotropy": ("penalty.cl", "(up - down)", "(up + down)"),
+    "mean_scale": ("penalty.cl", "total += scale;", "total += 2.0f * scale;"),
+    "mean_opacity": ("penalty.cl", "opacity * (1.0f - opacity)", "opacity * (1.0f + opacity)"),
+    "draw_pixels": ("rays.cl", "RANDOM_PIXELS, 0), (uint2)(seed, 0)).x", "RANDOM_PIXELS, 0), (uint2)(seed, 0)).y"),
+    "cast_rays": ("rays.cl", "cone[6] = CONE_RADIUS / camera", "cone[6] = 0.5f / camera"),
+    "spread_edges": ("rays.cl", "own[k] = near + width * place", "own[k] = near - width * place"),
+    "resample_edges": ("rays.cl", "0.5f * (low + high) + BLUR_PADDING", "0.5f * (low + high)"),
+    "encode_frustums": ("frustum.h", "(12.0f * m2 - h2)", "(12.0f * m2 + h2)"),
+    "encode_directions": ("encode.cl", "cone[3 + axis] / cone[7]", "cone[3 + axis]"),
+    "dense_forward": ("dense.cl", "larger(sums[k * BLOCK + v], (VF)(lowest))", "sums[k * BLOCK + v]"),
+    "dense_backward": ("dense.cl", "<= lowest ? (VF)(0.0f)", "< lowest ? (VF)(0.0f)"),
+    "dense_weights": ("dense.cl", "? tiles - first : CHUNK", "? tiles - first : CHUNK - 1"),
+    "dense_biases": ("dense.cl", "sum += VLOAD(by_outputs", "sum = VLOAD(by_outputs"),
+    "dense_sums": ("dense.cl", "sum += VLOAD(partials", "sum = VLOAD(partials"),
+    "dense_update": ("dense.cl", "correction2, epsilon)", "correction2, 1.0e-15f)"),
+    "grid_places": ("grid.cl", "+ 2.0f * f.across)", "+ f.across)"),
+    "grid_forward": ("grid.cl", "(down ? dy : 1.0f - dy)", "(down ? dy : 1.0f - dx)"),
+    "grid_backward": ("grid.cl", "own.z == 0.0f && own.w == 0.0f))", "own.z == 0.0f || own.w > 0.0f))"),
+    "composite_forward": ("composite.cl", "weight * colour_of(raw_colours", "weight * logistic(raw_colours"),
+    "composite_backward": ("composite.cl", "k] * by_weight - behind", "k] * by_weight + behind"),
+    "place_colours": ("composite.cl", "= colours[ray * 3 + channel];", "= colours[ray * 3];"),
+    "add_noise": ("noise.cl", "scale * scale * turned", "scale * turned"),
+    "project_forward": ("gaussian.h", "2.0f * (x * y - w * z)", "2.0f * (x * y + w * z)"),
+    "move_forward": ("motion.cl", "bounded + m.log_presence -", "bounded + 0.99f * m.log_presence -"),
+    "turn_forward": ("motion.cl", "(first + k) * stride + i) * dt", "first * stride + i) * dt"),
+    "move_backward": ("motion.cl", "(power * (float)order)", "power"),
+    "turn_backward": ("motion.cl", "by_centre - by_quat * VLOAD", "by_centre + by_quat * VLOAD"),
+    "motion_step": ("motion.cl", "smaller(larger(value, (VF)(lowest))", "smaller(larger(value, (VF)(-FLT_MAX))"),
+    "travel": ("motion_penalty.cl", "weight * time / speed", "weight * time"),
+    "brevity": ("motion_penalty.cl", "? (VF)(weight)", "? (VF)(2.0f * weight)"),
+    "pose_gradient": ("poses.cl", "- (d[m] * gd[n] - d[n] * gd[m])", "+ (d[m] * gd[n] - d[n] * gd[m])"),
+    "project_backward": ("backward.h", "energy2 = larger(1.0f + compensate", "energy2 = larger(1.0f - compensate"),
+    "accumulate_splitting": ("saddle.cl", "c * c * yy - power * c", "c * c * yy - power * a"),
+    "add_to_average": ("average.cl", "(number[i] + 1.0f)", "(number[i] + 1.1f)"),
+    "count_step": ("average.cl", "number[i] += 1.0f", "number[i] += 2.0f"),
+    "take_average": ("average.cl", "number[i] > 0.0f)", "number[i] > 2.5f)"),
+    "scan_blocks": ("scan.cl", "total = added(total, sums[i])", "total = sums[i] + 1"),
+    "scan_offsets": ("scan.cl", "offset[count] = sum", "offset[count] = sum - 1"),
+    "permute": ("scan.cl", "values[order[place]]", "values[order[place]] + 1"),
+    "count_pairs": ("sort_bitonic.cl", "if (pair < count)\n", "if (pair + 1 < count)\n"),
+    "fill_tiles": ("sort_bitonic.cl", "= depth_key[pair_splat[pair]]", "= pair_splat[pair]"),
+    "sort_tiles": ("sort_bitonic.cl", "key > other ||", "key < other ||"),
+    "radix_count": ("sort_radix.cl", "blocks + block] = sum;", "blocks + block] = sum / 2;"),
+    "radix_scatter": ("sort_radix.cl", "first_pass ? i : values[i]", "i"),
+    "lay_over": ("layer.cl", "total += inside * (1.0f - t)", "total += 1.0f - t"),
+    "look_behind": ("layer.cl", "t * VLOAD(values)", "VLOAD(values)"),
+    "measure_residuals": ("transients.cl", "(red + green + blue)", "(red + green + green)"),
+    "mask_transients": ("transients.cl", "2 * below >= counted", "2 * below > counted"),
+    "image_gradient": ("texture.cl", "0.587f * VLOAD", "0.578f * VLOAD"),
+    "hide_masked": ("texture.cl", "row <= y + 1", "row <= y"),
+    "sample_magnitude": ("texture.cl", "magnitude[row * stride + column]", "magnitude[row * stride]"),
+}  # fmt: skip
+OPEN = "ANY((one.t > 0.0f) | (other.t > 0.0f))"
+MORE = {  # that smaller pictures do not show
+    "colours_backward, what is cut": ("colours.cl", "+ g1 < 1.0f ? inside : zero", "+ g1 < 1.0f ? inside : inside"),
+    "colours_backward, a sum of another": ("colours.cl", "total[9] += passed_b * g", "total[9] += passed_b * r"),
+    "colour_grid_backward, what is cut": ("colour_grid.cl", "(changed < 1.0f ? inside : zero)", "inside"),
+    "colour_grid_backward, through the luminance": ("colour_grid.cl", "(float)(nz - 1) * between", "between"),
+    "colour_grid_centre, one photograph": ("colour_grid_table.cl", "own[p * each + i] -= mean", "own[i] -= mean"),
+    "blend_forward wide, dim pixels": (
+        "blend_wide.cl",
+        f"bool open = {OPEN}",
+        f"bool open = {OPEN}".replace("0.0", "0.01"),
+    ),
+    "grid_forward, entries that are shared": ("grid.cl", "HASH_Z 805459861u", "HASH_Z 805459863u"),
+    "grid_forward, the weight of a level": ("grid.cl", "TWO_PI * size * size", "TWO_PI * size"),
+    "grid_forward, outside of the cube": ("grid.cl", "(y <= 1.0f)", "(y <= 1.5f)"),
+    "grid_backward, sums in parts": ("grid.cl", "entry[corner] - begin < size", "entry[corner] - begin <= size"),
+    "dense_backward, rows of a grid": (
+        "dense.cl",
+        "kept ? VLOAD(found",
+        "kept ? 0.0f * VLOAD(found",
+    ),
+    "blend_forward simt, dim pixels": ("blend_simt.cl", "if (p.t > 0.0f)", "if (p.t > 0.01f)"),
+    "pixel_loss, pixels that are equal": ("loss.cl", "difference < 0.0f ?", "difference <= 0.0f ?"),
+    "scan_offsets simt, a sum that wraps": ("scan.cl", "sum | (0u - carry)", "sum"),
+    "pose_gradient, the shape": ("poses.cl", "moved + 0.5f * turned", "moved + turned"),
+    "pose_gradient, the focal length": ("backward.h", "+ s->ray_x * ray_x + s->ray_y", "- s->ray_x * ray_x + s->ray_y"),
+    "emit_large simt, one row an item": ("large.cl", "each = (rows + TEAM - 1) / TEAM", "each = 1"),
+    "emit_large simt, the same rows": ("large.cl", "begin = get_local_id(0) * each", "begin = get_local_id(0)"),
+    "emit_large simt, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),
+    "emit_large wide, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),
+    "project_forward wide, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
+    "project_forward simt, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
+    "blend_backward simt, a later batch": (
+        "blend_simt.cl",
+        "active = begin + item < last",
+        "active = begin + item < first + PIXELS",
+    ),
+    "blend_backward simt, the end of the last batch": ("blend_simt.cl", "begin < last + PIXELS &&", "begin < last &&"),
+}
+OPTIONAL = {  # in what few runs compute: doctor notices them, the check before every run has no time for it
+    **{
+        f"blend_backward {schedule}, {what}": ("splat.h", text, wrong)
+        for schedule in ("wide", "simt")
+        for what, text, wrong in (
+            ("numbers of pixels", "m->blended += k.blended ?", "m->blended += k.hit ?"),
+            ("squares", "passes ? s.opacity * grad_alpha", "passes ? k.uncapped * grad_alpha"),
+        )
+    },
+    "project_forward, what a view leaves out": ("project.cl", " & (left_out == 0)", ""),
+    "project_forward, the views of another plane": ("project.cl", "hidden_plane * stride + i", "i"),
+    "project_forward, opacities beside what is dropped": ("project.cl", " * opacity_factor", ""),
+    "draw_left_out, what the view hides": ("dropout.cl", "drawn || bits", "drawn"),
+    "adam_step, rows not seen": ("adam.cl", "(i & ~first)) != -1", "(i & ~first)) != 0"),
+    "adam_step, rows that wait": ("adam.cl", "first = every & undrawn", "first = every"),
+    "replay_updates, factors": ("deferred.cl", "factors[2 * u], factors", "factors[0], factors"),
+    "note_update, factors": ("deferred.cl", "[2 * update] = rate", "[2 * update] = correction2"),
+    "motion_step, rows not seen": ("motion.cl", "!= -1) | (VI)((int)every)", "!= 0) | (VI)((int)every)"),
+    "update_gaussians, rows not seen": ("adam.cl", "].touched | (VI)((int)every)", "].touched | (VI)(-1)"),
+    "update_gaussians, moments not seen": ("adam.h", "(updated ? v : v_before)", "v"),
+    "blend_forward wide, inverse depth": ("blend_wide.cl", "p.inverse_depth * inside", "p.inverse_depth * t"),
+    "blend_forward simt, inverse depth": ("blend_simt.cl", "inside ? p.inverse_depth", "inside ? t * p.inverse_depth"),
+    "blend_forward, weights of the inverse depth": (
+        "splat.h",
+        "p->inverse_depth += k.weight * colour",
+        "p->inverse_depth += p->t * colour",
+    ),
+    "blend_backward wide, inverse depth": ("blend_wide.cl", "+ p.inverse_depth * VLOAD", "- p.inverse_depth * VLOAD"),
+    "blend_backward simt, inverse depth": (
+        "blend_simt.cl",
+        "+ own.inverse_depth * image",
+        "- own.inverse_depth * image",
+    ),
+    "sum_inverse_depths wide, records": ("blend_wide.cl", "last = m.inverse_depth", "last = m.red"),
+    "sum_inverse_depths simt, records": ("blend_simt.cl", "last = m->inverse_depth", "last = m->red"),
+    "blend_backward, shade of the inverse depth": (
+        "splat.h",
+        "* p->inverse_depth;\n#endif\n    p->rest",
+        "* 2.0f * p->inverse_depth;\n#endif\n    p->rest",
+    ),
+    "project_forward, inverse depth": ("project.cl", "power_min, s.inverse_z", "power_min, s.z"),
+    "blend_forward wide, entropy": ("blend_wide.cl", "(p.entropy - t * log", "(p.entropy + t * log"),
+    "blend_forward simt, entropy": ("blend_simt.cl", "? p.entropy - t * log", "? p.entropy + t * log"),
+    "blend_forward, weights in the entropy": ("splat.h", "p->entropy -= k.weight *", "p->entropy -= p->t *"),
+    "blend_backward wide, entropy": ("blend_wide.cl", "(1.0f - VLOAD(image + 3", "(1.0f + VLOAD(image + 3"),
+    "blend_backward simt, entropy": ("blend_simt.cl", "(1.0f - image[3", "(1.0f + image[3"),
+    **{
+        f"{kernel} {schedule}, {what} of the pixel's box": (file, text, wrong)
+        for schedule in ("wide", "simt")
+        for kernel, what, file, text, wrong in (
+            ("blend_forward", "normal distribution", "pixel_box.h", "QUINTIC (-5.9", "QUINTIC (-6.5"),
+            ("blend_forward", "width", "pixel_box.h", "(1.0f + r - w2)", "(1.0f + r)"),
+            ("blend_forward", "variance", "pixel_box.h", "variance = c - tilt2", "variance = c + tilt2"),
+            ("blend_backward", "slope", "pixel_box.h", "= 24.0f * k * y.variance", "= 12.0f * k * y.variance"),
+            ("blend_backward", "blur", "pixel_box.h", "-(1.0f - r / w2) *", "-(1.0f + r / w2) *"),
+            ("blend_backward", "shift", "pixel_box.h", "? -mean_s : mean_s", "? mean_s : mean_s"),
+            ("blend_backward", "variance by size", "pixel_box.h", "s * s * (2.0f * part", "s * s * (part"),
+            ("project_forward", "turned splats", "project.cl", "turned ? (VF)(1.0f)", "!turned ? (VF)(1.0f)"),
+            ("project_backward", "covariance", "backward.h", "+ g_short * slope * slope", "- g_short * slope * slope"),
+            ("emit_large", "tiles", "tiles.h", "-k * longer * inverse", "k * longer * inverse"),
+        )
+    },
+    "blend_backward wide, what is left": (
+        "blend_wide.cl",
+        "p.rest + VLOAD(behind + at)",
+        "p.rest - VLOAD(behind + at)",
+    ),
+    "blend_backward simt, what no pixel blends": ("blend_simt.cl", "uint k = last + item", "uint k = end + item"),
+    "blend_backward simt, what is left": ("blend_simt.cl", "own.rest + behind[at]", "own.rest - behind[at]"),
+    "sky_forward, the lower half": ("sky.cl", "a = (x - run->sign_x * below)", "a = (x + run->sign_x * below)"),
+    "sky_cover, most of nine": ("sky.cl", "MOST_OF_BOX 0.6f", "MOST_OF_BOX 0.5f"),
+    "blend_backward, entropy": ("splat.h", "(log_weight(k.weight) + 1.0f)", "log_weight(k.weight)"),
+}
+
+
+CHECKS = {"doctor": [*KERNELS, *SPEED], "a run": [*ESSENTIAL, *BITONIC]}
+
+
+def kernel_names() -> set[str]:
+    """Names of all kernels, with their schedule where each has its own."""
+    found = set()
+    for path in resource_dir("cl_kernels").glob("*.cl"):
+        own = re.search("_(wide|simt)$", path.stem)
+        found |= {f"{name} {own[1]}" if own else name for name in parse_kernels(path.read_text())}
+    return found
+
+
+def checked_by(checks: list[Check]) -> set[str]:
+    return {kernel for check in checks for kernel in check.kernels}
+
+
+def test_every_kernel_has_a_check_and_a_planted_fault():
+    checked = checked_by(CHECKS["doctor"])
+    assert checked == {name.partition(" ")[0] for name in kernel_names()}
+    assert FAULTS.keys() == kernel_names()
+    assert checked_by(CHECKS["a run"]) < checked
+
+
+def kernel_of(planted: str) -> tuple[str, str]:
+    """The kernel of a fault, and its schedule or ''."""
+    kernel, _, schedule = planted.partition(",")[0].partition(" ")
+    return kernel, schedule
+
+
+def first_failure(device: Device, kernel: str, checks: list[Check]) -> str | None:
+    """The first figure beyond its bound in the checks of a kernel."""
+    for check in checks:
+        for found in check.figures(device) if kernel in check.kernels else ():
+            if not isinstance(found, Note) and not found.holds:
+                return found.text
+    return None
+
+
+@pytest.mark.parametrize("planted", [*FAULTS, *MORE, *OPTIONAL])
+def test_a_planted_fault_is_caught(monkeypatch, planted):
+    """The sources on disk stay as they are: the text is changed on its way to the compiler."""
+    file, text, wrong = {**FAULTS, **MORE, **OPTIONAL}[planted]
+    assert (resource_dir("cl_kernels") / file).read_text().count(text) == 1, "the place of the fault is not unique"
+    flatten = program.flatten
+
+    def with_the_fault(path, seen=None):
+        flat = flatten(path, seen)
+        return flat.replace(text, wrong) if path.name == file else flat
+
+    monkeypatch.setattr(program, "flatten", with_the_fault)
+    kernel, schedule = kernel_of(planted)
+    device = Device(choose(NAMES[0] or None), schedule or "auto")
+    for command, checks in CHECKS.items():
+        if kernel in checked_by(checks) and not (planted in OPTIONAL and command == "a run"):
+            assert first_failure(device, kernel, checks), f"{command} does not notice a fault in {kernel}"

@@ -1,0 +1,274 @@
+"""The check before a device makes pictures or models: it is done once, and a wrong device is refused everywhere."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pyopencl as cl
+import pytest
+
+import clsplat
+from clsplat import processes
+from clsplat.conformance import checks, host, quick, supervision, uses
+from clsplat.conformance import worker as worker_process
+from clsplat.conformance.check import Check
+from clsplat.conformance.checks import ESSENTIAL
+from clsplat.conformance.doctor import examine
+from clsplat.conformance.scenes import random_case
+from clsplat.errors import DeviceError, MemoryLimitError
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import tuning_of
+from clsplat.render.tiles import known_sort
+from tests.support.doctor_worker import worker
+from tests.support.models import model_of
+
+OTHER_BUILDS = {
+    "__version__": "0.0",
+    "_hash_of_checks": lambda: "other checks",
+    "_hash_of_kernels": lambda: "other sources",
+    "BUILD_OPTIONS": ("-cl-std=CL1.2", "-cl-mad-enable"),
+    "tuning_of": lambda info, schedule: {**tuning_of(info, schedule), "DIGIT_BITS": 6},
+}
+
+
+def like(device, **changes):
+    return SimpleNamespace(
+        **{"info": device.info, "schedule": device.schedule, "tuning": device.tuning, "text": "x", **changes}
+    )
+
+
+@pytest.mark.parametrize(
+    ("team", "sort", "bitonic"),
+    [(1, "auto", False), (1, "radix", False), (1, "bitonic", True), (64, "auto", True), (64, "radix", False)],
+)
+def test_bitonic_is_checked_where_the_run_can_choose_it(monkeypatch, info, empty_cache, team, sort, bitonic):
+    found = []
+    monkeypatch.setattr(quick, "supervised", lambda info, schedule, checks, seconds: found.extend(checks) or [])
+    device = like(Device(info), tuning={"TEAM": team})
+    quick.ensure_correct(device, sort)
+    assert any("sort_tiles" in check.kernels for check in found) == bitonic
+    found.clear()
+    quick.ensure_correct(device, sort)
+    assert not found
+    quick.ensure_correct(device, "bitonic")
+    assert bool(found) != bitonic
+
+
+def test_no_check_of_every_run_needs_bitonic():
+    assert not {"count_pairs", "fill_tiles", "sort_tiles"} & {name for check in ESSENTIAL for name in check.kernels}
+
+
+def test_doctor_forgets_a_device_that_it_finds_wrong(monkeypatch, info, empty_cache):
+    worker(monkeypatch)
+    device = Device(info)
+    quick.ensure_correct(device)
+    worker(monkeypatch, "0.3")
+    examine(device)
+    with pytest.raises(DeviceError, match="computes wrongly"):
+        quick.ensure_correct(device)
+
+
+def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache):
+    def check(device, rng):
+        raise MemoryLimitError("no buffer")
+        yield
+
+    out = io.StringIO()
+    worker_process._run(out, Check("rendering", (), check), lambda: None)
+    worker_process._print(out, end="rendering", seconds=0.1)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", f"print({out.getvalue()!r}, end='')"))
+    with pytest.raises(MemoryLimitError, match=r"no buffer.*other programs"):
+        quick.ensure_correct(Device(info))
+
+
+def test_a_damaged_cache_of_kernels_is_no_fault_of_the_device(monkeypatch, info, empty_cache):
+    worker(monkeypatch)
+    monkeypatch.setattr(checks, "ESSENTIAL", [Check("cached", ("blend_backward",), None)])
+    with pytest.raises(DeviceError, match=r"cache of built kernels is damaged: remove .*pyopencl"):
+        quick.ensure_correct(Device(info))
+    assert not list(empty_cache.iterdir())
+
+
+USE = """
+import os, sys
+from pathlib import Path
+from clsplat.conformance import uses
+uses.begin([Path(name) for name in sys.argv[2:]])
+if sys.argv[1] == "suddenly":
+    os.abort()
+"""
+
+
+@pytest.mark.parametrize("end", ["suddenly", "in order"])
+def test_device_is_rechecked_after_a_process_ends_silently(monkeypatch, info, empty_cache, end):
+    worker(monkeypatch)
+    device = Device(info)
+    quick.ensure_correct(device)
+    worker(monkeypatch, damaged="True")
+    records = [quick._record(info, device.schedule, "radix")]
+    subprocess.run([sys.executable, "-c", USE, end, *map(str, records)], check=False, capture_output=True)
+    if end == "in order":
+        quick.ensure_correct(device)
+        return
+    for _ in range(2):  # until that helps
+        with pytest.raises(DeviceError, match="cache of built kernels is damaged"):
+            quick.ensure_correct(device)
+    worker(monkeypatch)
+    quick.ensure_correct(device)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", "raise SystemExit(1)"))
+    quick.ensure_correct(device)
+
+
+def test_the_first_processes_of_two_containers_have_a_mark_each(monkeypatch, tmp_path):
+    """An orderly end of one says nothing of the other."""
+    marks = []
+    for namespace in ("pid:[1]", "pid:[2]"):
+        monkeypatch.setattr(processes, "_pid_namespace", lambda namespace=namespace: namespace)
+        monkeypatch.setattr(uses, "_own", set())
+        uses.begin([tmp_path / "conformance" / "record"])
+        marks += uses._own
+    assert sorted(marks) == sorted((tmp_path / uses.FOLDER).iterdir())
+    assert len(marks) == 2
+
+
+def test_an_exception_of_a_runtime_is_a_sentence():
+    def check(device, rng):
+        raise cl.LogicError("clCreateKernel failed: INVALID_KERNEL_NAME")
+        yield
+
+    out = io.StringIO()
+    worker_process._run(out, Check("rendering", (), check), lambda: None)
+    assert "the OpenCL runtime refuses a call: clCreateKernel failed: INVALID_KERNEL_NAME" in out.getvalue()
+
+
+def test_the_log_says_that_a_check_begins(monkeypatch, info, empty_cache, caplog):
+    worker(monkeypatch)
+    with caplog.at_level("INFO", "clsplat"):
+        quick.ensure_correct(Device(info))
+    assert f"checking {info.name}; this takes some seconds" in caplog.text
+
+
+def test_a_device_that_computes_wrongly_is_refused(monkeypatch, info, empty_cache):
+    worker(monkeypatch, "0.3")
+    device = Device(info)
+    for _ in range(2):  # it is not remembered
+        with pytest.raises(DeviceError, match=r"computes wrongly: blend_backward differs by 0.3 .*clsplat doctor"):
+            quick.ensure_correct(device)
+
+
+def test_a_device_that_computes_rightly_is_checked_once(monkeypatch, info, empty_cache):
+    worker(monkeypatch)
+    device = Device(info)
+    before = device.allocated, device.peak, dict(device.tuning)
+    quick.ensure_correct(device)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", "raise SystemExit(1)"))
+    quick.ensure_correct(device)
+    assert (device.allocated, device.peak, device.tuning) == before
+    for change in ({"driver": "another"}, {"platform": "another"}, {"name": "another"}):
+        with pytest.raises(DeviceError, match="cannot be trusted"):
+            quick.ensure_correct(like(device, info=replace(info, **change)))
+    other = Device(info, "simt" if device.schedule == "wide" else "wide")
+    with pytest.raises(DeviceError, match="cannot be trusted"):
+        quick.ensure_correct(other)
+    for name, changed in OTHER_BUILDS.items():
+        with monkeypatch.context() as patched:
+            patched.setattr(quick, name, changed, raising=False)
+            with pytest.raises(DeviceError, match="cannot be trusted"):
+                quick.ensure_correct(device)
+
+
+@pytest.mark.parametrize("variable", ["PYOPENCL_BUILD_OPTIONS", "POCL_VECTORIZER_PREFER_VECTOR_WIDTH", "CL_CONFIG_X"])
+def test_a_variable_that_changes_code_changes_the_record(monkeypatch, info, variable):
+    before = quick._record(info, "wide", "radix")
+    monkeypatch.setenv(variable, "-DTILE=8")
+    assert quick._record(info, "wide", "radix") != before
+    assert host.system()["environment"][variable] == "-DTILE=8"
+
+
+def test_the_place_of_a_cache_does_not_change_the_record(monkeypatch, info, tmp_path):
+    before = quick._record(info, "wide", "radix")
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    assert quick._record(info, "wide", "radix") == before
+
+
+def test_a_device_is_checked_again_with_other_build_options(monkeypatch, info, empty_cache):
+    device = Device(info)
+    quick.remember(info, device.schedule)
+    quick.ensure_correct(device)
+    monkeypatch.setenv("PYOPENCL_BUILD_OPTIONS", "-DTILE=8")
+    with pytest.raises(DeviceError, match="clsplat doctor"):
+        quick.ensure_correct(device)
+
+
+def test_device_is_checked_each_time_without_a_writable_cache(monkeypatch, info, tmp_path):
+    blocked = tmp_path / "a file"
+    blocked.write_text("")
+    monkeypatch.setattr(quick, "cache_folder", lambda: blocked)
+    started = []
+    monkeypatch.setattr(quick, "supervised", lambda *arguments: started.append(arguments) or [])
+    for _ in range(2):
+        quick.ensure_correct(Device(info))
+    assert len(started) == 2
+
+
+def test_the_two_second_form_holds(info, empty_cache):
+    opened = Device(info)
+    quick.ensure_correct(opened)
+    records = list((empty_cache / "conformance").iterdir())
+    assert len(records) == (1 if known_sort(opened, "auto") == "radix" else 2)  # either sort may be chosen
+
+
+# ---- wherever a device works
+
+
+@pytest.fixture
+def model(rng, tmp_path) -> Path:
+    """The file of a small model."""
+    model_of(random_case(rng, 3)).save(tmp_path / "model.ply")
+    return tmp_path / "model.ply"
+
+
+WORK: dict[str, Callable[[Path, Path, Path, object], object]] = {
+    "run": lambda scene, model, out, device: clsplat.run("smoke", scene, out / "run", device=device),
+    "describe_run": lambda scene, model, out, device: clsplat.describe_run("smoke", scene, out / "run", device=device),
+    "Trainer": lambda scene, model, out, device: clsplat.Trainer(scene, "smoke", out=out / "run", device=device),
+    "Renderer": lambda scene, model, out, device: clsplat.Renderer(clsplat.load(model), device),
+    "render_views": lambda scene, model, out, device: clsplat.render_views(model, scene, out / "views", device=device),
+    "evaluate": lambda scene, model, out, device: clsplat.evaluate(model, scene, device=device),
+}
+
+
+@pytest.mark.parametrize("given", ["default", "name", "open"])
+@pytest.mark.parametrize("work", WORK)
+def test_a_wrong_device_makes_no_picture_and_no_model(
+    work, given, monkeypatch, info, empty_cache, tiny_scene, model, tmp_path
+):
+    worker(monkeypatch, "0.3")
+    device = {"default": None, "name": info.name, "open": Device(info)}[given]
+    with pytest.raises(DeviceError, match=r"computes wrongly: blend_backward differs by 0.3 .*clsplat doctor"):
+        WORK[work](tiny_scene, model, tmp_path / "out", device)
+    assert not list((tmp_path / "out").rglob("*"))
+
+
+def test_a_device_is_proved_once_for_all_that_it_does(monkeypatch, info, empty_cache, tiny_scene, model, tmp_path):
+    started = []
+    supervised = quick.supervised
+    monkeypatch.setattr(quick, "supervised", lambda *arguments: started.append(1) or supervised(*arguments))
+    worker(monkeypatch)
+    for work in ("Renderer", "render_views", "evaluate", "Trainer"):
+        WORK[work](tiny_scene, model, tmp_path, Device(info))
+        assert len(started) == 1
+
+
+@pytest.mark.parametrize("records", [5, None, "name", [None, "a\0b", "../x"]])
+def test_a_damaged_mark_of_a_use_stops_nothing(records, tmp_path):
+    (tmp_path / "in_use").mkdir()
+    (tmp_path / "in_use" / "7-x.json").write_text(json.dumps({"process": os.getpid(), "records": records}))
+    uses.forget_after_sudden_ends(tmp_path)
+    assert not list((tmp_path / "in_use").iterdir())

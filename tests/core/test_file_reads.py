@@ -1,0 +1,146 @@
+"""Files are read by `clsplat.reading` alone, which takes regular files only; and what happens where they are none."""
+
+import ast
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+import clsplat
+from clsplat.errors import ClsplatError, ConfigError, DataError
+from clsplat.pipeline import recipes
+from clsplat.pipeline.matrix import load_experiment
+from clsplat.plugins import digest_of
+from clsplat.runs.summary import summary
+from clsplat.scene import decoding
+from clsplat.training import archive
+from data_tools.made import Made, hash_of
+from data_tools.video import write_frames
+from tests.support.timeouts import failing
+
+ROOT = Path(__file__).parents[2]
+METHODS = {"read_text", "read_bytes", "file_digest"}
+FUNCTIONS = {"json.load", "np.load", "np.fromfile", "cv2.imread", "cv2.VideoCapture", "os.open", "tarfile.open"}
+FUNCTIONS |= {"zipfile.ZipFile"}
+ALLOWED = {  # module and function -> why it reads by itself
+    "clsplat/reading.py:regular": "the place where files are opened",
+    "clsplat/reading.py:sha256": "the place where they are hashed",
+    "clsplat/streams.py": "opens the null device",
+    "clsplat/files.py:_sync": "syncs what was written",
+    "clsplat/training/archive.py:read": "takes a file that `regular` has opened",
+    "clsplat/training/archive.py:write": "writes",
+    "clsplat/lock.py:check_free": "locks what it opens",
+    "clsplat/lock.py:_opened": "opens for writing too",
+    "clsplat/formats/sog_files.py:sog_files": "takes the bytes that `reading` has read",
+    "clsplat/formats/sog_writing.py:_zipped": "writes",
+    "clsplat/video/encoding.py:opened": "syncs what it has written",
+    "clsplat/video/encoding.py:frames_of": "decodes what was written before",
+    "clsplat/video/webm.py:without_chance": "changes what was written before",
+    "clsplat/viewer/page.py": "reads files of the package",
+    "clsplat/live/page.py": "reads files of the package",
+    "clsplat/conformance/quick.py:_hash_of": "reads files of the package",
+    "clsplat/opencl/program.py": "reads kernels, of the package and of plug-ins: code that is trusted",
+    "clsplat/opencl/runtimes.py": "reads files of the system's loader, before clsplat can be imported",
+    "clsplat/conformance/host.py:available_memory": "reads what the kernel tells, which has no size",
+    "clsplat/opencl/kernel_caches.py:_start_of_the_machine": "reads what the kernel tells, which has no size",
+    "data_tools/video.py:decoded": "decodes what was hashed before",
+    "data_tools/moments.py:_length": "OpenCV opens videos by their names",
+    "data_tools/fetch.py:_members": "unpacks what it has downloaded",
+}
+
+
+def read_by(call: ast.Call) -> bool:
+    """Whether a call opens a file for reading."""
+    name = ast.unparse(call.func)
+    if name in FUNCTIONS or (isinstance(call.func, ast.Attribute) and call.func.attr in METHODS):
+        return True
+    mode = call.args[name == "open" :][:1] + [one.value for one in call.keywords if one.arg == "mode"]
+    reads = not mode or (isinstance(mode[0], ast.Constant) and str(mode[0].value).startswith("r"))
+    return (name == "open" or name.endswith(".open")) and reads and not (call.args[1:] and name != "open")
+
+
+def reads(path: Path) -> set[str]:
+    """Where a module reads files: 'module:function', of the innermost function."""
+    found = set()
+
+    def visit(node: ast.AST, function: str) -> None:
+        if isinstance(node, ast.FunctionDef):
+            function = node.name
+        if isinstance(node, ast.Call) and read_by(node):
+            found.add(f"{path.relative_to(ROOT).as_posix()}:{function}")
+        for child in ast.iter_child_nodes(node):
+            visit(child, function)
+
+    visit(ast.parse(path.read_text("utf-8")), "")
+    return found
+
+
+def test_files_are_read_in_one_place():
+    found = {one for room in ("clsplat", "data_tools") for path in (ROOT / room).rglob("*.py") for one in reads(path)}
+    known = {one for one in found for place in ALLOWED if one == place or one.startswith(f"{place}:")}
+    assert sorted(found - known) == [], "read with clsplat.reading, or say in ALLOWED why not"
+    unused = [place for place in ALLOWED if not any(one == place or one.startswith(f"{place}:") for one in found)]
+    assert unused == [], "is not needed any more"
+
+
+@pytest.mark.parametrize(
+    "text", ["p.open()", "p.open('rb')", "open(p)", "open(p, 'r')", "p.read_text()", "json.load(f)", "p.open(mode='r')"]
+)
+def test_the_search_finds_a_read(text):
+    assert read_by(ast.parse(text).body[0].value)
+
+
+@pytest.mark.parametrize("text", ["p.open('wb')", "open(p, 'a')", "json.loads(s)", "open_device()", "Job.open(a, b)"])
+def test_the_search_passes_over_other_calls(text):
+    assert not read_by(ast.parse(text).body[0].value)
+
+
+# ---- what is no regular file, or no text
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Path:
+    os.mkfifo(tmp_path / "pipe")
+    return tmp_path / "pipe"
+
+
+READERS = {
+    "a pipeline to copy": (lambda path: recipes.copy(str(path), path.with_name("copy.yaml")), ConfigError),
+    "a matrix": (lambda path: load_experiment(str(path)), ConfigError),
+    "a plug-in": (digest_of, ConfigError),
+    "a video": (lambda path: write_frames(path, path.with_name("frames"), 2), DataError),
+    "a file that is hashed": (hash_of, DataError),
+    "a checkpoint": (archive.read, ClsplatError),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_pipe_is_refused_at_once(name, pipe):
+    read, kind = READERS[name]
+    with failing("the reader waits", seconds=20), pytest.raises(kind, match="it is a pipe"):
+        read(pipe)
+
+
+def test_records_of_ours_that_are_pipes_count_as_missing(pipe, tmp_path, monkeypatch, caplog):
+    with failing("the reader waits", seconds=20):
+        pipe.rename(tmp_path / ".made.jsonl")
+        assert not Made(tmp_path).knows(tmp_path / "x.png")
+        os.mkfifo(tmp_path / "known.txt")
+        monkeypatch.setattr(decoding, "cache_folder", lambda: tmp_path)
+        (tmp_path / "decoded").mkdir()
+        os.mkfifo(tmp_path / "decoded" / f"opencv-{decoding.cv2.__version__}.txt")
+        assert decoding.Memory()._known == {}
+
+
+def test_a_pipeline_that_is_no_text_is_not_copied(tmp_path):
+    (tmp_path / "x.yaml").write_bytes(b"# one\n# tw\xf6\nname: x\n")
+    with pytest.raises(ConfigError, match=r"x\.yaml:2: expected UTF-8 text, found the byte 0xf6"):
+        clsplat.copy_pipeline(tmp_path / "x.yaml", tmp_path / "y.yaml")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", json.dumps({"test": 1, "gaussians": 2})])
+def test_metrics_that_are_damaged_are_one_sentence_after_a_run(text, tmp_path):
+    (tmp_path / "metrics.json").write_text(text)
+    with pytest.raises(DataError, match=r"metrics\.json: "):
+        summary(tmp_path)

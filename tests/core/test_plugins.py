@@ -1,0 +1,397 @@
+"""Variants from outside the package: loading, recording, refusing, and the same bits as inside."""
+
+import json
+import shutil
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from clsplat import plugins
+from clsplat.density.edit import Rule
+from clsplat.errors import ConfigError, as_clsplat_error
+from clsplat.pipeline.loading import load
+from clsplat.scene.detect import readers
+from clsplat.settings import Settings, variants
+from tests.support.runs import train
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+RULE = """
+from typing import Literal
+from clsplat.density.edit import Edit
+from clsplat.density.edit import Rule
+
+class Nothing(Rule):
+    type: Literal["{name}"] = "{name}"
+
+    def mark(self, edit: Edit) -> None:
+        pass
+"""
+TRIALS = {
+    "opacity_entropy": ("optimize.losses=[l1, {type: opacity_entropy, weight: 0.02}]",),
+    "box_blur": ("optimize.views={transforms: [{type: box_blur, reach: [[0, 3], [40, 0]]}]}",),
+}
+
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_plugins")]
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    path = folder / f"{name}.py"
+    path.write_text(text)
+    return path
+
+
+def test_a_class_in_a_file_is_a_variant(tmp_path):
+    plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
+    assert "mine" in variants(Rule)
+    assert load("splat", ["densify.rules=[mine]"]).resolved()["plugins"].keys() == {"mine"}
+
+
+def test_a_curve_in_a_file_is_a_schedule(tmp_path):
+    text = """
+import math
+from clsplat.schedule import Curve
+
+class Wave(Curve):
+    mean: float
+    period: int
+
+    def at(self, step: int) -> float:
+        return self.mean * (1 + 0.5 * math.sin(2 * math.pi * step / self.period))
+
+    @property
+    def values(self) -> list[float]:
+        return [0.5 * self.mean]
+"""
+    plugins.load_file(write(tmp_path, "wave", text))
+    rates = load("splat", ["optimize.rates.quats={mean: 0.002, period: 100}"]).settings.training.rates
+    assert rates.at(25, 1.0)["quats"] == pytest.approx(0.003)
+    with pytest.raises(ConfigError, match="expected values at least 0"):
+        load("splat", ["optimize.rates.quats={mean: -0.002, period: 100}"])
+
+
+def test_shipped_pipelines_name_no_plugin():
+    assert "plugins" not in load("splat").resolved()
+
+
+def test_the_schema_knows_plugins(tmp_path):
+    from clsplat.pipeline.schema import json_schema
+
+    plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
+    assert "Nothing" in json_schema()["$defs"]
+
+
+def test_the_hash_covers_kernels_and_the_headers_that_they_name(tmp_path):
+    path = write(tmp_path, "mine", "KERNELS = 'other.cl'\n")
+    (tmp_path / "other.cl").write_text('#include "own.h"\n')
+    (tmp_path / "own.h").write_text("#define A 1\n")
+    (tmp_path / "stranger.cl").write_text("x")
+    before = plugins.digest_of(path)
+    (tmp_path / "stranger.cl").write_text("y")
+    assert plugins.digest_of(path) == before
+    (tmp_path / "own.h").write_text("#define A 2\n")
+    assert plugins.digest_of(path) != before
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("import os\n1 / 0\n", r"bad\.py:2: the plug-in cannot be imported: ZeroDivisionError: division by zero"),
+        ("x = (\n", r"bad\.py:1: the plug-in cannot be imported: SyntaxError: '\(' was never closed"),
+        ("import not_there_at_all\n", r"bad\.py:1: .*ModuleNotFoundError: No module named 'not_there_at_all'"),
+        (RULE.format(name="clone"), r"two variants of \w+ have the name 'clone'"),
+    ],
+)
+def test_a_plugin_that_fails_is_one_line_and_leaves_nothing(tmp_path, text, message):
+    before = list(Settings.defined)
+    with pytest.raises(ConfigError, match=message) as error:
+        plugins.load_file(write(tmp_path, "bad", text))
+    assert "\n" not in str(error.value)
+    assert Settings.defined == before
+    load("splat", ["densify.rules=[clone]"])
+
+
+@pytest.mark.parametrize(
+    ("body", "fault"),
+    [
+        ("after: int = 3\n    def mark(self, edit): pass", r"class Mine: expected one name, as in .type: Literal"),
+        ("type: str = 'mine'\n    def mark(self, edit): pass", "class Mine: expected one name"),
+        ("type: Literal['mine', 'other'] = 'mine'\n    def mark(self, edit): pass", "class Mine: expected one name"),
+        ("type: Literal['mine'] = 'mine'", "class Mine: lacks mark"),
+    ],
+)
+def test_a_class_that_no_pipeline_can_name_is_refused(tmp_path, body, fault):
+    head = "from typing import Literal\nfrom clsplat.density.edit import Rule\nclass Mine(Rule):\n    "
+    with pytest.raises(ConfigError, match=fault):
+        plugins.load_file(write(tmp_path, "mine", head + body + "\n"))
+    assert "mine" not in variants(Rule)
+
+
+def test_an_exception_of_a_plugin_names_its_file_and_line(tmp_path):
+    text = RULE.format(name="raising").replace("pass", "1 / 0")
+    path = write(tmp_path, "raising", text)
+    plugins.load_file(path)
+    try:
+        variants(Rule)["raising"]().mark(None)
+    except ZeroDivisionError as error:
+        found = as_clsplat_error(error)
+    line = text.splitlines().index("        1 / 0") + 1
+    assert str(found) == f"{path}:{line}: ZeroDivisionError: division by zero"
+    assert found.exit_code == 2
+
+
+def test_what_a_plugin_prints_is_no_result(tmp_path, capsys):
+    plugins.load_file(write(tmp_path, "printer", "print('hello')\n"))
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", "hello\n")
+
+
+def test_a_missing_file_and_a_taken_name_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        plugins.load_file(tmp_path / "nothing.py")
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    plugins.load_file(write(tmp_path / "a", "mine", ""))
+    assert plugins.load_file(tmp_path / "a" / "mine.py") in plugins.loaded(), "the same file twice is fine"
+    with pytest.raises(ConfigError, match=r"a plug-in named .mine. is loaded from"):
+        plugins.load_file(write(tmp_path / "b", "mine", ""))
+
+
+def test_entry_points_are_loaded_and_recorded_where_used(tmp_path, monkeypatch):
+    write(tmp_path, "installed_rule", RULE.format(name="installed"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    entry = EntryPoint("a_package", "installed_rule", plugins.GROUP)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
+    plugins.load_installed()
+    assert "plugins" not in load("splat").resolved()
+    assert load("splat", ["densify.rules=[installed]"]).resolved()["plugins"].keys() == {"a_package"}
+    sys.modules.pop("installed_rule")
+
+
+STATISTIC = """
+from typing import Literal
+from clsplat.density.statistics import Statistic
+
+class Own(Statistic):
+    type: Literal["own"] = "own"
+
+    def add(self, gaussians, view, grad_mean2d, total):
+        pass
+"""
+READER = """
+from clsplat.scene import Reader
+
+class {name}(Reader):
+    name, expects = "{name}", "{name}.txt"
+
+    def matches(self, path):
+        return False
+
+    def read(self, path, holdout):
+        raise AssertionError
+"""
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Install packages: their files by name, and their entry points."""
+    folder = tmp_path / "installed"
+
+    def install(files: dict[str, str], **entries: str) -> None:
+        for name, text in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text)
+        found = [EntryPoint(name, module, plugins.GROUP) for name, module in entries.items()]
+        monkeypatch.setattr(plugins, "entry_points", lambda group: found)
+
+    monkeypatch.syspath_prepend(str(folder))
+    yield install
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("my", "my_other")]:
+        del sys.modules[name]
+
+
+def test_installed_plugin_is_recorded_where_its_import_is_used(install):
+    install(
+        {
+            "my/__init__.py": "",
+            "my/register.py": "import my.rules, my.columns",
+            "my/rules.py": RULE.format(name="one"),
+            "my/columns.py": STATISTIC,
+            "my_other.py": RULE.format(name="two"),
+        },
+        first="my.register",
+        second="my_other",
+    )
+    plugins.load_installed()
+
+    def recorded(rule: str) -> set[str]:
+        return set(load("splat", [f"densify.rules=[{rule}]"]).settings.plugins)
+
+    assert recorded("clone") == set()
+    assert recorded("one") == {"first"}
+    assert recorded("two") == {"second"}
+    assert recorded("{type: clone, statistic: own}") == {"first"}
+
+
+def test_an_installed_reader_is_recorded_always(install):
+    install({"my.py": READER.format(name="Own")}, first="my")
+    plugins.load_installed()
+    assert set(load("splat").settings.plugins) == {"first"}
+
+
+@pytest.mark.parametrize(("text", "reason"), [("\n1 / 0", "ZeroDivisionError"), ("\nx = (", "SyntaxError")])
+def test_the_failure_of_an_installed_plugin_names_file_and_line(install, text, reason):
+    install({"my/__init__.py": "", "my/register.py": "import my.rules", "my/rules.py": text}, first="my.register")
+    with pytest.raises(ConfigError, match=rf"/my/rules\.py:2: the plug-in cannot be imported: {reason}: "):
+        plugins.load_installed()
+    assert "my.register" not in sys.modules
+
+
+def test_the_hash_of_an_installed_plugin_covers_its_package(install, tmp_path):
+    install({"my/__init__.py": "", "my/register.py": "", "my/late.py": "x = 1"}, first="my.register")
+    plugins.load_installed()
+    (before,) = plugins.loaded()
+    plugins._loaded.clear()
+    install({"my/late.py": "x = 2"}, first="my.register")
+    plugins.load_installed()
+    assert plugins.loaded()[0].digest != before.digest
+
+
+def test_the_hash_covers_modules_of_the_folder_that_are_imported(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(plugins, "_loaded", {})
+    file = write(tmp_path, "mine", "from a_helper import x\n")
+    digests = set()
+    for text in ("x = 1", "x = 2000"):
+        write(tmp_path, "a_helper", text)
+        write(tmp_path, "not_imported", text)
+        plugins.load_file(file)
+        digests.add(plugins.loaded()[0].digest)
+        write(tmp_path, "not_imported", f"{text}0")
+        plugins.load_file(file)
+        write(tmp_path, "a_helper", f"{text}0")
+        with pytest.raises(ConfigError, match="have changed since it was loaded; restart Python"):
+            plugins.load_file(file)
+        plugins._loaded.clear()
+        del sys.modules["a_helper"]
+        Settings.defined[:] = [kind for kind in Settings.defined if kind.__module__ != "clsplat_plugin_mine"]
+    assert len(digests) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (READER.format(name="Own") + "1 / 0", r"bad\.py:12: .*ZeroDivisionError"),
+        (READER.format(name="Own") + "raise SystemExit(3)", r"bad\.py:12: .*SystemExit: 3"),
+        (READER.format(name="COLMAP"), r"bad\.py: two readers have the name 'COLMAP'"),
+    ],
+)
+def test_a_plugin_that_fails_leaves_no_reader_and_no_module(tmp_path, text, message):
+    before = [type(reader) for reader in readers()]
+    with pytest.raises(ConfigError, match=message):
+        plugins.load_file(write(tmp_path, "bad", text))
+    assert [type(reader) for reader in readers()] == before
+    assert "clsplat_plugin_bad" not in sys.modules
+
+
+def test_a_taken_name_is_found_in_the_first_call_of_a_process(tmp_path):
+    file = write(tmp_path, "bad", RULE.format(name="clone"))
+    code = f"""
+import clsplat
+try:
+    clsplat.load_plugin({str(file)!r})
+except clsplat.errors.ConfigError as error:
+    print(error)
+clsplat.check("splat")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"{file}: two variants of Rule have the name 'clone'")
+
+
+def test_pipeline_with_a_missing_or_changed_plugin_is_refused(tmp_path):
+    file = write(tmp_path, "mine", RULE.format(name="mine"))
+    plugins.load_file(file)
+    saved = tmp_path / "pipeline.yaml"
+    saved.write_text(load("splat", ["densify.rules=[mine]"]).text())
+    load(str(saved))
+    plugins._loaded.clear()
+    with pytest.raises(ConfigError, match=r"needs the plug-in 'mine', which is not loaded; use --plugin"):
+        load(str(saved))
+    Settings.defined[:] = [kind for kind in Settings.defined if not kind.__module__.startswith("clsplat_plugin_")]
+    file.write_text(file.read_text() + "\n# changed\n")
+    plugins.load_file(file)
+    with pytest.raises(ConfigError, match=r"needs the plug-in 'mine' with sha256 \w{12}, .*mine\.py has sha256 \w{12}"):
+        load(str(saved))
+
+
+@pytest.mark.parametrize("name", TRIALS)
+def test_the_bits_are_those_of_the_same_code_inside_the_package(name, tiny_scene, tmp_path):
+    """A copy of the package with the example among its modules, run in a process of its own, beside the plug-in."""
+    inside = tmp_path / "inside"
+    shutil.copytree(EXAMPLES.parent / "clsplat", inside / "clsplat", ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in ("cl_kernels", "pipelines", "data_tools"):
+        shutil.copytree(EXAMPLES.parent / folder, inside / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    room = {"opacity_entropy": "losses", "box_blur": "views"}[name]
+    shutil.copy(EXAMPLES / f"{name}.py", inside / "clsplat" / room)
+    shutil.copy(EXAMPLES / f"{name}.cl", inside / "clsplat" / room)
+    code = f"import sys; sys.path.insert(0, {str(inside)!r}); from clsplat.cli import main; main()"
+    hashes = []
+    for label, command in (("in", [sys.executable, "-c", code]), ("out", [sys.executable, "-m", "clsplat"])):
+        plugin = ["--plugin", str(EXAMPLES / f"{name}.py")] if label == "out" else []
+        sets = [part for setting in TRIALS[name] for part in ("--set", setting)]
+        arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(tmp_path / label), *sets]
+        cwd = inside if label == "in" else EXAMPLES.parent
+        done = subprocess.run([*command, *plugin, *arguments], capture_output=True, text=True, cwd=cwd, check=False)
+        assert done.returncode == 0, done.stderr
+        hashes.append((tmp_path / label / "point_cloud.ply").read_bytes())
+    assert hashes[0] == hashes[1]
+    recorded = (tmp_path / "out" / "pipeline.yaml").read_text()
+    assert f"plugins: {{{name}: " in recorded
+    plain = train(tiny_scene, tmp_path / "plain")
+    assert (plain.out / "point_cloud.ply").read_bytes() != hashes[0], "the example changes nothing"
+
+
+def test_a_run_with_a_plugin_resumes_only_with_it(tiny_scene, tmp_path):
+    runner, out = CliRunner(), tmp_path / "run"
+    from clsplat import cli
+
+    arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(out)]
+    arguments += ["--set", "optimize.losses=[l1, opacity_entropy]"]
+    plugin = ["--plugin", str(EXAMPLES / "opacity_entropy.py")]
+    assert runner.invoke(cli.app, [*plugin, *arguments]).exit_code == 0
+    command = [sys.executable, "-m", "clsplat", "run", str(out / "pipeline.yaml"), "--out", str(out), "--resume"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=EXAMPLES.parent, check=False)
+    assert done.returncode == 2
+    assert "needs the plug-in 'opacity_entropy', which is not loaded" in done.stderr
+    assert "Traceback" not in done.stderr
+    status = json.loads((out / "status.json").read_text())
+    assert status["state"] == "done", "a refused command leaves the run as it was"
+
+
+def test_a_comparison_says_which_plugins_are_missing(tiny_scene, tmp_path, caplog):
+    from clsplat.compare.page import write_comparison
+
+    plugins.load_file(EXAMPLES / "opacity_entropy.py")
+    out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]").out
+    write_comparison([out], tmp_path / "with.html")
+    plugins._loaded.clear()
+    write_comparison([out], tmp_path / "without.html")
+    sentence = "needs the plug-in 'opacity_entropy', which is not loaded"
+    assert sentence in caplog.text
+    assert sentence not in (tmp_path / "with.html").read_text()
+    assert sentence.replace("'", "&#39;") in (tmp_path / "without.html").read_text()
+
+
+@pytest.mark.parametrize("command", ["render", "evaluate"])
+def test_commands_on_a_run_say_that_its_plugin_is_missing(command, tiny_scene, tmp_path):
+    plugins.load_file(EXAMPLES / "opacity_entropy.py")
+    out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]").out
+    arguments = [sys.executable, "-m", "clsplat", command, str(out)]
+    done = subprocess.run(arguments, capture_output=True, text=True, cwd=EXAMPLES.parent, check=False)
+    assert done.returncode == 2
+    assert "needs the plug-in 'opacity_entropy', which is not loaded; use --plugin" in done.stderr

@@ -1,0 +1,201 @@
+"""How far work on the host is: who hears it, and the time that is left."""
+
+import io
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from clsplat import progress, terminal
+from clsplat.prepare.cache import Planned, prepare
+from clsplat.prepare.steps import FindFeatures, MapCameras
+from clsplat.progress import Count, Progress, clock, heard_by, watched
+from clsplat.runs.opening import READ_SCENE, counts_of
+from clsplat.training.found import photographs_text
+from clsplat.training.status import StatusFile
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """The time, which stands still but for the test."""
+    clocked = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clocked[0])
+    return clocked
+
+
+def test_the_time_left_follows_from_what_this_call_has_done(now):
+    count = Count("photographs", 30)
+    assert count.seconds_left is None
+    now[0] += 10
+    count.reach(5)
+    assert count.seconds_left == 50
+    now[0] += 50
+    count.reach(30)
+    assert count.seconds_left == 0
+
+
+def test_what_an_earlier_call_has_done_took_no_time(now, monkeypatch):
+    began = Count("photographs", 30)
+    began.reach(20)  # at once: it was there
+    now[0] += 5
+    began.reach(25)
+    assert began.seconds_left == pytest.approx(5, rel=0.9)
+
+
+def test_pieces_that_differ_much_tell_no_time(now):
+    count = Count("steps of the preparation", 4, is_even=False)
+    now[0] += 10
+    count.reach(1)
+    assert count.seconds_left is None
+
+
+def test_nothing_to_count_is_not_heard(tmp_path):
+    heard = []
+    with heard_by(lambda *what, seconds_left: heard.append((*what, seconds_left))):
+        prepare([], tmp_path, tmp_path)
+        Count("photographs", 0).reach(0)
+        assert heard == []
+        planned = [Planned(MapCameras(), "", "", tmp_path, "")] * 2
+        prepare(planned, tmp_path, tmp_path)
+    assert heard == [("steps of the preparation", done, 2, None) for done in (0, 0, 1)]
+
+
+def test_everyone_around_hears(now):
+    inner, outer = [], []
+    with (
+        heard_by(lambda *what, seconds_left: outer.append((*what, seconds_left))),
+        heard_by(lambda *what, seconds_left: inner.append(what)),
+    ):
+        count = Count("pairs", 4)
+        now[0] += 3
+        count.reach(1)
+    Count("others", 1)
+    assert inner == [("pairs", 0, 4), ("pairs", 1, 4)]
+    assert outer == [("pairs", 0, 4, None), ("pairs", 1, 4, 9)]
+
+
+def test_work_that_does_not_count_is_watched(monkeypatch):
+    monkeypatch.setattr(progress, "WATCH", 0.001)
+    heard, seen = [], threading.Event()
+
+    def listen(what, done, total, /, *, seconds_left):
+        heard.append(done)
+        if done == 2:
+            seen.set()
+
+    with heard_by(listen), watched(Count("pairs", 9), lambda: 2):
+        assert seen.wait(5)
+    assert heard == [0, 2]
+    assert not [thread for thread in threading.enumerate() if thread.name == "count"]
+
+
+def test_no_time_left_is_shown_while_preparation_steps_remain(tmp_path):
+    status = StatusFile(tmp_path)
+    listen = counts_of(status)
+    for stage, left in (("match_features", None), (READ_SCENE, 4), ("undistort", None)):
+        with status.stage(stage):
+            listen("pairs", 3, 9, seconds_left=4.0)
+            assert status.now.seconds_left == left
+            assert status.now.progress.unit == "pairs"
+    status.note(seconds_left=4)
+    status.enter("running")
+    assert status.now.seconds_left is None
+
+
+def test_a_terminal_shows_a_bar_and_a_pipe_does_not(monkeypatch, capsys):
+    with terminal.counted():
+        Count("pairs matched", 4).reach(2)
+    assert capsys.readouterr().out == ""
+    console = terminal.Console(force_terminal=True, width=100)
+    monkeypatch.setattr(terminal, "CONSOLE", console)
+    with console.capture() as shown, terminal.counted():
+        Count("pairs matched", 4).reach(2)
+    assert "pairs matched: 2 of 4" in shown.get()
+
+
+@pytest.fixture
+def screen(monkeypatch) -> io.StringIO:
+    """What a terminal shows, of stdout and of stderr."""
+    shown = io.StringIO()
+    for name in ("CONSOLE", "ERRORS"):
+        console = terminal.Console(file=shown, force_terminal=True, width=120, highlight=False)
+        monkeypatch.setattr(terminal, name, console)
+    return shown
+
+
+@pytest.fixture
+def log_shown(screen) -> Iterator[None]:
+    before = progress.LOG.handlers[:], progress.LOG.level
+    terminal.start_logging(debug=False, remarks=terminal.CONSOLE)
+    yield
+    progress.LOG.handlers[:] = before[0]
+    progress.LOG.setLevel(before[1])
+
+
+def text_of(bar: "terminal._RunBar") -> str:
+    return bar.__rich__().tasks[0].description
+
+
+def test_the_bar_of_a_run_moves_between_reports(tmp_path, monkeypatch):
+    status, now = StatusFile(tmp_path), [100.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    bar = terminal._RunBar(status)
+    status.note(stage="optimize")
+    assert text_of(bar) == "optimize"
+    status.count("steps", 1, 90, step=1, steps=90)
+    assert text_of(bar) == "step 1/90"
+    now[0] += 10
+    status.count("steps", 3, 90, step=3, steps=90)
+    assert text_of(bar) == "step 3/90  about 7:15 left"
+    bar.report(Progress(10, 90, 0.1, 20.0, 1000, 5.0, 80.0))
+    now[0] += 20
+    status.count("steps", 30, 90, step=30, steps=90)
+    assert text_of(bar) == "step 30/90  loss 0.1000  psnr 20.0  gaussians 1,000  5.0 ms/step  1:00 left"
+    assert (bar.bar.tasks[0].completed, bar.bar.tasks[0].total) == (30, 90)
+    status.note(stage="evaluate")
+    status.count("views", 2, 8)
+    assert text_of(bar) == "evaluate: 2 of 8 views"
+
+
+def test_warnings_stand_above_the_bar(screen, log_shown):
+    with terminal.counted():
+        Count("pairs matched", 4)
+        terminal.LOG.warning("cannot be renamed")
+        text = screen.getvalue()
+    before = text[: text.index("warning: cannot be renamed")]
+    assert before.endswith("\x1b[2K"), (before, text)
+
+
+def test_counts_are_not_said_above_a_bar(now, screen, log_shown):
+    with terminal.counted():
+        count = Count("pairs matched", 4)
+        now[0] += 9
+        count.reach(2)
+    assert "pairs matched: 2 of 4, 0:09 left" not in screen.getvalue()
+    count = Count("pairs matched", 4)
+    now[0] += 9
+    count.reach(2)
+    assert "pairs matched: 2 of 4, 0:09 left" in screen.getvalue()
+
+
+def test_what_was_placed_is_told_in_words():
+    figures = {"registered": 32, "not_registered": ["IMG_0034.jpg"], "points": 9, "error_px": 1.268}
+    step = MapCameras(stage="map_cameras")
+    assert step.told(figures) == "32 of 33 photographs placed, 1.27 px; left out: IMG_0034.jpg"
+    assert step.told({**figures, "not_registered": []}) == "32 of 32 photographs placed, 1.27 px"
+    many = step.told({**figures, "not_registered": [f"{i}.jpg" for i in range(20)]})
+    assert many.endswith("6.jpg, 7.jpg, and 12 more")
+    assert FindFeatures(stage="find_features").told({"photographs": 5, "none": ""}) == "photographs 5"
+
+
+def test_photographs_that_cannot_be_read_are_counted():
+    features = {"photographs": 4, "damaged": {"b.jpg": "not an image"}}
+    assert FindFeatures(stage="find_features").told(features) == "photographs 4, damaged b.jpg"
+    cameras = {"registered": 3, "not_registered": ["c.jpg"], "error_px": 0.5}
+    text = photographs_text({"find_features": features, "map_cameras": cameras})
+    assert text == "3 of 5 photographs placed, 0.50 px; left out: b.jpg (not an image), c.jpg"
+    assert photographs_text({"find_features": "damaged", "map_cameras": cameras}) == ""
+
+
+def test_times_are_read_as_on_a_clock():
+    assert [clock(seconds) for seconds in (0, 59.6, 3600, 3725)] == ["0:00", "1:00", "1:00:00", "1:02:05"]

@@ -1,0 +1,180 @@
+"""Variants: known as soon as their class is defined, named by a word or by a mapping, and explained when misspelt."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from clsplat.density.edit import Edit, Rule
+from clsplat.errors import ConfigError
+from clsplat.losses.base import ImageLoss, Loss, Penalty
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.schema import json_schema
+from clsplat.settings import OneOf, Settings, descriptions, rebuild, tag_of, variants
+from clsplat.stages.base import Scheduled, Stage
+from clsplat.training.run import Run
+from clsplat.views.order import Order, Paper
+from clsplat.views.transforms import PhotographTransform
+
+PIPELINE = """\
+name: small
+stages:
+  - init
+  - optimize:
+      steps: 10
+      views: {views}
+      losses: {losses}
+      during:
+        - densify: {{every: 5, rules: {rules}, budget: {budget}}}
+"""
+
+
+@pytest.fixture
+def loaded(tmp_path: Path):
+    def loaded(views: str = "{}", losses: str = "[l1]", rules: str = "[clone]", budget: str = "null") -> Pipeline:
+        path = tmp_path / "small.yaml"
+        path.write_text(PIPELINE.format(views=views, losses=losses, rules=rules, budget=budget))
+        return load(str(path))
+
+    return loaded
+
+
+@pytest.fixture
+def own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Forget afterwards the variants that a test defines."""
+    load("smoke")  # the first pipeline of a process makes all variants known that there are
+    with monkeypatch.context() as patch:
+        patch.setattr(Settings, "defined", list(Settings.defined))
+        yield
+    rebuild()
+
+
+def test_variants_are_the_subclasses_with_a_name():
+    images = ["inverse_depth", "weight_entropy", "l1", "l2", "dssim"]
+    assert list(variants(Loss)) == [
+        *images,
+        "travel",
+        "brevity",
+        "covariance_trace",
+        "anisotropy",
+        "mean_scale",
+        "mean_opacity",
+    ]
+    assert variants(Loss).keys() == variants(ImageLoss).keys() | variants(Penalty).keys()
+    assert variants(Order)["paper"] is Paper
+    assert tag_of(Paper) == ("type", "paper")
+    assert tag_of(Order) is None, "a base is no variant"
+    assert {"densify", "evaluate", "checkpoint"} <= variants(Scheduled).keys() < variants(Stage).keys()
+
+
+@pytest.mark.usefixtures("own")
+def test_a_variant_defined_later_is_known_after_a_rebuild(loaded):
+    class Thin(Rule):
+        """Remove every n-th Gaussian."""
+
+        type: Literal["thin"] = "thin"
+        nth: int = 2
+        """Which."""
+
+        def mark(self, edit: Edit) -> None:
+            pass
+
+    assert variants(Rule)["thin"] is Thin
+    with pytest.raises(ConfigError, match="no rule named 'thin'"):
+        loaded(rules="[thin]")
+    rebuild()
+    assert loaded(rules="[{type: thin, nth: 3}]").settings.training.during[0].rules == [Thin(nth=3)]
+    assert "Thin" in json_schema()["$defs"]
+
+
+@pytest.mark.usefixtures("own")
+def test_nested_variants_are_known_in_any_definition_order(tmp_path):
+    class Apply(Stage):
+        """Apply a rule."""
+
+        stage: Literal["apply"] = "apply"
+        rule: OneOf[Rule]
+        """Which."""
+
+        def run(self, run: Run) -> None:
+            pass
+
+    rebuild()
+
+    class Thin(Rule):
+        type: Literal["thin"] = "thin"
+
+        def mark(self, edit: Edit) -> None:
+            pass
+
+    rebuild()
+    (tmp_path / "apply.yaml").write_text("name: apply\nstages: [{apply: {rule: thin}}]\n")
+    assert load(str(tmp_path / "apply.yaml")).stages == [Apply(rule=Thin())]
+
+
+@pytest.mark.usefixtures("own")
+def test_two_variants_of_one_name_are_refused():
+    class Other(Order):
+        type: Literal["paper"] = "paper"
+
+    with pytest.raises(ConfigError) as error:
+        variants(Order)
+    assert str(error.value) == (
+        "two variants of Order have the name 'paper': clsplat.views.order.Paper and tests.core.test_settings.Other; "
+        "rename one"
+    )
+
+
+def test_a_word_means_the_variant_with_its_defaults(loaded):
+    words = loaded("{order: paper}", "[l1, dssim]", "[clone, prune_faint]")
+    mappings = loaded("{order: {type: paper}}", "[{type: l1}, {type: dssim}]", "[{type: clone}, {type: prune_faint}]")
+    assert words.resolved() == mappings.resolved()
+    assert words.resolved() != loaded("{order: code}", "[l1, dssim]", "[clone, prune_faint]").resolved()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"rules": "[clone, splitt]"}, "small.yaml:9: stages[1].optimize.during[0].densify.rules[1]: no rule named "
+         "'splitt'; did you mean 'split'?"),
+        ({"rules": "[{type: splitt}]"}, "no rule named 'splitt'; did you mean 'split'?"),
+        ({"losses": "[disim]"}, "small.yaml:7: stages[1].optimize.losses[0]: no loss named 'disim'; did you mean "
+         "'dssim'?"),
+        ({"losses": "[xyz]"}, "no loss named 'xyz'; there are anisotropy, brevity, covariance_trace, dssim, "
+         "inverse_depth, l1, l2"),
+        ({"views": "{order: papr}"}, "small.yaml:6: stages[1].optimize.views.order: no order named 'papr'; did you "
+         "mean 'paper'?"),
+        ({"views": "{transforms: [blurr]}"}, "no photograph transform named 'blurr'; did you mean 'blur'?"),
+        ({"views": "{order: 3}"}, "stages[1].optimize.views.order: "),
+        ({"views": "{order: {}}"}, "stages[1].optimize.views.order: expected a 'type', the name of the order"),
+        ({"views": "{order: {type: paper, share: 1}}"}, "optimize.views.order.share: unknown key 'share'"),
+        ({"budget": "{gaussians: 1}"}, "small.yaml:9: stages[1].optimize.during[0].densify.budget: expected a "
+         "'type', the name of the budget"),
+        ({"budget": "parabol"}, "no budget named 'parabol'; did you mean 'parabola'?"),
+        ({"views": "{oder: paper}"}, "unknown key 'oder'; did you mean 'order'?"),
+        ({"views": "{transforms: [blur]}"}, "'sigma' is missing"),
+        ({"rules": "[{type: clone, statistic: screen_grat}]"}, "rules[0].statistic: expected "),
+    ],
+)  # fmt: skip
+def test_what_is_not_a_variant_is_explained_in_one_line(loaded, settings, message):
+    with pytest.raises(ConfigError) as error:
+        loaded(**settings)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_every_variant_says_what_it_is():
+    """Its docstring is its manual, and so are those of its fields."""
+    for base in (Stage, Loss, Rule, Order, PhotographTransform):
+        for name, kind in variants(base).items():
+            assert kind.__doc__, name
+            for key in kind.model_fields:
+                assert key in ("stage", "type", *descriptions(kind)), f"{name}.{key} has no docstring"
+
+
+@pytest.mark.parametrize("key", ["screen_filter.variance", "near"])
+def test_number_no_model_file_holds_is_refused_before_training(key):
+    with pytest.raises(ConfigError, match=key.rpartition(".")[2]):
+        load("smoke", [f"model.{key}=1e38"])
+    load("smoke", [f"model.{key}=1e14"])

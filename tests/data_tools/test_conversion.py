@@ -1,0 +1,312 @@
+"""The small tools: frames of a video, image pyramids, masks."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from clsplat import cli
+from clsplat.errors import DataError
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import read_image
+from data_tools import resize as resize_tool
+from data_tools import video as video_tool
+from data_tools.masks import write_masks
+from data_tools.resize import write_pyramid
+from data_tools.video import sharpest, write_frames
+from tests.support.colmap_writer import CameraEntry, ColmapModel, ImageEntry, write_scene
+from tests.support.pictures import contents
+from tests.support.refusals import refusal
+
+# ---- video
+
+
+@pytest.fixture
+def video(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Thirty frames whose grey level is their number; only every third is not blurred."""
+    path = tmp_path / "v.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (96, 64))
+    noise = rng.integers(0, 60, (64, 96, 1))
+    for i in range(30):
+        image = np.repeat(noise + 6 * i, 3, axis=2).astype(np.uint8)
+        writer.write(image if i % 3 == 1 else cv2.GaussianBlur(image, (0, 0), 3))
+    writer.release()
+    return path
+
+
+def test_the_sharp_frames_of_a_video(video, tmp_path):
+    assert write_frames(video, tmp_path / "frames", frames=10) == 10
+    files = sorted((tmp_path / "frames").glob("*.png"))
+    assert [file.name for file in files] == [f"frame_{i:05d}.png" for i in range(1, 11)]
+    levels = [(read_image(file).mean() - 29.5) / 6 for file in files]
+    np.testing.assert_allclose(levels, np.arange(1, 30, 3), atol=0.6)
+
+
+def test_a_camera_that_rests_gives_one_frame(tmp_path, rng):
+    """It rests, passes a wall in the middle third of the video, and rests again."""
+    wall = cv2.GaussianBlur(rng.integers(0, 255, (90, 300, 3)).astype(np.uint8), (0, 0), 2)
+    writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (120, 90))
+    for i in range(60):
+        place = 3 * int(np.clip(i - 20, 0, 20))
+        writer.write(wall[:, place : place + 120])
+    writer.release()
+    write_frames(tmp_path / "v.avi", tmp_path / "frames", 8)
+    chosen = json.loads((tmp_path / "frames" / ".frames.json").read_text())["chosen"]
+    assert len(chosen) == 8
+    assert sum(20 <= place <= 41 for place in chosen) >= 6
+
+
+def test_parts_have_the_same_motion():
+    assert sharpest([1, 3, 2, 1, 2, 3], [0] * 6, 3) == [1, 2, 5]
+    assert sharpest([1, 1, 1, 1, 2, 1], [0, 0, 0, 0, 5, 5], 2) == [4, 5]
+    assert sharpest([1.0], [0.0], 4) == [0]
+
+
+def test_frames_are_not_taken_twice(video, tmp_path):
+    write_frames(video, tmp_path / "frames", frames=4, long_side=48)
+    files = sorted((tmp_path / "frames").glob("*.png"))
+    assert read_image(files[0]).shape == (32, 48, 3)
+    kept = files[0].stat().st_mtime_ns
+    files[1].unlink()
+    assert write_frames(video, tmp_path / "frames", frames=4, long_side=48) == 4
+    assert files[0].stat().st_mtime_ns == kept
+    assert files[1].is_file()
+
+
+@pytest.mark.parametrize("chosen", [5, [], [[1], 2], ["a"], [True], [3, 1], None])
+def test_a_damaged_list_of_frames_is_made_again(chosen, video, tmp_path):
+    write_frames(video, tmp_path / "frames", frames=4)
+    record = tmp_path / "frames" / ".frames.json"
+    before = record.read_text()
+    record.write_text(json.dumps({**json.loads(before), "chosen": chosen}))
+    (tmp_path / "frames" / "frame_00002.png").unlink()
+    assert write_frames(video, tmp_path / "frames", frames=4) == 4
+    assert record.read_text() == before
+    assert (tmp_path / "frames" / "frame_00002.png").is_file()
+
+
+def test_frames_that_the_video_does_not_have_are_told(video, tmp_path):
+    write_frames(video, tmp_path / "frames", frames=2)
+    record = tmp_path / "frames" / ".frames.json"
+    record.write_text(json.dumps({**json.loads(record.read_text()), "chosen": [0, 10**6]}))
+    (tmp_path / "frames" / "frame_00002.png").unlink()
+    with pytest.raises(DataError, match="names frame 1000000, which the video does not have"):
+        write_frames(video, tmp_path / "frames", frames=2)
+
+
+def test_a_frame_that_was_damaged_is_made_again(video, tmp_path):
+    write_frames(video, tmp_path / "frames", frames=2)
+    frame = tmp_path / "frames" / "frame_00001.png"
+    before = frame.read_bytes()
+    frame.write_bytes(b"")
+    assert write_frames(video, tmp_path / "frames", frames=2) == 2
+    assert frame.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "more", [{"frames": 5}, {"long_side": 32}, {"video": "w.avi"}], ids=lambda more: next(iter(more))
+)
+def test_frames_of_another_video_or_other_settings_do_not_mix(video, tmp_path, more):
+    write_frames(video, tmp_path / "frames", frames=4)
+    before = {path.name: path.read_bytes() for path in (tmp_path / "frames").iterdir()}
+    (tmp_path / "w.avi").write_bytes(video.read_bytes() + b"more")
+    asked = {"video": video, "frames": 4, "long_side": None, **more}
+    message = refusal(write_frames, tmp_path / asked["video"], tmp_path / "frames", asked["frames"], asked["long_side"])
+    assert f"holds frames that were taken with another {next(iter(more))}; give another folder" in message
+    assert {path.name: path.read_bytes() for path in (tmp_path / "frames").iterdir()} == before
+
+
+def test_frames_do_not_mix_with_images_of_the_user(video, tmp_path):
+    (tmp_path / "frames" / "below").mkdir(parents=True)
+    (tmp_path / "frames" / "notes.txt").write_text("not an image")
+    image = tmp_path / "frames" / "below" / "frame_00001.png"
+    cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
+    kept = image.read_bytes()
+    message = refusal(write_frames, video, tmp_path / "frames", 4)
+    assert "holds 1 images already, such as frame_00001.png, with which the frames would mix" in message
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["below", "notes.txt"]
+    assert image.read_bytes() == kept
+
+
+def test_frames_go_on_where_a_call_was_killed(video, tmp_path, monkeypatch):
+    write_frames(video, tmp_path / "whole", frames=6)
+    written: list[str] = []
+    write, looked = video_tool.write_image, video_tool._measured
+
+    def killed(path: Path, pixels: np.ndarray) -> None:
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(path.name)
+        write(path, pixels)
+
+    monkeypatch.setattr(video_tool, "write_image", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_frames(video, tmp_path / "frames", frames=6)
+    monkeypatch.setattr(
+        video_tool, "write_image", lambda path, pixels: (written.append(path.name), write(path, pixels))
+    )
+    monkeypatch.setattr(video_tool, "_measured", lambda image: pytest.fail("was measured before") or looked(image))
+    assert write_frames(video, tmp_path / "frames", frames=6) == 6
+    assert written == [f"frame_{i:05d}.png" for i in range(1, 7)]
+    assert contents(tmp_path / "frames") == contents(tmp_path / "whole")
+
+
+def test_not_a_video(tmp_path):
+    (tmp_path / "v.mp4").write_text("nothing")
+    assert "not a video that OpenCV decodes" in refusal(write_frames, tmp_path / "v.mp4", tmp_path / "out")
+    assert "No such file" in refusal(write_frames, tmp_path / "w.mp4", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_picture_is_no_video(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((60, 80, 3), np.uint8))
+    text = refusal(write_frames, tmp_path / "a.jpg", tmp_path / "out")
+    assert text.startswith(f"{tmp_path / 'a.jpg'}: has one frame; expected a video")
+    assert not list(tmp_path.glob("out/*.png"))
+
+
+@pytest.mark.parametrize(("values", "parts", "chosen"), [([1, 3, 2], 9, [0, 1, 2]), ([2, 2, 1, 5], 2, [0, 3])])
+def test_sharpest(values, parts, chosen):
+    assert sharpest(values, [0.0] * len(values), parts) == chosen
+
+
+# ---- pyramids
+
+
+def test_pyramids(tmp_path, rng):
+    pixels = rng.integers(0, 256, (21, 34, 3)).astype(np.uint8)
+    path = tmp_path / "images" / "a" / "b.png"
+    path.parent.mkdir(parents=True)
+    cv2.imwrite(str(path), pixels[:, :, ::-1])
+    assert write_pyramid(tmp_path, levels=2) == 2
+    half = read_image(tmp_path / "images_2" / "a" / "b.png")
+    assert half.shape == (10, 17, 3)
+    assert read_image(tmp_path / "images_4" / "a" / "b.png").shape == (5, 8, 3)
+    boxes = pixels[:20].reshape(10, 2, 17, 2, 3).mean(axis=(1, 3))
+    assert np.abs(half[0] - boxes[0]).mean() < 15
+    assert write_pyramid(tmp_path, levels=2) == 0
+    np.testing.assert_array_equal(read_image(path), pixels)
+    assert "holds no images" in refusal(write_pyramid, tmp_path / "images")
+
+
+def test_pyramids_go_on_and_keep_what_others_made(tmp_path, rng, monkeypatch):
+    folder, whole = tmp_path / "scene", tmp_path / "whole"
+    (folder / "images").mkdir(parents=True)
+    for i in range(4):
+        cv2.imwrite(str(folder / "images" / f"{i}.png"), rng.integers(0, 256, (16, 16, 3)).astype(np.uint8))
+    (folder / "images_2").mkdir()
+    (folder / "images_2" / "3.png").write_bytes(b"shipped")
+    shutil.copytree(folder, whole)
+    write_pyramid(whole, levels=2)
+    read: list[str] = []
+
+    def killed(path: Path) -> np.ndarray:
+        if len(read) == 2:
+            raise KeyboardInterrupt
+        read.append(path.name)
+        return read_image(path)
+
+    monkeypatch.setattr(resize_tool, "read_image", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_pyramid(folder, levels=2)
+    monkeypatch.setattr(resize_tool, "read_image", lambda path: (read.append(path.name), read_image(path))[1])
+    assert write_pyramid(folder, levels=2) == 3
+    assert read == ["0.png", "1.png", "2.png", "3.png"]
+    assert contents(folder) == contents(whole)
+    assert (folder / "images_2" / "3.png").read_bytes() == b"shipped"
+    cv2.imwrite(str(folder / "images" / "1.png"), np.full((16, 16, 3), 77, np.uint8))
+    assert write_pyramid(folder, levels=2) == 2
+    assert (read_image(folder / "images_4" / "1.png") == 77).all()
+
+
+# ---- masks
+
+
+def store_photos(folder: Path, channels: int) -> None:
+    """Two photographs, of whose alpha the first three columns are 100."""
+    (folder / "train").mkdir(parents=True, exist_ok=True)
+    for i in range(2):
+        pixels = np.full((6, 8, channels), 250, np.uint8)
+        pixels[:, :3, 3:] = 100
+        cv2.imwrite(str(folder / "train" / f"{i}.png"), pixels)
+
+
+def colmap_scene(path: Path, channels: int) -> Path:
+    camera = CameraEntry(1, "PINHOLE", 8, 6, (8.0, 8.0, 4.0, 3.0))
+    write_scene(path, ColmapModel([camera], [ImageEntry(f"train/{i}.png") for i in range(2)]))
+    store_photos(path / "images", channels)
+    return path
+
+
+def blender_scene(path: Path, name: str) -> Path:
+    store_photos(path, 4)
+    frames = [{"file_path": f"./train/{i}", "transform_matrix": np.eye(4).tolist()} for i in range(2)]
+    (path / name).write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    return path
+
+
+@pytest.mark.parametrize("name", ["transforms_train.json", "transforms.json"])
+def test_masks_that_nothing_would_read_are_refused(name, tmp_path):
+    scene = blender_scene(tmp_path / "scene", name)
+    told = refusal(write_masks, scene)
+    assert "scenes have no folder of masks" in told
+    assert "scene.alpha=mask" in told
+    assert not (scene / "masks").exists()
+    assert write_masks(scene, out=tmp_path / "masks") == 2
+
+
+def test_masks_lie_where_the_reader_looks_for_them(tmp_path):
+    scene = colmap_scene(tmp_path / "scene", 4)
+    assert write_masks(scene / "sparse" / "0") == 2
+    assert all(view.mask_path is not None for view in read_scene(scene).views)
+
+
+def test_masks_from_alpha(tmp_path):
+    scene = colmap_scene(tmp_path / "scene", 4)
+    assert write_masks(scene) == 2
+    mask = read_image(scene / "masks" / "train" / "0.png")[:, :, 0]
+    np.testing.assert_array_equal(mask, [[0] * 3 + [255] * 5] * 6)
+    assert write_masks(scene) == 0
+    assert write_masks(scene, out=tmp_path / "others", threshold=0.3) == 2
+    assert read_image(tmp_path / "others" / "train" / "0.png").min() == 255
+    assert "has no alpha" in refusal(write_masks, colmap_scene(tmp_path / "opaque", 3))
+
+
+def test_masks_follow_their_source_but_not_over_those_of_others(tmp_path):
+    scene = colmap_scene(tmp_path / "scene", 4)
+    (scene / "masks" / "train").mkdir(parents=True)
+    cv2.imwrite(str(scene / "masks" / "train" / "1.png"), np.zeros((6, 8), np.uint8))
+    assert write_masks(scene) == 1
+    assert write_masks(scene) == 0
+    assert write_masks(scene, threshold=0.3) == 1
+    assert read_image(scene / "masks" / "train" / "0.png").min() == 255
+    assert read_image(scene / "masks" / "train" / "1.png").max() == 0
+
+
+def test_masks_from_a_folder(tmp_path):
+    scene, folder = colmap_scene(tmp_path / "scene", 3), tmp_path / "made" / "train"
+    folder.mkdir(parents=True)
+    cv2.imwrite(str(folder / "0.png"), np.full((6, 8), 255, np.uint8))
+    assert "no masks for 1 of 2 photographs: train/1" in refusal(write_masks, scene, tmp_path / "made")
+    cv2.imwrite(str(folder / "1.png"), np.zeros((5, 8), np.uint8))
+    assert "1.png: the image is 8x5 pixels, its camera 8x6" in refusal(write_masks, scene, tmp_path / "made")
+    cv2.imwrite(str(folder / "1.png"), np.zeros((6, 8), np.uint8))
+    shutil.rmtree(scene / "masks", ignore_errors=True)
+    assert write_masks(scene, tmp_path / "made") == 2
+    assert read_image(scene / "masks" / "train" / "1.png").max() == 0
+
+
+# ---- on the command line
+
+
+def test_data_tools_are_commands(tmp_path):
+    scene = colmap_scene(tmp_path / "scene", 4)
+    result = CliRunner().invoke(cli.app, ["data", "masks", str(scene)])
+    assert result.output.endswith("2 masks written\n")
+    listing = CliRunner().invoke(cli.app, ["data", "--help"]).output
+    for name in ("photos", "video", "undistort", "resize", "masks", "multiscale", "synthetic", "fetch"):
+        assert name in listing

@@ -1,0 +1,111 @@
+"""Edits keep their order, and stay apart, in a recipe of another number of steps."""
+
+import functools
+import math
+from fractions import Fraction
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clsplat.cadence import is_act, places
+from clsplat.errors import ConfigError
+from clsplat.pipeline.file import PipelineFile
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.stretching import Axis, fewest_steps, in_steps, last_edit, with_steps
+from clsplat.stages.training import Training
+from tests.support.pipelines import TRAINING
+
+
+def edits(training: Training, recipe: Training) -> list[tuple[int, int]]:
+    """The step and the place in the list of each edit, but for those that the recipe makes at each step, in order; the
+    size of photographs that follows from their detail changes before all."""
+    found = [(int(step), -1) for step in training.views.changes]
+    for place, stage in enumerate(training.during):
+        if stage.edits and recipe.during[place].every != 1:
+            found += [(step, place) for step in range(1, training.steps) if stage.due(step)]
+    return sorted(found)
+
+
+@functools.cache
+def known(name: str) -> tuple[PipelineFile, list[tuple[int, int]]]:
+    recipe = load(name).settings
+    return recipe, edits(recipe.training, recipe.training)
+
+
+@pytest.mark.parametrize("name", TRAINING)
+@settings(max_examples=3)
+@given(data=st.data())
+def test_edits_keep_order_and_distance_in_any_number_of_steps(name, data):
+    """As many of each kind, in the same order; those at one step stay at one, no others come to be."""
+    recipe, old = known(name)
+    fewest, steps = fewest_steps(recipe.training), recipe.training.steps
+    new = edits(in_steps(recipe, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
+    assert [place for _, place in new] == [place for _, place in old]
+    for before, after in zip(pairwise(old), pairwise(new), strict=True):
+        assert (before[0][0] == before[1][0]) == (after[0][0] == after[1][0]), (before, after)
+
+
+@pytest.mark.parametrize("name", ["fast", "splat_7k", "dash_7k", "mini_7k", "smoke"])
+@settings(max_examples=3)
+@given(data=st.data())
+def test_stretched_pipeline_stretches_again_with_its_own_edits(name, data):
+    """Also that of a run in minutes, whose cadences are not whole."""
+    recipe, old = known(name)
+    fewest, steps = fewest_steps(recipe.training), recipe.training.steps
+    between = in_steps(recipe, data.draw(st.integers(fewest, 2 * steps)))
+    new = edits(in_steps(between, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
+    assert [place for _, place in new] == [place for _, place in old]
+
+
+@pytest.mark.parametrize("name", ["fast", "splat", "dash", "mini", "smoke"])
+@settings(max_examples=3)
+@given(data=st.data())
+def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
+    recipe, old = known(name)
+    steps = data.draw(st.integers(1, fewest_steps(recipe.training)))
+    factor = Axis.by(Fraction(steps, recipe.training.steps)).factor
+    old, new = (
+        {(step, place) for step, place in one if place != -1}  # at least one change of the size stays
+        for one in (old, edits(in_steps(recipe, steps).training, recipe.training))
+    )
+    assert new == {(math.floor(step * factor), place) for step, place in old if step * factor >= 1}
+
+
+@pytest.mark.parametrize("steps", [1, 7, 50, 200])
+def test_an_average_begins_after_growth_in_the_fewest_steps_too(steps):
+    """It began before in 200 steps: 40 cadences of 2.9 steps, each cut to 2, end sooner than 2 of 47."""
+    training = in_steps(load("fast").settings, steps).training
+    last = [max([0, *(n for n in range(1, steps) if stage.due(n))]) for stage in training.during]
+    (average,) = [stage for stage in training.during if stage.stage == "add_to_average"]
+    assert all(
+        average.start >= step for step, stage in zip(last, training.during, strict=True) if stage.stage == "densify"
+    )
+
+
+def test_fractional_cadence_fires_at_or_below_its_multiples():
+    assert places(2.5, 0, 13) == [2, 5, 7, 10, 12] == [step for step in range(1, 13) if is_act(2.5, step)]
+    assert places(2.5, 5, 12) == [7, 10]
+    assert places(5.8824, 90, 101) == [94, 100]
+    assert [step for step in range(1, 30) if is_act(10, step)] == places(10, 0, 30) == places(10.0, 0, 30)
+
+
+def test_a_cadence_below_a_step_is_refused():
+    with pytest.raises(ConfigError, match="expected a number of steps of at least 1, which need not be whole"):
+        load("splat_7k", ["densify.every=0.5"])
+    assert load("splat_7k", ["densify.every=2.94"]).settings.training.during[1].every == 2.94
+
+
+@pytest.mark.parametrize("name", TRAINING)
+@settings(max_examples=3)
+@given(data=st.data())
+def test_corrected_step_count_keeps_all_up_to_the_last_edit(name, data):
+    """Whatever begins behind the last edit, such as an average, still does."""
+    recipe, old = known(name)
+    last = last_edit(recipe.training)
+    done = data.draw(st.integers(1, recipe.training.steps - 1))
+    steps = data.draw(st.integers(max(done, last) + 2, 2 * recipe.training.steps + 2))
+    new = edits(with_steps(recipe, steps, done).training, recipe.training)
+    fixed = min(max(done, last), recipe.training.steps - 1)
+    assert [edit for edit in new if edit[0] <= fixed] == [edit for edit in old if edit[0] <= fixed]

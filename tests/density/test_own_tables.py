@@ -1,0 +1,54 @@
+"""A rule of one's own with a table of its own: the table lives with the Gaussians and returns on resume."""
+
+from typing import Literal
+
+import pytest
+
+from clsplat.density.edit import Edit, Rule
+from clsplat.errors import Interrupted
+from clsplat.gaussians.tables import Gaussians
+from clsplat.pipeline.loading import load
+from clsplat.progress import Progress
+from clsplat.runs import opening, runner
+from clsplat.settings import rebuild
+from tests.support.runs import train
+
+pytestmark = pytest.mark.slow
+
+SETTINGS = ("densify.rules=[clone, split, edits_seen]", "densify.start=5", "densify.every=10")
+
+
+@pytest.fixture
+def edits_seen(without_plugins):
+    class EditsSeen(Rule):
+        """Removes a Gaussian that has seen three edits."""
+
+        type: Literal["edits_seen"] = "edits_seen"
+
+        def mark(self, edit: Edit) -> None:
+            gaussians: Gaussians = edit.gaussians
+            if "edits_seen" not in gaussians.tables:
+                gaussians.add("edits_seen", 1, zero_fresh=True)
+            seen = gaussians.get("edits_seen") + 1
+            gaussians.set("edits_seen", seen)
+            edit.choose(seen[:, 0] >= 3, copies=0, kept=0)
+
+    rebuild()
+
+
+@pytest.mark.usefixtures("edits_seen")
+def test_a_table_of_a_rule_returns_on_resume(tiny_scene, tmp_path):
+    whole = train(tiny_scene, tmp_path / "whole", *SETTINGS)
+    assert sum(record["causes"].get("edits_seen", 0) for record in whole.records.read("densify")) > 0
+    checked = load("smoke", [f"scene.path='{tiny_scene}'", *SETTINGS])
+    out = tmp_path / "stopped"
+    run = opening.open_run(checked, out, None)
+
+    def stop(progress: Progress) -> None:
+        run.interrupted = progress.step >= 20
+
+    with pytest.raises(Interrupted):
+        runner.execute(checked, run, "new", stop)
+    resumed = train(tiny_scene, out, *SETTINGS, resume=True)
+    assert resumed.model.gaussians.tables["edits_seen"].zero_fresh
+    assert (out / "point_cloud.ply").read_bytes() == (whole.out / "point_cloud.ply").read_bytes()

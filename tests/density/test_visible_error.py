@@ -1,0 +1,74 @@
+"""Errors of harmonics as the training views show them, against sums over directions, and a palette that shows few."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.density.visible_error import FAINT, UNSEEN, VisibleError
+
+POSITIONS = np.array([[3.0, 0, 1], [2, 2, 2], [0, 3, 1.5], [-1, 2.5, 0.5], [2.5, -1, 0.2]])
+
+
+@pytest.fixture
+def seen(rng) -> SimpleNamespace:
+    """Gaussians, and what they weigh in some views; the last one in none."""
+    means, weights = rng.normal(0, 0.3, (60, 3)), rng.random((len(POSITIONS), 60)).astype(np.float32)
+    weights[:, -1] = 0
+    return SimpleNamespace(means=means, weights=weights)
+
+
+def error_of(seen: SimpleNamespace, coefficients: int) -> VisibleError:
+    looks = [SimpleNamespace(sum=lambda number, row=row: row) for row in seen.weights]
+    return VisibleError.of(zip(looks, POSITIONS, strict=True), seen.means, coefficients)
+
+
+def shown(seen: SimpleNamespace, i: int, error: np.ndarray) -> float:
+    """The squared error of a Gaussian's colours over the views, after the best change of its base colour."""
+    directions = seen.means[i] - POSITIONS
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    colours = ref.sh_basis(directions, 3)[:, 1 : 1 + len(error) // 3] @ error.reshape(-1, 3)
+    weight = seen.weights[:, i].astype(np.float64)[:, None]
+    best = (weight * colours).sum(axis=0) / weight.sum()
+    return float((weight * np.square(colours - best)).sum())
+
+
+@pytest.mark.parametrize("coefficients", [3, 8, 15])
+def test_the_form_is_the_error_that_the_views_show(seen, rng, coefficients):
+    found, errors = error_of(seen, coefficients), rng.normal(size=(60, 3 * coefficients))
+    forms = (found.gradient(errors) * errors).sum(axis=1)
+    everywhere = UNSEEN / (4 * np.pi) * (found.weights + FAINT * found.weights.mean())
+    expected = [shown(seen, i, errors[i]) for i in range(59)]
+    np.testing.assert_allclose(
+        (forms - everywhere * np.square(errors).sum(axis=1))[:59], expected, rtol=1e-6, atol=1e-9
+    )
+    assert forms[59] > 0, "a Gaussian that no view shows has a form"
+
+
+def test_the_base_colour_takes_up_the_mean_of_an_error(seen, rng):
+    found, error = error_of(seen, 15), rng.normal(size=(60, 45))
+    change = found.base_change(error)
+    directions = seen.means[7] - POSITIONS
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    colours = ref.sh_basis(directions, 3)[:, 1:] @ error[7].reshape(15, 3)
+    mean = np.average(colours, axis=0, weights=seen.weights[:, 7])
+    np.testing.assert_allclose(change[7] * 0.28209479177387814, mean, rtol=1e-6)
+
+
+def test_palette_shows_less_error_than_the_one_it_began_with(seen, rng):
+    found, rest = error_of(seen, 15), rng.normal(0, 0.1, (60, 45)).astype(np.float32)
+
+    def error_with(vectors: np.ndarray) -> float:
+        left = (rest[:, None] - vectors)[np.arange(60)[:, None], np.arange(len(vectors))]
+        forms = [(found.gradient(left[:, e]) * left[:, e]).sum(axis=1) for e in range(len(vectors))]
+        return float(np.min(forms, axis=0).sum())
+
+    def most_alike(points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+        return (points.astype(np.float64) @ vectors.T.astype(np.float64)).argmax(axis=1)
+
+    first = rest[:8].astype(np.float64)
+    vectors, labels = found.palette(rest, first, nearest=most_alike)
+    assert error_with(vectors) < 0.8 * error_with(first)
+    left = rest - vectors[labels]
+    assert (found.gradient(left) * left).sum() == pytest.approx(error_with(vectors), rel=1e-4), "each has its best one"

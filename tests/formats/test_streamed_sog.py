@@ -1,0 +1,338 @@
+"""Streamed SOG: the layout of its JSON, leaves and files, and what a damaged one is."""
+
+import errno
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, DataError, OutputError
+from clsplat.files import new_folder
+from clsplat.formats import lod
+from clsplat.formats.lod_tree import Limits, half_boxes, tree
+from clsplat.formats.lod_writing import write_lod
+from clsplat.formats.model_files import bytes_of
+from clsplat.formats.packing import morton_order
+from clsplat.formats.splats import SplatFile, Writing
+from clsplat.formats.table import detect, read, write
+from clsplat.gaussians.checkup import examine, verdict
+from clsplat.gaussians.conversion import convert
+from clsplat.gaussians.model import load
+from clsplat.lod.levels import levels_of_detail
+from tests.support.models import assert_close, interop, splats
+from tests.support.runs import NO_PROCESS
+
+BOUND = (-13.10682, -4.463487, -3.914306), (10.55131, 2.742857, 14.0425)  # of its root
+SMALL = Limits(splats=300, extent=4.0, few=50)
+
+
+def levels(rng: np.random.Generator, counts: tuple[int, ...] = (700, 300, 100)) -> list[SplatFile]:
+    return [splats(rng, count, 1, "mip") for count in counts]
+
+
+@pytest.fixture
+def written(tmp_path: Path, rng: np.random.Generator) -> tuple[Path, list[SplatFile]]:
+    made = levels(rng)
+    write_lod(tmp_path / "site", made, Writing(quality="high"), SMALL)
+    return tmp_path / "site", made
+
+
+def leaves(node: dict) -> list[dict]:
+    return [node] if "lods" in node else [leaf for child in node["children"] for leaf in leaves(child)]
+
+
+def test_a_file_has_the_keys_of_the_specification(written):
+    folder, _ = written
+    meta = json.loads((folder / "lod-meta.json").read_text())
+    assert meta["version"] == 1
+    assert (meta["count"], meta["counts"], meta["lodLevels"]) == (1100, [700, 300, 100], 3)
+    assert {name.split("/")[1] for name in meta["filenames"]} == {"meta.json"}
+    assert {"0_0/meta.json", "0_1/meta.json", "1_0/meta.json", "2_0/meta.json"} <= set(meta["filenames"])
+    nodes = [meta["tree"]]
+    for node in nodes:
+        assert node.keys() in ({"bound", "children"}, {"bound", "lods"})
+        nodes += node.get("children", [])
+        assert len(node.get("children", [0, 0])) == 2
+        numbers = [*node["bound"]["min"], *node["bound"]["max"]]
+        assert all(number == float(f"{number:.7g}") for number in numbers)
+
+
+def test_each_leaf_is_a_morton_run_inside_its_box(written):
+    """Runs fill their files without gaps, and the union of the leaves is the level."""
+    folder, made = written
+    meta = json.loads((folder / "lod-meta.json").read_text())
+    files = [read(folder / name) for name in meta["filenames"]]
+    ends, found = dict.fromkeys(range(len(files)), 0), {level: [] for level in range(3)}
+    for leaf in leaves(meta["tree"]):
+        assert sum(run["count"] for run in leaf["lods"].values()) <= SMALL.splats
+        low, high = np.array(leaf["bound"]["min"]), np.array(leaf["bound"]["max"])
+        for level, run in leaf["lods"].items():
+            assert meta["filenames"][run["file"]].startswith(f"{level}_")
+            assert run["offset"] == ends[run["file"]], "one run follows the other"
+            ends[run["file"]] += run["count"]
+            means = files[run["file"]].parameters["means"][run["offset"] : ends[run["file"]]]
+            assert (means >= low - 0.01).all()
+            assert (means <= high + 0.01).all()
+            found[int(level)].append(means)
+    assert ends == {file: len(part) for file, part in enumerate(files)}
+    for level, source in enumerate(made):
+        expected, means = source.parameters["means"], np.concatenate(found[level])
+        np.testing.assert_allclose(np.sort(means, axis=0), np.sort(expected, axis=0), atol=0.002)
+
+
+def test_the_finest_level_comes_back(written):
+    folder, made = written
+    for place in (folder, folder / "lod-meta.json"):
+        found = read(place)
+        assert (found.mode, found.rendering) == ("mip", made[0].rendering)
+        assert len(load(place)) == 700
+    assert detect(folder / "lod-meta.json").name == "streamed SOG"
+    order = np.concatenate([leaf.rows[0] for leaf in tree([one.parameters for one in made], SMALL).leaves()])
+    close = {"means": 0.002, "log_scales": 0.1, "opacity": 0.0101, "sh_base": 0.1, "sh_rest": 0.5}
+    assert_close(found, made[0].rows(order), 0.8, **close)
+
+
+def test_a_leaf_is_divided_while_it_has_too_many_or_is_too_wide(rng):
+    parameters = splats(rng, 700).parameters
+    for limits in (SMALL, Limits(100, 1e9, 1), Limits(1000, 1.0, 20)):
+        found = list(tree([parameters], limits).leaves())
+        for leaf in found:
+            span = np.ptp(parameters["means"][leaf.rows[0]], axis=0).max()
+            assert len(leaf.rows[0]) <= limits.splats
+            assert span <= limits.extent or len(leaf.rows[0]) <= limits.few
+            np.testing.assert_array_equal(morton_order(parameters["means"][leaf.rows[0]]), np.arange(len(leaf.rows[0])))
+        np.testing.assert_array_equal(np.sort(np.concatenate([leaf.rows[0] for leaf in found])), np.arange(700))
+
+
+def test_a_box_reaches_as_far_as_a_standard_deviation_turned(rng):
+    parameters = splats(rng, 50).parameters
+    expected = np.empty((50, 3))
+    for row, (quat, logs) in enumerate(zip(parameters["quats"], parameters["log_scales"], strict=True)):
+        w, v = float(quat[0]), quat[1:].astype(np.float64)
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * np.exp(logs)
+        length = w * w + v @ v
+        turned = [(c * (w * w - v @ v) + 2 * v * (v @ c) + 2 * w * np.cross(v, c)) / length for c in corners]
+        expected[row] = np.max(turned, axis=0)
+    np.testing.assert_allclose(half_boxes(parameters), expected, rtol=1e-5)
+
+
+def test_boxes_are_those_of_splat_transform(tmp_path):
+    """The root's box of what its version 2.7.1 writes for this file as one level."""
+    source = read(interop("train1000.ply"))
+    write_lod(tmp_path / "a", [source])
+    bound = json.loads((tmp_path / "a" / "lod-meta.json").read_text())["tree"]["bound"]
+    np.testing.assert_allclose(bound["min"], BOUND[0], rtol=1e-6)
+    np.testing.assert_allclose(bound["max"], BOUND[1], rtol=1e-6)
+
+
+def test_the_same_levels_give_the_same_bytes(written, tmp_path, rng):
+    folder, made = written
+    assert write_lod(tmp_path / "again", made, Writing(quality="high"), SMALL)
+    files = {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    again = {p.relative_to(tmp_path / "again"): p.read_bytes() for p in (tmp_path / "again").rglob("*") if p.is_file()}
+    assert files == again
+    assert bytes_of(folder) == sum(map(len, files.values()))
+
+
+def test_one_gaussian_and_many_in_one_place_are_levels(tmp_path, rng):
+    one = splats(rng, 1)
+    write_lod(tmp_path / "one", [one, one])
+    assert len(read(tmp_path / "one")) == 1
+    write_lod(tmp_path / "same", [one.rows(np.zeros(900, int))], limits=SMALL)
+    assert len(read(tmp_path / "same")) == 900
+
+
+def test_a_folder_is_there_once_it_is_whole(tmp_path, rng, monkeypatch):
+    made, calls, real = levels(rng), [], os.fsync
+
+    def fsync(number):
+        calls.append(number)
+        if len(calls) == 30:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(number)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with pytest.raises(OutputError, match="No space left"), new_folder(tmp_path / "site") as place:
+        write_lod(place, made, limits=SMALL)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_in_use_is_refused(tmp_path, monkeypatch):
+    for name in ("used/inner", "here", "empty"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "link").symlink_to("empty")
+    monkeypatch.chdir(tmp_path / "here")
+    for place in (*(tmp_path / name for name in ("used", "file", "link")), Path()):
+        with pytest.raises(ConfigError, match="is in use; give the name of a new folder"), new_folder(place):
+            pytest.fail("the work begins")
+
+
+@pytest.mark.parametrize("name", ["file/x", "n" * 245])
+def test_a_folder_that_cannot_be_is_refused_before_the_work(name, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="cannot be written"), new_folder(tmp_path / name):
+        pytest.fail("the work begins")
+
+
+def test_empty_folder_is_replaced_where_rename_cannot_replace(tmp_path, monkeypatch):
+    """As on Windows."""
+
+    def replace(old: Path, new: Path) -> None:
+        if new.exists():
+            raise PermissionError(errno.EACCES, "Access is denied")
+        real(old, new)
+
+    real = os.replace
+    monkeypatch.setattr(os, "replace", replace)
+    (tmp_path / "empty").mkdir()
+    with new_folder(tmp_path / "empty") as place:
+        (place / "a").write_text("x")
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["empty", "empty/a"]
+
+
+def test_folders_of_killed_processes_go_before_a_new_one_is_made(tmp_path):
+    left = f".site.{NO_PROCESS}-0.partial"
+    others = [f".other.{NO_PROCESS}-0.partial", f".site.{os.getppid()}-0.partial", ".site.partial"]
+    for name in (left, *others):
+        (tmp_path / name / "0_0").mkdir(parents=True)
+    with new_folder(tmp_path / "site") as place:
+        assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, place.name])
+        with new_folder(tmp_path / "site.2"):
+            pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, "site", "site.2"])
+
+
+def test_an_empty_level_is_refused(written, tmp_path):
+    _, made = written
+    with pytest.raises(DataError, match="holds no Gaussians"):
+        write_lod(tmp_path / "b", [made[0], made[1].rows([])])
+    with pytest.raises(ConfigError, match="streamed SOG is written by `clsplat lod`"):
+        write(tmp_path / "lod-meta.json", made[0])
+
+
+def test_values_beyond_sog_are_refused_and_boxes_stay_finite(tmp_path, rng):
+    large = splats(rng, 50)
+    large.parameters["log_scales"][7] = 1000
+    write_lod(tmp_path / "a", [large])
+    json.loads((tmp_path / "a" / "lod-meta.json").read_text(), parse_constant=lambda text: pytest.fail(text))
+    large.parameters["log_scales"][7] = 3e38
+    write(tmp_path / "a.ply", large)
+    told = r"1 of 50 Gaussians hold log_scales beyond 1e\+15, which SOG cannot hold"
+    with pytest.raises(DataError, match=told):
+        write_lod(tmp_path / "b", [large])
+    with pytest.raises(DataError, match=told):
+        levels_of_detail(tmp_path / "a.ply", tmp_path / "b")
+    assert not (tmp_path / "b").exists()
+
+
+def test_an_environment_is_part_of_the_model(written, rng):
+    folder, _ = written
+    write(folder / "env" / "meta.json", splats(rng, 20, 2))
+    meta = json.loads((folder / "lod-meta.json").read_text())
+    (folder / "lod-meta.json").write_text(json.dumps({**meta, "environment": "env/meta.json"}))
+    found = read(folder)
+    assert (len(found), found.sh_degree) == (720, 2)
+
+
+WRONG = {
+    "another version": ({"version": 2}, "of version 2; expected 1"),
+    "no names": ({"filenames": None}, "filenames is None"),
+    "a name twice": ({"filenames": ["0_0/meta.json", "0_0/meta.json"]}, "each once"),
+    "a name that leads out": ({"filenames": ["../meta.json"]}, "expected a meta.json in a folder below"),
+    "an absolute name": ({"filenames": ["/etc/meta.json"]}, "expected a meta.json in a folder below"),
+    "a NUL in a name": ({"filenames": ["0_0/meta.json", "\0/meta.json"]}, "expected a meta.json in a folder below"),
+    "a name that is no text": (
+        {"filenames": ["0_0/meta.json", "\ud800/meta.json"]},
+        "expected a meta.json in a folder",
+    ),
+    "a name of 5,000 letters": ({"filenames": [f"{'a' * 5000}/meta.json"]}, "expected a meta.json in a folder below"),
+    "a name of another file": ({"filenames": ["0_0/lod-meta.json"]}, "expected a meta.json in a folder below"),
+    "no such file": (
+        {"filenames": [f"{i}_9/meta.json" for i in range(20)]},
+        "_9/meta.json: cannot be read (No such file",
+    ),
+    "too few names": ({"filenames": []}, "name a file of level 0 that it has not"),
+    "no counts": ({"counts": []}, "expected a number for each of 1 to 64 levels"),
+    "more levels than are declared": ({"lodLevels": 2}, "lodLevels is 2; expected 3, as it has counts"),
+    "more levels than there can be": (
+        {"counts": [0] * 65, "lodLevels": 65},
+        "expected a number for each of 1 to 64 levels",
+    ),
+    "no number of levels": ({"lodLevels": None}, "lodLevels is None; expected 3"),
+    "a level beyond": (
+        {"counts": [700, 300], "lodLevels": 2},
+        "a leaf names level '2'; expected 0 to 1",
+    ),
+    "another count": ({"counts": [701, 0, 0]}, "declares 701 splats of level 0; its leaves have 700"),
+    "no tree": ({"tree": 7}, "a node of its tree is 7"),
+    "an empty tree": ({"tree": {"children": []}}, "name no file of level 0"),
+    "no number": ({"tree": {"lods": {"0": {"file": 0, "offset": "0", "count": 1}}}}, "offset of a leaf is '0'"),
+    "a negative number": ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": -1}}}}, "count of a leaf is -1"),
+    "beyond its file": ({"tree": {"lods": {"0": {"file": 0, "offset": 10**6, "count": 1}}}}, "which holds"),
+    "a run twice": ({"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 9}}}] * 2}}, "in other"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_damaged_one_is_refused_in_a_line(written, name):
+    folder, _ = written
+    change, message = WRONG[name]
+    meta = json.loads((folder / "lod-meta.json").read_text())
+    (folder / "lod-meta.json").write_text(json.dumps({**meta, **change}))
+    with pytest.raises(DataError) as error:
+        read(folder)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < len(str(folder)) + 300
+
+
+def test_the_tree_is_walked_once_whatever_the_number_of_levels(written, monkeypatch):
+    folder, _ = written
+    walks, real = [], lod._leaves
+    monkeypatch.setattr(lod, "_leaves", lambda path, tree: walks.append(path) or real(path, tree))
+    assert lod.faults_of_levels(folder / "lod-meta.json") == []
+    assert len(walks) == 1
+
+
+def renamed(folder: Path, file: int, name: str) -> Path:
+    """Give a file of the levels another name, in their JSON alone; return its path under the old name."""
+    path = folder / "lod-meta.json"
+    meta = json.loads(path.read_text())
+    old, meta["filenames"][file] = meta["filenames"][file], name
+    path.write_text(json.dumps(meta))
+    return folder / old
+
+
+def test_a_coarser_level_that_is_missing_is_damage_of_the_model(written, tmp_path):
+    folder, _ = written
+    renamed(folder, 1, "9_9/meta.json")
+    assert len(read(folder)) == 700
+    with pytest.raises(
+        DataError, match=r"lod-meta\.json: names '.*9_9/meta\.json', which cannot be read \(No such file"
+    ):
+        convert([folder], tmp_path / "a.ply")
+    assert not (tmp_path / "a.ply").exists()
+
+
+def test_check_names_each_missing_or_damaged_level_file(written):
+    folder, _ = written
+    assert examine(folder)["valid"]
+    path = folder / "lod-meta.json"
+    meta = json.loads(path.read_text())
+    coarse = [name for name in meta["filenames"] if not name.startswith("0_")]
+    shutil.rmtree(folder / coarse[0].split("/")[0])
+    next((folder / coarse[1]).parent.glob("scales*.webp")).write_bytes(b"RIFF")
+    meta["counts"][2] += 1
+    path.write_text(json.dumps({**meta, "filenames": [*meta["filenames"], "more/meta.json"]}))
+    found = examine(folder)
+    assert not found["valid"]
+    missing, damaged, count, spare = found["findings"]
+    assert missing.startswith(f"{folder / coarse[0]}: cannot be read (No such file")
+    assert str(folder / coarse[1]) in damaged
+    assert "splats of level 2; its leaves have 100" in count
+    assert spare.startswith(f"{folder / 'more'}")
+    assert verdict(found).endswith("; write it again")

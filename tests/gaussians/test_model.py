@@ -1,0 +1,168 @@
+"""Models on the host: files, views of their tables, choosing rows, and moving them in the world."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from clsplat.api.renderer import Renderer
+from clsplat.conformance.reference import sh_basis
+from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.errors import OutputError
+from clsplat.gaussians.model import Model, Rendering, load
+from clsplat.harmonics import basis, rotated_sh
+from clsplat.scene.view import View
+from tests.support.html_page import HOSTILE, Page
+from tests.support.models import WIDTHS, model_of
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    return Rotation.from_quat(rng.normal(size=4)).as_matrix()
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+@pytest.mark.parametrize("degree", WIDTHS)
+def test_a_file_read_and_written_again_has_the_same_bytes(tmp_path, rng, degree, filtered):
+    case = random_case(rng, 7)
+    model = model_of(with_world_filter(case, rng) if filtered else case, degree)
+    model = replace(model, rendering=Rendering(0.3, 0.1, 1.0, "white", "mask", {"version": "0"}))
+    model.save(tmp_path / "a.ply")
+    read = load(tmp_path / "a.ply")
+    read.save(tmp_path / "b.ply")
+    if not filtered:  # a standard deviation is written for the variance
+        assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    for name, table in model.tables().items():
+        np.testing.assert_allclose(getattr(read, name), table, rtol=3e-7 if name == "filter_variance" else 0)
+    assert replace(read.rendering, notes={}) == replace(model.rendering, notes={})
+    assert read.rendering.notes["version"] == "0"
+
+
+def test_a_run_folder_is_a_model(tmp_path, rng):
+    model_of(random_case(rng, 3)).save(tmp_path / "point_cloud.ply")
+    assert len(load(tmp_path)) == 3
+
+
+def test_views_are_the_values_after_activation(rng):
+    case = random_case(rng, 9)
+    model = model_of(case)
+    exact = case.gaussians()
+    np.testing.assert_allclose(model.scales, np.exp(exact.log_scales), rtol=1e-6)
+    np.testing.assert_allclose(model.opacities, 1 / (1 + np.exp(-exact.logit_opacity)), rtol=1e-6)
+    np.testing.assert_allclose(model.colours, 0.5 + exact.sh[:, 0] * sh_basis(np.array([[0, 0, 1.0]]), 0)[0], atol=1e-6)
+    assert (len(model), model.sh_degree, model.opacities.shape) == (9, 3, (9,))
+    assert all(table.dtype == np.float32 for table in (model.scales, model.opacities, model.colours))
+
+
+def test_rows_are_chosen_by_mask_slice_index_and_indices(rng):
+    model = model_of(with_world_filter(random_case(rng, 9), rng), 1)
+    mask = model.opacities > np.median(model.opacities)
+    for chosen, rows in ((mask, np.flatnonzero(mask)), (slice(1, 8, 3), [1, 4, 7]), (4, [4]), ([5, 5], [5, 5])):
+        some = model[chosen]
+        for name, table in model.tables().items():
+            np.testing.assert_array_equal(getattr(some, name), table[rows])
+    assert len(model[:0]) == 0
+    assert model[:0].sh_degree == 1
+
+
+def test_a_model_shares_no_memory_with_arrays_or_other_models(rng):
+    given = with_world_filter(random_case(rng, 9), rng).parameters
+    model = Model(**given)
+    for other in (given, model[:4].tables(), model[:].tables(), model.transformed().tables(), model.baked().tables()):
+        for name, table in other.items():
+            assert not np.shares_memory(table, getattr(model, name)), name
+
+
+@pytest.mark.parametrize("degree", WIDTHS)
+def test_moved_model_looks_the_same_to_a_moved_camera(device, rng, degree):
+    case = with_world_filter(random_case(rng, 40, compensate=1.0), rng)
+    model, scale, turn, shift = model_of(case, degree), 2.5, random_rotation(rng), rng.normal(size=3)
+    pose = case.view.world_to_camera
+    rotation = pose[:, :3] @ turn.T
+    moved = np.column_stack([rotation, scale * pose[:, 3] - rotation @ shift])
+    renderer = Renderer(model, device)
+    before = renderer.render(case.view, depth=True)
+    renderer.update(model.transformed(scale, turn, shift))
+    after = renderer.render(replace(case.view, world_to_camera=moved), depth=True)
+    assert before.image.std() > 0.05
+    np.testing.assert_allclose(after.image, before.image, atol=1e-4)
+    np.testing.assert_allclose(after.alpha, before.alpha, atol=1e-4)
+    np.testing.assert_allclose(after.depth, scale * before.depth, rtol=1e-3)
+
+
+def test_nothing_moves_without_a_movement(rng):
+    model = model_of(random_case(rng, 5))
+    for name, table in model.transformed().tables().items():
+        np.testing.assert_allclose(getattr(model, name), table, atol=1e-6, err_msg=name)
+
+
+def test_turned_harmonics_are_the_old_from_the_turned_side(rng):
+    turn = random_rotation(rng)
+    directions = rng.normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    np.testing.assert_allclose(basis(directions), sh_basis(directions, 3)[:, 1:], atol=1e-12)
+    coefficients = rng.normal(size=(4, 45))
+    turned = rotated_sh(coefficients, turn)
+    seen = np.einsum("dk,nkc->ndc", sh_basis(directions @ turn.T, 3)[:, 1:], turned.reshape(4, 15, 3))
+    expected = np.einsum("dk,nkc->ndc", sh_basis(directions, 3)[:, 1:], coefficients.reshape(4, 15, 3))
+    np.testing.assert_allclose(seen, expected, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("movement", "message"),
+    [
+        ({"rotation": np.diag([1, 1, -1])}, "mirrors"),
+        ({"rotation": 2 * np.eye(3)}, "a rotation matrix"),
+        ({"rotation": np.eye(2)}, "a rotation matrix"),
+        ({"scale": 0}, "a positive scale"),
+        ({"scale": float("nan")}, "a positive scale"),
+        ({"translation": 1.0}, r"the translation has shape \(\)"),
+    ],
+)
+def test_what_is_no_movement_is_refused(rng, movement, message):
+    with pytest.raises(ValueError, match=message):
+        model_of(random_case(rng, 2)).transformed(**movement)
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest"])
+@pytest.mark.parametrize("shape", [(3, 7), (2, 3), (3,)])
+def test_a_table_of_a_wrong_shape_is_named(rng, name, shape):
+    tables = {**random_case(rng, 3).parameters, name: np.zeros(shape)}
+    wrong = "quats" if name == "means" and shape == (2, 3) else name  # the means say how many there are
+    with pytest.raises(ValueError, match=rf"^{wrong} has shape .*; expected \([23], [\d or]+\)"):
+        Model(**tables)
+
+
+def test_tables_become_float32(rng):
+    tables = {name: table.astype(np.float64).tolist() for name, table in random_case(rng, 3).parameters.items()}
+    assert all(table.dtype == np.float32 for table in Model(**tables).tables().values())
+
+
+def test_a_model_shows_itself(rng):
+    model = model_of(random_case(rng, 3))
+    assert repr(model) == "Model(3 Gaussians, SH degree 3)"
+    for one in (model, model[:0]):
+        page = Page(one._repr_html_())
+        assert page.elements["tr"] == 6
+        assert f"Gaussians{len(one)}" in page.text.replace("\n", "")
+
+
+def test_a_scene_shows_four_photographs_and_escapes_their_names(tiny_scene):
+    import clsplat
+
+    scene = clsplat.read_scene(tiny_scene)
+    page = Page(scene._repr_html_())
+    assert (page.elements["img"], page.elements["table"]) == (4, 1)
+    assert "8 for training, 2 for testing" in page.text
+    views = (View(HOSTILE, scene.views[0].camera, scene.views[0].world_to_camera), *scene.views[1:])
+    named = replace(scene, path=scene.path / HOSTILE, views=tuple(replace(v, name=HOSTILE + v.name) for v in views))
+    page = Page(named._repr_html_())
+    assert page.elements["script"] == 0
+    assert page.text.count(HOSTILE) == 4, "the path, and the names of three photographs: the first has no file"
+    assert repr(scene) == "Scene(tiny: 8 training and 2 test views)"
+
+
+@pytest.mark.parametrize("path", ["", ".", "/"])
+def test_a_path_without_a_name_is_refused(rng, path):
+    with pytest.raises(OutputError, match=r"cannot be written \(it has no name\); expected the path of a file$"):
+        model_of(random_case(rng, 3)).save(path)

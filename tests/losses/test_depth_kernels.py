@@ -1,0 +1,150 @@
+"""The blended inverse depth against float64: the plane, its gradient, and the loss that reads it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.checks.depths import depth_figures, gradients_of, inverse_depths, losses_of_depths
+from clsplat.conformance.comparison import relative_error
+from clsplat.conformance.scenes import random_case, safe_case
+from clsplat.errors import ConfigError
+from clsplat.losses.depth import InverseDepth
+from clsplat.losses.entropy import WeightEntropy
+from clsplat.losses.image import L1
+from clsplat.opencl.device import Device
+from clsplat.scene.tracks import Tracks
+from clsplat.stages.optimize import Optimize
+from clsplat.views.known_depths import PointDepths, nearest_in_pixels
+from tests.support.device_images import trainer_of
+from tests.support.figures import hold, same_of_schedules
+
+
+def test_plane_and_gradients(device, rng):
+    hold(inverse_depths(device, rng))
+
+
+def test_the_loss_and_its_gradient(device, rng):
+    hold(losses_of_depths(device, rng))
+
+
+def test_the_box_of_the_pixel(device, rng):
+    case = replace(safe_case(rng, 40, 33, 30, 1e-5, variance=0.0, pixel_box=1.0))
+    hold(depth_figures(device, case, rng.normal(size=(4, 30, 33)).astype(np.float32), "the pixel's box"))
+
+
+def test_schedules_agree(device, rng):
+    case, weights = random_case(rng, 150, 50, 70), rng.normal(size=(4, 70, 50)).astype(np.float32)
+    other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
+    for number, (one, two) in enumerate(zip(*(gradients_of(d, case, weights) for d in (device, other)), strict=True)):
+        assert relative_error(two, one) < 1e-5
+        if number == 0:
+            same_of_schedules(device, two, one)
+
+
+def test_reference_gradient_is_that_of_finite_differences(rng):
+    """By parameters, so that depths move too."""
+    case = random_case(rng, 5, 24, 20)
+    gaussians, camera, weights = case.gaussians(), case.camera(), rng.normal(size=(20, 24))
+    numbers = {**case.numbers(), "thresholds": ref.SMOOTH}
+
+    def loss(moved: ref.Gaussians) -> float:
+        splats = ref.project(moved, camera, case.degree, **numbers)
+        return float((weights * ref.inverse_depth(splats, 24, 20, ref.SMOOTH)).sum())
+
+    splats = ref.project(gaussians, camera, case.degree, **numbers)
+    found, by_depth = ref.inverse_depth_backward(splats, 24, 20, weights, ref.SMOOTH)
+    upstream = found.mean2d, found.conic, found.opacity, found.colour
+    settings = case.degree, case.variance, case.compensate
+    gradients = ref.project_backward(gaussians, camera, *settings, splats, *upstream)
+    gradients["means"] = gradients["means"] + by_depth[:, None] * camera.rotation[2]
+    free = splats.opacity < 0.98
+    for name in ("means", "quats", "log_scales", "logit_opacity"):
+        values = gradients[name]
+        for place in np.ndindex(values.shape):
+            if not free[place[0]]:
+                continue
+            ends = []
+            for step in (1e-5, -1e-5):
+                table = getattr(gaussians, name).copy()
+                table[place] += step
+                ends.append(loss(replace(gaussians, **{name: table})))
+            difference = (ends[0] - ends[1]) / 2e-5
+            assert difference == pytest.approx(values[place], rel=1e-4, abs=1e-6 * np.abs(values).max())
+
+
+def test_the_gradient_of_the_loss_is_that_of_finite_differences(rng):
+    plane, targets, weights = rng.uniform(size=(6, 7)), rng.uniform(size=9), rng.uniform(size=9)
+    places = np.unravel_index(rng.permutation(42)[:9], plane.shape)
+    _, gradient = ref.inverse_depth_loss(plane, places, targets, weights)
+    for place in np.ndindex(plane.shape):
+        ends = []
+        for step in (1e-7, -1e-7):
+            moved = plane.copy()
+            moved[place] += step
+            ends.append(ref.inverse_depth_loss(moved, places, targets, weights)[0].sum())
+        assert (ends[0] - ends[1]) / 2e-7 == pytest.approx(gradient[place], abs=1e-6)
+
+
+def test_nearest_point_of_a_pixel_wins_and_outside_is_ignored(device, rng):
+    camera = random_case(rng, 1, 40, 30).device_camera(device)
+    pose = camera.values["world_to_camera"].reshape(3, 4).astype(np.float64)
+    fx, fy, cx, cy = (float(camera.values[name]) for name in ("fx", "fy", "cx", "cy"))
+
+    def at(column: float, row: float, depth: float) -> np.ndarray:
+        point = np.array([(column - cx) / fx * depth, (row - cy) / fy * depth, depth])
+        return pose[:, :3].T @ (point - pose[:, 3])
+
+    positions = [at(7.2, 3.9, 4), at(7.8, 3.1, 2), at(7.2, 3.2, 3), at(39.9, 29.9, 5), at(40.1, 3, 2), at(5, 5, -2)]
+    places, depths, rows = nearest_in_pixels(camera, np.stack(positions))
+    assert rows.tolist() == [1, 3]
+    assert places.tolist() == [3 * camera.stride + 7, 29 * camera.stride + 39]
+    np.testing.assert_allclose(depths, [2, 5], rtol=1e-6)
+
+
+def known(device: Device, trainer, photograph, count: int = 30) -> PointDepths:
+    """Depths at the means of the first Gaussians: a view with the number 0 shows all, another one half of them."""
+    means = trainer.model.gaussians.get("means")[:count].astype(np.float64)
+    tracks = Tracks(means, {"a": np.arange(count), "b": np.arange(count // 2), "c": np.arange(count // 2)})
+    return PointDepths(device, tracks, ["a", "x"], 2.0)
+
+
+def test_points_that_more_photographs_show_weigh_more(device, rng):
+    trainer, photograph = trainer_of(device, rng, [L1()])
+    found = known(device, trainer, photograph)
+    camera = replace(photograph.camera, view=0)
+    here = found.at(camera)
+    assert here is not None
+    assert here is found.at(camera), "kept"
+    assert set(np.unique(here.weights.get())) == {0.25, 0.75}
+    assert found.at(replace(camera, view=1)) is None, "a view without points"
+    assert found.at(photograph.camera) is None, "a view that is not trained on"
+
+
+def test_steps_with_the_loss_bring_depths_to_the_known_ones(device, rng):
+    """Of Gaussians that were moved along their rays; without weight the bits are those of a training without it."""
+    values = []
+    for weight in (0.0, 0.3):
+        local = np.random.default_rng(3)
+        trainer, photograph = trainer_of(device, local, [L1(weight=0.0), InverseDepth(weight=weight)])
+        trainer.depths = known(device, trainer, photograph)
+        photograph = replace(photograph, camera=replace(photograph.camera, view=0), mask=None)
+        measured = replace(trainer, losses=[L1(weight=0.0), InverseDepth(weight=1.0)])
+        for step in range(1, 60):
+            trainer.step(photograph, step)
+        values.append(measured.compare(photograph, 60).losses[1].value())
+    assert values[1] < 0.7 * values[0]
+
+
+def test_two_fourth_planes_are_refused(device, rng):
+    trainer, photograph = trainer_of(device, rng, [L1(), InverseDepth(), WeightEntropy()])
+    with pytest.raises(ConfigError, match="losses read entropy and inverse_depth of an image; expected one of them"):
+        trainer.step(photograph, 1)
+    trainer.losses = [L1(), InverseDepth(weight=[[0, 1.0], [5, 0.0]]), WeightEntropy()]
+    assert trainer.compare(photograph, 6).frame.content == "entropy", "a loss without weight reads nothing"
+
+
+def test_a_training_also_needs_a_loss_on_colours():
+    with pytest.raises(ValueError, match="at least one loss that compares images"):
+        Optimize(steps=3, losses=[InverseDepth()])

@@ -1,0 +1,202 @@
+"""The entropy of blend weights: the fourth plane of an image, its gradient, and the loss that reads them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.checks.blending import BACKGROUND, dim
+from clsplat.conformance.checks.images import comparison_of
+from clsplat.conformance.comparison import GRADIENT, relative_error
+from clsplat.conformance.scenes import Case, random_case, safe_case
+from clsplat.errors import ConfigError
+from clsplat.losses.base import Comparison
+from clsplat.losses.entropy import WeightEntropy
+from clsplat.losses.host import HostLoss
+from clsplat.losses.image import L1
+from clsplat.opencl.device import Device
+from clsplat.render.rasterizer import PIXEL_SUMS, Budget, Rasterizer
+from clsplat.stages.optimize import Optimize
+from tests.support.device_images import SIZES, trainer_of
+from tests.support.figures import same_of_schedules
+
+
+def entropy_of(device: Device, case: Case, sort: str = "radix") -> np.ndarray:
+    """The fourth plane, [H,W]; the other three must have the bits of an image without it."""
+    rasterizer, model, camera = Rasterizer(device, sort), case.model(device), case.device_camera(device)
+    background, (width, height) = device.upload(BACKGROUND), case.size
+    plain = rasterizer.forward(model, camera, background).image.get()
+    found = rasterizer.forward(model, camera, background, "entropy").image.get()
+    assert (plain.shape[0], found.shape[0]) == (3, 4)
+    np.testing.assert_array_equal(found[:3], plain)
+    assert (found[3, height:] == 0).all()
+    assert (found[3, :, width:] == 0).all()
+    return found[3, :height, :width]
+
+
+def pixel_sums_of(device: Device, case: Case, weights: np.ndarray, budget: Budget | None = None) -> np.ndarray:
+    """Sums over each Gaussian's pixels under the loss Σ weights · (image, entropy), [N, PIXEL_SUMS]."""
+    rasterizer, model, camera = Rasterizer(device, "radix", budget), case.model(device), case.device_camera(device)
+    frame = rasterizer.forward(model, camera, device.upload(BACKGROUND), "entropy")
+    planes = np.zeros((4, camera.rows, camera.stride), np.float32)
+    planes[:, : camera.height, : camera.width] = weights
+    return rasterizer.pixel_sums(model, frame, device.upload(planes)).get()[:, : model.gaussians.count].T
+
+
+def gradients_of(m: np.ndarray) -> dict[str, np.ndarray]:
+    return {
+        "opacity": m[:, 0],
+        "conic": np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1),
+        "colour": m[:, 6:9],
+    }
+
+
+def oracle(case: Case, weights: np.ndarray) -> dict[str, np.ndarray]:
+    splats = case.project()
+    grad = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights.astype(np.float64))
+    return {"opacity": grad.opacity * splats.opacity, "conic": grad.conic, "colour": grad.colour}
+
+
+def test_the_reference_is_the_entropy_of_shares_of_a_pixel():
+    """Two splats over one pixel, by hand."""
+    case = random_case(np.random.default_rng(0), 2, 1, 1)
+    splats = case.project(ref.SMOOTH)
+    splats.mean2d[:], splats.opacity[:], splats.visible[:], splats.depth[:] = 0.5, [0.5, 0.4], True, [1, 2]
+    shares = np.array([0.5, 0.2, 0.3])
+    found = ref.weight_entropy(splats, 1, 1, ref.SMOOTH)
+    assert found[0, 0] == pytest.approx(-(shares * np.log(shares)).sum(), rel=1e-12)
+
+
+def test_reference_gradient_is_that_of_finite_differences(rng):
+    case = random_case(rng, 6, 24, 20)
+    splats, weights = case.project(ref.SMOOTH), rng.normal(size=(4, 20, 24))
+    found = ref.blend_backward(splats, 24, 20, BACKGROUND, weights, ref.SMOOTH)
+
+    def loss(name: str, place: tuple[int, ...], step: float) -> float:
+        table = getattr(splats, name).copy()
+        table[place] += step
+        moved = replace(splats, **{name: table})
+        image, *_ = ref.blend(moved, 24, 20, BACKGROUND, ref.SMOOTH)
+        entropy = ref.weight_entropy(moved, 24, 20, ref.SMOOTH)
+        return float((weights[:3] * image).sum() + (weights[3] * entropy).sum())
+
+    capped = splats.opacity > 0.98
+    for name in ("mean2d", "conic", "opacity", "colour"):
+        values = getattr(found, name)
+        for place in np.ndindex(values.shape):
+            if capped[place[0]]:
+                continue
+            difference = (loss(name, place, 1e-5) - loss(name, place, -1e-5)) / 2e-5
+            assert difference == pytest.approx(values[place], rel=1e-4, abs=1e-6 * np.abs(values).max())
+
+
+@pytest.mark.parametrize(
+    ("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24), (30, 5, 3)]
+)
+def test_the_plane_and_its_gradient(device, rng, count, width, height):
+    case = safe_case(rng, count, width, height, 1e-5)
+    expected = ref.weight_entropy(case.project(), width, height)
+    np.testing.assert_allclose(entropy_of(device, case), expected, atol=2e-5)
+    weights = rng.normal(size=(4, height, width)).astype(np.float32)
+    for planes in (weights, weights * [[[0]], [[0]], [[0]], [[1]]]):
+        found, truth = gradients_of(pixel_sums_of(device, case, planes)), oracle(case, planes)
+        for name, value in truth.items():
+            assert relative_error(found[name], value) < GRADIENT, name
+
+
+def test_long_tiles_dim_and_finished_pixels(device, rng):
+    for change in (dim, lambda p: (p["log_scales"].__iadd__(0.6), p["logit_opacity"].__iadd__(2))):
+        case = safe_case(rng, 300, 14, 14, 2e-6, change)
+        expected = ref.weight_entropy(case.project(), 14, 14)
+        np.testing.assert_allclose(entropy_of(device, case), expected, atol=1e-4)
+        weights = rng.normal(size=(4, 14, 14)).astype(np.float32)
+        found, truth = gradients_of(pixel_sums_of(device, case, weights)), oracle(case, weights)
+        for name, value in truth.items():
+            assert relative_error(found[name], value) < 5 * GRADIENT, name
+
+
+def test_schedules_sorts_and_bands_give_the_same(device, rng):
+    case = random_case(rng, 150, 50, 70)
+    weights = rng.normal(size=(4, 70, 50)).astype(np.float32)
+    entropy, sums = entropy_of(device, case), pixel_sums_of(device, case, weights)
+    np.testing.assert_array_equal(entropy_of(device, case, "bitonic"), entropy)
+    np.testing.assert_array_equal(pixel_sums_of(device, case, weights, Budget(250, 3)), sums)
+    other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
+    same_of_schedules(device, entropy_of(other, case), entropy)
+    assert relative_error(pixel_sums_of(other, case, weights), sums) < 1e-5
+
+
+def test_without_entropy_weight_sums_are_those_of_plain_steps(device, rng):
+    case, weights = random_case(rng, 80), rng.normal(size=(4, 30, 40)).astype(np.float32)
+    weights[3] = 0
+    rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
+    planes = np.zeros((3, camera.rows, camera.stride), np.float32)
+    planes[:, :30, :40] = weights[:3]
+    frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
+    plain = rasterizer.pixel_sums(model, frame, device.upload(planes)).get()[:, :80].T
+    assert plain.shape[1] == PIXEL_SUMS
+    assert relative_error(pixel_sums_of(device, case, weights), plain) < 1e-6
+
+
+def with_entropy(device: Device, rng, width: int, height: int) -> tuple[Comparison, np.ndarray]:
+    """A comparison whose image has a fourth plane, and that plane; its gradient is 7 everywhere."""
+    x = rng.uniform(0, 1, (4, height, width)).astype(np.float32)
+    comparison = comparison_of(device, x, x[:3])
+    gradient = device.zeros((4, comparison.camera.rows, comparison.camera.stride))
+    gradient.fill(7)
+    return replace(comparison, gradient=gradient), x[3]
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_value_and_gradient_of_the_loss(device, rng, width, height):
+    comparison, entropy = with_entropy(device, rng, width, height)
+    value = WeightEntropy(weight=[[0, 0.5], [10, 1.5]]).add(replace(comparison, step=5))
+    assert value.name == "weight_entropy"
+    assert value.value() == pytest.approx(entropy.astype(np.float64).mean(), rel=1e-6)
+    planes = comparison.gradient.get()
+    assert (planes[:3] == 7).all()
+    np.testing.assert_allclose(planes[3, :height, :width] - 7, 1 / (width * height), rtol=1e-5, atol=1e-6)
+    planes[3, :height, :width] = 7
+    assert (planes[3] == 7).all(), "nothing is added outside the image"
+
+
+def test_a_frame_without_the_plane_is_refused(device, rng):
+    x = rng.uniform(0, 1, (3, 5, 5)).astype(np.float32)
+    with pytest.raises(ConfigError, match="weight_entropy needs a frame whose content is 'entropy'"):
+        WeightEntropy().add(comparison_of(device, x, x))
+
+
+def mean_difference(image: np.ndarray, photograph: np.ndarray) -> tuple[float, np.ndarray]:
+    difference = image - photograph
+    return float(np.abs(difference).mean()), np.sign(difference) / difference.size
+
+
+@pytest.mark.parametrize("colours", [L1(), HostLoss(mean_difference)])
+@pytest.mark.parametrize("first", [True, False])
+def test_the_trainer_adds_it_to_other_losses_in_any_order(device, rng, colours, first):
+    """With a mask, whose pixels count in no plane."""
+    entropy = WeightEntropy(weight=0.3)
+    losses = [entropy, colours, entropy] if first else [colours, entropy, entropy]
+    trainer, photograph = trainer_of(device, rng, losses)
+    comparison = trainer.differentiate(photograph, 1).comparison
+    image, gradient = comparison.image.get()[:, :30, :40], comparison.gradient.get()
+    assert (gradient[:, :30, :13] == 0).all()
+    np.testing.assert_allclose(gradient[3, :30, 13:40], 2 * 0.3 / 1200, rtol=1e-5)
+    assert np.abs(gradient[:3, :30, 13:40]).max() > 0
+    assert (gradient[:, 30:] == 0).all()
+    values = {one.name: one.value() for one in trainer.differentiate(photograph, 1).losses}
+    assert values["weight_entropy"] == pytest.approx(0.3 * image[3].sum(dtype=np.float64) / 1200, rel=1e-5)
+    assert (image[3, :, :13] == 0).all()
+    assert image[3, :, 13:].mean() > 0.05
+
+
+def test_steps_with_the_loss_alone_make_pixels_clearer(device, rng):
+    trainer, photograph = trainer_of(device, rng, [L1(weight=0.0), WeightEntropy(weight=1.0)])
+    values = [trainer.step(photograph, step).loss for step in range(1, 40)]
+    assert values[-1] < 0.8 * values[0]
+
+
+def test_a_training_also_needs_a_loss_on_colours():
+    with pytest.raises(ValueError, match="at least one loss that compares images"):
+        Optimize(steps=3, losses=[WeightEntropy()])

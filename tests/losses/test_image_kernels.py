@@ -1,0 +1,113 @@
+"""loss.cl: values and gradients against the oracle, also with a mask in an array of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.checks.images import LOSSES, camera_of, comparison_of, loss_figures
+from clsplat.conformance.checks.images import pictures as images
+from clsplat.errors import DataError
+from clsplat.losses.base import ImageLoss
+from clsplat.losses.image import L1, L2, Dssim, ssim_maps
+from clsplat.render.workspace import Workspace
+from clsplat.settings import variants
+from clsplat.views.photographs import Photograph, apply_mask, unpack
+from tests.support.device_images import SIZES, gradient_of
+from tests.support.figures import hold
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize(("loss", "oracle", "kernel"), LOSSES)
+def test_value_and_gradient(device, rng, width, height, loss, oracle, kernel):
+    x, y = images(rng, width, height)
+    hold(loss_figures(device, loss(weight=0.7), 0.7, oracle, kernel, x, y))
+
+
+def test_ssim_of_too_many_pixels_is_refused_before_allocation(device, rng):
+    comparison = comparison_of(device, *images(rng, 5, 3))
+    tile = comparison.camera.tile
+    large = replace(comparison.camera, width=2**15, height=2**14, tiles_x=2**15 // tile, tiles_y=2**14 // tile)
+    with pytest.raises(DataError, match="SSIM of a picture of 32768x16384 pixels; expected at most 477,218,588: "):
+        ssim_maps(replace(comparison, camera=large))
+    assert comparison.workspace.nbytes < 2**20
+
+
+def test_losses_add_up(device, rng):
+    x, y = images(rng, 50, 20)
+    comparison = comparison_of(device, x, y)
+    L1(weight=0.8).add(comparison)
+    Dssim(weight=0.2).add(comparison)
+    L2(weight=3.0).add(comparison)
+    x, y = x.astype(np.float64), y.astype(np.float64)
+    expected = 0.8 * ref.l1(x, y)[1] + 0.2 * ref.dssim(x, y)[1] + 3 * ref.l2(x, y)[1]
+    np.testing.assert_allclose(gradient_of(comparison), expected, atol=2e-4 * np.abs(expected).max())
+
+
+def test_equal_images_have_no_loss(device, rng):
+    x, _ = images(rng, 40, 30)
+    for loss in (kind for kind in variants(ImageLoss).values() if kind.reads_photograph):
+        comparison = comparison_of(device, x, x)
+        assert loss().add(comparison).value() == pytest.approx(0, abs=1e-6)
+        assert np.abs(gradient_of(comparison)).max() < 1e-7
+
+
+def test_flat_images(device):
+    """Variances are zero: rounding must not make the gradient blow up."""
+    x, y = np.full((3, 30, 40), 0.999, np.float32), np.full((3, 30, 40), 1.0, np.float32)
+    comparison = comparison_of(device, x, y)
+    Dssim().add(comparison)
+    expected = ref.dssim(x.astype(np.float64), y.astype(np.float64))[1]
+    assert np.abs(gradient_of(comparison) - expected).max() < 2e-7
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_pixels_are_unpacked_times_a_factor(device, rng, width, height):
+    pixels = rng.integers(0, 256, (4, height, width)).astype(np.uint8)
+    camera = camera_of(device, width, height)
+    workspace = Workspace(device)
+    workspace.array("photograph", (4, camera.rows, camera.stride)).fill(9)
+    for channels, factor in ((3, 1 / 255), (1, 1.0), (4, 0.5)):
+        planes = unpack(workspace, camera, device.upload(pixels[:channels]), factor, "photograph").get()
+        assert planes.shape == (channels, camera.rows, camera.stride)
+        np.testing.assert_allclose(planes[:, :height, :width], pixels[:channels] * factor, rtol=1e-6)
+        assert (planes[:, height:] == 0).all()
+        assert (planes[:, :, width:] == 0).all()
+
+
+def test_ssim_against_scikit_image(device, rng):
+    """Away from the border, where padding does not matter, the map's mean is scikit-image's."""
+    metrics = pytest.importorskip("skimage.metrics")
+    x, y = images(rng, 64, 48)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
+    _, full = metrics.structural_similarity(x, y, channel_axis=0, full=True, **options)
+    oracle = ref.ssim_map(x.astype(np.float64), y.astype(np.float64))
+    np.testing.assert_allclose(full[:, 5:-5, 5:-5], oracle[:, 5:-5, 5:-5], atol=1e-5)
+    _, sums = ssim_maps(comparison_of(device, x, y))
+    assert sums.get().sum(dtype=np.float64) / x.size == pytest.approx(oracle.mean(), rel=1e-5)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_mask_blackens_what_it_leaves_out(device, rng, width, height):
+    camera = camera_of(device, width, height)
+    colours = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
+    mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
+    photograph = Photograph(camera, device.upload(colours), device.upload(mask))
+    assert photograph.nbytes == 4 * width * height
+    np.testing.assert_array_equal(photograph.image(), colours.transpose(1, 2, 0))
+    np.testing.assert_array_equal(photograph.counted(), mask[0] > 0)
+    workspace = Workspace(device)
+    planes = photograph.planes(workspace)
+    before, counted = planes.colours.get(), planes.mask.get()
+    np.testing.assert_array_equal(counted[:, :height, :width], mask)
+    assert (counted[:, height:] == 0).all()
+    apply_mask(workspace, camera, planes.colours, planes.mask)
+    np.testing.assert_array_equal(planes.colours.get(), before * counted)
+
+
+def test_a_photograph_without_a_mask_counts_everywhere(device, rng):
+    photograph = Photograph(camera_of(device, 5, 3), device.upload(rng.integers(0, 256, (3, 3, 5)).astype(np.uint8)))
+    assert photograph.planes(Workspace(device)).mask is None
+    assert photograph.counted() is None
+    assert photograph.nbytes == 45

@@ -1,0 +1,121 @@
+"""Whole runs with rules and losses of shipped recipes: what they decide, and that runs resume and repeat to the bit."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.formats.table import read as read_ply
+from clsplat.scene.points import read_points_ply, write_points_ply
+from tests.support.runs import train
+
+pytestmark = pytest.mark.slow
+
+PRUNE = "{type: prune_faint, opacity_below: 0.005}"
+SADDLE = "{type: split_saddle, gradient_above: 1.0e-5, distance: 0.5, shrink: 1.6}"
+CROWDED = "{type: clone_crowded, gradient_above: 1.0e-5, size_below: 0.1, ratio_above: 2.0, cells: 3, extremes: 8}"
+GAINFUL = "{type: clone, statistic: gain, gradient_above: 0.1, size_below: 0.1}"
+SPARE = "{type: prune_spare, error_rise: 0.1, views: 3}"
+ENTROPY = "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: weight_entropy, weight: 0.05}]"
+CASES = {  # what acts -> settings
+    "split_saddle": (f"densify.rules=[{SADDLE}, {PRUNE}]",),
+    "clone_crowded": (f"densify.rules=[{CROWDED}, {{type: clone}}, {PRUNE}]",),
+    "clone": (f"densify.rules=[{GAINFUL}, {PRUNE}]",),
+    "prune_spare": (f"densify.rules=[{GAINFUL}, {SPARE}]",),
+    "weight_entropy": (ENTROPY,),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_runs_resume_and_repeat_to_the_bit(tiny_scene, tmp_path, name):
+    settings = (*CASES[name], "optimize.checkpoint.keep=9", "optimize.log_every=5")
+    first = train(tiny_scene, tmp_path / "first", *settings)
+    whole = (first.out / "point_cloud.ply").read_bytes()
+    lines = [json.loads(line) for line in (first.out / "metrics.jsonl").read_text().splitlines()]
+    edits = [line for line in lines if line["kind"] == "densify"]
+    assert name == "weight_entropy" or sum(edit["causes"][name] for edit in edits) > 20
+    again = train(tiny_scene, tmp_path / "again", *settings)
+    assert (again.out / "point_cloud.ply").read_bytes() == whole
+    for step in (30, 40, 50):
+        (again.out / "checkpoints" / f"step_{step:06d}.npz").unlink()
+    (again.out / "point_cloud.ply").unlink()
+    resumed = train(tiny_scene, tmp_path / "again", *settings, resume=True)
+    assert (resumed.out / "point_cloud.ply").read_bytes() == whole
+    assert resumed.records.read("densify") == first.records.read("densify")
+
+
+def test_entropy_sharpens_opacities_and_weight_0_changes_little(tiny_scene, tmp_path):
+    middling, losses = {}, "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}%s]"
+    for name, extra in (
+        ("none", ""),
+        ("zero", ", {type: weight_entropy, weight: 0.0}"),
+        ("heavy", ", {type: weight_entropy, weight: 1.0}"),
+    ):
+        run = train(tiny_scene, tmp_path / name, losses % extra, f"densify.rules=[{PRUNE}]")
+        opacity = 1 / (1 + np.exp(-read_ply(run.out / "point_cloud.ply").parameters["logit_opacity"].astype(float)))
+        middling[name] = np.mean(opacity * (1 - opacity))
+    assert middling["zero"] == pytest.approx(middling["none"], rel=1e-3)
+    assert middling["heavy"] < 0.8 * middling["none"]
+
+
+def test_parabolic_growth_ends_at_the_number_and_not_above(tiny_scene, tmp_path):
+    """Every Gaussian may grow at each of the five edits, 10 to 30, of which the draws take as many as the curve has."""
+    settings = [
+        *(
+            "optimize.steps=40",
+            "init.source=random",
+            "init.count=100",
+            "densify.every=5",
+            "densify.start=5",
+            "densify.stop=31",
+        ),
+        *("densify.budget={type: parabola, gaussians: 300}", "optimize.evaluate.every=100", "reset_opacity.every=1000"),
+        "densify.rules=[{type: clone, gradient_above: 1.0e-12, size_below: 100.0}, {type: grow_scored, views: 3}]",
+    ]
+    edits = train(tiny_scene, tmp_path / "run", *settings).records.read("densify")
+    assert [edit["after"] for edit in edits] == [172, 228, 268, 292, 300]
+
+
+def times(scene, factor, folder):
+    """A copy of a scene in other units of length, beside the same photographs."""
+    shutil.copytree(scene, folder)
+    for file in folder.glob("transforms_*.json"):
+        data = json.loads(file.read_text())
+        for frame in data["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] *= factor
+            frame["transform_matrix"] = matrix.tolist()
+        file.write_text(json.dumps(data))
+    points = read_points_ply(folder / "points3d.ply")
+    write_points_ply(folder / "points3d.ply", replace(points, positions=points.positions * np.float32(factor)))
+    return folder
+
+
+def test_mcmc_does_not_depend_on_the_unit_of_length(tiny_scene, tmp_path):
+    """Within 0.02 dB, in ten times the units: rates, noise, penalties and sizes are shares of the scene's extent."""
+    found = []
+    for factor in (1, 10):
+        scene = times(tiny_scene, factor, tmp_path / f"scene{factor}")
+        settings = (
+            *(f"model.near={0.2 * factor}", "optimize.steps=160", "densify.start=20", "densify.every=20"),
+            *("densify.stop=120", "optimize.evaluate.every=1000", "densify.max_gaussians=4000"),
+            *("add_noise.stop=120", "add_noise.opacity_below=0.6"),  # where the opacities of so short a run are
+        )
+        run = train(scene, tmp_path / f"run{factor}", *settings, pipeline="mcmc_7k")
+        found.append(json.loads((run.out / "metrics.json").read_text())["test"]["1"]["psnr"])
+    assert found[0] > 15
+    assert found[1] == pytest.approx(found[0], abs=0.02)
+
+
+def test_growth_stops_at_so_many_gaussians_for_each_pixel(tiny_scene, tmp_path):
+    """Of a photograph of 40 x 40 px: at 160, where growth alone would go on."""
+    grown = []
+    for limit in ("null", "0.1"):
+        settings = "optimize.steps=12", "init.count=100", f"densify.per_pixel={limit}", "densify.every=2"
+        rules = "densify.start=2", "densify.rules=[{type: clone, gradient_above: 1.0e-9, size_below: 9}]"
+        out = train(tiny_scene, tmp_path / limit, *settings, *rules, "init.source=random").out
+        grown.append(json.loads((out / "metrics.json").read_text())["gaussians"])
+    assert grown[0] > 160
+    assert grown[1] == 160

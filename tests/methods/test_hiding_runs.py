@@ -1,0 +1,86 @@
+"""Whole runs in which training views leave out what matters little in them."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from clsplat.density.importance import useless
+from clsplat.formats.table import read as read_ply
+from clsplat.gaussians.tables import HIDDEN
+from clsplat.training import checkpoint
+from tests.support.runs import train
+
+pytestmark = pytest.mark.slow
+
+STEPS = 24
+HIDING = f"""
+name: hiding
+stages:
+  - init: {{source: random, count: 1000, opacity: 0.3}}
+  - optimize:
+      steps: {STEPS}
+      update: seen
+      losses: [l1]
+      during:
+        - densify: {{every: 7, stop: 15, rules: [{{type: clone, gradient_above: 1.0e-9, size_below: 1}}]}}
+        - hide_useless: {{every: 5, stop: 11, of_view: 0.6}}
+        - checkpoint: {{every: 1, keep: 99}}
+  - export: {{file: point_cloud.ply}}
+"""
+
+
+@pytest.fixture
+def pipeline(tmp_path):
+    file = tmp_path / "hiding.yaml"
+    file.write_text(HIDING)
+    return str(file)
+
+
+def bits(path) -> np.ndarray:
+    return checkpoint.load(path)[1][f"gaussians/{HIDDEN}"][:, 0].astype(int)
+
+
+def test_it_is_the_same_after_a_stop_and_when_it_is_done_again(tiny_scene, tmp_path, pipeline):
+    whole = train(tiny_scene, tmp_path / "whole", pipeline=pipeline).out
+    of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.saved(whole)}
+    assert not bits(of_step[5]).any(), "an edit follows its step"
+    assert bits(of_step[6]).any()
+    assert (bits(of_step[11]) != bits(of_step[10])).any(), "a second look"
+    expected = (whole / "point_cloud.ply").read_bytes()
+    again = tmp_path / "again"
+    shutil.copytree(whole, again)
+    for path in checkpoint.saved(again):
+        if int(path.stem.removeprefix("step_")) > 8:
+            path.unlink()
+    (again / "point_cloud.ply").unlink()
+    train(tiny_scene, again, pipeline=pipeline, resume=True)
+    assert (again / "point_cloud.ply").read_bytes() == expected
+
+
+def test_what_is_new_is_hidden_where_its_source_was(tiny_scene, tmp_path, pipeline):
+    of_step = checkpoint.saved(train(tiny_scene, tmp_path / "run", pipeline=pipeline).out)
+    before, after = (next(path for path in of_step if path.stem.endswith(f"_{step:06d}")) for step in (14, 15))
+    assert len(bits(after)) > len(bits(before))
+    assert set(bits(after)) == set(bits(before))
+    assert np.bincount(bits(after) > 0)[1] > np.bincount(bits(before) > 0)[1]
+
+
+def test_a_step_changes_nothing_that_its_view_leaves_out(tiny_scene, tmp_path, pipeline):
+    """With `update: seen`; what other views leave out changes with the rest."""
+    out = train(tiny_scene, tmp_path / "run", "optimize.densify.every=999", pipeline=pipeline).out
+    saved = {int(path.stem.removeprefix("step_")): checkpoint.load(path)[1] for path in checkpoint.saved(out)}
+    always = ~saved[11][f"gaussians/{HIDDEN}"][:, 0].astype(int)
+    views = int(saved[11][f"gaussians/{HIDDEN}"].max()).bit_length()
+    everywhere = (always & (2**views - 1)) == 0
+    assert everywhere.any()
+    moved = saved[STEPS]["gaussians/means"] != saved[11]["gaussians/means"]
+    assert not moved[everywhere].any()
+    assert moved[~everywhere].any()
+
+
+def test_all_are_drawn_behind_the_training(tiny_scene, tmp_path, pipeline):
+    run = train(tiny_scene, tmp_path / "run", pipeline=pipeline)
+    assert HIDDEN not in run.model.gaussians.tables
+    assert len(read_ply(run.out / "point_cloud.ply").parameters["means"]) == run.model.gaussians.count
+    assert useless(run.survey(), 0.6).any()

@@ -1,0 +1,108 @@
+"""Whole runs with changing weights, penalties and subdividing rules: bits, resume, and what the report says of them."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from clsplat.conformance.scenes import random_case
+from clsplat.formats.table import read as read_ply
+from clsplat.metrics.distribution import SHARES, distribution
+from clsplat.pages.svg import Line, curve
+from tests.support.runs import train
+
+pytestmark = pytest.mark.slow
+
+PENALTY = "{type: covariance_trace, weight: 0.5, pixels: 1.0}"
+LOSSES = f"optimize.losses=[{{type: l1, weight: [[10, 0.8], [40, 0.4]]}}, {{type: l2, weight: 2.0}}, {PENALTY}]"
+RULES = (
+    "densify.rules=[{type: clone}, {type: split_textured, texture_above: {quantile: 0.5, of: pixels}, "
+    "gradient_above: 0.0, radius_above: 0.5}, {type: split_oversized, pixels: 1.5, radius_above: 0.5}, "
+    "{type: merge_neighbours}, {type: prune_unimportant, share: 0.01}]"
+)
+SETTINGS = (LOSSES, RULES, "optimize.log_every=5", "optimize.checkpoint.keep=9")
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("micro") / "run"
+    return train(tiny_scene, out, *SETTINGS)
+
+
+def test_every_rule_and_penalty_acts(finished):
+    lines = [json.loads(line) for line in (finished.out / "metrics.jsonl").read_text().splitlines()]
+    edits = [line for line in lines if line["kind"] == "densify"]
+    growing, thinning = ("clone", "split_textured", "split_oversized"), ("merge_neighbours", "prune_unimportant")
+    for name in (*growing, *thinning):
+        total, grown = (sum(edit[key][name] for edit in edits) for key in ("causes", "grown"))
+        assert total > 0, name
+        assert 0 < grown <= total if name in growing else grown == 0, name
+    found = [line for line in lines if line["kind"] == "distribution"]
+    assert found[-1]["step"] == 50
+    assert all(len(line["anisotropy"]) == len(SHARES) for line in found)
+    page = (finished.out / "report.html").read_text()
+    assert "anisotropy" in page
+    assert re.search("share of growth.*split_oversized", page)
+    shown = re.findall(r"<figcaption>(\S+) ", page)
+    assert len(shown) == len(set(shown)) > 0, "a view is shown twice"
+
+
+def test_legends_stay_below_the_title_and_break_into_rows():
+    names = ["clone", "split_textured", "split_oversized", "prune_unimportant", "merge_neighbours", "prune_faint"]
+    chart = curve("Gaussians changed by each rule", [Line([(0.0, 0.0), (1.0, 1.0)], name) for name in names])
+    rows = re.findall(r'<text x="56" y="(\d+)">(<tspan.*?)</text>', chart)
+    assert [y for y, _ in rows] == ["29", "43"]
+    assert re.findall(r">(\w+)</tspan>", "".join(row for _, row in rows)) == names
+    assert "<tspan" not in curve("loss", [Line([(0.0, 0.0), (1.0, 1.0)], "alone")])
+
+
+def test_a_narrow_logarithmic_axis_has_numbers():
+    chart = curve("anisotropy", [Line([(0.0, 1.05), (1.0, 1.7)])], logarithmic=True)
+    assert re.findall(r'text-anchor="end">([\d.]+)<', chart) == ["1.2", "1.4", "1.6"]
+
+
+def test_same_bits_and_exact_resume(finished, tiny_scene, tmp_path):
+    whole = (finished.out / "point_cloud.ply").read_bytes()
+    again = train(tiny_scene, tmp_path / "again", *SETTINGS)
+    assert (again.out / "point_cloud.ply").read_bytes() == whole
+    for step in (30, 40, 50):
+        (again.out / "checkpoints" / f"step_{step:06d}.npz").unlink()
+    (again.out / "point_cloud.ply").unlink()
+    assert (again.out / "checkpoints" / "step_000020.npz").exists()
+    resumed = train(tiny_scene, tmp_path / "again", *SETTINGS, resume=True)
+    assert (resumed.out / "point_cloud.ply").read_bytes() == whole
+    assert resumed.records.read("densify") == finished.records.read("densify")
+
+
+@pytest.mark.parametrize("penalty", ["{type: covariance_trace, above: 0.0", "{type: anisotropy, above: 1.0"])
+def test_penalties_move_gaussians(tiny_scene, tmp_path, penalty):
+    """A heavy one shrinks what it is about; without weight the run is the same without it."""
+    measured = {}
+    for name, extra in (
+        ("none", ""),
+        ("zero", f", {penalty}, weight: 0.0}}"),
+        ("heavy", f", {penalty}, weight: 1000.0}}"),
+    ):
+        settings = f"optimize.losses=[{{type: l1}}{extra}]"
+        run = train(tiny_scene, tmp_path / name, settings, "densify.rules=[{type: prune_faint}]")
+        scales = np.exp(read_ply(run.out / "point_cloud.ply").parameters["log_scales"].astype(np.float64))
+        measured[name] = np.median((scales**2).sum(axis=1) if "trace" in penalty else np.ptp(np.log(scales), axis=1))
+    assert measured["zero"] == pytest.approx(measured["none"], rel=1e-3)
+    assert measured["heavy"] < 0.5 * measured["none"]
+
+
+def test_a_ramp_of_weights_needs_no_more_memory(finished, tiny_scene, tmp_path):
+    steady = LOSSES.replace("[[10, 0.8], [40, 0.4]]", "0.8")
+    run = train(tiny_scene, tmp_path / "run", steady, *SETTINGS[1:])
+    assert finished.rasterizer.workspace._arrays.keys() == run.rasterizer.workspace._arrays.keys()
+
+
+def test_distribution_of_known_gaussians(device, rng):
+    case = random_case(rng, 5)
+    case.parameters["log_scales"][:] = np.log([[1, 1, 1], [1, 1, 2], [1, 1, 3], [1, 1, 4], [1, 1, 5]])
+    case.parameters["logit_opacity"][:] = 0
+    found = distribution(case.model(device).gaussians)
+    np.testing.assert_allclose(found["anisotropy"], np.quantile([1, 2, 3, 4, 5], SHARES), rtol=1e-6)
+    np.testing.assert_allclose(found["size"][2], np.sqrt(11 / 3), rtol=1e-6)
+    assert found["opacity"] == [0.5] * 5

@@ -1,0 +1,146 @@
+"""Figures in the colours of the photographs, beside PSNR."""
+
+import re
+
+import numpy as np
+import pytest
+
+from clsplat.metrics.colours import PIXELS, colour_figures, corrected_by_regression, in_colours_of, mean_figures
+from clsplat.metrics.images import MAX_PSNR, psnr, to_8_bits
+from clsplat.stages.keeping import compared
+from clsplat.training.colours import tell_of_colours
+from clsplat.views.colours import Affine, Gain
+
+GAINS = np.array([1.3, 0.9, 1.1])
+
+
+@pytest.fixture
+def image(rng) -> np.ndarray:
+    return rng.uniform(0.05, 0.7, (20, 31, 3)).astype(np.float32)
+
+
+def everywhere(image: np.ndarray) -> np.ndarray:
+    return np.ones(image.shape[:2], bool)
+
+
+def test_exposure_costs_psnr_but_nothing_in_photograph_colors(image):
+    photograph = to_8_bits(image * GAINS.astype(np.float32))
+    assert psnr(image, photograph) < 25
+    found = colour_figures(image, photograph, None, Gain())
+    assert found["psnr_colour"] > 50
+    assert found["psnr_affine"] > 50
+
+
+def test_equal_images_stay_equal(image):
+    photograph = to_8_bits(image)
+    for model in (Gain(), Affine()):
+        assert colour_figures(photograph / np.float32(255), photograph, None, model)["psnr_colour"] == MAX_PSNR
+
+
+def test_no_pixel_is_measured_in_colours_that_were_fitted_to_it(image):
+    """What is true of one half alone does not help there."""
+    photograph = to_8_bits(image)
+    photograph[:, :15] = to_8_bits(image[:, :15] * 0.5)
+    changed = in_colours_of(image.astype(np.float64), photograph, everywhere(image), Gain())
+    assert changed[:, :15] == pytest.approx(image[:, :15], abs=0.01), "as the right half asks for"
+    assert changed[:, 15:] == pytest.approx(0.5 * image[:, 15:], abs=0.01)
+
+
+def test_white_black_and_masked_pixels_say_nothing_of_colours(image, rng):
+    truth = np.minimum(image * 1.5, 1)
+    photograph, counted = to_8_bits(truth), rng.random(image.shape[:2]) < 0.8
+    assert (photograph == 255).any()
+    photograph[~counted] = 128
+    changed = in_colours_of(image.astype(np.float64), photograph, counted, Gain())
+    assert changed[counted] == pytest.approx(truth[counted], abs=0.01)
+
+
+@pytest.mark.parametrize(("model", "numbers"), [(Gain(), 1), (Affine(), 4)])
+@pytest.mark.parametrize("half", [np.s_[:, :15], np.s_[:, 15:]])
+def test_half_with_too_few_pixels_gives_no_color_figure(image, model, numbers, half):
+    photograph, counted = to_8_bits(image), everywhere(image)
+    counted[half] = False
+    rows, columns = np.nonzero(~counted)
+    for number, has in ((PIXELS * numbers - 1, False), (PIXELS * numbers, True)):
+        counted[rows[:number], columns[:number]] = True
+        found = colour_figures(image, photograph, counted, model)
+        assert ("psnr_colour" in found) == has
+        assert "psnr_affine" in found
+
+
+@pytest.mark.parametrize("model", [Gain(), Affine()])
+def test_which_views_have_the_figure_is_independent_of_the_model(image, model):
+    """Else two steps are compared on different views.  A picture that is white everywhere is bad in any colours."""
+    photograph = to_8_bits(0.5 * image)
+    for step in (image, image + 2, np.ones_like(image), np.full_like(image, np.inf), np.full_like(image, np.nan)):
+        assert "psnr_colour" in colour_figures(step, photograph, None, model)
+    assert colour_figures(np.ones_like(image), photograph, None, model)["psnr_colour"] < 22, "one colour"
+    bright = colour_figures(image / 0.05, to_8_bits(image), None, model)
+    assert bright["psnr_colour"] > 50, "beyond white a picture still says which colours it asks for"
+
+
+def test_pixels_beyond_white_are_dropped_where_enough_remain(image):
+    photograph, bright = to_8_bits(0.5 * image), image.astype(np.float64)
+    bright[:5] = 3
+    changed = in_colours_of(bright, photograph, everywhere(image), Gain())
+    assert changed[5:] == pytest.approx(0.5 * image[5:], abs=0.01)
+
+
+def test_a_mean_says_of_how_many_views_it_is():
+    both, one = {"psnr_colour": 30.0, "psnr_affine": 32.0}, {"psnr_affine": 20.0}
+    assert mean_figures([both, both]) == both
+    assert mean_figures([{}, {}]) == {}
+    assert mean_figures([both, one]) == {
+        "psnr_colour": 30.0,
+        "psnr_affine": 26.0,
+        "psnr_colour_views": 1,
+        "psnr_colour_reason": "1 of 2 views have a half with too few pixels to fit colours to",
+    }
+    none = mean_figures([one])
+    assert (none["psnr_colour"], none["psnr_colour_views"]) == (None, 0)
+
+
+def test_the_log_says_of_how_many_views_the_mean_is(caplog):
+    caplog.set_level("INFO", "clsplat")
+    whole = {"psnr": 20.0, "psnr_colour": 24.0}
+    tell_of_colours({"psnr": 20.0})
+    assert not caplog.messages
+    for averages, said in (
+        (whole, r"PSNR 24.00 dB; exposures of these photographs differ"),
+        ({**whole, "psnr_colour_views": 1, "psnr_colour_reason": "why"}, r"PSNR 24.00 dB, the mean of 1 view: why$"),
+        (
+            {"psnr": 20.0, "psnr_colour": None, "psnr_colour_reason": "why"},
+            r"^no PSNR in the .* colours: why$",
+        ),
+    ):
+        caplog.clear()
+        tell_of_colours(averages)
+        (message,) = caplog.messages
+        assert re.search(said, message)
+
+
+def test_best_model_is_chosen_by_psnr_where_no_view_has_colors():
+    fitted, bare = {"psnr": 20.0, "psnr_colour": 24.0}, {"psnr": 21.0, "psnr_colour": None}
+    assert compared([fitted, fitted]) == [24.0, 24.0]
+    assert compared([fitted, bare]) == compared([fitted, {"psnr": 21.0}]) == [20.0, 21.0]
+    assert compared([fitted, {}]) == [20.0, None]
+
+
+def test_steps_compare_by_psnr_where_some_views_lack_colors():
+    """30 dB of one view is no better than 31 and 22 dB of two."""
+    first = {"psnr": 20.0, **mean_figures([{"psnr_colour": 30.0}, {"psnr_affine": 20.0}])}
+    second = {"psnr": 21.0, **mean_figures([{"psnr_colour": 31.0}, {"psnr_colour": 22.0}])}
+    assert (first["psnr_colour"], second["psnr_colour"]) == (30.0, 26.5)
+    whole = {"psnr": 22.0, "psnr_colour": 29.0}
+    assert compared([whole, first]) == [22.0, 20.0]
+    assert compared([first, whole]) == [20.0, 22.0]
+    assert compared([whole, second]) == [29.0, 26.5]
+
+
+def test_the_regression_is_of_the_image_on_the_photograph(rng):
+    """With noise in the image its slope is too small by nothing, with noise in the photograph by 1 / (1 + noise)."""
+    truth = rng.uniform(0.2, 0.8, (60, 60, 3))
+    image = 0.5 * truth + 0.1
+    assert corrected_by_regression(image, truth, everywhere(image)) == pytest.approx(truth)
+    flat = np.full_like(truth, 0.3)
+    assert corrected_by_regression(flat, truth, everywhere(flat)) == pytest.approx(flat)

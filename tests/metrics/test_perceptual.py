@@ -1,0 +1,132 @@
+"""MS-SSIM against the oracle, FLIP and LPIPS as far as the packages and files for them are there."""
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from clsplat.conformance import reference as ref
+from clsplat.errors import ConfigError, DataError
+from clsplat.metrics.lpips import Lpips
+from clsplat.metrics.perceptual import Perceptual, flip, metric_names, ms_ssim, ms_ssim_scales
+from clsplat.stages.evaluate import Evaluate
+from tests.support.onnx_writer import distance_network
+
+
+def images(rng, height: int, width: int, noise: float = 30.0) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth random image and a noisy copy, 8 bits."""
+    coarse = rng.uniform(0, 255, (max(2, height // 8), max(2, width // 8), 3))
+    photograph = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    image = photograph + rng.normal(0, noise, photograph.shape)
+    return np.clip(image, 0, 255).astype(np.uint8), np.clip(photograph, 0, 255).astype(np.uint8)
+
+
+# 11 px is the window; 22, 44, 88 and 176 are the smallest sides of 2, 3, 4 and 5 scales; odd sides lose a row
+@pytest.mark.parametrize(
+    ("height", "width", "scales"),
+    [(11, 30, 1), (21, 40, 1), (22, 23, 2), (43, 60, 2), (45, 44, 3), (91, 100, 4), (176, 177, 5), (201, 190, 5)],
+)
+def test_ms_ssim_is_the_oracles(rng, height, width, scales):
+    image, photograph = images(rng, height, width)
+    assert ms_ssim_scales(image) == scales
+    x, y = (pixels.astype(np.float64).transpose(2, 0, 1) / 255 for pixels in (image, photograph))
+    assert ms_ssim(image, photograph) == pytest.approx(ref.ms_ssim(x, y, scales), rel=1e-12)
+    assert 0 < ms_ssim(image, photograph) < 1
+
+
+def test_one_scale_is_the_ssim_of_scikit_image(rng):
+    metrics = pytest.importorskip("skimage.metrics")
+    image, photograph = images(rng, 21, 40)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
+    _, full = metrics.structural_similarity(image, photograph, channel_axis=2, full=True, **options)
+    assert ms_ssim(image, photograph) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-6)
+
+
+def test_ms_ssim_of_equal_opposite_and_tiny_images(rng):
+    image, photograph = images(rng, 60, 50)
+    assert ms_ssim(photograph, photograph) == 1
+    assert ms_ssim(255 - photograph, photograph) == 0, "negative structure counts as none"
+    assert ms_ssim(image[:10], photograph[:10]) is None
+    more = images(rng, 60, 50, noise=60)[0]
+    assert ms_ssim(more, photograph) < ms_ssim(image, photograph)
+
+
+def test_averages_say_why_a_figure_is_missing(rng):
+    perceptual = Perceptual(("ms_ssim",))
+    small = [perceptual.measure(*images(rng, 9, 40)) for _ in range(2)]
+    averages = perceptual.mean(small)
+    assert averages["ms_ssim"] is None
+    assert "smaller than the window of 11 px" in averages["ms_ssim_reason"]
+    assert averages["lpips"] is None
+    assert averages["lpips_reason"] == "no ONNX file given"
+    both = perceptual.mean([perceptual.measure(*images(rng, height, 50)) for height in (50, 30)])
+    assert both["ms_ssim_scales"] == 2
+    assert "ms_ssim_reason" not in both
+
+
+def test_flip_is_zero_for_equal_images_and_that_of_its_package(rng):
+    package = pytest.importorskip("flip_evaluator")
+    image, photograph = images(rng, 40, 60)
+    assert flip(photograph, photograph) == 0
+    _, expected, _ = package.evaluate(
+        (photograph / 255).astype("f4"), (image / 255).astype("f4"), "LDR", applyMagma=False
+    )
+    assert flip(image, photograph) == pytest.approx(expected, rel=1e-6)
+    assert 0 < flip(image, photograph) < flip(255 - photograph, photograph) < 1
+
+
+def test_flip_without_its_package_is_refused_before_training(monkeypatch):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.raises(ConfigError, match=r"pip install 'clsplat\[metrics\]'"):
+        Evaluate(metrics=["psnr", "ssim", "flip"]).check()
+
+
+def test_psnr_and_ssim_are_always_measured():
+    with pytest.raises(ValidationError, match="must be among the metrics"):
+        Evaluate(metrics=["flip"])
+    with pytest.raises(ConfigError, match="no metric named 'mssim'; there are psnr, ssim, ms_ssim, flip"):
+        metric_names(["psnr", "mssim"])
+
+
+@pytest.fixture
+def network(tmp_path):
+    def write(**changes: object) -> Lpips:
+        path = tmp_path / "distance.onnx"
+        path.write_bytes(distance_network(**changes))
+        return path
+
+    return write
+
+
+def test_lpips_runs_the_network_on_the_stated_range(rng, network):
+    """The range doubles differences, so this network's squares are four times as large."""
+    path = network()
+    for height, width in ((40, 30), (33, 57), (40, 30)):  # one network, several sizes
+        image, photograph = images(rng, height, width)
+        expected = np.mean(((image.astype(np.float64) - photograph) / 255) ** 2)
+        assert Lpips(path, "0..1").distance(image, photograph) == pytest.approx(expected, rel=1e-5)
+        assert Lpips(path, "-1..1").distance(image, photograph) == pytest.approx(4 * expected, rel=1e-5)
+
+
+def test_lpips_says_where_it_comes_from(rng, network):
+    perceptual = Perceptual.open(["psnr", "ssim"], network(), "0..1")
+    averages = perceptual.mean([perceptual.measure(*images(rng, 20, 20)) for _ in range(3)])
+    assert averages["lpips"] > 0
+    assert averages["lpips_input"] == "0..1"
+    assert averages["lpips_model"].startswith("distance.onnx sha256:")
+    assert "lpips_reason" not in averages
+
+
+def test_files_that_are_not_lpips_are_refused(rng, network, tmp_path):
+    with pytest.raises(DataError, match=r"nowhere.onnx: cannot be read"):
+        Evaluate(lpips=str(tmp_path / "nowhere.onnx")).check()
+    (tmp_path / "text.onnx").write_text("not a network")
+    with pytest.raises(DataError, match="not an ONNX file"):
+        Lpips(tmp_path / "text.onnx", "-1..1")
+    with pytest.raises(ConfigError, match="expected the inputs in0 and in1") as error:
+        Lpips(network(inputs=("image", "photograph")), "-1..1")
+    assert "\n" not in str(error.value)
+    with pytest.raises(ConfigError, match=r"distance of equal images is 0.5, expected 0"):
+        Lpips(network(offset=0.5), "-1..1")

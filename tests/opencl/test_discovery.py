@@ -1,0 +1,270 @@
+"""Which device is chosen, what keeps one from working, and what a compiler's limits lead to."""
+
+import logging
+import os
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from pyopencl import _cl
+
+from clsplat.conformance.scenes import random_case
+from clsplat.errors import DeviceError, KernelError
+from clsplat.opencl import discovery, probe, program, runtimes
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import DeviceInfo, choose
+from clsplat.opencl.kernel_caches import kernel_caches
+from clsplat.render.rasterizer import Rasterizer
+
+CPU = DeviceInfo("Two Cores", "Runtime A", "CPU", "1", 2, 2**32, 2**31, 2**15, 4096, 16, (0, 0), 3000, True)
+INTEGRATED = replace(CPU, name="Small", kind="GPU", units=96, clock=1300, group=256, float_width=1, place=(1, 0))
+LARGE = replace(INTEGRATED, name="Large", units=28, clock=1800, unified=False, place=(2, 0))
+LARGER = replace(LARGE, name="Larger", units=80, clock=1700, place=(2, 1))
+
+OTHER = replace(CPU, name="Accelerator", kind="other", units=96, group=256, place=(3, 0))
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """Lets the test say which devices there are; all work."""
+    monkeypatch.delenv("CLSPLAT_DEVICE", raising=False)
+    monkeypatch.setattr(runtimes, "fault_of", lambda *_: None)
+    return lambda *devices: monkeypatch.setattr(discovery, "list_devices", lambda: list(devices))
+
+
+@pytest.mark.parametrize(
+    ("devices", "first"),
+    [
+        ([CPU], CPU),
+        ([CPU, INTEGRATED], INTEGRATED),
+        ([CPU, INTEGRATED, LARGE], LARGE),
+        ([INTEGRATED, LARGE, LARGER, CPU], LARGER),
+        ([INTEGRATED, replace(INTEGRATED, clock=1400), LARGE], LARGE),
+        ([CPU, replace(CPU, units=64)], CPU),
+        ([OTHER, CPU], CPU),
+        ([OTHER, CPU, LARGE], LARGE),
+        ([OTHER, replace(OTHER, units=64)], OTHER),
+    ],
+)
+def test_the_strongest_gpu_is_chosen_and_of_cpus_the_first(found, devices, first):
+    found(*devices)
+    assert choose() is first
+
+
+def test_the_other_gpus_are_named_in_one_line(found, caplog):
+    found(CPU, INTEGRATED, LARGE, LARGER)
+    with caplog.at_level(logging.INFO, "clsplat"):
+        choose()
+    assert [record.message for record in caplog.records] == [
+        "chose Larger (GPU) on Runtime A; other GPUs: Small (GPU) on Runtime A; Large (GPU) on Runtime A; "
+        "--device NAME chooses one"
+    ]
+    caplog.clear()
+    found(CPU, LARGE)
+    choose()
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(("info", "least"), [(CPU, 16), (LARGE, 64)])
+def test_a_device_with_small_groups_does_not_work(found, info, least):
+    assert replace(info, group=least).fault() is None
+    small = replace(info, group=least - 1)
+    assert small.fault() == f"its work-groups have at most {least - 1} items; expected {least} or more"
+    found(small)
+    with pytest.raises(DeviceError, match="work-groups have at most"):
+        choose()
+
+
+def test_device_failing_only_with_a_damaged_cache_is_reported_so(monkeypatch, tmp_path):
+    """Its second try has an empty folder for kernels; of a device that fails there, too, the first fault is told."""
+    broken, folders = False, []
+
+    def probe(*arguments, env, **values):
+        folder = env.get("POCL_CACHE_DIR") if "PYOPENCL_NO_CACHE" in env else None
+        folders.append(folder)
+        assert folder is None or not os.listdir(folder)
+        return subprocess.CompletedProcess([], int(broken or folder is None), "", f"error: fault {len(folders)}")
+
+    monkeypatch.delenv("PYOPENCL_NO_CACHE", raising=False)
+    monkeypatch.setattr(runtimes.subprocess, "run", probe)
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    fault = CPU.fault()
+    assert fault == f"its cache of built kernels is damaged: remove {kernel_caches()}"
+    assert (len(folders), folders[0], os.path.exists(folders[1])) == (2, None, False)
+    assert list(tmp_path.iterdir()) == [], "it is tried again"
+    broken = True
+    assert CPU.fault() == "error: fault 3"
+
+
+def test_a_runtime_that_does_not_know_the_processor_is_told_so(monkeypatch, tmp_path):
+    """PoCL 3.0 builds kernels for a newer processor without an error, and then has none that takes whole roots."""
+    said = "error: a test kernel fails (clCreateKernel failed: INVALID_KERNEL_NAME)"
+    monkeypatch.setattr(
+        runtimes.subprocess,
+        "run",
+        lambda *_, **__: subprocess.CompletedProcess([], 1, "", f"{said}\nreferences to IRs"),
+    )
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    assert CPU.fault().startswith(f"{said}; this runtime may not support the processor: apt install pocl-opencl-icd")
+
+
+@pytest.mark.parametrize(("width", "lanes"), [(16, 16), (8, 8), (4, 4), (1, 4)])
+def test_kernels_compiled_without_vector_units_are_not_made(monkeypatch, width, lanes):
+    """PoCL 3.0 on a newer processor may take minutes to make one; the warning is in the log of the build."""
+    warning = f"'float{lanes}' (vector of {lanes} 'float' values) without 'avx512f' enabled changes the ABI"
+    built = []
+
+    class Program:
+        def __init__(self, context, source):
+            built.append(source)
+
+        def build(self, options):
+            return self
+
+        def get_build_info(self, device, what):
+            return f"1 warning generated: {warning}"
+
+    chosen = SimpleNamespace(native_vector_width_float=width)
+    monkeypatch.setattr(probe.cl, "get_platforms", lambda: [SimpleNamespace(get_devices=lambda: [chosen])])
+    for name in ("Context", "CommandQueue", "Buffer"):
+        monkeypatch.setattr(probe.cl, name, lambda *_, **__: None)
+    monkeypatch.setattr(probe.cl, "Program", Program)
+    with pytest.raises(SystemExit, match="error: kernels are compiled without the vectors of the processor"):
+        probe.main(0, 0)
+    assert f"vload{lanes}(" in built[0]
+
+
+def test_a_device_works_where_a_success_cannot_be_noted(monkeypatch, tmp_path):
+    """As in a cache with a folder of another user."""
+    monkeypatch.setattr(runtimes.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 0, "", ""))
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    (tmp_path / "probes").touch()
+    assert CPU.fault() is None
+    assert [path.name for path in tmp_path.iterdir()] == ["probes"]
+
+
+def refusal(code: int) -> cl.Error:
+    return cl.LogicError(_cl._ErrorRecord("clGetInfo", code, ""))
+
+
+class BrokenDevice:
+    """A device that tells nothing of itself."""
+
+    @property
+    def name(self):
+        raise refusal(cl.status_code.INVALID_VALUE)
+
+
+class Platform:
+    """A runtime with these devices, or one that refuses to tell them."""
+
+    name, version = "Runtime", "OpenCL 3.0"
+
+    def __init__(self, *found) -> None:
+        self.found = found
+
+    def get_devices(self):
+        for error in self.found:
+            if isinstance(error, cl.Error):
+                raise error
+        return list(self.found)
+
+
+def test_a_broken_runtime_takes_no_other_down_and_is_told(monkeypatch, info, caplog):
+    platform, number = info.place
+    good = discovery.platforms()[platform]
+    devices = [BrokenDevice(), good.get_devices()[number]]
+    runtimes_found = [
+        Platform(refusal(cl.status_code.DEVICE_NOT_FOUND)),
+        Platform(refusal(cl.status_code.OUT_OF_HOST_MEMORY)),
+        Platform(*devices),
+    ]
+    monkeypatch.setattr(discovery.cl, "get_platforms", lambda: runtimes_found)
+    (found,) = discovery.list_devices()
+    assert (found.name, found.place) == (info.name, (2, 1))
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 2, "one without a device is no fault"
+    assert "OpenCL platform 1: its devices cannot be listed (clGetInfo failed: OUT_OF_HOST_MEMORY" in told[0]
+    assert "OpenCL platform 2: its device 0 cannot be asked (clGetInfo failed: INVALID_VALUE" in told[1]
+
+
+@pytest.mark.parametrize(("code", "lines"), [("PLATFORM_NOT_FOUND_KHR", 0), ("OUT_OF_HOST_MEMORY", 1)])
+def test_failing_loader_is_reported_but_not_one_without_runtimes(monkeypatch, caplog, code, lines):
+    def refuse():
+        raise refusal(getattr(cl.status_code, code))
+
+    monkeypatch.setattr(discovery.cl, "get_platforms", refuse)
+    assert discovery.list_devices() == []
+    assert len(caplog.records) == lines
+
+
+def test_a_success_counts_for_the_very_test_kernels(monkeypatch, tmp_path):
+    results = []
+    monkeypatch.setattr(
+        runtimes.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], len(results), "", "error: none")
+    )
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    assert CPU.fault() is None
+    results.append("fails from now on")
+    assert CPU.fault() is None, "it is not tried again"
+    monkeypatch.setattr(runtimes, "PROBE", Path(__file__))
+    assert CPU.fault() == "error: none"
+
+
+@pytest.fixture
+def info() -> DeviceInfo:
+    return choose()
+
+
+def capped(monkeypatch: pytest.MonkeyPatch, items: int, *kernels: str) -> None:
+    """Cap the work-groups of these kernels, of all without names, as a compiler may do."""
+    limit = program.group_limit
+    monkeypatch.setattr(
+        program,
+        "group_limit",
+        lambda kernel, device: items if not kernels or kernel.function_name in kernels else limit(kernel, device),
+    )
+
+
+def image_of(device: Device, rng: np.random.Generator) -> np.ndarray:
+    case = random_case(rng, 60, 50, 37)
+    frame = Rasterizer(device).forward(case.model(device), case.device_camera(device), device.zeros(3))
+    return frame.image.get()[:, :37, :50]
+
+
+def test_capped_blending_gets_smaller_tiles_and_the_same_image(info, rng, monkeypatch, caplog):
+    image = image_of(Device(info, "simt"), np.random.default_rng(1))
+    capped(monkeypatch, 255, "blend_forward")
+    with caplog.at_level(logging.INFO, "clsplat"):
+        device = Device(info, "simt")
+    assert device.tuning["TILE"] == 8
+    assert len(caplog.records) == 1
+    assert (
+        "tiles of 8 x 8 px instead of 16 x 16: blend_simt.cl:blend_forward has work-groups of 256 items" in caplog.text
+    )
+    np.testing.assert_array_equal(image_of(device, np.random.default_rng(1)), image)
+
+
+def test_kernel_whose_group_is_too_large_is_refused(info, monkeypatch):
+    capped(monkeypatch, 63, "scan_blocks")
+    with pytest.raises(KernelError, match=r"scan.cl:scan_blocks has work-groups of 64 items, and .* allows it 63; use"):
+        Device(info, "simt").program("scan.cl")
+
+
+def test_a_limit_that_rusticl_understates_refuses_no_kernel(info, monkeypatch):
+    capped(monkeypatch, 32)
+    monkeypatch.setattr(program, "group_multiple", lambda *_: 32)
+    assert Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt").tuning["TILE"] == 16
+    capped(monkeypatch, 48)
+    with pytest.raises(KernelError, match="allows it 48"):
+        Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt")
+
+
+def test_wide_needs_no_kernel_with_barriers(info, rng, monkeypatch):
+    image = image_of(Device(info, "wide"), np.random.default_rng(1))
+    capped(monkeypatch, 1, "sort_tiles", "blend_forward", "blend_backward", "scan_offsets", "radix_count")
+    np.testing.assert_array_equal(image_of(Device(info, "wide"), np.random.default_rng(1)), image)

@@ -1,0 +1,108 @@
+"""Colours of each photograph: their numbers, their table, and whole runs with them."""
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.errors import ConfigError
+from clsplat.pipeline.loading import load
+from clsplat.schedule import at_step
+from clsplat.views.colours import IDENTITY, Affine, Auto, Gain
+from clsplat.views.photograph_colours import PhotographColours
+from clsplat.views.view_table import ViewTable
+
+MODELS = pytest.mark.parametrize("model", [Gain(), Affine()], ids=lambda model: model.type)
+
+
+@MODELS
+def test_derivatives_by_numbers_are_those_of_the_matrix(rng, model):
+    row, by_matrix, step = rng.normal(0, 0.2, len(model.columns)), rng.normal(size=(3, 4)), 1e-5
+    values = [
+        ((by_matrix * (model.matrix(row + change) - model.matrix(row - change))).sum() / (2 * step))
+        for change in step * np.eye(len(row))
+    ]
+    assert model.gradient(row, by_matrix) == pytest.approx(np.array(values), rel=1e-6, abs=1e-9)
+    penalties = [
+        (model.penalty(row + change)[0] - model.penalty(row - change)[0]) / (2 * step)
+        for change in step * np.eye(len(row))
+    ]
+    assert model.penalty(row)[1] == pytest.approx(np.array(penalties), rel=1e-6, abs=1e-9)
+
+
+def test_the_gain_is_that_of_the_reference(rng):
+    row, by_matrix = rng.normal(0, 0.3, 3), rng.normal(size=(3, 4))
+    assert Gain().matrix(row) == pytest.approx(ref.gain_matrix(*row))
+    assert Gain().gradient(row, by_matrix) == pytest.approx(ref.gain_gradient(*row, by_matrix))
+
+
+@MODELS
+def test_numbers_of_gains_make_these_gains_and_zeros_no_change(rng, model):
+    gains = rng.normal(0, 0.3, 3)
+    assert np.diag(model.matrix(model.of_gains(gains))) == pytest.approx(np.exp(gains))
+    assert (model.matrix(np.zeros(len(model.columns))) == IDENTITY).all()
+    assert model.penalty(np.zeros(len(model.columns)))[0] == 0
+
+
+@MODELS
+def test_the_fitted_matrix_is_the_one_that_made_a_photograph(rng, model):
+    image, made = rng.uniform(0, 0.6, (500, 3)), model.of_gains(np.array([0.2, -0.1, 0.3]))
+    matrix = model.matrix(made)
+    photograph = image @ matrix[:, :3].T + matrix[:, 3]
+    assert model.fitted(image, photograph) == pytest.approx(matrix)
+    assert np.isfinite(model.fitted(image[:0], photograph[:0])).all()
+    assert model.fitted(np.zeros((9, 3)), np.zeros((9, 3))).shape == (3, 4)
+
+
+def test_table_changes_its_views_row_and_keeps_means_at_zero(rng):
+    table, numbers = ViewTable("t", ("a", "b/c", "d"), ("x", "y")), {"other": 1.0}
+    assert not table.begun(numbers)
+    table.begin(numbers, {"a": np.array([0.3, 0.0]), "d": np.array([0.0, 0.6])})
+    assert table.begun(numbers)
+    assert table.row(numbers, "a") == pytest.approx([0.2, -0.2])
+    before = {view: table.row(numbers, view) for view in table.views}
+    table.update(numbers, "b/c", np.array([2.0, -5.0]), rate=0.03)
+    after = {view: table.row(numbers, view) for view in table.views}
+    assert sum(after.values()) == pytest.approx([0, 0], abs=1e-15)
+    moved = {view: after[view] - before[view] for view in table.views}
+    assert moved["b/c"] == pytest.approx([-0.02, 0.02]), "by the rate, less the mean"
+    assert moved["a"] == pytest.approx([0.01, -0.01])
+    assert {key for key in numbers if key.endswith("updates")} == {"t/b/c/x/updates", "t/b/c/y/updates"}
+    assert numbers["other"] == 1
+
+
+def test_a_view_has_one_row_at_all_its_sizes():
+    colours, numbers = PhotographColours(Gain(), ("a", "b", "a"), rate=0.01), {}
+    colours.begin(numbers, {})
+    colours.learn(numbers, 2, -IDENTITY, step=1)
+    assert colours.matrix(numbers, 0)[0, 0] == colours.matrix(numbers, 2)[0, 0] > 1 > colours.matrix(numbers, 1)[0, 0]
+
+
+def test_rates_follow_how_often_a_photograph_is_visited():
+    few, many = Gain().rate_of(7000, 50), Gain().rate_of(30_000, 50)
+    assert [at_step(few, step) for step in (0, 7000)] == pytest.approx([1e-2, 1e-3])
+    assert [at_step(many, step) for step in (0, 30_000)] == pytest.approx([2e-3, 2e-5])
+    unknown = [Gain().rate_of(steps, 50, known=False) for steps in (500, 7000, 30_000)]
+    assert [at_step(rate, 0) for rate in unknown] == pytest.approx([0.05, 0.0183, 0.00426], rel=0.01)
+    reach = [
+        sum(at_step(rate, step) for step in range(1, steps, 50))
+        for steps, rate in zip((7000, 30_000), unknown[1:], strict=True)
+    ]
+    assert reach == pytest.approx([1, 1], rel=0.05), "as far as a gain of e"
+    assert Gain(rate=0.5).rate_of(7000, 50) == 0.5
+
+
+@pytest.mark.parametrize("rate", ["1000", "{initial: 0.1, final: 2, over: 9}", "-1"])
+def test_a_rate_that_ends_in_no_numbers_is_refused(rate):
+    with pytest.raises(ConfigError, match=r"expected values (of at most 0\.5|at least 0)"):
+        load("smoke", [f"optimize.colours={{type: gain, rate: {rate}}}"])
+
+
+def test_the_key_takes_names_and_mappings():
+    def colours(setting: str):
+        return load("smoke", [f"optimize.colours={setting}"]).settings.training.colours
+
+    assert load("smoke").settings.training.colours is None
+    assert colours("gain") == Gain()
+    assert colours("{type: affine, weight: 0.1}") == Affine(weight=0.1)
+    assert colours("auto") == Auto()
+    assert colours("{type: auto, model: {type: affine}}").model == Affine()

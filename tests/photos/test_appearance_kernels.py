@@ -1,0 +1,108 @@
+"""The colours of a photograph (colours.cl) against float64, and in a training step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance.checks.colours import colour_figures
+from clsplat.conformance.checks.images import camera_of, planes_of
+from clsplat.conformance.scenes import random_case
+from clsplat.density.statistics import SplatStats
+from clsplat.losses.entropy import WeightEntropy
+from clsplat.losses.image import L1, L2, Dssim
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.workspace import Workspace
+from clsplat.training.adam import Adam, Rates
+from clsplat.training.trainer import Trainer
+from clsplat.views.colours import IDENTITY, Affine, Gain
+from clsplat.views.photograph_colours import PhotographColours, change_colours
+from clsplat.views.photographs import Photograph
+from clsplat.views.view_table import ViewTable
+from tests.support.figures import hold
+
+SMOOTH = (L2(),)
+BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
+SIZES = ((1, 1), (2, 1), (15, 4), (16, 16), (17, 5), (33, 18), (127, 32), (129, 65), (257, 3))
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_image_and_derivatives(device, rng, width, height):
+    hold(colour_figures(device, rng, width, height))
+
+
+def test_no_change_cuts_white_alone(device, rng):
+    image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
+    camera = camera_of(device, 33, 18)
+    found = change_colours(Workspace(device), camera, planes_of(device, camera, image), IDENTITY).get()
+    assert (found[:, :18, :33] == np.minimum(image, 1)).all()
+
+
+class Case:
+    """A trainer of a random scene; its photograph is the second of two, which have colours of their own."""
+
+    def __init__(self, device, rng, colours=None, losses=SMOOTH, share=None) -> None:
+        case, self.numbers = random_case(rng, 40, 50, 36), {}
+        model, pixels = case.model(device), rng.integers(0, 256, (3, 36, 50)).astype(np.uint8)
+        mask = None if share is None else device.upload((rng.random((1, 36, 50)) < share).astype(np.uint8))
+        camera = replace(case.device_camera(device), view=1)
+        self.photograph = Photograph(camera, device.upload(pixels), mask)
+        parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
+        self.trainer = Trainer(*parts, device.upload(BACKGROUND), losses, Rates(), numbers=self.numbers)
+        self.trainer.colours = colours and PhotographColours(colours, ("a", "b"), rate=0.01)
+        if colours:
+            gains = np.array([0.3, 0.1, -0.2])
+            self.trainer.colours.begin(self.numbers, {"a": -gains, "b": gains})
+
+    def loss(self, key: str, change: float) -> float:
+        """The loss with one number changed."""
+        self.trainer.numbers = {**self.numbers, key: self.numbers[key] + change}
+        return self.trainer.compare(self.photograph, 1).loss
+
+
+@pytest.mark.parametrize("colours", [Gain(), Affine(weight=0.3)], ids=lambda one: one.type)
+@pytest.mark.parametrize("share", [None, 0.7])
+def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, monkeypatch, colours, share):
+    """By finite differences of the loss; l2 is smooth."""
+    case, found = Case(device, rng, colours, share=share), []
+    table, step = case.trainer.colours.table, 2e-3
+    numeric = [(case.loss(key, step) - case.loss(key, -step)) / (2 * step) for key in table.keys("b")]
+    case.trainer.numbers = case.numbers
+    monkeypatch.setattr(ViewTable, "update", lambda self, numbers, view, gradient, rate: found.append((view, gradient)))
+    case.trainer.step(case.photograph, 1)
+    ((view, gradient),) = found
+    assert view == "b"
+    assert gradient == pytest.approx(np.array(numeric), rel=0.02, abs=2e-4)
+
+
+def gradients_of(device, rng, colours, losses) -> dict[str, np.ndarray]:
+    """Of the parameters of the Gaussians, at one view."""
+    trainer = (case := Case(device, rng, colours, losses)).trainer
+    gaussians = trainer.model.gaussians
+    for name in ("sh_base", "sh_rest"):  # no pixel is beyond white, where the image would be cut
+        gaussians.set(name, gaussians.get(name) * np.float32(0.2))
+    view = trainer.differentiate(case.photograph, 1)
+    found = trainer.rasterizer.gradients(trainer.model, view.frame, view.pixel_sums)
+    return {name: found[name].get() for name in ("means", "sh_base", "logit_opacity")}
+
+
+@pytest.mark.parametrize("losses", [(L1(weight=0.8), Dssim(weight=0.2)), (L2(), WeightEntropy(weight=0.1))])
+def test_numbers_of_no_change_give_the_gradients_of_none(device, rng, monkeypatch, losses):
+    """The entropy of the fourth plane passes as it is."""
+    monkeypatch.setattr(Gain, "of_gains", lambda self, gains: np.zeros(3))
+    state = rng.bit_generator.state
+    plain = gradients_of(device, rng, None, losses)
+    rng.bit_generator.state = state
+    found = gradients_of(device, rng, Gain(), losses)
+    for name, expected in plain.items():
+        assert np.linalg.norm(found[name] - expected) < 1e-4 * np.linalg.norm(expected), name
+
+
+def test_a_mask_hides_pixels_whatever_their_colours_become(device, rng):
+    """An offset makes black pixels bright."""
+    case = Case(device, rng, Affine(), share=0.5)
+    case.numbers.update({key: 0.2 for key in case.trainer.colours.table.keys("b") if key.endswith("1")})
+    image = case.trainer.compare(case.photograph, 1).comparison.image.get()[:, :36, :50]
+    hidden = ~case.photograph.counted()
+    assert (image[:, hidden] == 0).all()
+    assert (image[:, ~hidden] > 0.1).all()

@@ -1,0 +1,78 @@
+"""Backgrounds that are drawn for each step of a training."""
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import choose
+from clsplat.pipeline.loading import load
+from clsplat.render.workspace import Workspace
+from clsplat.runs.description import describe
+from clsplat.scene.detect import read_scene
+from clsplat.scene.view import load_image
+from clsplat.views.backgrounds import Backgrounds
+from clsplat.views.photographs import Photographs
+from tests.support.runs import digest, train
+
+RANDOM = "optimize.background=random"
+
+
+def test_colours_depend_on_the_seed_and_the_step_alone():
+    device = Device(choose())
+    drawn = [tuple(Backgrounds(device, seed).at(step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
+    assert len(set(drawn)) == 3
+    assert drawn[0] == drawn[3]
+
+
+def test_photograph_has_the_drawn_color_where_transparent(tiny_scene):
+    device, scene = Device(choose()), read_scene(tiny_scene)
+    photographs, view = Photographs(device, "white"), scene.split("train")[0]
+    behind = Backgrounds(device, 0).at(3)
+    height, width = view.camera.height, view.camera.width
+
+    def shown() -> np.ndarray:
+        planes = photographs.get(view).planes(Workspace(device), backgrounds=(photographs.background, behind))
+        return planes.colours.get()[:, :height, :width].transpose(1, 2, 0)
+
+    on_white = load_image(view, (1.0, 1.0, 1.0)) / 255
+    np.testing.assert_allclose(shown(), on_white, atol=1e-6)  # transparency is not kept unless it is asked for
+    photographs.keep_transparency()
+    expected = load_image(view, behind.get().astype(np.float64)) / 255
+    assert np.abs(expected - on_white).max() > 0.3
+    assert np.abs(shown() - expected).max() < 2.5 / 255
+
+
+@pytest.mark.slow
+def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, tmp_path):
+    steps = "optimize.steps=12", "init.count=60", "checkpoint.every=4", "checkpoint.keep=9"
+    whole = digest(train(tiny_scene, tmp_path / "whole", *steps, RANDOM).out)
+    again = train(tiny_scene, tmp_path / "again", *steps, RANDOM).out
+    assert digest(again) == whole
+    (again / "checkpoints" / "step_000012.npz").unlink()
+    (again / "point_cloud.ply").unlink()
+    train(tiny_scene, again, *steps, RANDOM, resume=True)
+    assert digest(again) == whole
+    assert digest(train(tiny_scene, tmp_path / "scene", *steps).out) != whole
+    found = train(tiny_scene, tmp_path / "transparent", *steps, "optimize.background=transparent").out
+    assert digest(found) == whole
+    opaque = [
+        digest(
+            train(
+                tiny_scene, tmp_path / f"opaque {name}", *steps, "scene.alpha=mask", f"optimize.background={name}"
+            ).out
+        )
+        for name in ("transparent", "scene")
+    ]
+    assert opaque[0] == opaque[1]
+
+
+@pytest.mark.slow
+def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
+    with pytest.raises(ConfigError, match="models without a sky"):
+        train(tiny_scene, tmp_path / "run", RANDOM, "model.background=directions", "optimize.steps=2")
+    asked = load(
+        "smoke", [f"scene.path='{tiny_scene}'", "optimize.background=transparent", "model.background=directions"]
+    )
+    with pytest.raises(ConfigError, match="models without a sky"):
+        describe(asked, tmp_path / "other", None, "new")

@@ -1,0 +1,77 @@
+"""blur.cl against the oracle."""
+
+import math
+
+import numpy as np
+import pytest
+
+from clsplat.conformance.reference import blurred
+from clsplat.conformance.reference.blur import averaged
+from clsplat.pipeline.loading import load
+from clsplat.schedule import at_step
+from clsplat.stages.optimize import Optimize
+from clsplat.views.transforms import Blur, MeanFilter
+from tests.support.device_images import colours_of, planes_of
+
+SIZES = ((1, 1), (2, 3), (15, 4), (16, 16), (17, 5), (33, 18), (63, 3), (64, 2), (65, 7))  # tiles and groups
+
+
+@pytest.mark.parametrize("share", [None, 0.7, 0.05], ids=["no mask", "most count", "few count"])
+@pytest.mark.parametrize("sigma", [0.3, 1.0, 2.5, 200.0])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_blur_is_the_oracles(device, rng, width, height, sigma, share):
+    image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
+    mask = None if share is None else rng.random((height, width)) < share
+    found = colours_of(Blur(sigma=sigma).apply(planes_of(device, image, mask), step=1))
+    np.testing.assert_allclose(found, blurred(image.astype(np.float64), sigma, mask), rtol=2e-5, atol=1e-6)
+
+
+def test_a_pixel_keeps_its_value_where_nothing_near_it_counts(device, rng):
+    image = rng.uniform(0, 1, (3, 20, 40)).astype(np.float32)
+    mask = np.zeros((20, 40), bool)
+    mask[10, 5] = True
+    found = colours_of(Blur(sigma=1.0).apply(planes_of(device, image, mask), step=1))
+    near = np.zeros((20, 40), bool)
+    near[7:14, 2:9] = True
+    np.testing.assert_array_equal(found[:, ~near], image[:, ~near])
+    np.testing.assert_allclose(found[:, near], np.broadcast_to(image[:, 10, 5, None], (3, 49)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_neither_the_edge_nor_a_mask_darkens_a_flat_image(device, rng, masked):
+    image = np.full((3, 18, 33), 0.75, np.float32)
+    mask = rng.random((18, 33)) < 0.5 if masked else None
+    if mask is not None:
+        image[:, ~mask] = 0
+    found = colours_of(Blur(sigma=4.0).apply(planes_of(device, image, mask), step=1))
+    np.testing.assert_allclose(found, 0.75, rtol=1e-6)
+
+
+def test_without_a_sigma_the_photograph_stays(device, rng):
+    image = rng.uniform(0, 1, (3, 5, 9)).astype(np.float32)
+    blur = Blur(sigma={"points": [[0, 0.0], [10, 2.0]], "between": "steps"})
+    np.testing.assert_array_equal(colours_of(blur.apply(planes_of(device, image), step=9)), image)
+    expected = blurred(image.astype(np.float64), 2.0)
+    np.testing.assert_allclose(colours_of(blur.apply(planes_of(device, image), step=10)), expected, rtol=2e-5)
+
+
+@pytest.mark.parametrize(("share", "reach"), [(0.0, 0), (0.09, 0), (0.1, 1), (0.24, 2), (0.25, 2), (0.5, 5), (3.0, 30)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_mean_filter_is_the_oracles(device, rng, share, reach, masked):
+    image = rng.uniform(0, 1, (3, 17, 20)).astype(np.float32)
+    mask = rng.random((17, 20)) < 0.5 if masked else None
+    found = colours_of(MeanFilter(width=share).apply(planes_of(device, image, mask), step=1))
+    if reach == 0:
+        np.testing.assert_array_equal(found, image)
+    np.testing.assert_allclose(found, averaged(image.astype(np.float64), reach, 0.0, mask), rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("recipe", "end"), [("opti3dgs", 12000), ("opti3dgs_7k", 2800)])
+def test_opti3dgs_squares_shrink_by_a_pixel_a_side_to_the_end(recipe, end):
+    """15, 13, … 1 px at 1 237 px, the width of the paper's photographs, each as long as the others."""
+    (training,) = (stage for stage in load(recipe).stages if isinstance(stage, Optimize))
+    (filtering,) = training.views.transforms
+    reaches = [math.floor(at_step(filtering.width, step) * 1237 / 2) for step in range(end + 1)]
+    changes = [step for step in range(1, end + 1) if reaches[step] != reaches[step - 1]]
+    assert [reaches[0], *(reaches[step] for step in changes)] == [7, 6, 5, 4, 3, 2, 1, 0]
+    assert changes == [round(end * k / 7) for k in range(1, 8)]

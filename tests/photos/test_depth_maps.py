@@ -1,0 +1,123 @@
+"""Depth maps of other programs: fitted to points, refused or left out where they do not go with them."""
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.places import contents
+from clsplat.render.camera import upload_camera
+from clsplat.views.depth_maps import FEWEST, MOST, DepthMaps, fitted
+from clsplat.views.known_depths import PointDepths
+from tests.support.outdoor_scene import HEIGHT, WIDTH, Yard
+from tests.support.runs import TWO_DOZEN, digest, train
+
+
+def write_map(file: Path, inverse: np.ndarray, bits: int = 16, factor: float = 0.4, offset: float = 0.1) -> None:
+    """A map in which inverse depths have a factor and an offset of their own."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    kind = np.uint16 if bits == 16 else np.uint8
+    cv2.imwrite(str(file), np.rint((factor * inverse + offset) * np.iinfo(kind).max).astype(kind))
+
+
+def ground(yard: Yard, view) -> np.ndarray:
+    """Inverse depths of the ground, [HEIGHT, WIDTH]; 0 above the horizon."""
+    down = yard.rays(view)[..., 1]
+    return np.where(down > 0, np.clip(down, 0, 1.5), 0)  # the camera is 1 above it: depth along its axis is 1 / down
+
+
+@pytest.fixture
+def yard(rng, tmp_path) -> Yard:
+    """A scene, with a folder of maps beside it."""
+    yard = Yard(rng)
+    yard.write(tmp_path / "scene")
+    for number, view in enumerate(yard.views):
+        write_map((tmp_path / "maps" / view.name), ground(yard, view), factor=0.3 + 0.02 * number)
+    return yard
+
+
+@pytest.mark.parametrize(("bits", "scale"), [(16, 1), (8, 1), (16, 2)])
+def test_map_has_the_inverse_depths_of_the_points_in_any_unit(tmp_path, rng, bits, scale):
+    inverse = cv2.GaussianBlur(rng.uniform(0.1, 1.5, (30, 40)).astype(np.float32), (0, 0), 4)
+    write_map(tmp_path / "deep" / "a.png", np.kron(inverse, np.ones((scale, scale))), bits)
+    rows, columns = rng.integers(0, 30, 50), rng.integers(0, 40, 50)
+    told = inverse[rows, columns].copy()
+    told[:5] *= 1.5  # wrong points
+    found = DepthMaps(tmp_path).at("deep/a.jpg", (40, 30), rows, columns, told)
+    assert found is not None
+    assert len(found[2]) == 1200
+    np.testing.assert_allclose(found[2], inverse[found[0], found[1]], atol=2e-4 if bits == 16 else 1e-2)
+
+
+def test_maps_that_show_other_depths_are_left_out_and_named(tmp_path, rng, caplog):
+    """Those where dark is near, plain ones, and those of photographs with few points."""
+    inverse = rng.uniform(0.1, 1.5, (30, 40))
+    rows, columns = rng.integers(0, 30, 50), rng.integers(0, 40, 50)
+    write_map(tmp_path / "dark.png", 2 - inverse)
+    write_map(tmp_path / "plain.png", np.ones((30, 40)))
+    write_map(tmp_path / "good.png", inverse)
+    with caplog.at_level(logging.WARNING):
+        for name in ("dark.jpg", "plain.jpg"):
+            assert DepthMaps(tmp_path).at(name, (40, 30), rows, columns, inverse[rows, columns]) is None
+            assert f"{name}: its depth map does not fit to the points" in caplog.text
+    few = slice(0, FEWEST - 1)
+    assert fitted(inverse[rows, columns][few], inverse[rows, columns][few]) is None
+    assert DepthMaps(tmp_path).at("good.jpg", (40, 30), rows, columns, inverse[rows, columns]) is not None
+
+
+def test_of_a_large_map_an_even_grid_is_compared(tmp_path):
+    inverse = np.linspace(0.1, 1.5, 400 * 300).reshape(300, 400)
+    write_map(tmp_path / "a.png", inverse)
+    rows, columns = np.arange(300), np.arange(300)
+    found = DepthMaps(tmp_path).at("a.jpg", (400, 300), rows, columns, inverse[rows, columns])
+    assert found is not None
+    assert MOST / 2 < len(found[0]) <= MOST
+    assert set(np.diff(np.unique(found[0]))) == set(np.diff(np.unique(found[1]))) == {2}
+
+
+def test_a_map_that_is_missing_or_damaged_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"a\.png: no such file; expected the depth map of a\.jpg"):
+        DepthMaps(tmp_path).read("a.jpg", 4, 3)
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n")
+    with pytest.raises(DataError, match=r"a\.png: "):
+        DepthMaps(tmp_path).read("a.jpg", 4, 3)
+
+
+def test_depths_are_those_of_the_ground(device, yard, tmp_path):
+    tracks = type("T", (), {"positions": yard.points.positions, "seen": {}})
+    tracks.seen = {view.name: np.arange(len(yard.points)) for view in yard.views}
+    names = [view.name for view in yard.views]
+    depths = PointDepths(device, tracks, names, 1.0, DepthMaps(tmp_path / "maps"))
+    for number, view in enumerate(yard.views[:3]):
+        camera = upload_camera(device, view)
+        known = depths.at(type(camera)(**{**vars(camera), "view": number}))
+        assert known is not None
+        places, inverse = known.pixels.get(), known.inverse.get()
+        rows, columns = places // camera.stride, places % camera.stride
+        assert len(places) > 0.4 * WIDTH * HEIGHT
+        truth = ground(yard, view)[rows, columns]
+        np.testing.assert_allclose(inverse, truth, atol=0.06)
+
+
+@pytest.mark.slow
+def test_a_training_takes_them_and_notices_that_they_changed(yard, tmp_path):
+    losses = "[{type: l1, weight: 0.8}, {type: inverse_depth, weight: 0.3%s}]"
+    folder = f", folder: '{tmp_path / 'maps'}'"
+    scene = tmp_path / "scene"
+    runs = [
+        train(scene, tmp_path / name, *TWO_DOZEN, f"optimize.losses={losses % key}")
+        for name, key in (("a", folder), ("b", ""))
+    ]
+    assert digest(runs[0].out) != digest(runs[1].out)
+    asked = load("smoke", [f"scene.path='{scene}'", f"optimize.losses={losses % folder}"])
+    before = contents(asked)
+    assert list(before) == [str(tmp_path / "maps")]
+    write_map(tmp_path / "maps" / yard.views[0].name, ground(yard, yard.views[0]), bits=8)
+    assert contents(asked) != before
+    two = losses.replace("%s}]", f"{folder}}}, {{type: inverse_depth}}]")
+    with pytest.raises(ConfigError, match="given with two folders; expected one"):
+        train(scene, tmp_path / "c", *TWO_DOZEN, f"optimize.losses={two}")

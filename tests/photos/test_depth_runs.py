@@ -1,0 +1,49 @@
+"""Trainings that know depths: they repeat and resume to the bit, and refuse what they cannot know."""
+
+import json
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, DataError
+from tests.support.outdoor_scene import Yard, missing
+from tests.support.runs import TWO_DOZEN, digest, train
+
+pytestmark = pytest.mark.slow
+
+DEPTH = "{type: inverse_depth, weight: [[0, 0.5], [20, 0.0]]}"
+LOSSES = f"optimize.losses=[{{type: l1, weight: 0.8}}, {{type: dssim, weight: 0.2}}, {DEPTH}]"
+
+
+def test_runs_resume_and_repeat_to_the_bit(rng, tmp_path):
+    """While the loss has weight, and after."""
+    scene = Yard(rng).write(tmp_path / "scene")
+    first = train(scene, tmp_path / "first", *TWO_DOZEN, LOSSES)
+    again = train(scene, tmp_path / "again", *TWO_DOZEN, LOSSES)
+    assert digest(again.out) == digest(first.out)
+    plain = train(scene, tmp_path / "plain", *TWO_DOZEN)
+    assert digest(plain.out) != digest(first.out)
+    lines = [(run.out / "metrics.jsonl").read_text().splitlines() for run in (first, plain)]
+    losses = [[row["loss"] for row in map(json.loads, text) if row["kind"] == "train"] for text in lines]
+    assert losses[0][0] > losses[1][0] * 1.01, "it is part of the loss that is told"
+    for step in (16, 24):
+        (again.out / "checkpoints" / f"step_{step:06d}.npz").unlink()
+    (again.out / "point_cloud.ply").unlink()
+    assert digest(train(scene, tmp_path / "again", *TWO_DOZEN, LOSSES, resume=True).out) == digest(first.out)
+
+
+def test_a_scene_must_tell_which_photographs_show_a_point(tiny_scene, tmp_path):
+    with pytest.raises(DataError, match="nothing tells which photographs show a point, which the loss 'inverse_depth'"):
+        train(tiny_scene, tmp_path / "run", *TWO_DOZEN, LOSSES)
+
+
+def test_poses_are_not_learned_beside_it(rng, tmp_path):
+    with pytest.raises(ConfigError, match=r"the loss 'inverse_depth' does not go with optimize\.poses"):
+        train(Yard(rng).write(tmp_path / "scene"), tmp_path / "run", *TWO_DOZEN, LOSSES, "optimize.poses={start: 5}")
+
+
+def test_photographs_showing_points_elsewhere_give_no_depths(rng, tmp_path):
+    """The bits are those without the loss."""
+    scene = missing(tmp_path / "scene", np.array([1.2, -0.9]), rng)
+    with_loss, plain = train(scene, tmp_path / "loss", *TWO_DOZEN, LOSSES), train(scene, tmp_path / "plain", *TWO_DOZEN)
+    assert digest(with_loss.out) == digest(plain.out)

@@ -1,0 +1,133 @@
+"""The sizes that follow from the photographs' detail, and the number of Gaussians that goes with them."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clsplat.density.budget import Moment, Momentum
+from clsplat.errors import ConfigError
+from clsplat.pipeline.loading import load
+from clsplat.schedule import Decay
+from clsplat.training.adam import Rates
+from clsplat.views.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, course, knots
+from clsplat.views.sampling import ViewSettings
+
+BOUNDS = np.linspace(0, 1, LEVELS + 1)
+NOISE = Spectrum(BOUNDS**2)  # as many amplitudes at every frequency of the plane
+NATURAL = Spectrum(BOUNDS)  # amplitudes that fall as 1 / frequency
+
+
+def test_a_flat_spectrum_begins_with_a_quarter_of_the_pixels():
+    steps, divisors = knots([NOISE, NOISE], 27000, 8)
+    amplitudes = [0.25 + 0.75 * i / (KNOTS - 1) for i in range(KNOTS)]
+    assert divisors == pytest.approx([a**-0.5 for a in amplitudes], rel=2e-3)
+    assert steps == pytest.approx([27000 * math.log(4 * a) / math.log(4) for a in amplitudes], rel=2e-3, abs=1e-6)
+
+
+def test_a_natural_spectrum_begins_with_a_sixteenth():
+    steps, divisors = knots([NATURAL], 6000, 8)
+    assert divisors[0] == pytest.approx(4, rel=2e-3)
+    middle = 0.25 + 0.75 * 10 / (KNOTS - 1)
+    assert (divisors[10], steps[10]) == (
+        pytest.approx(1 / middle, rel=2e-3),
+        pytest.approx(6000 * math.log(4 * middle) / math.log(4), rel=2e-3),
+    )
+
+
+def test_largest_divisor_is_of_the_most_detailed_and_limited():
+    assert knots([NATURAL, NOISE], 6000, 8)[1][0] == pytest.approx(2, rel=2e-3)
+    assert knots([NATURAL], 6000, 3)[1][0] == 3
+
+
+def test_without_detail_the_size_is_full_from_the_start():
+    grey = DetailDivisor(follows="detail", until=900).of([np.full((40, 60, 3), 77, np.uint8)])
+    assert grey.points == [[0, 1]]
+    assert "full size" in course(grey)
+
+
+@pytest.mark.parametrize("size", [(48, 64), (33, 57), (1, 20), (2, 2)])
+def test_a_spectrum_sums_what_the_centred_window_holds(size):
+    image = np.random.default_rng(3).integers(0, 256, (*size, 3), dtype=np.uint8)
+    amplitudes = np.abs(np.fft.fft2(image.astype(np.float64), axes=(0, 1))).sum(axis=2)
+    spectrum = Spectrum.of(image)
+    assert spectrum.total == pytest.approx(amplitudes.sum(), rel=1e-5)
+    down, right = (np.abs(np.fft.fftfreq(n)) * 2 for n in size)
+    for divisor in (1.5, 2.0, 4.0):
+        inside = np.maximum(down[:, None], right[None, :]) <= 1 / divisor
+        below, above = (spectrum.at(1 / (1 / divisor + shift / LEVELS)) for shift in (-1.001, 1.001))
+        assert below * (1 - 1e-5) <= amplitudes[inside].sum() <= above * (1 + 1e-5)
+
+
+def test_size_changes_by_integers_after_edits_to_full_at_the_end():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    smooth = np.repeat(np.repeat(image[::4, ::4], 4, axis=0), 4, axis=1)
+    settings = DetailDivisor(follows="detail", until=3000, every=100, start=500)
+    points = settings.of([smooth]).points
+    assert points[0][0] == 0
+    assert points[0][1] > 1
+    assert points[-1][1] == 1
+    assert points[-1][0] <= 3001
+    assert all(step > 500 and step % 100 == 1 for step, _ in points[1:])
+    assert all(value == int(value) for _, value in points)
+    steps, divisors = knots([Spectrum.of(smooth)], 3000, 8)
+    sizes = settings.of([smooth])
+    for step in (700, 1500, 2300, 2900):  # the floor of the knots' value, linear in the number of pixels
+        assert sizes.at(step + 1) == int(np.interp(step, steps, divisors**-2) ** -0.5)
+
+
+def test_settings_that_follow_detail_are_resolved_before_use():
+    views = ViewSettings(resolution={"follows": "detail", "until": 900})
+    with pytest.raises(ConfigError, match="needs photographs"):
+        views.divisor(1)
+    image = np.zeros((64, 64, 3), np.uint8)
+    image[:, 32:] = 255
+    settled = views.settled(lambda: [image])
+    assert settled.divisor(1) > 1
+    assert settled.divisor(1000) == 1
+    full = settled.full_size(1000)
+    assert settled.divisor(full) == 1 < settled.divisor(full - 1)
+    assert settled.settled(lambda: []) is settled
+
+
+def test_the_rate_of_the_means_is_constant_up_to_the_full_size():
+    rates = Rates(means={"initial": 1e-2, "final": 1e-4, "start": "full_size", "until": 1000})
+    assert rates.settled(601).means == Decay(initial=1e-2, final=1e-4, start=601, over=399)
+    means = [rates.settled(600).at(step, 2.0)["means"] for step in (1, 600, 800, 1000, 2000)]
+    assert means == pytest.approx([2e-2, 2e-2, 2e-3, 2e-4, 2e-4], rel=1e-9)
+    assert rates.settled(5000).means.over == 1
+
+
+def test_rates_waiting_for_full_size_are_resolved_before_use():
+    rates = load("dash").settings.training.rates
+    with pytest.raises(ConfigError, match=r"start: full_size.* expected what `settled\(step\)` returns"):
+        rates.at(1, 1.0)
+    assert rates.settled(1).at(1, 1.0)["means"] == pytest.approx(rates.means.initial, rel=1e-3)
+
+
+def edit_of(count: int, eager: int, step: int = 100) -> SimpleNamespace:
+    means = np.where(np.arange(count) < eager, 1e-3, 1e-5).astype(np.float32)
+    stats = SimpleNamespace(mean=lambda name: means)
+    return SimpleNamespace(gaussians=SimpleNamespace(count=count), stats=stats, at=lambda value: value, step=step)
+
+
+def test_momentum_follows_its_formulas():
+    budget, numbers = Momentum(), {}
+    begin = 1000
+    assert budget.limit(edit_of(begin, 300), Moment(0.1, 5, 4.0), numbers) == 1200  # at most a fifth more
+    assert numbers == {"momentum/start": begin, "momentum/sum": 5200}  # .98 * 5000 + 300
+    target = begin + 5200 / 4**1.7
+    assert budget.limit(edit_of(1200, 0), Moment(0.3, 5, 4.0), numbers) == int(1200 * (1 + min(0.2, target / 1200 - 1)))
+    assert numbers["momentum/sum"] == 5200  # it does not fall
+    assert budget.limit(edit_of(6000, 900), Moment(0.9, 5, 1.0), numbers) == 6200
+    assert numbers["momentum/sum"] == 5996
+    assert budget.limit(edit_of(6900, 0), Moment(0.95, 1, 2.0), numbers) == 6996  # the last edit reaches it
+    assert budget.limit(edit_of(7400, 0), Moment(0.95, 1, 1.0), numbers) == 7400  # pruned ones are replaced
+
+
+def test_momentum_with_a_number_of_its_own_ends_there():
+    budget, numbers = Momentum(gaussians=2000), {}
+    for share in (0.2, 0.5, 0.8):
+        assert budget.limit(edit_of(1950, 1900), Moment(share, 5, 1.0), numbers) == 2000

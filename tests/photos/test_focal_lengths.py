@@ -1,0 +1,159 @@
+"""Focal lengths that are learned with poses: shared by a camera's photographs, kept, measured, and written."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.cameras.posed import posed
+from clsplat.errors import DataError
+from clsplat.pipeline.loading import load
+from clsplat.render.camera import camera_values, moved_camera, upload_camera
+from clsplat.runs import cameras
+from clsplat.runs.model_file import evaluate
+from clsplat.scene.camera import Camera
+from clsplat.scene.detect import read_scene
+from clsplat.scene.lens import Lens
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import View
+from clsplat.scene.zoom import DEGREES, zoomed
+from clsplat.schedule import at_step
+from clsplat.training.poses import photograph_poses, poses_beside, refined, require_zoom
+from clsplat.views.focal_lengths import FocalLengths
+from clsplat.views.poses import Poses
+from tests.support.camera_rings import FISHEYE, STRONG
+from tests.support.runs import FEW, digest, killed, train
+
+ON = (*FEW, "optimize.poses={start: 2, focal: auto}")
+PARAMS = {  # after focal lengths and middle
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": (-0.2,),
+    "RADIAL": (-0.2, 0.05),
+    "OPENCV": (-0.25, 0.06, 0.002, -0.001),
+    "FULL_OPENCV": (-0.2, 0.05, 0.002, -0.001, 0.01, 0.03, -0.02, 0.01),
+}
+
+
+@pytest.mark.parametrize("model", DEGREES)
+def test_lens_of_another_focal_length_undistorts_to_same_pixels(model):
+    focals = (160.0,) if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else (160.0, 165.0)
+    lens = Lens(200, 150, model, (*focals, 97.0, 80.0, *PARAMS[model]))
+    other = zoomed(lens, 1.03)
+    u, v = np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.5, 0.5, 7))
+    for one, same in zip(lens.distort(u, v), other.distort(u / 1.03, v / 1.03), strict=True):
+        np.testing.assert_allclose(same, one, rtol=0, atol=1e-10)
+    assert (other.pinhole.width, other.pinhole.height) == (lens.pinhole.width, lens.pinhole.height)
+    assert other.pinhole.cx == pytest.approx(lens.pinhole.cx)
+    assert other.camera.fx == 1.03 * lens.camera.fx
+
+
+def test_a_fisheye_has_no_other_focal_length():
+    assert zoomed(FISHEYE, 1.0) is FISHEYE
+    with pytest.raises(DataError, match=r"OPENCV_FISHEYE has no form with another focal length.*undistort"):
+        zoomed(FISHEYE, 1.01)
+
+
+def test_focal_length_that_cannot_be_written_is_not_learned(tiny_scene):
+    scene = read_scene(tiny_scene)
+    with pytest.raises(DataError, match=r"optimize\.poses\.focal: the lens of .*OPENCV_FISHEYE.*undistort"):
+        require_zoom(replace(scene, views=(replace(scene.views[0], lens=FISHEYE),)))
+
+
+def test_views_are_written_with_the_lens_of_their_focal_length(tmp_path):
+    view = View("a.png", STRONG.pinhole, np.eye(3, 4), tmp_path / "a.png", lens=STRONG)
+    scene = replace(_scene_of([view, replace(view, name="b.png")]), path=tmp_path)
+    assert posed(scene)[0].lens is STRONG
+    moved = replace(view, camera=view.camera.zoomed(1.02))
+    assert posed(replace(scene, views=(moved,), test=()))[0].lens.params == pytest.approx(zoomed(STRONG, 1.02).params)
+
+
+def _scene_of(views: list[View]) -> Scene:
+    return Scene(Path(), tuple(views), tuple(range(len(views))), (), None, 1.0)
+
+
+def test_photographs_of_one_camera_share_a_number():
+    one, other = Camera(64, 48, 50, 51, 32, 24), Camera(48, 64, 50, 51, 24, 32)
+    views = [View(name, camera, np.eye(3, 4)) for name, camera in (("a", one), ("b", other), ("c", one))]
+    focals = FocalLengths.of([*views, View("d", one, np.eye(3, 4), lens=STRONG)], 0.01)
+    assert focals.cameras == {"a": "a", "b": "b", "c": "a", "d": "d"}
+    numbers: dict[str, float] = {}
+    assert [focals.factor(numbers, name) for name in "abcd"] == [1, 1, 1, 1]
+    focals.update(numbers, "c", 5.0, 1)
+    assert focals.factor(numbers, "a") == focals.factor(numbers, "c") == pytest.approx(np.exp(-0.01))
+    assert [focals.factor(numbers, name) for name in "bd"] == [1, 1]
+    assert focals.learned(numbers) == ["a"]
+    replace(focals, rate=0.0).update(numbers, "b", 5.0, 2)
+    assert focals.learned(numbers) == ["a"]
+
+
+def test_rates_follow_the_visits_of_a_camera():
+    auto = Poses(focal="auto")
+    assert [at_step(auto.focal_rate(30_500, 1), step) for step in (0, 500, 30_500)] == pytest.approx([1e-4, 1e-4, 1e-6])
+    seldom = auto.focal_rate(2500, 1)
+    assert sum(at_step(seldom, step) for step in range(500, 2500)) == pytest.approx(0.2, rel=0.01)
+    assert at_step(auto.focal_rate(600, 50), 0) == pytest.approx(1e-3), "at most"
+    assert Poses(focal=0.5).focal_rate(600, 50) == 0.5
+    assert Poses().focal_rate(600, 50) == 0.0
+    assert load("smoke", ["optimize.poses={focal: auto}"]).settings.training.poses == auto
+
+
+def test_device_camera_gets_its_rays_from_its_focal_length(device):
+    view = View("a", Camera(70, 50, 60.0, 62.0, 33.0, 26.0), np.eye(3, 4))
+    camera = moved_camera(upload_camera(device, view), view.world_to_camera, 1.02)
+    expected = camera_values(replace(view, camera=view.camera.zoomed(1.02)), camera.tile)
+    for name in expected.dtype.names or ():
+        np.testing.assert_allclose(camera.values[name], expected[name], rtol=2e-7, err_msg=name)
+    assert camera.array.get()[0] == camera.values
+
+
+@pytest.fixture(scope="module")
+def with_focals(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of twelve steps in which focal lengths are learned; nothing is changed in it."""
+    out = tmp_path_factory.mktemp("runs") / "focals"
+    train(tiny_scene, out, *ON)
+    return out
+
+
+@pytest.mark.slow
+def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_focals, tiny_scene, tmp_path):
+    out = killed(with_focals, tmp_path / "run")
+    run = train(tiny_scene, out, *ON, resume=True)
+    assert digest(out) == digest(with_focals)
+    (key,) = [name for name in run.numbers if name.startswith("focal_lengths/") and name.endswith("/log")]
+    assert run.numbers[f"{key}/updates"] == 12 - 2
+    assert abs(run.numbers[key]) > 1e-4
+    found = refined(run.numbers, run.original)
+    factors = [after.camera.fx / view.camera.fx for view, after in zip(run.original.views, found.views, strict=True)]
+    assert factors == pytest.approx([np.exp(run.numbers[key])] * len(factors)), "also those of test views"
+    later = photograph_poses(None, run, 24)
+    assert later is not None
+    assert later.focals.factor(run.numbers, run.original.views[0].name) != 1, "it stays"
+
+
+@pytest.mark.slow
+def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene, tmp_path):
+    measured = json.loads((with_focals / "metrics.json").read_text())["test"]["1"]
+    assert evaluate(with_focals)["test"]["1"]["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
+    rows = json.loads((with_focals / "view_poses.json").read_text())["photographs"]
+    (lengths,) = {tuple(row["focal_lengths"]) for row in rows.values()}
+    scene = read_scene(tiny_scene, 5)
+    assert lengths[0] != scene.views[0].camera.fx
+    assert poses_beside(with_focals / "point_cloud.ply", scene).views[0].camera.fx == lengths[0]
+    cameras.write(with_focals, tmp_path / "cameras", "nerfstudio", "copy")
+    for view in read_scene(tmp_path / "cameras", 5).views:
+        assert (view.camera.fx, view.camera.fy) == pytest.approx(lengths)
+    for row in ({"focal_lengths": [1]}, {"focal_lengths": [1, -1]}, {"focal_lengths": [1e300, 60]}, []):
+        broken = {name: row for name in rows}
+        (tmp_path / "view_poses.json").write_text(json.dumps({"photographs": broken}))
+        with pytest.raises(DataError, match=r"view_poses.json: .*no two focal lengths within 10 times"):
+            poses_beside(tmp_path / "point_cloud.ply", scene)
+
+
+@pytest.mark.slow
+def test_poses_alone_keep_their_files(with_focals, tiny_scene, tmp_path):
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.poses={start: 2}")
+    assert digest(tmp_path / "run") != digest(with_focals)
+    assert "focal_lengths" not in (tmp_path / "run" / "view_poses.json").read_text()

@@ -1,0 +1,214 @@
+"""The Haar transform of photographs and its filter, which is learned (haar.cl, AutoOpti3DGS), in float64."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.checks.images import camera_of, haar_figures, planes_of
+from clsplat.conformance.scenes import random_case
+from clsplat.density.statistics import SplatStats
+from clsplat.errors import ConfigError
+from clsplat.losses.entropy import WeightEntropy
+from clsplat.losses.host import HostLoss
+from clsplat.losses.image import L1, L2, Dssim
+from clsplat.losses.penalties import Anisotropy
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.workspace import Workspace
+from clsplat.training.adam import Adam, Rates
+from clsplat.training.trainer import Trainer
+from clsplat.views.haar import Haar
+from clsplat.views.photographs import Photograph, apply_mask
+from clsplat.views.transforms import Blur, Planes
+from tests.support.figures import hold
+
+SIZES = ((1, 1), (2, 1), (1, 2), (3, 3), (15, 4), (16, 16), (17, 5), (33, 18), (127, 32), (128, 33), (129, 65))
+HAAR = np.array([1.0, -1.0]) / np.sqrt(2)  # the filter that changes nothing
+LEAK = np.array([1.0, 1.0]) / np.sqrt(2)
+COURSE = {1000: 0.10, 3000: 0.28, 5000: 0.46, 7000: 0.63, 10000: 0.85, 15000: 1.0}  # published
+
+
+def taps_of(numbers: dict[str, float]) -> np.ndarray:
+    """The filter, h0 and h1."""
+    return numbers["haar/scale"] * HAAR + numbers.get("haar/leak", 0.0) * LEAK
+
+
+def through(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> np.ndarray:
+    """The photograph [3, H, W] after the transform."""
+    camera = camera_of(device, image.shape[2], image.shape[1])
+    counted = None if mask is None else planes_of(device, camera, mask[None])
+    numbers = {"haar/scale": HAAR @ taps, "haar/leak": LEAK @ taps}
+    planes = Planes(Workspace(device), camera, planes_of(device, camera, image), counted, numbers)
+    return Haar().apply(planes, step=1).colours.get()[:, : camera.height, : camera.width]
+
+
+@pytest.mark.parametrize("share", [None, 0.7, 0.1], ids=["no mask", "most count", "few count"])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_photograph_and_derivatives_are_the_oracles(device, rng, width, height, share):
+    for taps in ((0.0, 0.0), HAAR, (0.3, 0.9)):
+        hold(haar_figures(device, rng, width, height, share, np.array(taps)))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.37, 1.0, 1.2])
+def test_the_oracle_is_the_closed_form(rng, share):
+    """Per block [a b; c d], with means m, h, v, g of its four patterns."""
+    image = rng.uniform(0, 1, (3, 6, 8))
+    a, b, c, d = image[:, ::2, ::2], image[:, ::2, 1::2], image[:, 1::2, ::2], image[:, 1::2, 1::2]
+    m, h, v, g = (a + b + c + d) / 4, (a - b + c - d) / 4, (a + b - c - d) / 4, (a - b - c + d) / 4
+    expected = np.empty(image.shape)
+    for row, column in np.ndindex(2, 2):
+        across, down = (-1) ** column * share, (-1) ** row * share
+        expected[:, row::2, column::2] = m + across * h + down * v + across * down * g
+    np.testing.assert_allclose(ref.haar_filtered(image, share * np.array(HAAR)), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_without_a_filter_squares_are_means_and_haar_is_identity(device, rng, masked):
+    image = rng.uniform(0, 1, (3, 10, 22)).astype(np.float32)
+    mask = rng.random((10, 22)) < 0.6 if masked else np.ones((10, 22), bool)
+    squares = np.where(mask, image, np.nan).reshape(3, 5, 2, 11, 2)
+    count = mask.reshape(5, 2, 11, 2).sum(axis=(1, 3))
+    mean = np.nansum(squares, axis=(2, 4), dtype=np.float64) / np.maximum(count, 1)
+    found = through(device, image, (0.0, 0.0), mask if masked else None)[:, mask]
+    np.testing.assert_allclose(found, np.kron(mean, np.ones((2, 2)))[:, mask], rtol=1e-6)
+    np.testing.assert_allclose(
+        through(device, image, HAAR, mask if masked else None)[:, mask], image[:, mask], atol=3e-7
+    )
+
+
+def test_what_is_not_finite_stays_in_its_square(device, rng):
+    image = rng.uniform(0, 1, (3, 20, 30)).astype(np.float32)
+    image[1, 7, 12] = np.nan
+    bad = np.zeros(image.shape, bool)
+    bad[1, 6:8, 12:14] = True
+    np.testing.assert_array_equal(np.isnan(through(device, image, (0.2, 0.1))), bad)
+
+
+@pytest.mark.parametrize("learn", ["filter", "scale"])
+def test_the_filter_takes_the_published_course_by_its_own_loss(learn):
+    """Adam decides it, whatever the weight."""
+    for weight in (0.05, 7.0):
+        haar, numbers = Haar(learn=learn, weight=weight), {}
+        for step in range(1, 15001):
+            haar.update(numbers, haar.penalty(haar.now(numbers), step)[1], step)
+            assert step not in COURSE or numbers["haar/scale"] == pytest.approx(COURSE[step], abs=0.005), step
+        assert numbers.get("haar/leak", 0.0) == 0
+
+
+@pytest.mark.parametrize("learn", ["filter", "scale"])
+def test_the_loss_of_the_filter_and_its_derivatives(learn):
+    haar = Haar(learn=learn, weight=0.3)
+    at = dict(zip(haar.first(), (0.2, -0.5), strict=False))
+    value, derivatives = haar.penalty(at, step=1)
+    assert value == pytest.approx(0.3 * 2 * ((taps_of(at) - HAAR) ** 2).sum())
+    for name in at:
+        up, down = (haar.penalty({**at, name: at[name] + e}, step=1)[0] for e in (1e-4, -1e-4))
+        assert derivatives[name] == pytest.approx((up - down) / 2e-4, rel=1e-6)
+
+
+# ---- in a training step
+
+
+def trainer_of(device, rng, losses, masked: bool = True) -> tuple[Trainer, Photograph]:
+    case = random_case(rng, 60, 41, 30)
+    model = case.model(device)
+    parts = Adam(model.gaussians), SplatStats(model.gaussians), device.zeros(3)
+    trainer = Trainer(Rasterizer(device, "radix"), model, *parts, losses, Rates())
+    colours = rng.integers(0, 256, (3, 30, 41)).astype(np.uint8)
+    mask = device.upload((rng.random((1, 30, 41)) < 0.7).astype(np.uint8)) if masked else None
+    return trainer, Photograph(case.device_camera(device), device.upload(colours), mask)
+
+
+@pytest.mark.parametrize("learn", ["filter", "scale"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked):
+    """Finite differences of the float64 losses of the rendered image, by each number."""
+    losses = [L1(weight=0.8), Dssim(weight=0.2), L2(weight=3.0), Anisotropy(above=1.0)]
+    trainer, photograph = trainer_of(device, rng, losses, masked)
+    haar = Haar(learn=learn, weight=0.01)
+    trainer.numbers = {name: 0.31 + 0.4 * i for i, name in enumerate(haar.first())}
+    before, counted = dict(trainer.numbers), photograph.counted()
+    view = trainer.differentiate(photograph, 1, [haar])
+    image = view.comparison.image.get()[:, :30, :41].astype(np.float64)
+    colours = photograph.image().transpose(2, 0, 1) / 255
+
+    def total(numbers: dict[str, float]) -> float:
+        taps = taps_of(numbers)
+        found = ref.haar_filtered(colours, taps, counted) * (1 if counted is None else counted)
+        parts = ((0.8, ref.l1), (0.2, ref.dssim), (3.0, ref.l2))
+        images = sum(weight * loss(image, found)[0] for weight, loss in parts)
+        return images + 0.01 * 2 * ((taps - HAAR) ** 2).sum()
+
+    expected = {}
+    for name, value in before.items():
+        up, down = (total({**before, name: value + e}) for e in (1e-6, -1e-6))
+        expected[name] = (up - down) / 2e-6
+    trainer.update(view)
+    for name, gradient in expected.items():
+        assert trainer.numbers[f"{name}/moment1"] / 0.1 == pytest.approx(gradient, rel=2e-3, abs=1e-5)
+        assert trainer.numbers[name] == pytest.approx(before[name] - 1e-4 * np.sign(gradient), abs=1e-9)
+        assert trainer.numbers[f"{name}/updates"] == 1
+    own = next(loss.value() for loss in view.losses if loss.name == "haar")
+    assert view.loss - view.losses[-1].value() == pytest.approx(total(before), rel=1e-4)
+    assert own == pytest.approx(0.01 * 2 * ((taps_of(before) - HAAR) ** 2).sum())
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_what_the_filter_needs_changes_no_loss_and_no_gradient(device, rng, masked):
+    """Bit for bit those of the changed photograph alone."""
+    trainer, photograph = trainer_of(device, rng, [L1(weight=0.8), L2(), Dssim(weight=0.2)], masked)
+    view = trainer.differentiate(photograph, 1, [Haar()])
+    values, gradient = [loss.value() for loss in view.losses[:-1]], view.comparison.gradient.get()
+    alone = replace(view.comparison, workspace=Workspace(device), gradient=device.zeros(gradient.shape))
+    alone = replace(alone, accumulate=False)
+    assert [loss.add(alone).value() for loss in trainer.losses] == values
+    if masked:
+        apply_mask(alone.workspace, alone.camera, alone.gradient, alone.mask)
+    np.testing.assert_array_equal(alone.gradient.get(), gradient)
+
+
+def test_differentiating_changes_no_number(device, rng):
+    trainer, photograph = trainer_of(device, rng, [L1()])
+    trainer.differentiate(photograph, 1, [Haar()])
+    assert trainer.numbers == {}
+    trainer.step(photograph, 1, [Haar()])
+    assert trainer.numbers.keys() > Haar().first().keys()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
+    """The filter's derivatives are those without it, and it adds to the gradient as elsewhere."""
+    of_colours, moments = [L1(weight=0.8), Dssim(weight=0.2)], []
+    for losses in (of_colours, [WeightEntropy(weight=0.3), *of_colours]):
+        trainer, photograph = trainer_of(device, np.random.default_rng(5), losses, masked)
+        view = trainer.step(photograph, 1, [Haar()])
+        moments.append({name: value for name, value in trainer.numbers.items() if name.endswith("moment1")})
+    assert moments[0] == pytest.approx(moments[1], rel=1e-6)
+    assert all(moments[0].values())
+    entropy = next(loss.value() for loss in view.losses if loss.name == "weight_entropy")
+    sums = view.comparison.image.get()[3].sum(dtype=np.float64)
+    assert entropy == pytest.approx(0.3 * sums / (30 * 41), rel=1e-5)
+    trainer.losses, trainer.numbers = [WeightEntropy()], {}
+    trainer.step(photograph, 2, [Haar(weight=0.05)])
+    assert trainer.numbers["haar/scale/moment1"] / 0.1 == pytest.approx(-0.2), "its own loss alone"
+
+
+def test_a_loss_that_is_not_symmetric_is_refused(device, rng):
+    def brightness(image: np.ndarray, photograph: np.ndarray) -> tuple[float, np.ndarray]:
+        return float(image.mean()), np.full(image.shape, 1 / image.size)
+
+    trainer, photograph = trainer_of(device, rng, [L1(), HostLoss(brightness)])
+    trainer.differentiate(photograph, 1, [Blur(sigma=1.0)])
+    with pytest.raises(
+        ConfigError, match=r"^the loss 'brightness', where 'haar' learns: expected .* `symmetric = True`$"
+    ):
+        trainer.differentiate(photograph, 1, [Haar()])
+
+
+def test_a_copy_that_was_begun_is_of_what_was_there(device):
+    array = device.upload(np.arange(40, dtype=np.float32))
+    copied = array.get_later()
+    array.fill(3)
+    np.testing.assert_array_equal(copied(), np.arange(40))
+    np.testing.assert_array_equal(array.get_later()(), 3)

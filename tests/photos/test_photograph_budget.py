@@ -1,0 +1,61 @@
+"""What lies on the device is counted, and photographs keep to their budget."""
+
+import gc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError
+from clsplat.render.camera import upload_camera
+from clsplat.scene.detect import read_scene
+from clsplat.views.photographs import Photographs
+
+
+def test_buffers_are_counted_while_they_live(device):
+    gc.collect()
+    before = device.allocated
+    one, two = device.empty(1000), device.zeros((3, 500), np.uint32)
+    assert device.allocated - before == 4032 + 6016  # whole lines of 64 bytes
+    assert device.peak >= device.allocated
+    del one
+    assert device.allocated - before == 6016
+    del two
+    assert device.allocated == before
+
+
+@pytest.mark.parametrize("kept", [0, 1, 3, 100])
+def test_photographs_keep_to_the_budget(device, tiny_scene, kept):
+    views = read_scene(tiny_scene).split("train")
+    size = 3 * views[0].camera.width * views[0].camera.height
+    tight, plenty = Photographs(device, "white", budget=kept * size), Photographs(device, "white")
+    for turn in range(3):
+        tight.announce(views[turn : turn + 2])
+        for view in views:
+            np.testing.assert_array_equal(tight.get(view).image(), plenty.get(view).image())
+            assert sum(held.nbytes for held in tight._held.values()) <= max(kept, 1) * size
+
+
+@pytest.mark.parametrize("kept", [0, 100])
+def test_photograph_has_the_camera_of_the_requested_view(device, tiny_scene, kept):
+    """Whatever camera the same photograph had before: one of a measurement, in a training that learns cameras."""
+    view = read_scene(tiny_scene).views[0]
+    other = replace(
+        view, camera=view.camera.zoomed(0.9), world_to_camera=view.world_to_camera + np.float64([0, 0, 0, 0.1])
+    )
+    photographs = Photographs(device, "white", budget=kept << 20)
+    for one in (other, view, other):
+        expected = upload_camera(device, one)
+        for camera in (photographs.get(one).camera, photographs.camera(one)):
+            assert camera.values == expected.values
+            np.testing.assert_array_equal(camera.array.get(), expected.array.get())
+
+
+def test_damaged_photograph_read_ahead_is_reported_on_request(device, tiny_scene, tmp_path):
+    damaged = tmp_path / "damaged.png"
+    damaged.write_bytes(b"not an image")
+    view = replace(read_scene(tiny_scene).split("train")[0], image_path=damaged)
+    photographs = Photographs(device, "white")
+    photographs.announce([view])
+    with pytest.raises(DataError, match=r"damaged\.png"):
+        photographs.get(view)

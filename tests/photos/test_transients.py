@@ -1,0 +1,83 @@
+"""Pixels that are left out since their photograph shows what the scene does not have."""
+
+import numpy as np
+import pytest
+
+from clsplat.training import checkpoint
+from clsplat.views.transients import BINS, KEYS, Transients, measure_residuals
+from tests.support.runs import FEW, digest, train
+
+ON = (*FEW, "optimize.transients={start: 4, above: 1, tail: 0}")
+
+
+def distribution(**numbers: float) -> dict[str, float]:
+    """Numbers of residuals by bin."""
+    return {KEYS[int(name[1:])]: number for name, number in numbers.items()}
+
+
+def test_the_threshold_is_in_units_of_the_upper_edge_of_a_bin():
+    settings = Transients(start=10, quantile=0.9, above=1, tail=0)
+    numbers = distribution(_40=50, _60=40, _80=10)
+    assert settings.threshold(numbers, 10) is None, "not yet"
+    assert settings.threshold({}, 11) is None
+    assert settings.threshold(numbers, 11) == 2.0**-12 * 2**7 * (1 + 5 / 8), "bin 61 begins there"
+    assert settings.model_copy(update={"above": 2}).threshold(numbers, 11) == 2 * settings.threshold(numbers, 11)
+    assert settings.model_copy(update={"quantile": 0.5}).threshold(numbers, 11) == 2.0**-12 * 2**5 * (1 + 1 / 8)
+
+
+def test_all_pixels_count_where_no_few_differ_much_more():
+    """Eight bins are an octave: 24 of them a factor of eight."""
+    settings = Transients(start=0, tail=8)
+    assert settings.threshold(distribution(_40=90, _64=10), 1) is None
+    assert settings.threshold(distribution(_40=90, _65=10), 1) is not None
+    assert settings.threshold(distribution(_40=995, _65=5), 1) is None, "beyond the 99 % quantile"
+
+
+def test_the_distribution_fades():
+    settings, numbers = Transients(start=0, decay=0.5), {}
+    for _ in range(2):
+        settings.learn(numbers, np.eye(BINS, dtype=np.uint32)[3] * 8)
+    assert numbers == {key: 12.0 if key == KEYS[3] else 0.0 for key in KEYS}
+
+
+@pytest.mark.slow
+def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(tiny_scene, tmp_path, few_steps):
+    run = train(tiny_scene, tmp_path / "run", *ON)
+    assert sum(run.numbers[key] for key in KEYS) > 40 * 40
+    assert digest(tmp_path / "run") != digest(few_steps)
+    expected = digest(tmp_path / "run")
+    (tmp_path / "run" / "checkpoints" / "step_000012.npz").unlink()
+    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
+        (tmp_path / "run" / name).unlink()
+    again = train(tiny_scene, tmp_path / "run", *ON, resume=True)
+    assert digest(tmp_path / "run") == expected
+    assert again.numbers == run.numbers
+    assert checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])[0].numbers == run.numbers
+
+
+@pytest.mark.slow
+def test_where_no_pixel_is_left_out_the_bits_are_those_without(tiny_scene, tmp_path, few_steps):
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.transients={start: 4, tail: 1e9}")
+    assert digest(tmp_path / "run") == digest(few_steps)
+
+
+@pytest.mark.slow
+def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_path):
+    """And little else, of a model that has begun to look like the scene."""
+    run = train(
+        tiny_scene, tmp_path / "run", "optimize.steps=300", "densify.stop=200", "optimize.transients={start: 300}"
+    )
+    photograph = run.photographs.get(run.scene.split("train")[3])
+    pixels = photograph.colours.get()
+    pixels[:, 12:24, 10:22] = np.array([255, 0, 255])[:, None, None]
+    photograph.colours.set(pixels)
+    workspace, planes = run.rasterizer.workspace, photograph.planes(run.rasterizer.workspace)
+    image = run.rasterizer.forward(run.model, photograph.camera, run.photographs.background).image
+    residuals, _ = measure_residuals(workspace, photograph.camera, image, planes.colours, None)
+    settings = Transients(start=300, tail=0)
+    threshold = settings.threshold(run.numbers, 301)
+    assert threshold is not None
+    left_out = settings.mask(workspace, photograph.camera, residuals, threshold).get()[0, :40, :40] == 0
+    inside = left_out[12:24, 10:22].copy()
+    left_out[11:25, 9:23] = False
+    assert (inside.mean() > 0.8, left_out.mean() < 0.05) == (True, True), (inside.mean(), left_out.mean())

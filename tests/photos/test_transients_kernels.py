@@ -1,0 +1,43 @@
+"""transients.cl: residuals, their numbers by size, and the mask without the large ones."""
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.checks.images import camera_of, planes_of
+from clsplat.conformance.checks.transients import SCALES, transient_figures
+from clsplat.render.workspace import Workspace
+from clsplat.views.transients import BINS, mask_transients, measure_residuals
+from tests.support.device_images import SIZES
+from tests.support.figures import hold
+
+
+@pytest.mark.parametrize("share", [None, 0.5, 0.0])
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_residuals_numbers_and_masks_are_those_of_the_reference(device, rng, width, height, scale, share):
+    hold(transient_figures(device, rng, width, height, scale, share))
+
+
+def test_a_bin_begins_at_its_upper_bits(device):
+    """A residual on an edge is in the bin above."""
+    edges = (2.0**-12 * 2.0 ** (np.arange(BINS) // 8) * (1 + np.arange(BINS) % 8 / 8)).astype(np.float32)
+    for values in (edges, np.nextafter(edges[1:], np.float32(0))):
+        x = np.zeros((3, 1, len(values)), np.float32)
+        x[1] = 3 * values  # the mean of the channels is exact
+        camera = camera_of(device, len(values), 1)
+        planes = planes_of(device, camera, x), planes_of(device, camera, np.zeros_like(x))
+        numbers = measure_residuals(Workspace(device), camera, *planes, None)[1]()
+        np.testing.assert_array_equal(numbers, ref.residual_numbers(values.astype(np.float64)))
+
+
+def test_what_is_not_a_number_stays_for_the_losses_to_find(device):
+    x = np.zeros((3, 4, 5), np.float32)
+    x[1, 2, 3] = np.nan
+    camera = camera_of(device, 5, 4)
+    planes = planes_of(device, camera, x), planes_of(device, camera, np.zeros_like(x))
+    workspace = Workspace(device)
+    residuals, numbers = measure_residuals(workspace, camera, *planes, None)
+    assert numbers().sum() == 20
+    mask = mask_transients(workspace, camera, residuals, 1e-3, 1).get()[0]
+    assert mask.sum() == mask[:4, :5].sum() == 20

@@ -1,0 +1,493 @@
+"""Pipeline files: what is accepted, what is refused and in which words."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from jsonschema import Draft202012Validator
+from ruamel.yaml import YAML
+
+from clsplat import resource_dir
+from clsplat.errors import ConfigError
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.matrix import load_experiment
+from clsplat.pipeline.schema import json_schema
+from clsplat.pipeline.yaml_file import read_yaml
+from clsplat.plugins import load_file
+from clsplat.stages.optimize import Optimize
+from tests.support.pipelines import flat
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SHIPPED = sorted(path.stem for path in resource_dir("pipelines").glob("*.yaml"))
+SMALL = """\
+name: small
+stages:
+  - init
+  - optimize:
+      steps: 10
+      losses:
+        - {type: l1, weight: 0.8}
+        - {type: dssim, weight: 0.2}
+      during:
+        - densify:
+            every: 100
+            rules:
+              - {type: clone}
+        - checkpoint: {every: 5}
+  - evaluate
+  - export
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text: str) -> str:
+        path = tmp_path / "x.yaml"
+        path.write_text(text)
+        return str(path)
+
+    return write
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_pipelines_are_valid_and_resolve_to_themselves(name, write):
+    pipeline = load(name)
+    assert pipeline.settings.name == name
+    again = load(write(pipeline.text()))
+    assert again.resolved() == pipeline.resolved()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_scheduled_stage_of_a_shipped_pipeline_acts(name):
+    loops, before = [stage for stage in load(name).settings.stages if isinstance(stage, Optimize)], 0
+    for loop in loops:
+        last = before + loop.steps
+        for stage in loop.during:
+            steps = range(before + 1, last + (0 if stage.edits else 1))  # nothing is edited after the last step
+            assert any(stage.due(step) for step in steps), f"{stage.stage}, every {stage.every}"
+        before = last
+
+
+def changes(base: str, recipe: str) -> set[str]:
+    """Places, shortened, in which a recipe has other settings than its base."""
+    old, new = flat(load(base).resolved()), flat(load(recipe).resolved())
+    places = {place for place in old.keys() | new.keys() if old.get(place, "-") != new.get(place, "-")}
+    return {place.removeprefix("stages.optimize.").removeprefix("during.") for place in places - {"name"}}
+
+
+SMOOTHING = {"model.world_filter", "model.world_filter.focal", "model.world_filter.variance"}
+MIP = {"model.screen_filter", "model.screen_filter.compensate", "model.screen_filter.variance"}
+REFRESH = {f"refresh_filter.{key}" for key in ("every", "start", "stop")}
+ENDS = {f"{stage}.stop" for stage in ("densify", "reset_opacity")}
+TWIN = {"steps", "rates.means.over", "evaluate.every", *ENDS}
+MATCHING = {
+    f"densify.rules.{rule}~2{key}"
+    for rule, size in (("clone", (".size_below",)), ("split", (".size_above", ".children", ".shrink")))
+    for key in ("", ".start", ".statistic", ".as_many_as", ".gradient_above", ".opacity", *size)
+}
+SUBDIVIDE = (".start", ".at_most", ".beta", ".children", ".radius_above")
+STAGE = ("budget", "every", "grow_until", "inside", "max_gaussians", "patience", "per_pixel", "start", "stop")
+THINNING = {
+    *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
+    *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),
+    *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
+}
+LIMITED = {  # a limit of the opacity, in front of the resets
+    *("reset_opacity.every", "reset_opacity.to", "reset_opacity~2.every", "reset_opacity~2.stop"),
+    *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
+    *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
+}
+
+
+def rules(stage: str, **keys: str) -> set[str]:
+    """The places of rules that a recipe has more, or less, by their keys."""
+    return {
+        f"{stage}.rules.{rule}{key}"
+        for rule, named in keys.items()
+        for key in ("", *(f".{one}" for one in named.split()))
+    }
+
+
+WRONG = " views error_above start"
+FASTGS = {
+    *rules("densify", prune_faint="opacity_below start", prune_large="size_above start"),
+    *rules("densify", ungrow_accurate="pixels_above" + WRONG),
+    *rules("densify", prune_sampled="opacity_below share size_above.between size_above.points" + WRONG),
+    *rules("densify~2", prune_faint="opacity_below start", prune_inaccurate="score_above" + WRONG),
+    *(f"densify~2.{key}" for key in STAGE),
+    *("densify.every", "densify.rules.clone.size_below", "reset_opacity.start"),
+    *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),
+    *LIMITED,
+}
+MINI = {
+    *rules("densify", prune_large="size_above start"),
+    *(
+        place
+        for n in ("", "~2", "~3")
+        for place in rules(f"densify{n}", prune_useless="of_all of_view start views views_below")
+    ),
+    *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
+    *(f"hide_useless{n}.{key}" for n in ("", "~2") for key in ("every", "of_view", "start", "stop")),
+    *("densify.every", "densify.start", "densify.stop"),
+    *(f"reset_opacity.{key}" for key in ("every", "stop", "when_background")),
+    *(f"reset_opacity~2.{key}" for key in ("every", "start", "stop", "to", "when_background")),
+}
+LEAST = ("prune_least", "prune_least~2")
+MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
+MOMENTUM = (".gradient_above", ".growth", ".keep", ".most")
+DASH = {
+    *(f"densify.budget{key}" for key in ("", ".begin", ".gaussians", *MOMENTUM)),
+    *(f"views.resolution{key}" for key in ("", ".every", ".follows", ".largest", ".start", ".until")),
+    *(f"rates.means.{key}" for key in ("over", "start", "until")),
+    *(f"densify.rules.prune_large{key}" for key in ("", ".size_above", ".start")),
+    "densify.stop",
+}
+HAAR = {f"views.transforms.haar{key}" for key in ("", ".learn", ".rate", ".weight")}
+SADDLE = {
+    *(f"densify.rules.{rule}{key}" for rule in ("clone", "split") for key in ("", ".start", ".statistic", ".opacity")),
+    *(f"densify.rules.{rule}{key}" for rule in ("clone", "split") for key in (".as_many_as", ".gradient_above")),
+    *("densify.rules.clone.size_below", "densify.rules.split.size_above"),
+    *("densify.rules.split.children", "densify.rules.split.shrink"),
+    *(f"densify.rules.split_saddle{key}" for key in ("", ".start", ".eigenvalue_below", ".gradient_above")),
+    *(f"densify.rules.split_saddle{key}" for key in (".distance", ".shrink", ".opacity")),
+}
+CROWDED = {
+    *(f"densify.rules.clone_crowded{key}" for key in ("", ".start", ".gradient_above", ".size_below")),
+    *(f"densify.rules.clone_crowded{key}" for key in (".ratio_above", ".jitter", ".cells", ".extremes")),
+}
+DIFFERENCES = {
+    ("splat", "splat_7k"): TWIN,
+    ("splat", "auto"): {
+        f"densify.rules.{rule}.{key}" for rule in ("clone", "split") for key in ("gradient_above", "statistic")
+    }
+    | {f"densify~2.{key}" for key in STAGE}
+    | {f"densify~2.rules.prune_spare{key}" for key in ("", ".start", ".error_rise", ".views")},
+    ("auto", "auto_7k"): TWIN | {f"densify~2.{key}" for key in ("every", "start", "stop")},
+    ("splat", "steep"): SADDLE,
+    ("steep", "steep_7k"): TWIN,
+    ("splat", "gdgs"): CROWDED,
+    ("gdgs", "gdgs_7k"): TWIN | {"densify.rules.clone_crowded.start"},
+    ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
+    ("mip_splatting", "box"): {"model.screen_filter", "model.screen_filter.variance"},
+    ("splat", "mip_splatting_no_3d"): MIP,
+    ("mip_splatting", "mip_splatting_no_2d"): {"model.screen_filter.variance"},
+    ("splat", "splat_ewa"): {"model.screen_filter", "model.screen_filter.compensate"},
+    ("mip_splatting", "mip_splatting_gof"): MATCHING,
+    ("splat", "absgs"): {
+        *("densify.rules.clone.size_below", "densify.rules.split.size_above"),
+        *("densify.rules.split.statistic", "densify.rules.split.gradient_above"),
+        *LIMITED,
+    },
+    ("absgs", "absgs_7k"): TWIN | {"reset_opacity~2.stop"},
+    ("splat", "fastgs"): FASTGS,
+    ("fastgs", "fastgs_7k"): TWIN | {"densify~2.every", "densify~2.start", "reset_opacity~2.stop"},
+    ("splat", "taming"): {
+        *rules("densify", grow_scored="start views", prune_faint="opacity_below start", prune_large="size_above start"),
+        *rules("densify", prune_scored="opacity_below share size_above.between size_above.points start views"),
+        *("densify.every", "densify.budget", "densify.budget.gaussians"),
+    },
+    ("taming", "taming_7k"): TWIN | {"densify.every", "densify.budget.gaussians"},
+    ("splat", "mini"): MINI,
+    ("mini", "mini_7k"): TWIN - ENDS
+    | {f"{stage}.{key}" for stage in ("densify~3", "hide_useless~2") for key in ("every", "stop")},
+    ("splat", "speedy"): {
+        f"{stage}.{key}" for stage in LEAST for key in ("every", "keep", "remove", "score", "start", "stop")
+    },
+    ("speedy", "speedy_7k"): TWIN
+    | {f"{stage}.{key}" for stage in LEAST for key in ("every", "start")}
+    | {"prune_least.stop"},
+    ("splat", "opti3dgs"): MEAN_FILTER,
+    ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
+    ("splat", "dash"): DASH | {"reset_opacity.stop", "rates.logit_opacity"},
+    ("splat_7k", "dash_7k"): DASH,
+    ("splat_7k", "fast"): {
+        *rules("densify~2", prune_useless="of_all of_view start views views_below"),
+        *(f"densify~2.{key}" for key in STAGE),
+        *(f"densify.rules.prune_large{key}" for key in ("", ".size_above", ".start")),
+        *(f"rates.{key}" for key in ("log_scales", "logit_opacity", "quats", "sh_base", "sh_rest")),
+        *(f"rates.means.{key}" for key in ("over", "start", "until")),
+        *(f"views.resolution{key}" for key in ("", ".every", ".follows", ".largest", ".start", ".until")),
+        *(f"{stage}.{key}" for stage in ("add_to_average", "reset_opacity~2") for key in ("every", "start", "stop")),
+        *(f"reset_opacity{key}" for key in (".every", ".start", ".stop", ".to", ".when_background")),
+        *(
+            "reset_opacity~2.to",
+            "reset_opacity~2.when_background",
+            "raise_sh.every",
+            "raise_sh.stop",
+            "evaluate.every",
+            "steps",
+        ),
+        *("densify.start", "densify.stop", "stages.init.count", "stages.init.fewest", "stages.init.transparent"),
+    },
+    ("fast", "fast_30k"): {
+        *(f"{stage}.every" for stage in ("raise_sh", "densify~2", "add_to_average", "evaluate", "checkpoint")),
+        *("raise_sh.stop", "densify.stop", "densify~2.stop", "add_to_average.start"),
+        *(f"rates.{key}" for key in ("log_scales", "logit_opacity", "quats", "sh_base", "sh_rest")),
+        *(f"rates.means.{key}" for key in ("over", "start", "until")),
+        *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),
+        *(f"densify~2.rules.prune_useless.{key}" for key in ("of_all", "of_view")),
+        *("densify.rules.clone.size_below", "views.resolution.until", "steps"),
+        *("losses.l1.weight", "losses.l2", "losses.l2.weight"),
+    },
+    ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
+    ("mip_splatting_7k", "dash_mip_7k"): DASH | {"refresh_filter.start"},
+    ("splat", "auto_opti3dgs"): HAAR,
+    ("splat_7k", "auto_opti3dgs_7k"): HAAR,
+    ("splat", "micro_splatting"): {
+        *(f"densify.rules.split_textured{key}" for key in ("", *SUBDIVIDE, ".texture", ".gradient_above")),
+        *(f"densify.rules.split_textured.texture_above.{key}" for key in ("of", "quantile")),
+        *(f"densify.rules.split_oversized{key}" for key in ("", *SUBDIVIDE, ".pixels", ".rms_above")),
+        *(f"losses.covariance_trace{key}" for key in ("", ".above", ".pixels", ".weight")),
+        *("losses.l1.weight", "losses.l2", "losses.l2.weight"),
+        *("densify.rules.clone.gradient_above", "densify.rules.split.gradient_above"),
+        *(
+            f"stages.evaluate~2.{key}"
+            for key in ("downscales", "file", "lpips", "lpips_input", "metrics", "most", "split")
+        ),
+    },
+    ("micro_splatting", "micro_splatting_v2"): THINNING,
+    ("micro_splatting_7k", "micro_splatting_v2_7k"): THINNING,
+    ("micro_splatting", "micro_splatting_7k"): TWIN | {"losses.l1.weight", "losses.l2.weight"},
+    **{
+        (name, f"{name}_7k"): TWIN | ({"refresh_filter.start", "refresh_filter.stop"} if refreshes else set())
+        for name, refreshes in (
+            ("mip_splatting", True),
+            ("box", True),
+            ("mip_splatting_no_3d", False),
+            ("mip_splatting_no_2d", True),
+            ("splat_ewa", False),
+        )
+    },
+}
+
+
+@pytest.mark.parametrize(("base", "recipe"), DIFFERENCES, ids="-".join)
+def test_recipes_differ_only_where_their_headers_say(base, recipe):
+    assert changes(base, recipe) == DIFFERENCES[base, recipe]
+
+
+@pytest.mark.parametrize(("full", "short"), [("splat", "splat_7k"), ("splat_ewa", "splat_ewa_7k")])
+def test_the_short_recipes_shorten_alike(full, short):
+    old, new = flat(load(full).resolved()), flat(load(short).resolved())
+    place = "stages.optimize.rates.means.over"
+    assert 2 * new[place] == old[place]
+    assert new["stages.optimize.during.densify.stop"] == new["stages.optimize.during.reset_opacity.stop"] == 4000
+
+
+def replaced(old: str, new: str) -> str:
+    assert old in SMALL
+    return SMALL.replace(old, new)
+
+
+REFUSED = {
+    "misspelt key": (
+        replaced("weight: 0.8", "wieght: 0.8"),
+        r"x.yaml:7: stages\[1\].optimize.losses\[0\].wieght: unknown key 'wieght'; did you mean 'weight'",
+    ),
+    "misspelt stage": (replaced("- evaluate", "- evalute"), r"no stage named 'evalute'; did you mean 'evaluate'\?"),
+    "misspelt loss": (
+        replaced("type: dssim", "type: dsim"),
+        r"x.yaml:8: stages\[1\].optimize.losses\[1\].*no loss named 'dsim'; did you mean 'dssim'\?",
+    ),
+    "misspelt rule": (
+        replaced("type: clone", "type: clon"),
+        r"during\[0\].densify.rules\[0\].*no rule named 'clon'; did you mean 'clone'\?",
+    ),
+    "misspelt top key": (replaced("name: small", "nam: small"), "unknown key 'nam'; did you mean 'name'"),
+    "text for a number": (
+        replaced("steps: 10", "steps: 30k"),
+        r"x.yaml:5: stages\[1\].optimize.steps: expected a whole number, got '30k'",
+    ),
+    "quoted number": (replaced("steps: 10", "steps: '10'"), "expected a whole number, got '10'"),
+    "fraction for a whole": (replaced("steps: 10", "steps: 10.5"), "expected a whole number, got 10.5"),
+    "negative": (replaced("steps: 10", "steps: -1"), "greater than 0, got -1"),
+    "infinite": (replaced("weight: 0.8", "weight: .inf"), "finite"),
+    "a number to reach without an end": (
+        replaced("every: 100\n", "every: 100\n            budget: {type: parabola, gaussians: 10}\n"),
+        r"'budget' needs 'stop'",
+    ),
+    "no number to reach": (
+        replaced("every: 100\n", "every: 100\n            budget: {type: parabola, gaussians: 0}\n"),
+        r"budget.gaussians: expected a value of at least 1",
+    ),
+    "missing steps": (replaced("      steps: 10\n", ""), "'steps' is missing"),
+    "a start outside": (replaced("- evaluate", "- evaluate: {start: 3}"), r"'start' belongs inside optimize.during"),
+    "a stop outside": (replaced("- evaluate", "- evaluate: {stop: 3}"), r"'stop' belongs inside optimize.during"),
+    "another stage inside": (
+        replaced("- init", "- init: {stage: export}"),
+        r"x.yaml:3: stages\[0\].init.stage: unknown key 'stage'; remove it",
+    ),
+    "another stage inside during": (
+        replaced("{every: 5}", "{every: 5, stage: evaluate}"),
+        r"stages\[1\].optimize.during\[1\].checkpoint.stage: unknown key 'stage'",
+    ),
+    "no cadence": (replaced("checkpoint: {every: 5}", "checkpoint"), "needs 'every' inside 'during'"),
+    "cadence outside": (replaced("- evaluate", "- evaluate: {every: 3}"), r"'every' belongs inside optimize.during"),
+    "wrong order": (
+        replaced("  - init\n", ""),
+        r"stages\[0\] optimize needs 'model', which no earlier stage makes \(init makes it\)",
+    ),
+    "statistics that a cleanup has dropped": (
+        replaced("- evaluate", "- cleanup\n  - densify: {rules: [clone]}"),
+        r"stages\[3\] densify needs 'stats', which stages\[2\] cleanup takes away \(optimize makes it again\)",
+    ),
+    "statistics of a model that was replaced": (
+        replaced("- evaluate", "- init\n  - densify: {rules: [clone]}"),
+        r"stages\[3\] densify needs 'stats', which stages\[2\] init takes away",
+    ),
+    "figures of a model that was replaced": (
+        replaced("- export", "- init\n  - report"),
+        r"stages\[4\] report needs 'metrics', which stages\[3\] init takes away",
+    ),
+    "stage not for during": (replaced("checkpoint: {every: 5}", "init: {every: 5}"), "no stage named 'init'"),
+    "duplicate key": (replaced("steps: 10", "steps: 10\n      steps: 20"), r"x.yaml:6: found duplicate key"),
+    "two keys in a stage": (
+        replaced("  - evaluate", "  - evaluate: {}\n    export: {}"),
+        r"stages\[2\]: expected '- stage'",
+    ),
+    "not yaml": ("name: [", r"x.yaml:\d"),
+    "a list": ("- a\n- b\n", "expected keys such as name and stages"),
+    "empty": ("", "expected keys"),
+    "tagged object": ("name: !!python/object:os.system small\n", "x.yaml"),
+    "unsafe name": (replaced("name: small", "name: ../up"), "name"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals(case, write):
+    text, words = REFUSED[case]
+    with pytest.raises(ConfigError, match=words) as error:
+        load(write(text))
+    assert "\n" not in str(error.value)
+    assert error.value.exit_code == 2
+
+
+def test_alias_bombs_and_large_files_are_refused(write):
+    layers = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    layers += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 9)]
+    for text in ("\n".join(layers), "x" * (2 << 20)):
+        with pytest.raises(ConfigError):
+            read_yaml(Path(write(text)))
+
+
+def test_numbers_are_yaml_1_2(write):
+    data = read_yaml(Path(write("a: 1e-4\nb: no\nc: 010\nd: 0x10\n"))).data
+    assert data == {"a": 1e-4, "b": "no", "c": 10, "d": 16}
+
+
+def test_overrides(write):
+    path = write(SMALL)
+    pipeline = load(path, [
+        "optimize.steps=500", "model.sh_degree=1", "densify.every=50", "optimize.losses[0].weight=1e-1",
+        "scene.downscale=2", "optimize.checkpoint.every=7", "seed=3",
+    ])  # fmt: skip
+    optimize = pipeline.settings.stages[1]
+    assert optimize.steps == 500
+    assert pipeline.settings.model.sh_degree == 1
+    assert optimize.during[0].every == 50
+    assert optimize.losses[0].weight == 0.1
+    assert optimize.during[1].every == 7
+    assert pipeline.settings.scene.downscale == 2
+    assert pipeline.settings.seed == 3
+
+
+def test_unknown_pipelines_name_the_nearest():
+    with pytest.raises(ConfigError, match="did you mean 'splat'"):
+        load("splatt")
+    with pytest.raises(ConfigError, match="no such pipeline file"):
+        load("nowhere.yaml")
+
+
+def test_a_folder_is_no_pipeline_and_hides_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "splat").mkdir()
+    assert load("splat").settings.name == "splat"
+    with pytest.raises(ConfigError, match=re.escape(f"`clsplat run splat_7k --scene {tmp_path}`")):
+        load(str(tmp_path))
+    (tmp_path / "pipeline.yaml").write_text(SMALL)
+    with pytest.raises(ConfigError, match=r"is a run folder.* `clsplat resume .*` goes on"):
+        load(str(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "\udcff"])
+def test_names_that_no_file_can_have_are_refused(name):
+    with pytest.raises(ConfigError):
+        load(name)
+
+
+def test_schema_describes_the_file():
+    schema = json_schema()
+    assert json.loads(json.dumps(schema)) == schema
+    names = {
+        next(iter(item["properties"]))
+        for item in schema["properties"]["stages"]["items"]["oneOf"]
+        if "properties" in item
+    }
+    assert {"init", "optimize", "evaluate", "export"} <= names
+    assert "steps" in schema["$defs"]["Optimize"]["properties"]
+
+
+def valid(text: str, schema: Draft202012Validator | None = None) -> bool:
+    return (schema or Draft202012Validator(json_schema())).is_valid(read_yaml_text(text))
+
+
+@pytest.fixture(scope="module")
+def own_schema():
+    """The schema of files without plug-ins."""
+    return Draft202012Validator(json_schema())
+
+
+def read_yaml_text(text: str) -> object:
+    return YAML(typ="safe").load(text)
+
+
+FILES = [*resource_dir("pipelines").glob("*.yaml"), *EXAMPLES.glob("*.yaml")]
+
+
+@pytest.mark.usefixtures("without_plugins")
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_schema_accepts_what_the_loader_accepts(path, own_schema):
+    schema = own_schema
+    if (plugin := path.with_suffix(".py")).is_file():
+        load_file(plugin)
+        schema = None
+    assert valid(path.read_text(), schema)
+    matrix = load_experiment(str(path))
+    assert valid(matrix.text if matrix else load(str(path)).text(), schema), "the resolved file"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("- init", "- init:"),
+        ("{type: clone}", "clone"),
+        ("{type: l1, weight: 0.8}", "l1"),
+        ("steps: 10", "steps: 10\n      views: {order: paper}"),
+    ],
+)
+def test_schema_accepts_bare_names_and_stages_without_settings(old, new, write):
+    load(write(replaced(old, new)))
+    assert valid(replaced(old, new))
+
+
+SCHEMA_REFUSES = {
+    "a loss without a type": replaced("type: l1, weight", "weight"),
+    "a transform that needs settings": replaced("steps: 10", "steps: 10\n      views: {transforms: [blur]}"),
+    "a stage that needs settings": "name: x\nstages: [init, optimize]\n",
+    "a stage without settings that it needs": "name: x\nstages: [init, optimize: ]\n",
+    "another stage inside": replaced("- init", "- init: {stage: export}"),
+    "no cadence, with a name": replaced("checkpoint: {every: 5}", "checkpoint"),
+    "no cadence": replaced("checkpoint: {every: 5}", "checkpoint: {}"),
+    "no stages": "name: x\n",
+    **{case: REFUSED[case][0] for case in ("misspelt key", "misspelt stage", "misspelt loss", "misspelt rule")},
+    **{case: REFUSED[case][0] for case in ("misspelt top key", "text for a number", "negative", "missing steps")},
+    **{case: REFUSED[case][0] for case in ("stage not for during", "two keys in a stage", "unsafe name")},
+}
+
+
+@pytest.mark.parametrize("case", SCHEMA_REFUSES)
+def test_the_schema_refuses_what_the_loader_refuses(case, write):
+    with pytest.raises(ConfigError):
+        load(write(SCHEMA_REFUSES[case]))
+    assert not valid(SCHEMA_REFUSES[case])

@@ -1,0 +1,160 @@
+"""A recipe in another number of steps."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from clsplat.pipeline.file import PipelineFile
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.stretching import in_steps, last_edit, stretched, with_steps
+from clsplat.schedule import at_step
+from clsplat.settings import Settings
+from clsplat.views.detail import DetailDivisor
+from tests.support.pipelines import TRAINING, flat
+
+STEPS = ("steps", "start", "stop", "over", "until", "every")
+
+
+def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
+    pipeline = load(name)
+    old, new = (
+        flat(one.resolved()) for one in (pipeline, replace(pipeline, settings=stretched(pipeline.settings, factor)))
+    )
+    assert old.keys() == new.keys()
+    return {place: (old[place], new[place]) for place in old if old[place] != new[place]}
+
+
+def test_the_long_recipe_in_fewer_steps_is_the_short_one():
+    """But for the cadence and the end of growth, which splat_7k.yaml chooses."""
+    new = stretched(load("splat").settings, 7000 / 30000).training
+    assert (new.steps, new.rates.means.over) == (7000, 7000)
+    raise_sh, densify, reset, white = new.during[:4]
+    assert (raise_sh.every, densify.every, densify.start, densify.stop) == (233.334, 23.3334, 116, 3500)
+    assert [rule.start for rule in densify.rules] == [0, 0, 0, 700]
+    assert (reset.every, reset.stop) == (700.002, 3500)
+    assert [step for step in range(1, 7000) if white.due(step)] == [116]
+
+
+@pytest.mark.parametrize("name", TRAINING)
+def test_only_steps_change_and_all_of_them(name):
+    """What acts at multiples of a cadence ends one step after the last; a rate of what is learned falls."""
+    found = changes(name, 2.0)
+    for place, (old, new) in found.items():
+        if isinstance(old, list):
+            assert new == [[2 * step, value] for step, value in old], place
+        elif place.endswith(".haar.rate"):
+            assert new == old / 2
+        else:
+            assert place.endswith(STEPS), place
+            assert new in (2 * old, 2 * old - place.endswith(".stop")), place
+    stretchable = [
+        place
+        for place, value in flat(load(name).resolved()).items()
+        if place.endswith((".steps", ".start", ".stop", ".over", ".until")) and isinstance(value, int) and value
+    ]
+    assert set(stretchable) <= found.keys()
+
+
+@pytest.mark.parametrize("factor", [0.0371, 0.617, 1.9])
+@pytest.mark.parametrize("name", sorted({*TRAINING} - {"smoke"}))  # which has few steps as it is
+def test_what_ends_acts_as_often(name, factor):
+    settings = load(name).settings
+    old, new = settings.training, stretched(settings, factor).training
+    for before, after in zip(old.during, new.during, strict=True):
+        if before.stop is None or before.every == 1:
+            continue
+        counts = [
+            sum(stage.due(step) for step in range(1, training.steps))
+            for stage, training in ((before, old), (after, new))
+        ]
+        assert counts[0] == counts[1], before
+
+
+def test_per_step_acts_end_at_the_same_share_of_training():
+    new = in_steps(load("mcmc_7k").settings, 2000).training
+    (noise,) = [stage for stage in new.during if stage.stage == "add_noise"]
+    assert (noise.every, noise.stop) == (1, 5000 * 2000 // 7000)
+
+
+@pytest.mark.parametrize("steps", [1, 2000, 7001])
+@pytest.mark.parametrize("name", TRAINING)
+def test_a_recipe_has_the_steps_that_were_asked_for(name, steps):
+    assert in_steps(load(name).settings, steps).training.steps == steps
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.13, 1.0, 3.7])
+@pytest.mark.parametrize("name", TRAINING)
+def test_every_stretched_recipe_is_valid(name, factor):
+    settings = load(name).settings
+    new = stretched(settings, factor)
+    assert type(settings).model_validate(new.model_dump()) == new
+    assert factor != 1 or new == settings
+
+
+def checked_again(name: str, settings: PipelineFile, folder: Path) -> Pipeline:
+    """The pipeline as it is written and read: every stage has what it needs."""
+    file = folder / "again.yaml"
+    file.write_text(replace(load(name), settings=settings).text())
+    return load(str(file))
+
+
+@pytest.mark.parametrize("steps", [340, 500, 1000, 5000])
+def test_stretched_average_begins_at_the_same_share_of_training(tmp_path, steps):
+    settings = load("fast").settings
+    new = checked_again("fast", in_steps(settings, steps), tmp_path).settings.training
+    assert new == in_steps(settings, steps).training
+    (average,) = [stage for stage in new.during if stage.stage == "add_to_average"]
+    assert average.start == 2000 * steps // 3400
+    assert sum(average.due(step) for step in range(1, steps)) == 27
+
+
+@pytest.mark.parametrize("done", [900, 1700, 2500])
+@pytest.mark.parametrize("left", [2, 50, 900, 9000])
+@pytest.mark.parametrize("name", ["fast", "splat_7k"])
+def test_corrected_step_count_keeps_what_comes_later(tmp_path, name, done, left):
+    """And what was done: a stage that had begun acts at the same steps."""
+    settings = load(name).settings
+    new = checked_again(name, with_steps(settings, done + left, done), tmp_path).settings.training
+    assert new.steps == done + left
+    for before, after in zip(settings.training.during, new.during, strict=True):
+        for step in range(1, done + 1):
+            assert before.due(step) == after.due(step)
+        assert before.start <= done or done < after.start + 1 < new.steps
+
+
+@pytest.mark.parametrize("name", TRAINING)
+def test_corrected_count_is_after_growth_and_small_photographs(name):
+    training = load(name).settings.training
+    last, resolution = last_edit(training), training.views.resolution
+    assert last <= training.steps
+    is_fixed = not isinstance(resolution, DetailDivisor)
+    assert at_step(resolution, last) == at_step(resolution, training.steps) if is_fixed else last >= resolution.until
+    grows = [stage for stage in training.during if stage.stage == "densify" and stage.stop]
+    assert not any(stage.due(step) for stage in grows for step in range(last, training.steps))
+
+
+def test_training_by_detail_is_not_cut_before_the_full_size():
+    assert last_edit(load("dash_7k").settings.training) == 6300
+
+
+def test_rate_of_what_learns_in_n_updates_falls_as_much():
+    (haar,) = in_steps(load("auto_opti3dgs").settings, 7000).training.views.transforms
+    (short,) = load("auto_opti3dgs_7k").settings.training.views.transforms
+    assert haar.rate == pytest.approx(1e-4 * 30 / 7)
+    assert short.rate == pytest.approx(haar.rate, rel=0.01)
+    (points,) = stretched([haar.model_copy(update={"rate": [[0, 1e-3], [100, 1e-4]]})], 0.5)
+    assert points.rate == [[0, 2e-3], [50, 2e-4]]
+
+
+def test_never_stays_a_number_that_a_file_holds():
+    never = load("splat_7k", [f"densify.stop={2**63 - 1}"]).settings
+    assert stretched(never, 3.0).training.during[1].stop == 2**63 - 1
+    assert stretched(load("splat_7k", ["densify.every=9e18"]).settings, 3.0).training.during[1].every == 2**63 - 1
+
+
+def test_points_that_fall_together_become_one():
+    class Holder(Settings):
+        values: list[list[float]]
+
+    assert stretched(Holder(values=[[0, 1.0], [10, 2.0], [14, 3.0]]), 0.1).values == [[0, 1.0], [1, 3.0]]

@@ -1,0 +1,412 @@
+"""Photographs as people take them: turned by EXIF, of several lenses, and sets that give no model."""
+
+import math
+import struct
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError, in_shell
+from clsplat.prepare.cache import fingerprint
+from clsplat.scene.exif import copied, exposure_of, optics_of
+from clsplat.scene.images import read_grey, read_header, read_image
+from data_tools import mapping
+from data_tools import reasons as reasons_tool
+from data_tools.database import image_names, opened
+from data_tools.features import Sought, find_features, sift
+from data_tools.gather import gather, list_photographs
+from data_tools.mapping import map_cameras
+from data_tools.matching import match_features
+from data_tools.reasons import Matched, diagnosis, reasons
+from data_tools.told import left_out
+from data_tools.turning import without_depth
+from tests.support.pictures import blocks
+from tests.support.refusals import refusal
+
+# ---- lenses
+
+
+@pytest.mark.parametrize("damage", ["a text for a place", "no focal length", "cut"])
+def test_exif_that_is_damaged_tells_no_lens(tmp_path, damage):
+    segment = bytearray(exif())
+    if damage == "a text for a place":
+        segment[segment.index(struct.pack("<HH", 0x8769, 4)) + 2] = 2
+    if damage == "no focal length":
+        segment[-4:] = bytes(4)  # its divisor
+    path = take(tmp_path / "a.jpg", (16, 16), bytes(segment[:60] if damage == "cut" else segment))
+    assert optics_of(path) is None
+    assert (exposure_of(path) is None) == (damage != "no focal length")
+
+
+def exif(orientation: int = 1, focal: float = 4.2, model: str = "Phone 1") -> bytes:
+    """An Exif segment: orientation, make, model, exposure and focal length."""
+    texts, rationals = [b"Maker\0", model.encode() + b"\0"], [(1, 50), (18, 10), (round(focal * 100), 100)]
+    outer, inner = 8 + 2 + 12 * 4 + 4, 2 + 12 * 4 + 4
+    ends = [outer + inner, outer + inner + len(texts[0])]
+    data = ends[1] + len(texts[1])
+    block = b"II*\0" + struct.pack("<IH", 8, 4)
+    block += struct.pack("<HHII", 0x010F, 2, len(texts[0]), ends[0])
+    block += struct.pack("<HHII", 0x0110, 2, len(texts[1]), ends[1])
+    block += struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0) + struct.pack("<HHII", 0x8769, 4, 1, outer) + bytes(4)
+    block += struct.pack("<H", 4)
+    for place, tag in enumerate((0x829A, 0x829D)):
+        block += struct.pack("<HHII", tag, 5, 1, data + 8 * place)
+    block += struct.pack("<HHIHH", 0x8827, 3, 1, 100, 0) + struct.pack("<HHII", 0x920A, 5, 1, data + 16) + bytes(4)
+    block += b"".join(texts) + b"".join(struct.pack("<II", *pair) for pair in rationals)
+    return b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block
+
+
+def take(path: Path, size: tuple[int, int], segment: bytes = b"", seed: int = 0) -> Path:
+    """A photograph of `size` (width, height) with an Exif segment."""
+    pixels = cv2.GaussianBlur(
+        np.random.default_rng(seed).integers(0, 256, (*size[::-1], 3)).astype(np.uint8), (0, 0), 2
+    )
+    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data.tobytes()[:2] + segment + data.tobytes()[2:])
+    return path
+
+
+def test_turned_photographs_keep_exif_except_for_the_rotation(tmp_path):
+    for i in range(3):
+        take(tmp_path / "p" / f"{i}.jpg", (64, 48), exif(6), seed=i)
+    (tmp_path / "images").mkdir()
+    gather(tmp_path / "p", tmp_path / "images", ["0.jpg", "1.jpg", "2.jpg"])
+    source, turned = tmp_path / "p" / "0.jpg", tmp_path / "images" / "0.jpg"
+    assert not turned.is_symlink()
+    assert (read_header(source).orientation, read_header(turned).orientation) == (6, 1)
+    assert (read_header(turned).width, read_header(turned).height) == (48, 64)
+    assert optics_of(turned) == optics_of(source) == ("Maker", "Phone 1", 4.2, "")
+    assert exposure_of(turned) == exposure_of(source)
+    assert exposure_of(turned).value == pytest.approx(math.log2(100 / 50 / 1.8**2))
+    assert np.abs(read_image(turned).astype(int) - read_image(source, upright=True)).max() < 12
+
+
+def test_exif_of_the_other_byte_order_and_none_at_all(tmp_path):
+    _, jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
+    block = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, 3, 0, 0)
+    head = jpeg.tobytes()[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block
+    (tmp_path / "a.jpg").write_bytes(copied(head, jpeg.tobytes()))
+    assert read_header(tmp_path / "a.jpg").orientation == 1
+    assert b"MM\0*" in (tmp_path / "a.jpg").read_bytes()
+    assert copied(jpeg.tobytes(), jpeg.tobytes()) == jpeg.tobytes()
+
+
+@pytest.mark.parametrize(("cameras", "groups"), [("auto", 4), ("one", 2), ("per_folder", 3), ("per_image", 8)])
+def test_which_photographs_share_a_camera(tmp_path, cameras, groups, caplog):
+    """Of one lens: across, and turned; of another; and without EXIF data."""
+    pycolmap = pytest.importorskip("pycolmap")
+    caplog.set_level("INFO")
+    for i, orientation in enumerate((1, 6, 1, 8)):
+        take(tmp_path / "p" / f"{i}.jpg", (96, 72), exif(orientation), seed=i)
+    for i, segment in enumerate((exif(focal=9.0), exif(focal=9.0), b"", b"")):
+        take(tmp_path / "p" / "b" / f"{i}.jpg", (96, 72), segment, seed=9 + i)
+    (tmp_path / "out").mkdir()
+    figures = find_features(tmp_path / "p", tmp_path / "out", Sought(96, 50), cameras=cameras)
+    assert figures["cameras"] == groups
+    with opened(pycolmap, tmp_path / "out" / "database.db") as rows:
+        images, cameras_found = rows.read_all_images(), rows.read_all_cameras()
+    assert [image.name for image in images] == image_names(pycolmap, tmp_path / "out" / "database.db")
+    assert {image.camera_id for image in images} == set(range(1, groups + 1))
+    if cameras == "auto":
+        shared = {image.name: image.camera_id for image in images}
+        assert shared["0.jpg"] == shared["2.jpg"] != shared["1.jpg"] == shared["3.jpg"]
+        assert {(one.width, one.height) for one in cameras_found} == {(96, 72), (72, 96)}
+        assert (
+            "2 photographs have no EXIF data of their lens: those of one size share a camera, 1 camera" in caplog.text
+        )
+
+
+# ---- features
+
+
+def test_reduced_photographs_tell_where_their_pixels_were(tmp_path):
+    """A JPEG of an odd size, made smaller by its decoder first; a spot stays where it is."""
+    pixels = np.full((901, 1203, 3), 60, np.uint8)
+    cv2.circle(pixels, (1000, 700), 24, (200, 200, 200), -1)
+    cv2.imwrite(str(tmp_path / "a.jpg"), pixels)
+    for long_side in (2000, 800, 300, 160):
+        grey, (across, down) = read_grey(tmp_path / "a.jpg", long_side)
+        assert max(grey.shape) == min(long_side, 1203)
+        weight = np.maximum(grey.astype(float) - 80, 0)
+        y, x = (np.indices(grey.shape) * weight).sum(axis=(1, 2)) / weight.sum()
+        np.testing.assert_allclose([(x + 0.5) * across, (y + 0.5) * down], [1000.5, 700.5], atol=0.3)
+
+
+def test_features_lie_where_spots_are():
+    pixels = np.full((120, 160), 90, np.float32)
+    y, x = np.indices(pixels.shape) + 0.5
+    spots = [(40.0, 30.0), (110.25, 70.75), (60.5, 95.0)]
+    for at in spots:
+        pixels += 120 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * 3.0**2))
+    keypoints, descriptors = sift(np.rint(pixels).astype(np.uint8), Sought(count=50))
+    for at in spots:
+        assert np.linalg.norm(keypoints[:, :2] - at, axis=1).min() < 0.1
+    assert descriptors.dtype == np.uint8
+    assert descriptors.shape == (len(keypoints), 128)
+    np.testing.assert_allclose((descriptors.astype(float) ** 2).sum(axis=1), 512**2, rtol=0.1)
+    assert len(sift(np.rint(pixels).astype(np.uint8), Sought(count=2))[0]) == 2
+
+
+# ---- photographs that cannot be placed
+
+
+def test_files_that_cannot_be_read_come_with_how_to_convert_them(tmp_path, caplog):
+    for name in ("a.jpg", "b.jpg", "c.jpg", "d.HEIC", "e.dng"):
+        (tmp_path / name).touch()
+    assert len(list_photographs(tmp_path)) == 3
+    assert "1 HEIC file such as d.HEIC is left out" in caplog.text
+    assert "1 DNG file such as e.dng is left out" in caplog.text
+    (tmp_path / "a.jpg").unlink()
+    text = refusal(list_photographs, tmp_path)
+    assert "found 2 photographs" in text
+    assert "heif-convert" in text
+
+
+def test_files_named_as_another_kind_come_with_how_to_convert(tmp_path):
+    for i in range(3):
+        take(tmp_path / "p" / f"{i}.jpg", (64, 48), seed=i)
+    for name, brand in (("h.jpg", b"heic"), ("m.JPG", b"mif1"), ("v.png", b"avif"), ("o.jpg", b"isom")):
+        (tmp_path / "p" / name).write_bytes(b"\0\0\0\x18ftyp" + brand + bytes(40))
+    (tmp_path / "images").mkdir()
+    kept, damaged = gather(tmp_path / "p", tmp_path / "images", list_photographs(tmp_path / "p"))
+    assert kept == ["0.jpg", "1.jpg", "2.jpg"]
+    assert damaged == {
+        "h.jpg": "HEIC by its content",
+        "m.JPG": "HEIC by its content",
+        "v.png": "AVIF by its content",
+        "o.jpg": "not an image, or a damaged one",
+    }
+    (told,) = left_out({"photographs": 3, "damaged": damaged})
+    assert "name HEIC files so, and make JPEG files of them, such as by heif-convert" in told
+    assert "such as by ffmpeg" in told
+    assert told.endswith("; export the others again")
+    assert left_out({"photographs": 3, "damaged": {"a": "cut"}})[0].endswith("(cut); export them again")
+    (tmp_path / "p" / "0.jpg").unlink()
+    text = refusal(gather, tmp_path / "p", tmp_path / "images", ["1.jpg", "2.jpg", "h.jpg"])
+    assert "only 2 of 3 photographs can be read: h.jpg (HEIC by its content); name HEIC files so" in text
+
+
+@pytest.mark.parametrize("read", [list_photographs, lambda path: fingerprint(path, path)])
+def test_video_given_as_a_folder_comes_with_what_makes_one(tmp_path, read):
+    (tmp_path / "my walk.AVI").write_bytes(b"RIFF")
+    (tmp_path / "notes").touch()
+    command = f"`clsplat data video {in_shell(tmp_path / 'my walk.AVI')} FOLDER`"
+    assert command in refusal(read, tmp_path / "my walk.AVI")
+    assert "is a file; expected a folder with photographs" in refusal(read, tmp_path / "notes")
+    assert "no such folder" in refusal(read, tmp_path / "none.avi")
+
+
+def matched(tmp_path: Path) -> Matched:
+    """Photographs of which three are in the model, and three are soft: two of its place, and one of another."""
+    names = ["a", "b", "c", "blurred", "soft", "elsewhere", "plain", "alone", "pair", "other", "few", "many"]
+    soft = ("blurred", "soft", "elsewhere")
+    for name in names:
+        pixels = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / name) + ".png", cv2.GaussianBlur(pixels, (0, 0), 3) if name in soft else pixels)
+        (tmp_path / f"{name}.png").rename(tmp_path / name)
+    pairs = {("a", "b"): 200, ("b", "c"): 150, ("pair", "other"): 90, ("few", "a"): 18, ("many", "a"): 80}
+    pairs |= {("blurred", "a"): 60, ("soft", "a"): 20}
+    return Matched(tmp_path, {name: 40 if name == "plain" else 3000 for name in names}, pairs)
+
+
+def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
+    found = reasons(matched(tmp_path), [{"a", "b", "c"}])
+    assert found == {
+        "blurred": "blurred",
+        "soft": "few matches, at most 20, with a; it may be blurred",
+        "elsewhere": "shows nothing that another photograph shows; it may be blurred",
+        "plain": "only 40 features: blurred, dark, or of a plain surface",
+        "alone": "shows nothing that another photograph shows",
+        "pair": "matches other alone, which is not placed either",
+        "other": "matches pair alone, which is not placed either",
+        "few": "few matches, at most 18, with a",
+        "many": "80 matches with a, but too few on points of the model",
+    }
+    assert reasons(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"] == "in another model, with other"
+    figures = {"registered": 3, "not_registered": ["plain"], "reasons": found, "other_models": [2]}
+    missing, others = left_out(figures)
+    assert "1 of 4 photographs could not be placed: plain (only 40 features: blurred" in missing
+    assert missing.endswith("places between, or find more features (find_features.long_side)")
+    assert others == "1 smaller model, of 2 photographs, is left out: add photographs that join it to the largest"
+    missing, others = left_out({**figures, "other_models": [3, 1], "denser_tried": True})
+    assert missing.endswith("places between")
+    assert others.startswith("2 smaller models, of 3, 1 photograph, are left out: add photographs that join them")
+
+
+def test_set_without_a_model_is_described_by_its_groups(tmp_path):
+    found = matched(tmp_path)
+    assert diagnosis(found) == (
+        "they do not belong together: 2 groups of good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
+        "without a good match (alone, elsewhere, few, plain, soft); take photographs of one scene, with more overlap"
+    )
+    joined = replace(found, pairs={**found.pairs, ("a", "pair"): 30})
+    assert diagnosis(joined).startswith("take more sharp ones"), "seven of twelve belong together"
+    weak = replace(found, pairs={("a", "b"): 20, ("b", "c"): 29})
+    assert diagnosis(weak).startswith("no two of them show enough of the same: 29 matches at most; take")
+    two = Matched(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
+    assert "the largest of 2 (a, b), and 1 without a good match (c); take" in diagnosis(two)
+
+
+def test_blur_is_told_from_an_equally_soft_photograph_elsewhere(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    wide = blocks(1, 900, 600)
+    pictures = {f"{i}.png": wide[:, 60 * i : 60 * i + 700] for i in range(3)}
+    pictures |= {"blurred.png": cv2.GaussianBlur(wide[:, 90:790], (0, 0), 2)}
+    pictures |= {"elsewhere.png": cv2.GaussianBlur(blocks(2, 700, 600), (0, 0), 2)}
+    for name in ("photographs", "features", "matches"):
+        (tmp_path / name).mkdir()
+    for name, pixels in pictures.items():
+        cv2.imwrite(str(tmp_path / "photographs" / name), pixels)
+    find_features(tmp_path / "photographs", tmp_path / "features", Sought(700, 3000))
+    match_features(tmp_path / "features", tmp_path / "matches")
+    found = Matched.of(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
+    assert reasons(found, [{"0.png", "1.png", "2.png"}]) == {
+        "blurred.png": "blurred",
+        "elsewhere.png": "shows nothing that another photograph shows; it may be blurred",
+    }
+
+
+def turned(number: int) -> np.ndarray:
+    """What a camera sees that turns before a far wall, by 6 degrees each time."""
+    angle = math.radians(6 * number - 15)
+    turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    near, far = (
+        np.array([[250, 0, 120], [0, 250, 90], [0, 0, 1.0]]),
+        np.array([[250, 0, 300], [0, 250, 150], [0, 0, 1]]),
+    )
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(blocks(1, 600, 300), far @ turn @ np.linalg.inv(near), (240, 180), flags=flags)
+
+
+def stranger(number: int) -> np.ndarray:
+    return blocks(10 + number, 240, 180)
+
+
+def prepared(tmp_path: Path, pictures: list[np.ndarray], **matching: object) -> tuple[Path, Path]:
+    """The folder of matches of pictures, and an empty one for their cameras."""
+    pytest.importorskip("pycolmap")
+    for name in ("photographs", "features", "matches", "cameras"):
+        (tmp_path / name).mkdir()
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(tmp_path / "photographs" / f"{number:02}.png"), picture)
+    find_features(tmp_path / "photographs", tmp_path / "features", Sought(240, 600))
+    match_features(tmp_path / "features", tmp_path / "matches", **matching)
+    return tmp_path / "matches", tmp_path / "cameras"
+
+
+@pytest.fixture
+def dense(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapping, "DENSER", Sought(240, 1000, 0.01))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "sentence"),
+    [
+        (turned, "match like those of a camera that only turned on the spot"),
+        (lambda number: (turned if number else stranger)(number), "match like those of a camera that only turned"),
+        (stranger, "no two of them show the same features"),
+        (lambda number: turned(1), "photographs are all the same: nothing moves from one to the next"),
+        (lambda number: np.full((180, 240, 3), 180 + number, np.uint8), "none has features, where thousands"),
+        (lambda number: np.full((180, 240, 3), 9, np.uint8) if number else turned(1), "half of them have no features"),
+    ],
+    ids=["turned", "turned, with a stranger", "other places", "copies", "a wall", "a wall, with one of texture"],
+)
+def test_sets_that_cannot_work_end_in_a_sentence(tmp_path, dense, pixels, sentence):
+    matches, cameras = prepared(tmp_path, [pixels(number) for number in range(6)])
+    with pytest.raises(DataError, match=sentence):
+        map_cameras(matches, cameras)
+
+
+def test_plain_photographs_not_fully_matched_end_in_a_sentence(tmp_path, dense):
+    """More pairs are looked for among photographs without features."""
+    plain = [np.full((180, 240, 3), 100 + number, np.uint8) for number in range(12)]
+    matches, cameras = prepared(tmp_path, plain, matching="sequential", neighbours=2)
+    with pytest.raises(DataError, match="none has features, where thousands"):
+        map_cameras(matches, cameras)
+
+
+def test_only_attempts_that_are_made_count(tmp_path, dense, caplog):
+    """All pairs were matched, so that there are no more of them to try."""
+    caplog.set_level("INFO")
+    matches, cameras = prepared(tmp_path, [stranger(number) for number in range(4)])
+    with pytest.raises(DataError, match="no two of them show the same features"):
+        map_cameras(matches, cameras, attempts=3)
+    tried = [text.rpartition(": ")[2] for text in caplog.messages if "another attempt" in text]
+    assert tried == ["smaller angles and fewer matches", "denser features"]
+
+
+def test_copies_among_photographs_tell_nothing_of_the_camera(tmp_path, dense):
+    """Three neighbours that shift before a wall, each with two copies, which match it best: it has not turned."""
+    wide = blocks(1, 400, 180)
+    matches, _ = prepared(tmp_path, [wide[:, 30 * (number // 3) :][:, :240] for number in range(9)])
+    pycolmap = pytest.importorskip("pycolmap")
+    assert without_depth(pycolmap, matches / "database.db") == ""
+    assert "all the same" in without_depth(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
+
+
+def test_model_counts_only_photographs_in_no_larger_model(tmp_path):
+    class Model:
+        def __init__(self, *numbers: int) -> None:
+            self.numbers = numbers
+            self.images = {number: SimpleNamespace(name=f"{number}.jpg") for number in numbers}
+
+        def reg_image_ids(self) -> tuple[int, ...]:
+            return self.numbers
+
+        def write(self, path: str) -> None: ...
+
+        def num_points3D(self) -> int:
+            return 9
+
+        def compute_mean_reprojection_error(self) -> float:
+            return 0.5
+
+    models = [Model(1, 2, 3, 4), Model(3, 4, 5), Model(2, 4, 5)]
+    figures = mapping._written(models, tmp_path, [f"{number}.jpg" for number in range(1, 7)])
+    assert figures["other_models"] == [1]
+    assert figures["not_registered"] == ["5.jpg", "6.jpg"]
+
+
+def test_model_of_a_turning_camera_is_refused_among_strangers(tmp_path, dense):
+    """Before there is one, too few photographs match to know."""
+    matches, cameras = prepared(tmp_path, [turned(number) if number < 6 else stranger(number) for number in range(14)])
+    with pytest.raises(DataError, match=r"the \d of 14 photographs that could be placed match like those"):
+        map_cameras(matches, cameras)
+    assert not (cameras / "sparse").exists()
+
+
+def test_features_are_not_sought_again_for_unrelated_photographs(tmp_path, dense, monkeypatch, caplog):
+    monkeypatch.setattr(reasons_tool, "TEXTURED", 100)
+    caplog.set_level("INFO")
+    matches, cameras = prepared(tmp_path, [stranger(number) for number in range(6)])
+    with pytest.raises(DataError, match="no two of them show the same features"):
+        map_cameras(matches, cameras)
+    assert "denser features would not help" in caplog.text
+    assert "another attempt: denser" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("features", "pairs", "expected"),
+    [
+        (3000, "", True),
+        (3000, "ab bc ad ef", True),
+        (3000, "ab bc ad ae", False),
+        (900, "", False),
+    ],
+    ids=["no pair", "chance pairs", "half of them", "plain surfaces"],
+)
+def test_when_photographs_have_nothing_in_common(tmp_path, features, pairs, expected):
+    """Ten photographs; however few matches a pair has."""
+    found = Matched(tmp_path, dict.fromkeys("abcdefghij", features), {(a, b): 15 for a, b in pairs.split()})
+    assert found.have_nothing_in_common() == expected
+
+
+@pytest.mark.parametrize(("names", "pairs"), [("abc", "ab"), ("abcd", "ab cd")], ids=["one is loose", "two pairs"])
+def test_few_photographs_are_related_where_two_match(tmp_path, names, pairs):
+    found = Matched(tmp_path, dict.fromkeys(names, 3000), {(a, b): 200 for a, b in pairs.split()})
+    assert not found.have_nothing_in_common()

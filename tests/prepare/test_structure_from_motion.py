@@ -1,0 +1,474 @@
+"""Structure from motion on real photographs, against the poses they came with; and photographs that need care."""
+
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat import progress
+from clsplat.errors import DataError
+from clsplat.progress import heard_by
+from clsplat.scene.detect import read_scene
+from clsplat.scene.lens import Lens
+from clsplat.scene.scene import Camera, View
+from clsplat.scene.view import load_image, load_mask
+from data_tools import features as features_tool
+from data_tools import mapping as mapping_tool
+from data_tools import undistort as undistort_tool
+from data_tools.colmap_writer import write_model
+from data_tools.features import Sought, find_features
+from data_tools.gather import list_photographs
+from data_tools.mapping import map_cameras
+from data_tools.matching import Pairing, match_features
+from data_tools.triangulation import with_pairs
+from data_tools.undistort import undistort_scene
+from data_tools.vocabulary import alike
+from tests.support.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry
+from tests.support.colmap_writer import write_model as write_test_model
+from tests.support.data_sets import data_set
+from tests.support.pictures import contents, with_orientation
+from tests.support.refusals import refusal
+
+ROOT = Path(__file__).parents[2]
+
+
+def place(photos: Path, out: Path, **matching: object) -> Path:
+    for name in ("features", "matches", "cameras"):
+        (out / name).mkdir(parents=True)
+    find_features(photos, out / "features", Sought(480, 2048))
+    match_features(out / "features", out / "matches", **matching)
+    map_cameras(out / "matches", out / "cameras")
+    return out / "cameras"
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fourteen neighbouring photographs."""
+    pytest.importorskip("pycolmap")
+    source = data_set("fox_opencv")
+    folder = tmp_path_factory.mktemp("photos")
+    for view in sorted(read_scene(source).views, key=lambda view: view.name)[:14]:
+        shutil.copy(view.image_path, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def placed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return place(photos, tmp_path_factory.mktemp("placed"))
+
+
+def aligned_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Distances after the best similarity transform (Umeyama 1991), [N]."""
+    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    u, d, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = (d * np.diag(sign)).sum() / (a**2).sum()
+    return np.linalg.norm(b - scale * a @ (u @ sign @ vt).T, axis=1)
+
+
+def pose_errors(placed: Path) -> np.ndarray:
+    """Distances of cameras from where they were, by the size of their path."""
+    truth = {view.name: view.position for view in read_scene(data_set("fox_opencv")).views}
+    views = read_scene(placed).views
+    errors = aligned_errors(np.stack([v.position for v in views]), np.stack([truth[v.name] for v in views]))
+    return errors / np.linalg.norm(np.ptp([truth[v.name] for v in views], axis=0))
+
+
+def test_cameras_are_where_they_were(placed):
+    errors = pose_errors(placed)
+    assert len(errors) == 14
+    assert np.median(errors) < 0.01
+    assert errors.max() < 0.03
+
+
+def test_the_same_photographs_give_the_same_cameras(photos, placed, tmp_path):
+    again = place(photos, tmp_path)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (again / "sparse" / "0" / name).read_bytes() == (placed / "sparse" / "0" / name).read_bytes(), name
+
+
+def test_points_that_two_photographs_show(placed, tmp_path):
+    """The cameras stay, and the points of three photographs; those of pairs come with them."""
+    map_cameras(placed.with_name("matches"), tmp_path, fewest=2)
+    model, before = read_model(tmp_path / "sparse" / "0"), read_model(placed / "sparse" / "0")
+    assert not list(tmp_path.glob(".*"))
+    for number, image in before.images.items():
+        assert np.array_equal(model.images[number].cam_from_world().matrix(), image.cam_from_world().matrix())
+    views = np.array([point.track.length() for point in model.points3D.values()])
+    errors = np.array([point.error for point in model.points3D.values()])
+    known = sum(point.track.length() > 2 for point in before.points3D.values())
+    assert views.min() == 2
+    assert abs((views > 2).sum() - known) < 0.02 * known
+    assert (views == 2).sum() > 0.5 * known
+    assert errors[views == 2].max() <= 1.0
+    once, again = (
+        with_pairs(read_model(placed / "sparse" / "0"), placed.with_name("matches") / "database.db", tmp_path)
+        for _ in range(2)
+    )
+    points = [{number: point.xyz.tobytes() for number, point in found.points3D.items()} for found in (once, again)]
+    assert points[0] == points[1]
+
+
+def read_model(folder: Path):
+    return pytest.importorskip("pycolmap").Reconstruction(str(folder))
+
+
+@pytest.mark.parametrize("matching", ["sequential", "vocabulary"])
+def test_other_ways_to_match(photos, tmp_path, matching):
+    placed = place(photos, tmp_path, matching=matching, neighbours=3)
+    assert len(read_scene(placed).views) >= 12
+
+
+def test_photographs_that_show_nothing(tmp_path):
+    pytest.importorskip("pycolmap")
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64, 3), 80, np.uint8))
+    with pytest.raises(DataError, match="none has features"):
+        place(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(("few", "attempt"), [(40, "smaller angles and fewer matches"), (16, "denser features")])
+def test_another_attempt_places_what_the_first_does_not(photos, tmp_path, monkeypatch, few, attempt):
+    """With so few features of each photograph."""
+    monkeypatch.setattr(mapping_tool, "DENSER", Sought(480, 1500))
+    for name in ("features", "matches", "cameras"):
+        (tmp_path / name).mkdir()
+    find_features(photos, tmp_path / "features", Sought(480, few))
+    match_features(tmp_path / "features", tmp_path / "matches")
+    figures = map_cameras(tmp_path / "matches", tmp_path / "cameras")
+    assert figures["attempt"] == attempt
+    assert figures["registered"] >= 12
+    assert pose_errors(tmp_path / "cameras").max() < 0.05
+    assert not list((tmp_path / "cameras").glob(".*")), "what attempts have made is removed"
+
+
+def test_further_attempts_match_as_the_first_and_can_be_off(photos, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(mapping_tool, "DENSER", Sought(320, 300))
+    for name in ("features", "matches", "cameras", "once"):
+        (tmp_path / name).mkdir()
+    find_features(photos, tmp_path / "features", Sought(240, 16))
+    match_features(tmp_path / "features", tmp_path / "matches", "sequential", 2)
+    caplog.set_level("INFO")
+    with pytest.raises(DataError, match="could not be placed"):
+        map_cameras(tmp_path / "matches", tmp_path / "once", attempts=1)
+    assert "another attempt" not in caplog.text
+    used, more = list[Pairing](), list[int]()
+    monkeypatch.setattr(mapping_tool, "match_within", lambda database, pairing: used.append(pairing))
+    monkeypatch.setattr(mapping_tool, "match_pairs", lambda database, pairs, threads: more.append(len(pairs)))
+    with pytest.raises(DataError):
+        map_cameras(tmp_path / "matches", tmp_path / "cameras")
+    assert set(used) == {Pairing("sequential", 2)}
+    assert len(more) == 3, "with more pairs first, and twice with denser features"
+    assert len(set(more)) == 1
+
+
+# ---- interrupted and gone on with
+
+
+def rows(database: Path) -> dict[str, list[tuple]]:
+    """All tables of a database.  The layout of its file depends on when it was written; its rows do not."""
+    with closing(sqlite3.connect(database)) as opened:
+        names = [name for (name,) in opened.execute("select name from sqlite_master where type = 'table'")]
+        return {name: sorted(opened.execute(f"select * from {name}").fetchall(), key=repr) for name in names}
+
+
+@pytest.fixture(scope="module")
+def few(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five of the photographs, one of them turned by EXIF."""
+    folder = tmp_path_factory.mktemp("few")
+    for file in sorted(photos.iterdir())[:5]:
+        shutil.copy(file, folder)
+    file = sorted(folder.iterdir())[2]
+    with_orientation(file, cv2.imread(str(file)), 6)
+    return folder
+
+
+def test_features_are_found_once_each_also_after_a_kill(few, tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    for name in ("whole", "half"):
+        (tmp_path / name).mkdir()
+    find_features(few, tmp_path / "whole", Sought(320, 500))
+    killed = f"""
+import os, signal
+from pathlib import Path
+from data_tools import features
+find, calls = features.sift, []
+def counted(*a):
+    calls.append(a)
+    return find(*a) if len(calls) < 3 else os.kill(os.getpid(), signal.SIGKILL)
+features.sift = counted
+features.find_features(Path({str(few)!r}), Path({str(tmp_path / "half")!r}), features.Sought(320, 500))
+"""
+    assert subprocess.run([sys.executable, "-c", killed], cwd=ROOT).returncode == -signal.SIGKILL
+    sift, sizes = features_tool.sift, []
+    monkeypatch.setattr(features_tool, "sift", lambda *a: (sizes.append(a[0].shape), sift(*a))[1])
+    find_features(few, tmp_path / "half", Sought(320, 500))
+    assert len(sizes) == 3, "two of five were kept"
+    assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
+    for file in sorted((tmp_path / "whole" / "images").iterdir()):
+        assert (tmp_path / "half" / "images" / file.name).read_bytes() == file.read_bytes()
+
+
+def test_a_database_without_all_photographs_starts_again(few, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    for name in ("whole", "half"):
+        (tmp_path / name).mkdir()
+    find_features(few, tmp_path / "whole", Sought(320, 500))
+    first = sorted(path.name for path in few.iterdir())[:2]
+    (tmp_path / "half" / "images").mkdir()
+    for name in first:
+        shutil.copy(few / name, tmp_path / "half" / "images")
+    database = str(tmp_path / "half" / "database.db")
+    pycolmap.Database.open(database).close()
+    pycolmap.import_images(database, str(few), image_names=first)
+    find_features(few, tmp_path / "half", Sought(320, 500))
+    assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
+
+
+def test_pairs_are_matched_once(photos, placed, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    source, whole = placed.parent / "features", placed.parent / "matches"
+    half = tmp_path / "half"
+    half.mkdir()
+    shutil.copy(source / "database.db", half)
+    names = sorted(path.name for path in photos.iterdir())
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("".join(f"{names[0]} {other}\n" for other in names[1:]))
+    options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    options.use_gpu, verification.ransac.random_seed = False, 0
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = pairs
+    pycolmap.match_image_pairs(
+        str(half / "database.db"),
+        pairing_options=pairing,
+        matching_options=options,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+    with closing(sqlite3.connect(half / "database.db")) as opened:
+        opened.execute("create table counted (pair)")
+        opened.execute("create trigger counts after insert on matches begin insert into counted values (1); end")
+        opened.commit()
+    match_features(source, half)
+    found = rows(half / "database.db")
+    assert len(found.pop("counted")) == 14 * 13 // 2 - 13
+    assert found == rows(whole / "database.db")
+    (tmp_path / "cameras").mkdir()
+    map_cameras(half, tmp_path / "cameras")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (tmp_path / "cameras" / "sparse" / "0" / name).read_bytes() == (
+            placed / "sparse" / "0" / name
+        ).read_bytes()
+
+
+def test_pairs_are_matched_once_also_after_a_kill(placed, tmp_path):
+    source, database = placed.parent / "features", tmp_path / "database.db"
+    killed = f"""
+import os, signal, threading, time
+from pathlib import Path
+from data_tools import matching
+def kill():
+    while matching.pairs_done(Path({str(database)!r})) < 5:
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGKILL)
+threading.Thread(target=kill, daemon=True).start()
+matching.match_features(Path({str(source)!r}), Path({str(tmp_path)!r}))
+"""
+    assert subprocess.run([sys.executable, "-c", killed], cwd=ROOT).returncode == -signal.SIGKILL
+    with closing(sqlite3.connect(database)) as opened:
+        (kept,) = opened.execute("select count(*) from two_view_geometries").fetchone()
+        opened.execute("create table counted (pair)")
+        opened.execute("create trigger counts after insert on matches begin insert into counted values (1); end")
+        opened.commit()
+    assert 5 <= kept < 14 * 13 // 2, "it was killed in the middle"
+    match_features(source, tmp_path)
+    found = rows(database)
+    assert len(found.pop("counted")) in (14 * 13 // 2 - kept, 14 * 13 // 2 - kept - 1), "the last one may be half there"
+    assert found == rows(placed.parent / "matches" / "database.db")
+
+
+def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
+    """A reader in pycolmap's own process would release the locks of its writes."""
+    monkeypatch.setattr(progress, "WATCH", 0.01)
+    heard: set[int] = set()
+    with heard_by(lambda what, done, total, seconds_left: heard.add(done)):
+        match_features(placed.parent / "features", tmp_path)
+    assert max(heard) == 14 * 13 // 2
+    assert len(heard) > 2, "counts between none and all of them"
+    assert rows(tmp_path / "database.db") == rows(placed.parent / "matches" / "database.db")
+
+
+def test_features_are_counted_while_they_are_found(few, tmp_path):
+    heard: list[int] = []
+
+    def hear(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        if what == "photographs with features":
+            heard.append(done)
+
+    with heard_by(hear):
+        find_features(few, tmp_path, Sought(320, 500))
+    assert heard == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("blank", ["crop", "mask"])
+def test_undistortion_goes_on(tmp_path, monkeypatch, blank):
+    source, written = shutil.copytree(data_set("fox_opencv"), tmp_path / "source"), []
+    write = undistort_tool.write_image
+
+    def counted(path: Path, pixels: np.ndarray) -> None:
+        if path.parent.name == "images":
+            if len(written) == 7:
+                raise KeyboardInterrupt
+            written.append(path.name)
+        write(path, pixels)
+
+    undistort_scene(source, tmp_path / "whole", 120, blank)
+    monkeypatch.setattr(undistort_tool, "write_image", counted)
+    with pytest.raises(KeyboardInterrupt):
+        undistort_scene(source, tmp_path / "half", 120, blank)
+    first = list(written)
+    written.clear()
+    monkeypatch.setattr(undistort_tool, "write_image", lambda path, image: (written.append(path), write(path, image)))
+    undistort_scene(source, tmp_path / "half", 120, blank)
+    again = [path.name for path in written if path.parent.name == "images"]
+    assert sorted(first + again) == sorted(path.name for path in (tmp_path / "half" / "images").iterdir())
+    assert contents(tmp_path / "half") == contents(tmp_path / "whole")
+    changed = sorted((source / "images").iterdir())[0]
+    shutil.copy(sorted((source / "images").iterdir())[1], changed)
+    written.clear()
+    undistort_scene(source, tmp_path / "half", 120, blank)
+    assert {path.stem for path in written} == {changed.stem}
+    written.clear()
+    undistort_scene(source, tmp_path / "half", 90, blank)
+    assert len([path for path in written if path.parent.name == "images"]) == 50
+
+
+def test_undistorted_images_do_not_mix_with_others(tmp_path):
+    source = data_set("fox_opencv")
+    name = f"{sorted((source / 'images').iterdir())[3].stem}.png"
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / name), np.zeros((4, 4, 3), np.uint8))
+    assert "exists, and was not made from this scene" in refusal(undistort_scene, source, tmp_path)
+    assert [path.name for path in tmp_path.rglob("*")] == ["images", name]
+
+
+# ---- which photographs
+
+
+def test_photographs_are_found_below_the_folder(tmp_path):
+    (tmp_path / "a" / ".hidden").mkdir(parents=True)
+    (tmp_path / "runs").mkdir()
+    for name in ("b.JPG", "a/ü 1.png", "a/.hidden/x.jpg", ".y.png", "runs/r.png", "K.txt", "c.tif"):
+        (tmp_path / name).touch()
+    assert list_photographs(tmp_path, tmp_path / "runs") == ["a/ü 1.png", "b.JPG", "c.tif"]
+    (tmp_path / "c.tif").unlink()
+    assert "found 2 photographs; expected at least 3" in refusal(list_photographs, tmp_path, tmp_path / "runs")
+
+
+def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplog):
+    pytest.importorskip("pycolmap")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    pixels = np.random.default_rng(0).integers(0, 256, (32, 48, 3)).astype(np.uint8)
+    for i in range(3):
+        cv2.imwrite(str(photos / f"{i}.png"), pixels)
+    with_orientation(photos / "turned.jpg", pixels, 6)
+    (photos / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
+    (tmp_path / "out").mkdir()
+    summary = find_features(photos, tmp_path / "out")
+    images = tmp_path / "out" / "images"
+    assert summary == {"photographs": 4, "cameras": 2, "damaged": {"broken.jpg": "not an image, or a damaged one"}}
+    warned = "1 of 5 photographs cannot be read: broken.jpg (not an image, or a damaged one); export them again"
+    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == [warned]
+    assert sorted(path.name for path in images.iterdir()) == ["0.png", "1.png", "2.png", "turned.jpg"]
+    assert (images / "0.png").is_symlink()
+    assert cv2.imread(str(images / "turned.jpg"), cv2.IMREAD_UNCHANGED).shape == (48, 32, 3)
+
+
+def test_alike_photographs(rng):
+    """Each shares half of its features with the next one, in a ring."""
+    halves = rng.random((6, 300, 128), dtype=np.float32)
+    tables = [np.concatenate([halves[i], halves[(i + 1) % 6]]) for i in range(6)]
+    assert alike(tables, 2) == [(0, 1), (0, 5), (1, 2), (2, 3), (3, 4), (4, 5)]
+    assert alike([*tables[:2], np.empty((0, 128), np.float32)], 1)[0] == (0, 1)
+    assert alike([np.empty((0, 128), np.float32)] * 3, 1) == [(0, 1), (0, 2)], "of plain ones, the first"
+
+
+# ---- the scene written
+
+
+def test_a_written_model_reads_back(tmp_path, rng):
+    camera = Camera(6, 4, 5.5, 5.25, 3.1, 1.9)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    views = [
+        View("é/a.png", camera, np.column_stack([turn, [1.0, 2.0, 3.0]]), tmp_path),
+        View("b.png", Camera(4, 6, 5, 5, 2, 3), np.eye(3, 4), tmp_path),
+    ]
+    write_model(tmp_path / "sparse" / "0", views, None)
+    for view in views:
+        path = tmp_path / "images" / view.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.zeros((view.camera.height, view.camera.width, 3), np.uint8))
+    for view, read in zip(sorted(views, key=lambda v: v.name), read_scene(tmp_path).views, strict=True):
+        assert (read.name, read.camera) == (view.name, view.camera)
+        np.testing.assert_allclose(read.world_to_camera, view.world_to_camera, atol=1e-12)
+
+
+BENT = [
+    Lens(200, 150, "OPENCV", (160.0, 165.0, 97.0, 80.0, -0.25, 0.06, 0.002, -0.001)),
+    Lens(200, 150, "OPENCV_FISHEYE", (90.0, 91.0, 101.0, 74.0, 0.02, -0.01, 0.003, 0.0)),
+    Lens(200, 150, "SIMPLE_RADIAL", (160.0, 100.0, 75.0, 0.1)),
+]
+
+
+@pytest.mark.parametrize("lens", BENT, ids=lambda lens: lens.model)
+@pytest.mark.parametrize("blank", ["crop", "mask"])
+def test_undistorted_scene(tmp_path, lens, blank):
+    """A pattern that depends on the ray is seen along the pinhole's own rays; what is blank is masked."""
+    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    (tmp_path / "images").mkdir()
+    photograph = np.nan_to_num(pattern(*lens.undistort(columns, rows)))
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), np.rint(photograph).astype(np.uint8))
+    entry = CameraEntry(1, lens.model, lens.width, lens.height, lens.params)
+    write_test_model(tmp_path / "sparse" / "0", ColmapModel([entry], [ImageEntry("a.png")], [PointEntry((0, 0, 3))]))
+    assert undistort_scene(tmp_path, tmp_path / "out", blank=blank) == 1
+    (view,) = read_scene(tmp_path / "out", 0).views
+    assert view.lens is None
+    shown, mask = load_image(view), load_mask(view)
+    if blank == "crop":
+        assert mask is None
+        mask = np.ones(shown.shape[:2], bool)
+    else:
+        assert mask is not None
+        assert 0.4 < mask.mean() < 1
+        assert view.camera.width * view.camera.height > lens.pinhole.width * lens.pinhole.height
+    y, x = np.nonzero(mask)
+    u, v = (x + 0.5 - view.camera.cx) / view.camera.fx, (y + 0.5 - view.camera.cy) / view.camera.fy
+    px, py = lens.distort(u, v)
+    inside = (px > 0.5) & (py > 0.5) & (px < lens.width - 0.5) & (py < lens.height - 0.5)  # between pixel centres
+    assert inside.mean() > 0.95
+    assert np.abs(shown[y, x, 0] - pattern(u, v))[inside].max() < 1
+
+
+def pattern(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Smooth enough for the edge of a fisheye, where a pixel is a long way."""
+    return 127 + 100 * np.sin(2 * u) * np.cos(1.5 * v)
+
+
+def test_undistorted_photographs_are_smaller_and_kept(tmp_path):
+    source = data_set("brighton")
+    count = undistort_scene(source, tmp_path / "out", long_side=120)
+    views = read_scene(tmp_path / "out").views
+    assert len(views) == count == len(read_scene(source).views)
+    assert {max(view.camera.width, view.camera.height) for view in views} == {120}
+    times = {view.image_path: view.image_path.stat().st_mtime_ns for view in views}
+    undistort_scene(source, tmp_path / "out", long_side=120)
+    assert {path: path.stat().st_mtime_ns for path in times} == times

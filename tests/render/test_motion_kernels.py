@@ -1,0 +1,112 @@
+"""Gaussians at a moment, and the gradients by their motion (motion.cl), against float64."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.checks.motion import TIME, moment_figures, motion, moving_case
+from clsplat.conformance.comparison import CONIC, relative_error
+from clsplat.conformance.scenes import random_case
+from clsplat.density.statistics import SplatStats
+from clsplat.formats.motion import MOTION, STILL, WIDTHS, width_of
+from clsplat.gaussians.model import Model
+from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians
+from clsplat.losses.base import Comparison, ViewGradients
+from clsplat.render.motion import at_moment
+from clsplat.render.rasterizer import Rasterizer
+from tests.support.figures import hold
+
+
+def test_motion_and_its_gradients(device, rng):
+    hold(motion(device, rng))
+
+
+@pytest.mark.parametrize("count", [16, 63, 64, 129])
+def test_sizes_around_the_groups(device, rng, count):
+    hold(moment_figures(device, rng, count, width_of(2, True)))
+
+
+def test_a_moment_on_the_host_looks_like_that_on_the_device(device, rng):
+    case = moving_case(rng, 65, width_of(3, True))
+    model = Model(**case.parameters)
+    camera, rasterizer = case.device_camera(device), Rasterizer(device, "radix")
+    moving = rasterizer.forward(case.model(device), camera, device.zeros(3)).image.get()
+    static = model.at(case.view.time)
+    assert static.motion is None
+    assert 0 < len(static) < len(model)
+    same_numbers = replace(case.model(device), gaussians=static.upload(device).gaussians)
+    drawn = rasterizer.forward(same_numbers, camera, device.zeros(3))
+    np.testing.assert_allclose(drawn.image.get(), moving, atol=2e-5)
+
+
+def test_gradients_of_an_image_are_carried_back_to_the_motion(device, rng):
+    """Those of a static model of the moment, carried back in float64, are what the rasterizer returns."""
+    case, width = moving_case(rng, 65, width_of(2, True)), width_of(2, True)
+    camera, rasterizer, p = case.device_camera(device), Rasterizer(device, "radix"), case.parameters
+    weights = np.zeros((3, camera.rows, camera.stride), np.float32)
+    weights[:, : camera.height, : camera.width] = rng.normal(size=(3, camera.height, camera.width))
+
+    def gradients_of(model: DeviceModel) -> dict[str, np.ndarray]:
+        frame = rasterizer.forward(model, camera, device.zeros(3))
+        found = rasterizer.gradients(model, frame, rasterizer.pixel_sums(model, frame, device.upload(weights)))
+        return {name: array.get()[:, :65].T.astype(np.float64) for name, array in found.arrays.items()}
+
+    model = case.model(device)
+    moment = at_moment(rasterizer.workspace, model, camera).gaussians
+    tables = {name: moment.get(name) for name in PARAMETERS}
+    static = gradients_of(replace(model, gaussians=Gaussians(device, tables)))
+    upstream = static["means"], static["quats"], static["logit_opacity"][:, 0]
+    logit = p["logit_opacity"][:, 0].astype(np.float64)
+    by_motion, by_logit = ref.moved_backward(p[MOTION].astype(np.float64), logit, *upstream, TIME, *WIDTHS[width])
+    found = gradients_of(model)
+    for column in range(width):
+        assert relative_error(found[MOTION][:, column], by_motion[:, column]) < CONIC
+    assert relative_error(found["logit_opacity"][:, 0], by_logit) < CONIC
+    for name in ("means", "quats", "log_scales", "sh_base", "sh_rest"):
+        np.testing.assert_array_equal(found[name], static[name])
+
+
+def test_what_stands_still_for_ever_has_the_bits_of_none(device, rng):
+    case = random_case(rng, 65)
+    still = np.zeros((65, 5), np.float32)
+    still[:, 3], still[:, 4] = rng.uniform(0, 1, 65), STILL
+    moving = replace(case, parameters={**case.parameters, MOTION: still}, view=replace(case.view, time=0.625))
+    found = []
+    for one in (case, moving):
+        rasterizer, model, camera = Rasterizer(device, "radix"), one.model(device), one.device_camera(device)
+        frame = rasterizer.forward(model, camera, device.zeros(3))
+        sums = rasterizer.pixel_sums(model, frame, device.upload(np.ones(frame.image.shape, np.float32)))
+        gradients = rasterizer.gradients(model, frame, sums)
+        radius = frame.radius.get()[:65]
+        found.append([frame.image.get(), radius, *(gradients[name].get()[:, :65] for name in case.parameters)])
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_is_not_there_counts_as_not_seen(device, rng):
+    case = moving_case(rng, 65)
+    frame = Rasterizer(device, "radix").forward(case.model(device), case.device_camera(device), device.zeros(3))
+    absent = np.zeros(65, bool)
+    absent[::10] = True
+    assert (frame.radius.get()[:65][absent] == 0).all()
+    assert (frame.radius.get()[:65][~absent] > 0).mean() > 0.5
+
+
+def test_splitting_matrices_are_those_of_the_moment(device, rng):
+    case = moving_case(rng, 65, width_of(3, True))
+    camera, background = case.device_camera(device), device.zeros(3)
+    weights = device.upload(rng.normal(size=(3, camera.rows, camera.stride)).astype(np.float32))
+    rasterizer, found = Rasterizer(device, "radix"), []
+    moment = at_moment(rasterizer.workspace, case.model(device), camera).gaussians
+    static = Gaussians(device, {name: moment.get(name) for name in PARAMETERS})
+    for model in (case.model(device), replace(case.model(device), gaussians=static)):
+        frame = rasterizer.forward(model, camera, background)
+        pixel_sums = rasterizer.pixel_sums(model, frame, weights)
+        stats = SplatStats(model.gaussians, ("splitting",))
+        comparison = Comparison(rasterizer.workspace, camera, frame.image, frame.image, frame.image)
+        stats.add(ViewGradients(frame, comparison, [], pixel_sums), pixel_sums)
+        found.append(model.gaussians.get("stats/splitting"))
+    assert np.abs(found[1]).max() > 0
+    np.testing.assert_array_equal(*found)

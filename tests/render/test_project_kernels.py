@@ -1,0 +1,134 @@
+"""project.cl and the derivatives by the pose of a camera (poses.cl) against the float64 oracle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance.checks.poses import pose_figures, poses
+from clsplat.conformance.checks.projection import (
+    beyond_the_clamp,
+    gradient_figures,
+    hidden_figures,
+    not_drawable,
+    record_figures,
+    splats_of,
+)
+from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.gaussians.left_out import HIDDEN_VIEWS, hide
+from clsplat.render.camera import CAMERA
+from clsplat.render.rasterizer import RECORD, Budget, Rasterizer
+from tests.support.figures import hold
+
+COUNTS = (1, 7, 8, 9, 15, 16, 17, 63, 64, 65, 200)
+
+
+def compare(device, case: Case) -> None:
+    hold(record_figures(device, case, "the scene"))
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_records_at_group_edges(device, rng, count):
+    compare(device, random_case(rng, count))
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_harmonics_degrees(device, rng, degree):
+    compare(device, random_case(rng, 50, degree=degree))
+
+
+@pytest.mark.parametrize(("variance", "compensate"), [(0.3, 0.0), (0.3, 1.0), (0.1, 1.0), (0.0, 0.0)])
+def test_filters(device, rng, variance, compensate):
+    compare(device, with_world_filter(random_case(rng, 60, variance=variance, compensate=compensate), rng))
+
+
+@pytest.mark.parametrize("views", [1, HIDDEN_VIEWS, 2 * HIDDEN_VIEWS + 1])
+@pytest.mark.parametrize("count", COUNTS)
+def test_a_view_leaves_out_what_is_hidden_in_it(device, rng, count, views):
+    hold(hidden_figures(device, random_case(rng, count), rng, views))
+
+
+def test_other_pictures_leave_out_nothing(device, rng):
+    case = random_case(rng, 40)
+    model, camera = case.model(device), case.device_camera(device)
+    rasterizer = Rasterizer(device)
+    expected = rasterizer.forward(model, camera, device.zeros(3)).image.get().copy()
+    hide(model.gaussians, np.ones((3, 40), bool))
+    np.testing.assert_array_equal(rasterizer.forward(model, camera, device.zeros(3)).image.get(), expected)
+    nothing = rasterizer.forward(model, replace(camera, view=1), device.zeros(3)).image.get()
+    assert expected.any()
+    assert not nothing.any()
+
+
+def test_bands_leave_out_the_same(device, rng):
+    """A frame in several bands is projected again by the backward pass."""
+    case = random_case(rng, 60, 70, 50)
+    model, camera = case.model(device), replace(case.device_camera(device), view=1)
+    hide(model.gaussians, rng.random((2, 60)) < 0.5)
+    sums = []
+    for budget in (None, Budget(40)):
+        rasterizer = Rasterizer(device, "radix", budget)
+        frame = rasterizer.forward(model, camera, device.zeros(3))
+        gradient = device.upload(np.ones((3, camera.rows, camera.stride), np.float32))
+        sums.append(rasterizer.pixel_sums(model, frame, gradient).get()[:, :60].copy())
+    assert len(frame.bands) > 1
+    np.testing.assert_array_equal(sums[0] == 0, sums[1] == 0)
+    np.testing.assert_allclose(sums[1], sums[0], rtol=1e-4, atol=1e-5)
+
+
+def test_nothing_to_project(device, rng):
+    records, keys, _ = splats_of(device, random_case(rng, 0))
+    assert records.shape == (0, RECORD)
+    assert keys.shape == (0,)
+
+
+def test_what_cannot_be_drawn_is_culled(device, rng):
+    case = not_drawable(rng)
+    records, keys, radius = splats_of(device, case)
+    for n in (0, 1, 2, 3, 4, 5, 7, 8):
+        assert (records[n] == 0).all(), n
+        assert keys[n] == 0xFFFFFFFF
+    assert (radius[:6] == 0).all()
+    assert np.isfinite(records).all() or not np.isnan(records).any()
+    compare(device, Case({k: v[9:] for k, v in case.parameters.items()}, case.view))
+
+
+def test_camera_struct_has_the_kernels_layout(device):
+    assert CAMERA.itemsize == 4 * 27
+    assert all(CAMERA.fields[name][1] % 4 == 0 for name in CAMERA.names)
+
+
+def backward_case(device, rng, case: Case) -> None:
+    hold(gradient_figures(device, case, rng, "the scene"))
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_gradients_at_group_edges(device, rng, count):
+    backward_case(device, rng, random_case(rng, count))
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_gradients_of_harmonics(device, rng, degree):
+    backward_case(device, rng, random_case(rng, 40, degree=degree))
+
+
+@pytest.mark.parametrize(("variance", "compensate"), [(0.3, 1.0), (0.1, 1.0), (0.3, 0.0)])
+def test_gradients_through_the_filters(device, rng, variance, compensate):
+    backward_case(device, rng, with_world_filter(random_case(rng, 60, variance=variance, compensate=compensate), rng))
+
+
+def test_gradients_where_the_ray_is_clamped(device, rng):
+    case = beyond_the_clamp(rng)
+    in_camera = case.parameters["means"] @ case.camera().rotation.T + case.camera().translation
+    limits = case.device_camera(device).array.get()[0]
+    assert (np.abs(in_camera[:, 0] / in_camera[:, 2]) > limits["ray_x_max"]).any()
+    backward_case(device, rng, case)
+
+
+def test_derivatives_by_a_pose(device, rng):
+    hold(poses(device, rng))
+
+
+@pytest.mark.parametrize("count", [16, 64, 511, 513])
+def test_sums_over_groups(device, rng, count):
+    hold(pose_figures(device, random_case(rng, count), rng, f"{count} Gaussians"))

@@ -1,0 +1,122 @@
+"""A background of directions (sky.cl) against float64, and in a training step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance.checks.blending import loss_of_what_is_left
+from clsplat.conformance.checks.sky import adam_of_the_sky, cover_figures, sky_figures
+from clsplat.conformance.scenes import random_case
+from clsplat.density.statistics import SplatStats
+from clsplat.gaussians.sky import Sky
+from clsplat.losses.image import L2
+from clsplat.render.backdrops import Directions
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.sky import Skies
+from clsplat.training.adam import Adam, Rates
+from clsplat.training.sky import LearnedSky
+from clsplat.training.trainer import Trainer
+from clsplat.views.photographs import Photograph
+from tests.support.figures import hold
+
+SIZES = ((1, 1, 8), (2, 1, 9), (15, 4, 8), (16, 16, 16), (17, 5, 33), (33, 18, 8), (127, 9, 21), (129, 17, 64))
+
+
+@pytest.mark.parametrize(("width", "height", "side"), SIZES)
+def test_picture_and_derivatives(device, rng, width, height, side):
+    hold(sky_figures(device, rng, width, height, side))
+
+
+@pytest.mark.parametrize(("width", "height", "side"), SIZES)
+def test_what_covers_the_sky(device, rng, width, height, side):
+    hold(cover_figures(device, rng, width, height, side))
+
+
+def test_adam_of_the_texels_that_a_view_shows(device, rng):
+    hold(adam_of_the_sky(device, rng))
+
+
+def test_a_loss_of_the_transmittance_reaches_the_splats(device, rng):
+    hold(loss_of_what_is_left(device, rng))
+
+
+class Scene:
+    """A trainer of a random model before a random sky, and a photograph that shows the sky in most pixels."""
+
+    def __init__(self, device, rng, settings, share=None) -> None:
+        case = random_case(rng, 40, 50, 36)
+        self.model, self.settings = case.model(device), settings
+        sky = Sky(rng.random((settings.side**2, 3)).astype(np.float32)).upload(device)
+        self.model.sky, camera = sky, case.device_camera(device)
+        rasterizer, black = Rasterizer(device), device.zeros(3)
+        bare = rasterizer.forward(replace(self.model, gaussians=self.model.gaussians), camera, black).image.get()
+        pixels = np.clip(bare[:, :36, :50] + rng.normal(0, 0.2, (3, 36, 50)) * (rng.random((36, 50)) < 0.05), 0, 1)
+        mask = None if share is None else device.upload((rng.random((1, 36, 50)) < share).astype(np.uint8))
+        self.photograph = Photograph(camera, device.upload(np.rint(255 * pixels).astype(np.uint8)), mask)
+        parts = rasterizer, self.model, Adam(self.model.gaussians), SplatStats(self.model.gaussians, [])
+        self.trainer = Trainer(*parts, black, (L2(),), Rates(), sky=LearnedSky(settings, sky))
+        sky.texels.set(np.clip(sky.texels.get() + rng.normal(0, 0.01, sky.texels.shape), 0, 1).astype(np.float32))
+
+    def loss(self) -> float:
+        return self.trainer.compare(self.photograph, 1).loss
+
+
+def numeric(scene: Scene, array, place: tuple[int, int], step: float) -> float:
+    """The derivative of the loss by one value of an array on the device."""
+    before, losses = array.get(), []
+    for sign in (1, -1):
+        changed = before.copy()
+        changed[place] += sign * step
+        array.set(changed)
+        losses.append(scene.loss())
+    array.set(before)
+    return (losses[0] - losses[1]) / (2 * step)
+
+
+@pytest.mark.parametrize("share", [None, 0.7])
+def test_the_gradient_by_the_sky_is_that_of_the_losses(device, rng, share):
+    scene = Scene(device, rng, Directions(side=8, cover=0), share)
+    view = scene.trainer.compare(scene.photograph, 1)
+    view = scene.trainer.backward(view)
+    skies, sky = scene.trainer.rasterizer.skies, scene.model.sky
+    shown = skies.runs(scene.photograph.camera, 8).shown.get()
+    found = scene.trainer.rasterizer.workspace.array("texels", (3, len(shown))).get()
+    places = [(int(np.abs(found[channel]).argmax()), channel) for channel in range(3)]
+    for place, channel in places:
+        expected = numeric(scene, sky.texels, (channel, int(shown[place])), 0.02)
+        assert found[channel, place] == pytest.approx(expected, rel=0.01, abs=1e-6)
+
+
+def test_masked_pixels_are_not_asked_to_show_the_sky(device, rng):
+    scene = Scene(device, rng, Directions(side=8, cover=0.5, difference=0.5), 0.7)
+    view = scene.trainer.compare(scene.photograph, 1)
+    behind, mask = view.behind.get(), view.comparison.mask.get()
+    assert behind.shape == mask.shape
+    assert np.abs(behind[mask > 0]).max() > 0
+    assert np.abs(behind[mask == 0]).max() == 0
+
+
+def test_the_gradient_by_opacities_has_that_of_the_cover(device, rng):
+    """By finite differences, with the pixels that show the sky and those that do not left as they are."""
+    scene = Scene(device, rng, Directions(side=8, cover=0.5, difference=0.5))
+    gaussians, rasterizer = scene.model.gaussians, scene.trainer.rasterizer
+    view = scene.trainer.backward(scene.trainer.compare(scene.photograph, 1))
+    assert {value.name for value in view.losses} == {"l2", "sky"}
+    found = rasterizer.gradients(scene.model, view.frame, view.pixel_sums)["logit_opacity"].get()[0]
+    without = rasterizer.pixel_sums(scene.model, view.frame, view.comparison.gradient)
+    plain = rasterizer.gradients(scene.model, view.frame, without)["logit_opacity"].get()[0]
+    row = int(np.abs(found - plain).argmax())
+    expected = numeric(scene, gaussians["logit_opacity"], (0, row), 0.02)
+    assert found[row] == pytest.approx(expected, rel=0.03)
+    assert abs(plain[row] - expected) > 0.2 * abs(expected)
+
+
+def test_runs_of_pixels_are_kept_within_a_budget(device, rng):
+    scene = Scene(device, rng, Directions(side=8))
+    camera, workspace = scene.photograph.camera, scene.trainer.rasterizer.workspace
+    skies = Skies(device, workspace, kept=1)
+    first = skies.runs(camera, 8)
+    assert skies.runs(camera, 8) is first, "the last camera's are kept, whatever their size"
+    assert skies.runs(camera, 16) is not first
+    assert skies.runs(camera, 8) is not first

@@ -1,0 +1,160 @@
+"""A run that fails, wherever it is, saves the last whole state and ends, resumed, with the same bits."""
+
+import errno
+import json
+import re
+
+import pytest
+
+from clsplat.density import control
+from clsplat.density.statistics import SplatStats
+from clsplat.errors import DataError, DeviceError, InternalError, OutputError, as_clsplat_error
+from clsplat.opencl.program import Kernel
+from clsplat.runs.experiment import Job
+from clsplat.stages.evaluate import Evaluate
+from clsplat.stages.report import Report
+from clsplat.training import checkpoint
+from clsplat.training.status import StatusFile
+from clsplat.views.photographs import Photographs
+from tests.support.runs import FEW, digest, records, steps_saved, train
+
+pytestmark = pytest.mark.slow
+
+
+def fails_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exception]:
+    """Let a run fail in a step, in different places of it."""
+    counts = {"photograph": 0, "kernel": 0}
+    get, call = Photographs.get, Kernel.__call__
+
+    def photograph(photographs, view):
+        counts["photograph"] += 1
+        if counts["photograph"] == step:
+            raise DataError("the photograph is damaged")
+        return get(photographs, view)
+
+    def kernel(one, **values):
+        if one.label.endswith(":blend_forward"):
+            counts["kernel"] += 1
+            if counts["kernel"] == step:
+                raise DeviceError("the device is lost for a moment")
+        return call(one, **values)
+
+    if where == "photograph":
+        monkeypatch.setattr(Photographs, "get", photograph)
+        return DataError
+    monkeypatch.setattr(Kernel, "__call__", kernel)
+    return DeviceError
+
+
+@pytest.mark.parametrize("where", ["photograph", "kernel"])
+@pytest.mark.parametrize("step", [5, 6])  # 5: after the edit of step 4, before the update
+def test_a_failure_inside_a_step_leaves_the_step_before(
+    where, step, tiny_scene, tmp_path, monkeypatch, few_steps, caplog
+):
+    raised = fails_at(step, monkeypatch, where)
+    with pytest.raises(raised):
+        train(tiny_scene, tmp_path, *FEW)
+    monkeypatch.undo()
+    assert steps_saved(tmp_path)[-1] == f"step_00000{step - 1}.npz"
+    assert f"the state of step {step - 1} is saved in {tmp_path}" in caplog.text
+    status = json.loads((tmp_path / "status.json").read_text())
+    assert (status["state"], status["step"], status["checkpoint"]) == ("failed", step - 1, steps_saved(tmp_path)[-1])
+    train(tiny_scene, tmp_path, *FEW, resume=True)
+    assert digest(tmp_path) == digest(few_steps)
+    assert records(tmp_path) == records(few_steps)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        *(DataError("cut"), MemoryError(), ZeroDivisionError(), OSError(errno.EIO, "bad disk")),
+        *(SystemExit(3), GeneratorExit(), StopIteration("out")),
+    ],
+)
+@pytest.mark.parametrize("call", [1, 2], ids=["during", "after"])
+def test_an_evaluation_that_fails_loses_nothing(error, call, tiny_scene, tmp_path, monkeypatch, few_steps):
+    evaluate, calls = Evaluate.run, []
+
+    def run(stage, run):
+        calls.append(run.step)
+        if len(calls) == 2 * call - 1:  # after step 6, and at the end
+            raise error
+        evaluate(stage, run)
+
+    monkeypatch.setattr(Evaluate, "run", run)
+    with pytest.raises(type(as_clsplat_error(error)), match=re.escape(str(as_clsplat_error(error)))):
+        train(tiny_scene, tmp_path, *FEW)
+    monkeypatch.undo()
+    assert steps_saved(tmp_path)[-1] == ("step_000006.npz" if call == 1 else "step_000012.npz")
+    train(tiny_scene, tmp_path, *FEW, resume=True)
+    assert digest(tmp_path) == digest(few_steps)
+    assert records(tmp_path) == records(few_steps)
+
+
+def test_a_failure_is_recorded_once(tiny_scene, tmp_path, monkeypatch):
+    end, states = StatusFile.end, []
+
+    def recorded(status, state, *more):
+        states.append(state)
+        end(status, state, *more)
+
+    def fail(stage, run):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(StatusFile, "end", recorded)
+    monkeypatch.setattr(Report, "run", fail)
+    with pytest.raises(InternalError, match="ZeroDivisionError"):
+        Job.open("smoke", tiny_scene, tmp_path, FEW).run()
+    assert states == ["failed"]
+
+
+def test_a_report_that_fails_is_written_when_the_run_goes_on(tiny_scene, tmp_path, monkeypatch, few_steps):
+    def fail(stage, run):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Report, "run", fail)
+    with pytest.raises(Exception, match="ZeroDivisionError"):
+        train(tiny_scene, tmp_path, *FEW)
+    monkeypatch.undo()
+    assert not (tmp_path / "report.html").exists()
+    assert train(tiny_scene, tmp_path, *FEW, resume=True).step == 12
+    assert (tmp_path / "report.html").exists()
+    assert digest(tmp_path) == digest(few_steps)
+
+
+@pytest.mark.parametrize("place", ["SplatStats.add", "density edit"])
+def test_a_step_that_is_half_done_is_not_saved(place, tiny_scene, tmp_path, monkeypatch, few_steps, caplog):
+    of, name, at = (SplatStats, "add", 7) if place == "SplatStats.add" else (control, "apply_edit", 2)
+    before, calls = getattr(of, name), []
+
+    def fail(*arguments):
+        calls.append(1)
+        if len(calls) == at:
+            raise MemoryError
+        return before(*arguments)
+
+    monkeypatch.setattr(of, name, fail)
+    with pytest.raises(Exception, match="out of memory"):
+        train(tiny_scene, tmp_path, *FEW)
+    monkeypatch.undo()
+    newest = steps_saved(tmp_path)[-1]
+    assert newest in ("step_000004.npz", "step_000008.npz")
+    assert f"was not whole; the last good state is {tmp_path / 'checkpoints' / newest}" in caplog.text
+    train(tiny_scene, tmp_path, *FEW, resume=True)
+    assert digest(tmp_path) == digest(few_steps)
+    assert records(tmp_path) == records(few_steps)
+
+
+def test_a_state_that_cannot_be_saved_does_not_hide_the_failure(tiny_scene, tmp_path, monkeypatch, caplog):
+    fails_at(6, monkeypatch, "photograph")
+    save = checkpoint.save
+
+    def full(run, keep=None):
+        if run.step == 5:
+            raise OutputError("the disk is full")
+        return save(run, keep)
+
+    monkeypatch.setattr(checkpoint, "save", full)
+    with pytest.raises(DataError, match="the photograph is damaged"):
+        train(tiny_scene, tmp_path, *FEW)
+    assert "could not be saved (the disk is full); the last good state is " in caplog.text

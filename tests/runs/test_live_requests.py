@@ -1,0 +1,144 @@
+"""Who may ask, and for what: before any answer is computed."""
+
+import json
+
+import pytest
+
+from clsplat.live.answers import Answers, camera, moment
+from clsplat.live.desk import Desk
+from clsplat.live.requests import Answer, Refused, Request, host_name, read
+
+TOKEN = "secret-token"
+
+
+def head(target: str = f"/{TOKEN}/state.json?after=3", host: str = "127.0.0.1:8710", method: str = "GET") -> bytes:
+    return f"{method} {target} HTTP/1.1\r\nHost: {host}\r\nAccept: */*\r\n".encode()
+
+
+def refusal(data: bytes) -> int:
+    with pytest.raises(Refused) as caught:
+        read(data, TOKEN)
+    return caught.value.answer.status
+
+
+def test_a_request_is_its_path_behind_the_secret_and_its_fields():
+    request = read(head(), TOKEN)
+    assert (request.path, request.query) == ("state.json", {"after": "3"})
+    assert request.number("after", 0, 9) == 3
+    assert read(head(f"/{TOKEN}/"), TOKEN).path == ""
+
+
+@pytest.mark.parametrize("host", ["localhost", "localhost:9000", "127.0.0.1", "[::1]:80", "LocalHost:1"])
+def test_names_of_this_machine_are_answered_at_every_port(host):
+    """A tunnel may end at another port."""
+    assert read(head(host=host), TOKEN).path == "state.json"
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8710", "127.0.0.1.evil.example", "localhost.evil", ""])
+def test_a_name_that_was_bound_to_this_machine_is_refused(host):
+    assert refusal(head(host=host)) == 403
+
+
+@pytest.mark.parametrize("method", ["POST", "HEAD", "PUT", "OPTIONS", "get"])
+def test_only_get_is_answered(method):
+    assert refusal(head(method=method)) == 405
+
+
+@pytest.mark.parametrize("target", ["/", "/state.json", "/secret-toke/", "/secret-token2/x", "/%FF/", "//x/"])
+def test_without_the_secret_nothing_is_there(target):
+    assert refusal(head(target)) == 404
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"GET\r\n",
+        b"GET /secret-token/ HTTP/1.1\r\n",
+        b"GET /secret-token/ HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n",
+        b"GET /secret-token/ SPDY/3\r\nHost: localhost\r\n",
+        b"GET http://localhost/secret-token/ HTTP/1.1\r\nHost: localhost\r\n",
+        b"GET /secret-token/?" + b"a=1&" * 50 + b" HTTP/1.1\r\nHost: localhost\r\n",
+        b"\xff\xfe /secret-token/ HTTP/1.1\r\nHost: localhost\r\n",
+        b"GET //[ HTTP/1.1\r\nHost: localhost\r\n",
+    ],
+)
+def test_what_is_no_request_is_refused(data):
+    assert refusal(data) == 400
+
+
+@pytest.mark.parametrize("text", ["", "-1", "10", "1.0", "१", "9" * 4000, "0x1"])
+def test_a_number_is_checked(text):
+    request = read(head(f"/{TOKEN}/?view=5"), TOKEN)
+    request.query["view"] = text
+    with pytest.raises(Refused, match="view: expected a whole number from 0 to 9"):
+        request.number("view", 0, 9)
+
+
+def test_an_answer_forbids_frames_caches_and_referrers():
+    lines = Answer.json({"a": 1}).bytes().decode().split("\r\n")
+    assert lines[0] == "HTTP/1.1 200 OK"
+    assert lines[-1] == '{"a":1}'
+    kept = Answer(200, headers={"Cache-Control": "private"}).bytes()
+    assert kept.count(b"Cache-Control: ") == kept.count(b"Cache-Control: private") == 1
+    for line in ("Cache-Control: no-store", "Referrer-Policy: no-referrer", "X-Frame-Options: DENY"):
+        assert line in lines
+    assert "X-Content-Type-Options: nosniff" in lines
+
+
+def test_a_name_without_its_port():
+    assert [host_name(text) for text in ("a:1", "a", "[::1]:5", "a:b")] == ["a", "a", "[::1]", "a:b"]
+
+
+def test_a_camera_is_what_the_page_has_written():
+    view = camera("1,2,3;0,0,0.70710678,0.70710678;100,110,50,40,101,81")
+    assert view.position == pytest.approx([1, 2, 3])
+    assert view.world_to_camera[:, :3].tolist() == [pytest.approx(row) for row in ([0, -1, 0], [1, 0, 0], [0, 0, 1])]
+    assert (view.camera.width, view.camera.height, view.camera.fy) == (101, 81, 110)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "1,2,3;0,0,0,1",
+        "1,2;0,0,0,1;9,9,5,5,10,10",
+        "nan,2,3;0,0,0,1;9,9,5,5,10,10",
+        "1,2,inf;0,0,0,1;9,9,5,5,10,10",
+        "1,2,3;0,0,0,0;9,9,5,5,10,10",
+        "1,2,3;0,0,0,1;0,9,5,5,10,10",
+        "1,2,3;0,0,0,1;9,-9,5,5,10,10",
+        "1,2,3;0,0,0,1;9,9,5,5,0,10",
+        "1,2,3;0,0,0,1;9,9,5,5,10,1000000",
+        "1,2,3;0,0,0,1;9,9,5,5,10,1000",
+        "1,2,3;0,0,0,1;9,9,1e300,5,10,10",
+        "a,2,3;0,0,0,1;9,9,5,5,10,10",
+    ],
+)
+def test_an_impossible_camera_is_refused(text):
+    with pytest.raises(Refused, match="camera: expected"):
+        camera(text)
+
+
+@pytest.mark.parametrize("text", ["", "x", "nan", "1.01", "-0.1"])
+def test_a_moment_is_from_0_to_1(text):
+    assert moment("0.35") == 0.35
+    with pytest.raises(Refused, match="time: expected a number from 0"):
+        moment(text)
+
+
+def test_page_that_missed_the_end_does_not_count_as_informed():
+    class Ending(Desk):
+        looks = 0
+
+        @property
+        def ended(self) -> bool:  # it ends while the answer is made
+            self.looks += 1
+            return self.looks > 1
+
+        @ended.setter
+        def ended(self, _: bool) -> None: ...
+
+    desk = Ending()
+    state = json.loads(Answers(desk)(Request("state.json", {})).body)
+    assert desk.told == state["ended"]

@@ -1,0 +1,213 @@
+"""The server itself: loopback alone, bounded requests, ports, its end."""
+
+import socket
+import threading
+import time
+from contextlib import suppress
+
+import pytest
+
+from clsplat.errors import ConfigError
+from clsplat.live import server as module
+from clsplat.live.budget import Budget
+from clsplat.live.orders import MOST, Order, Orders, Picture
+from clsplat.live.requests import LONGEST, Answer
+from clsplat.live.server import Server
+
+
+@pytest.fixture
+def server(monkeypatch):
+    monkeypatch.setattr(module, "IDLE", 0.5)
+    made = Server(0, "token", lambda request: Answer(200, request.path.encode()))
+    yield made
+    made.stop()
+
+
+def talk(server: Server, data: bytes) -> bytes:
+    """Send bytes; return all that comes back until the other side closes."""
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        connection.sendall(data)
+        connection.shutdown(socket.SHUT_WR)
+        found = b""
+        while more := connection.recv(1 << 16):
+            found += more
+        return found
+
+
+def test_it_listens_on_the_loopback_address_alone(server):
+    assert server.socket.getsockname()[0] == "127.0.0.1"
+
+
+def test_requests_of_one_connection_are_answered_in_order(server):
+    one = b"GET /token/%s HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    answers = talk(server, one % b"a" + one % b"b")
+    assert answers.count(b"HTTP/1.1 200 OK") == 2
+    assert answers.index(b"\r\n\r\na") < answers.index(b"\r\n\r\nb")
+
+
+def test_overlong_request_is_refused_without_reading_on(server):
+    data = b"GET /token/ HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * (2 * LONGEST)
+    found = b""
+    with suppress(OSError):  # the rest was not read
+        found = talk(server, data)
+    assert found[:12] in (b"HTTP/1.1 431", b"")
+    assert talk(server, b"GET /token/ HTTP/1.1\r\nHost: localhost\r\n\r\n").startswith(b"HTTP/1.1 200")
+
+
+def test_after_a_request_with_a_body_the_connection_is_closed(server):
+    body = b"GET /token/ HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    head = b"POST /token/ HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(body)
+    assert talk(server, head + body).count(b"HTTP/1.1") == 1
+
+
+@pytest.mark.parametrize("begun", [b"GET /tok", b"GET /token/ HTTP/1.1\r\nHost: localhost\r\n\r\nGET"])
+def test_a_request_that_does_not_end_is_closed_soon(server, monkeypatch, begun):
+    """Others wait for its place meanwhile; between two requests a browser may take its time."""
+    monkeypatch.setattr(module, "HEAD", 0.1)
+    monkeypatch.setattr(module._Connection, "timeout", 60)
+    monkeypatch.setattr(module, "IDLE", 60)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        connection.sendall(begun)
+        while connection.recv(1 << 16):
+            pass
+
+
+def test_a_request_that_comes_a_byte_at_a_time_is_closed_soon(server, monkeypatch):
+    monkeypatch.setattr(module, "HEAD", 0.3)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=0.05) as connection:
+        for _ in range(400):
+            with suppress(OSError):  # it was closed
+                connection.sendall(b"x")
+            with suppress(TimeoutError):
+                assert connection.recv(100) == b""
+                return
+    pytest.fail("it waits for more")
+
+
+def test_a_connection_that_says_nothing_is_closed(server, monkeypatch):
+    monkeypatch.setattr(module._Connection, "timeout", 0.1)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        connection.sendall(b"GET /tok")
+        assert connection.recv(100) == b""
+
+
+def test_connections_beyond_the_slots_are_closed(server, monkeypatch):
+    monkeypatch.setattr(module._Connection, "timeout", 5)
+    server._slots = threading.Semaphore(2)
+    address = "127.0.0.1", server.port
+    held = [socket.create_connection(address, timeout=10) for _ in range(2)]
+    with socket.create_connection(address, timeout=10) as third:
+        assert third.recv(100) == b""
+    for one in held:
+        one.close()
+
+
+def test_the_end_of_the_server_ends_its_connections(server):
+    request = b"GET /token/a HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        connection.sendall(request)
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 200")
+        (thread,) = (one for one in threading.enumerate() if "process_request_thread" in one.name)
+        server.stop()
+        with suppress(OSError):
+            connection.sendall(request)
+            assert connection.recv(1 << 16) == b""
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+def test_final_answer_is_complete_and_the_last():
+    given, going = threading.Event(), threading.Event()
+
+    def answer(request):
+        given.set()
+        going.wait(10)
+        return Answer(200, b"farewell")
+
+    server = Server(0, "token", answer)
+    request = b"GET /token/a HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        connection.sendall(2 * request)
+        given.wait(10)
+        server.stop()
+        going.set()
+        found = b""
+        with suppress(ConnectionError):
+            while more := connection.recv(1 << 16):
+                found += more
+    assert found.endswith(b"farewell")
+    assert found.count(b"HTTP/1.1 200") == 1
+
+
+def test_used_port_is_one_sentence_or_the_next_one_is_taken(server):
+    with pytest.raises(ConfigError, match=rf"--live: port {server.port} of 127.0.0.1 cannot be used \(.*\); give ano"):
+        Server(server.port, "token", server.answer)
+    other = Server(0, "token", server.answer)
+    assert server.port < other.port < module.PORT + module.TRIED
+    other.stop()
+
+
+def test_answers_are_paced(server):
+    server._rate.spend(module.BURST + 3)
+    waited = threading.Event()
+    threading.Thread(target=lambda: (server.paced(), waited.set()), daemon=True).start()
+    assert not waited.wait(0.05)
+    assert waited.wait(5)
+
+
+def test_budget_grows_to_a_limit_and_owes_what_was_too_much():
+    now = [100.0]
+    budget = Budget(0.05, 1.0, lambda: now[0])
+    assert budget.credit == 0
+    now[0] += 10
+    assert budget.credit == pytest.approx(0.5)
+    budget.spend(0.8)
+    assert budget.credit == pytest.approx(-0.3)
+    now[0] += 6
+    assert budget.credit == pytest.approx(0, abs=1e-9)
+    now[0] += 1000
+    assert budget.credit == 1
+    budget.spend(1)
+    now[0] += 1000
+    budget.skip()
+    assert budget.credit == 0
+
+
+def asked(orders: Orders, *wanted: Order) -> list[threading.Thread]:
+    threads = [threading.Thread(target=orders.ask, args=(order, 10)) for order in wanted]
+    for number, thread in enumerate(threads, 1):
+        thread.start()
+        while sum(order in orders._waiting for order in wanted) < number:
+            time.sleep(0.001)
+    return threads
+
+
+def test_motion_comes_before_rest_and_the_queue_is_short():
+    orders, picture = Orders(), Picture(b"", 1)
+    wanted = [Order(page, None, "again" if page < 2 else "moving") for page in range(MOST)]
+    threads = asked(orders, *wanted)
+    assert not orders.ask(Order(99, None, "moving"), 0)
+    for order in (wanted[2], wanted[3], wanted[0], wanted[1]):
+        assert orders.first() is order
+        orders.deliver(order, picture)
+    for thread in threads:
+        thread.join(5)
+    assert not orders
+
+
+def test_a_page_that_asks_again_takes_its_own_place():
+    orders, first, second = Orders(), Order(1, None, "moving"), Order(1, None, "still")
+    (thread,) = asked(orders, first)
+    others = asked(orders, second)
+    thread.join(5)
+    assert first.picture is None
+    assert orders.first() is second
+    orders.deliver(second, Picture(b"x", 2))
+    others[0].join(5)
+
+
+def test_who_has_waited_too_long_waits_no_more():
+    orders, order = Orders(), Order(1, None, "moving")
+    assert orders.ask(order, 0)
+    assert order.picture is None
+    assert not orders

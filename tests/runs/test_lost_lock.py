@@ -1,0 +1,118 @@
+"""A process whose run.lock was removed or replaced notices it, ends with one sentence, and writes nothing more."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from clsplat import lock
+from clsplat.errors import OutputError
+from clsplat.names import LOCK
+from clsplat.runs import folders
+from clsplat.runs.experiment import Job
+from clsplat.stages.densify import Densify
+from clsplat.training import checkpoint
+from clsplat.training import status as writing
+from tests.support.runs import FEW
+
+GONE = "run.lock was removed or replaced while this process held it"
+OTHER = json.dumps({"process": 4321, "host": "there", "time": 0, "command": "clsplat resume"})
+
+
+def taken(out: Path) -> dict[str, bytes]:
+    """Another process takes the folder and writes in it; what is there then."""
+    (out / LOCK).unlink()
+    (out / LOCK).write_text(OTHER)
+    (out / "status.json").write_text(OTHER)
+    return files(out)
+
+
+def files(out: Path) -> dict[str, bytes]:
+    """What lies in a run folder, but for the log, to which lines are added."""
+    found = (path for path in out.rglob("*") if path.is_file() and path.name != "log.txt")
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in found}
+
+
+def test_who_holds_a_folder_can_ask_whether_it_still_does(tmp_path):
+    with lock.held(tmp_path) as require_held:
+        require_held()
+        (tmp_path / LOCK).unlink()
+        with pytest.raises(OutputError, match=f"{GONE}; nothing more was written") as gone:
+            require_held()
+        assert gone.value.exit_code == 7
+        (tmp_path / LOCK).write_text(OTHER)
+        with pytest.raises(OutputError, match=f"{GONE}, and process 4321 on there holds it now; "):
+            require_held()
+    assert (tmp_path / LOCK).read_text() == OTHER, "the other's is left alone"
+    require_held()  # after the block it is nobody's matter
+
+
+def run(scene: Path, out: Path) -> None:
+    Job.open("smoke", scene, out, FEW).run()
+
+
+@pytest.mark.parametrize("failure", [None, RuntimeError("a defect"), KeyboardInterrupt()])
+@pytest.mark.parametrize("take", [taken, lambda out: (out / LOCK).unlink() or files(out)], ids=["replaced", "removed"])
+def test_a_run_that_lost_its_folder_writes_nothing_more(take, failure, tiny_scene, tmp_path, monkeypatch):
+    """It loses the folder at step 8, in an edit before the second checkpoint; with a failure, that ends it, too."""
+    before: dict[str, bytes] = {}
+    edit: Callable[..., None] = Densify.run
+
+    def losing(stage: Densify, state) -> None:
+        edit(stage, state)
+        if state.step == 8:
+            before.update(take(state.out))
+            if failure is not None:
+                raise failure
+
+    monkeypatch.setattr(Densify, "run", losing)
+    with pytest.raises(Exception, match=GONE if failure is None else None) as ended:
+        run(tiny_scene, tmp_path)
+    if failure is None:
+        assert ended.value.exit_code == 7
+    assert "checkpoints/step_000004.npz" in before
+    assert files(tmp_path) == before
+
+
+def test_a_rescue_saves_nothing_into_a_folder_that_was_lost(tiny_scene, tmp_path, monkeypatch):
+    """The stage that saves fails the first time: the state is whole, and would be rescued."""
+    before: dict[str, bytes] = {}
+    save = checkpoint.save
+
+    def failing(state, keep=None) -> None:
+        if state.step == 8 and not before:
+            before.update(taken(state.out))
+            raise RuntimeError("a defect")
+        save(state, keep)
+
+    monkeypatch.setattr(checkpoint, "save", failing)
+    with pytest.raises(Exception, match="a defect"):
+        run(tiny_scene, tmp_path)
+    assert files(tmp_path) == before
+
+
+def test_heartbeat_stops_in_a_lost_folder_and_the_run_learns_it(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(writing, "BEAT", 0.002)
+    with folders.opened(tmp_path / "run", "new") as status:
+        before = taken(tmp_path / "run")
+        while status.lost is None:
+            time.sleep(0.001)
+        with pytest.raises(OutputError, match=GONE):
+            status.note(step=1)  # as a training does at each step
+    assert files(tmp_path / "run") == before
+    assert "the run goes on" not in caplog.text
+
+
+def test_run_ending_before_its_first_step_spares_the_next_one(tmp_path):
+    before: dict[str, bytes] = {}
+
+    def ends() -> None:
+        with folders.opened(tmp_path / "run", "new"):
+            before.update(taken(tmp_path / "run"))
+            raise ValueError("ends")
+
+    with pytest.raises(ValueError, match="ends"):
+        ends()
+    assert files(tmp_path / "run") == before

@@ -1,0 +1,180 @@
+"""What a run writes is reserved for it, and read back at its end: a file that has changed since is no success."""
+
+import ast
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from clsplat import names
+from clsplat.errors import InternalError, OutputError
+from clsplat.gaussians.model import Model
+from clsplat.pipeline.loading import load
+from clsplat.runs import opening, outputs, runner, verify
+from clsplat.runs.experiment import Job
+from clsplat.scene.images import write_image
+from clsplat.settings import rebuild
+from clsplat.stages.base import Stage
+from clsplat.stages.render import image_paths
+from clsplat.stages.report import Report
+from clsplat.training.run import Run
+from clsplat.training.status import read_status
+
+pytestmark = pytest.mark.slow
+
+SETTINGS = ["optimize.steps=3", "optimize.during=[{stage: export, every: 2, file: early.ply}]"]
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def change_a_value(path: Path) -> None:
+    """Change a byte of the last Gaussian: the file still has its header and its size."""
+    data = bytearray(path.read_bytes())
+    data[-2] ^= 1
+    path.write_bytes(data)
+
+
+def replace(path: Path) -> None:
+    write_image(path, np.zeros((3, 3, 3), np.uint8))
+
+
+DAMAGE: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "a render is missing": ("renders/FIRST", Path.unlink),
+    "a render is cut": ("renders/LAST", truncate),
+    "a render is of another size": ("renders/LAST", replace),
+    "the report is cut": ("report.html", truncate),
+    "the metrics are cut": ("metrics.json", truncate),
+    "the model is missing": ("point_cloud.ply", Path.unlink),
+    "the model is cut": ("point_cloud.ply", truncate),
+    "a value of the model is another": ("point_cloud.ply", change_a_value),
+    "a model made during the training is cut": ("early.ply", truncate),
+    "a model made during the training is missing": ("early.ply", Path.unlink),
+    "a value of a model made during the training is another": ("early.ply", change_a_value),
+}
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Run]:
+    out = tmp_path_factory.mktemp("outputs") / "run"
+    checked = load("smoke", [f"scene.path='{tiny_scene}'", *SETTINGS])
+    run = opening.open_run(checked, out, None)
+    runner.execute(checked, run, "new", lambda progress: None)
+    return checked, run
+
+
+@pytest.mark.slow
+def test_what_a_run_writes_is_in_the_table_of_reserved_names(finished):
+    pipeline, run = finished
+    chosen = {path for stage in pipeline.stages for path in stage.outputs(run.out)}
+    made = {path.name for path in run.out.iterdir()} - {path.relative_to(run.out).parts[0] for path in chosen}
+    assert {"status.json", "metrics.jsonl", "checksums.json"} <= made
+    assert made <= names.RESERVED
+
+
+def test_names_of_run_files_are_in_one_table_and_reserved():
+    table = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
+    assert {"pipeline.yaml", "run.lock", "compare.html", "undistorted"} < table <= names.RESERVED
+    package = Path(names.__file__).parent
+    for file in package.rglob("*.py"):
+        if file.parent.name in ("api", "cli") or file.name == "names.py":  # of a page that is no run's
+            continue
+        texts = {node.value for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Constant)}
+        assert not texts & table, file
+
+
+def test_views_that_differ_in_their_suffix_have_a_render_each():
+    names = ["a.jpg", "a.png", "b/a.jpg", "c.jpg", "d"]
+    files = [path.as_posix() for path in image_paths(Path("r"), names)]
+    assert files == ["r/a.jpg.png", "r/a.png.png", "r/b/a.png", "r/c.png", "r/d.png"]
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_what_cannot_be_read_back_is_no_success(name, finished):
+    pipeline, run = finished
+    place, damage = DAMAGE[name]
+    renders = sorted((run.out / "renders").rglob("*.png"))
+    file = {"renders/FIRST": renders[0], "renders/LAST": renders[-1]}.get(place, run.out / place)
+    before = file.read_bytes()
+    try:
+        damage(file)
+        with pytest.raises(OutputError, match=f"{file.name}.*at the end of the run; see .*log.txt"):
+            outputs.check_outputs(pipeline, run)
+    finally:
+        file.write_bytes(before)
+    outputs.check_outputs(pipeline, run)
+
+
+@pytest.mark.parametrize("damage", [truncate, Path.unlink, change_a_value])
+def test_model_written_before_a_kill_is_the_one_written(damage, tiny_scene, tmp_path, monkeypatch):
+    out, few = tmp_path / "run", [*SETTINGS, "init.count=50"]
+
+    def fail(*arguments):
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Report, "run", fail)
+        with pytest.raises(InternalError):
+            Job.open("smoke", tiny_scene, out, few).run()
+    whole = {name: (out / name).read_bytes() for name in ("early.ply", "point_cloud.ply")}
+    damage(out / "early.ply")  # its model has been trained further
+    with pytest.raises(OutputError, match=r"early\.ply.*at the end of the run"):
+        Job.resume(out).run()
+    assert not (out / names.CHECKSUMS).exists()
+    (out / "early.ply").write_bytes(whole["early.ply"])
+    (out / "point_cloud_raw.ply").write_bytes(whole["early.ply"])
+    with pytest.raises(OutputError, match="no record of writing it"):
+        Job.resume(out).run()
+    (out / "point_cloud_raw.ply").unlink()
+    damage(out / "point_cloud.ply")
+    found = {one["file"]: one["whole"] for one in verify.verify(out)["objects"]}
+    assert [name for name, good in found.items() if not good] == ["point_cloud.ply"]
+    Job.resume(out).run()
+    assert {name: (out / name).read_bytes() for name in whole} == whole
+
+
+def test_a_model_of_a_cadence_that_never_came_is_not_expected(finished):
+    _, run = finished
+    late = load("smoke", [*SETTINGS[:1], SETTINGS[1].replace("every: 2, file: early", "every: 4, file: late")])
+    outputs.check_outputs(late, run)
+
+
+def test_checksums_include_models_made_during_training(finished):
+    _, run = finished
+    assert '"early.ply"' in (run.out / names.CHECKSUMS).read_text()
+
+
+def test_later_stage_that_damages_the_model_is_an_error(tiny_scene, tmp_path, without_plugins):
+    class Spoil(Stage):
+        """Changes the file of another stage."""
+
+        stage: Literal["spoil"] = "spoil"
+
+        def run(self, run: Run) -> None:
+            change_a_value(run.out / "point_cloud.ply")
+
+    rebuild()
+    file = tmp_path / "pipeline.yaml"
+    file.write_text(
+        "name: spoilt\nstages: [{init: {count: 50, source: random}}, {optimize: {steps: 1, losses: [l1]}}, "
+        "export, spoil]\n"
+    )
+    with pytest.raises(OutputError, match=r"point_cloud\.ply: differs from what was written"):
+        Job.open(str(file), tiny_scene, tmp_path / "run").run()
+    assert read_status(tmp_path / "run")["exit_code"] == OutputError.exit_code
+
+
+def test_a_writer_that_loses_bytes_is_noticed_at_once(tiny_scene, tmp_path, monkeypatch):
+    save = Model.save
+
+    def saved_and_cut(model: Model, path: Path, *more: Any) -> Any:
+        result = save(model, path, *more)
+        truncate(Path(path))
+        return result
+
+    monkeypatch.setattr(Model, "save", saved_and_cut)
+    with pytest.raises(OutputError, match=r"early\.ply: .*truncated.*written just now"):
+        Job.open("smoke", tiny_scene, tmp_path / "run", SETTINGS).run()

@@ -1,0 +1,88 @@
+"""Settings of a run that may change when it goes on, and those that may not."""
+
+import json
+import shutil
+
+import pytest
+
+from clsplat.errors import ConfigError
+from clsplat.runs.experiment import Job
+from clsplat.training import archive
+from clsplat.training.status import read_status
+from tests.support.runs import FEW, crafted, digest, steps_saved, train
+
+pytestmark = pytest.mark.slow
+
+
+def test_what_no_table_depends_on_may_change(killed_run, tiny_scene, few_steps, caplog):
+    train(tiny_scene, killed_run, *FEW, "checkpoint.keep=1", "optimize.log_every=4", "render.folder=other", resume=True)
+    assert digest(killed_run) == digest(few_steps)
+    assert "bits are not" not in caplog.text
+    assert "changes" not in json.loads((killed_run / "metrics.json").read_text())
+    assert steps_saved(killed_run) == ["step_000012.npz"]
+
+
+@pytest.mark.parametrize(
+    "change", ["optimize.steps=14", "densify.stop=6", "optimize.losses.0.weight=0.7", "optimize.update=seen"]
+)
+def test_numbers_of_the_training_may_change(change, killed_run, tiny_scene, caplog):
+    run = train(tiny_scene, killed_run, *FEW, change, resume=True)
+    assert run.step == (14 if "steps" in change else 12)
+    assert caplog.text.count("from here on the bits are not those of a run without a change") == 1
+    assert len(json.loads((killed_run / "metrics.json").read_text())["changes"]) == 1
+    assert f"{change.split('=')[1]}" in (killed_run / "pipeline.yaml").read_text()
+
+
+@pytest.mark.parametrize("change", ["seed=3", "init.count=70", "model.sh_degree=2", "optimize.losses=[l1]"])
+def test_what_tables_depend_on_may_not_change(change, killed_run, tiny_scene):
+    with pytest.raises(ConfigError, match=r"was made with other settings: .*those settings, or begin anew: `clsp"):
+        train(tiny_scene, killed_run, *FEW, change, resume=True)
+
+
+def test_a_run_that_has_trained_for_longer_is_refused(killed_run, tiny_scene, caplog):
+    before = (killed_run / "pipeline.yaml").read_text()
+    words = r"already at step 8; optimize.steps=6 would end before it: give 8 or more, or begin anew: `clsplat run`"
+    with pytest.raises(ConfigError, match=words):
+        train(tiny_scene, killed_run, *FEW, "optimize.steps=6", resume=True)
+    assert "bits" not in caplog.text, "nothing goes on"
+    assert (killed_run / "pipeline.yaml").read_text() == before
+
+
+def test_a_training_without_a_step_left_takes_no_other_numbers(few_steps, tiny_scene, tmp_path):
+    out = shutil.copytree(few_steps, tmp_path / "run")
+    before = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    words = rf"no step is left to train, at step 12: .*rates.quats was .*; `clsplat resume {out} --steps 24` with that"
+    with pytest.raises(ConfigError, match=words):
+        Job.resume(out, ["optimize.rates.quats=1e-5"]).run()
+    assert {file: file.read_bytes() for file in before if file.name != "log.txt"} == {
+        file: content for file, content in before.items() if file.name != "log.txt"
+    }
+    Job.resume(out, ["optimize.rates.quats=1e-5", "optimize.steps=14"]).run()
+    assert len(json.loads((out / "metrics.json").read_text())["changes"]) == 2
+
+
+def test_training_ends_where_it_stopped_if_asked(killed_run):
+    Job.resume(killed_run, ["optimize.steps=8"]).run()
+    assert read_status(killed_run)["state"] == "done"
+    assert (killed_run / "point_cloud.ply").is_file()
+
+
+def test_a_stage_that_is_over_keeps_its_settings(killed_run, tiny_scene):
+    crafted(killed_run / "checkpoints" / "step_000008.npz", lambda notes, arrays: notes.update(cursor=2, stage_step=0))
+    with pytest.raises(ConfigError, match="was saved after that stage, at step 8"):
+        train(tiny_scene, killed_run, *FEW, "optimize.steps=20", resume=True)
+
+
+def test_a_run_that_stopped_after_its_last_stage_ends(killed_run, tiny_scene, few_steps):
+    last = len(archive.read(killed_run / "checkpoints" / "step_000008.npz")[0]["pipeline"]["stages"])
+    shutil.copy(few_steps / "checkpoints" / "step_000012.npz", killed_run / "checkpoints")
+    written = {"point_cloud.ply": digest(few_steps)}
+    crafted(
+        killed_run / "checkpoints" / "step_000012.npz",
+        lambda notes, arrays: notes.update(cursor=last, stage_step=0, written=written),
+    )
+    shutil.copy(few_steps / "point_cloud.ply", killed_run)
+    before = (killed_run / "checkpoints" / "step_000012.npz").read_bytes()
+    assert train(tiny_scene, killed_run, *FEW, resume=True).step == 12
+    assert json.loads((killed_run / "status.json").read_text())["state"] == "done"
+    assert (killed_run / "checkpoints" / "step_000012.npz").read_bytes() == before

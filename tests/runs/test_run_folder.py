@@ -1,0 +1,143 @@
+"""The folder of a run is its own: not that of photographs, of a user's file, or outside."""
+
+import sys
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from clsplat import cli, names
+from clsplat.errors import ConfigError
+from clsplat.pipeline.files import shipped
+from clsplat.pipeline.loading import load
+from clsplat.runs import experiment, outputs
+from clsplat.runs.experiment import Job
+from clsplat.runs.folders import Start, check_run_folder
+
+
+def opened(scene: Path, out: Path, *changes: str) -> None:
+    outputs.check_places(load("smoke", [f"scene.path={str(scene)!r}", *changes]), out)
+
+
+def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
+    for out in (tiny_scene, tiny_scene / "train" / ".."):
+        with pytest.raises(ConfigError, match="is the folder of the photographs"):
+            opened(tiny_scene, out)
+    monkeypatch.chdir(tiny_scene)
+    with pytest.raises(ConfigError, match="is the folder of the photographs"):
+        opened(tiny_scene, Path())
+    with pytest.raises(ConfigError, match="is the root of a file system"):
+        opened(tiny_scene, Path(Path.cwd().anchor))
+    opened(tiny_scene, tiny_scene / "runs" / "a")
+    photographs = tiny_scene / "train"
+    with pytest.raises(ConfigError, match="is the folder of the photographs, or right in it"):
+        outputs.check_places(load("photos", [f"scene.path={str(photographs)!r}"]), photographs / "run")
+
+
+@pytest.mark.parametrize(
+    "name", ["renders", "report.html", "point_cloud.ply", *sorted(names.OF_A_RUN - {names.PIPELINE})]
+)
+def test_a_link_that_leads_outside_is_not_followed(name, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / name).symlink_to(tmp_path / "elsewhere")
+    for _ in ("new", "with a run"):
+        with pytest.raises(ConfigError, match=f"{name}: a link leads outside of the run folder"):
+            opened(tiny_scene, out)
+        (out / "pipeline.yaml").touch()
+    (out / name).unlink()
+    (out / name).symlink_to(out / "inside")
+    opened(tiny_scene, out)
+
+
+def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path):
+    (tmp_path / "holiday").mkdir()
+    (tmp_path / "holiday" / "r_1.png").write_text("mine")
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(ConfigError, match=r"report.html: exists, and is not of this run"):
+        opened(tiny_scene, tmp_path)
+    with pytest.raises(ConfigError, match=r"holiday: exists, and is not of this run"):
+        opened(tiny_scene, tmp_path, "render.folder=holiday", "report.file=other.html")
+    for start in ("new", "resume", "restart"):
+        with pytest.raises(ConfigError, match="is not of this run"):
+            Job.open("smoke", tiny_scene, tmp_path, start=start).run()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["holiday", "report.html"]
+    (tmp_path / "pipeline.yaml").touch()
+    opened(tiny_scene, tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted(names.OF_A_RUN - {names.PIPELINE, names.CHECKPOINTS, names.UNDISTORTED}))
+def test_foreign_files_with_names_of_a_run_are_not_replaced(name, tiny_scene, tmp_path):
+    (tmp_path / name).write_text('{"state": "mine"}')
+    for start in ("new", "resume", "restart"):
+        with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
+            Job.open("smoke", tiny_scene, tmp_path, start=start).run()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == '{"state": "mine"}'
+
+
+@pytest.mark.parametrize("name", sorted(names.OF_A_MATRIX - {names.PIPELINE}))
+def test_foreign_files_with_names_of_a_matrix_are_not_replaced(name, tmp_path):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
+        experiment.check_matrix_folder(tmp_path)
+
+
+def test_what_a_run_that_never_began_has_left_is_its_own(tiny_scene, tmp_path):
+    (tmp_path / "run.lock").touch()
+    opened(tiny_scene, tmp_path)
+    (tmp_path / "run.lock").write_text('{"process": 7}')
+    opened(tiny_scene, tmp_path)
+    (tmp_path / "status.json").write_text('{"state": "preparing", "process": 7}')
+    (tmp_path / "log.txt").write_text("a line")
+    opened(tiny_scene, tmp_path)
+
+
+UNWRITABLE = {  # --out -> the exit code, and what the sentence says
+    "FILE/run": (7, "cannot be written (Not a directory)"),
+    "FILE": (7, "cannot be written (File exists)"),
+    "x" * 300: (7, "File name too long"),
+    "SCENE": (2, "is the folder of the photographs"),
+    "ROOT": (2, "is the root of a file system"),
+    "not \udcff text": (0, ""),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="names and faults of POSIX")
+@pytest.mark.parametrize("out", UNWRITABLE)
+def test_a_run_folder_that_cannot_be_is_one_sentence(out, tiny_scene, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("")
+    place = out.replace("FILE", "file").replace("SCENE", str(tiny_scene)).replace("ROOT", "/")
+    monkeypatch.chdir(tmp_path)
+    quick = ["--set", "optimize.steps=2", "optimize.during=[]"]
+    monkeypatch.setattr(sys, "argv", ["clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", place, *quick])
+    code, words = UNWRITABLE[out]
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == code
+    errors = [line for line in capsys.readouterr().err.splitlines() if "training views" not in line]
+    assert len(errors) == (code != 0)
+    assert words in "".join(errors)
+    if code == 0:
+        assert (Path(place) / "report.html").is_file()
+
+
+@pytest.mark.parametrize("start", get_args(Start))
+def test_a_run_does_not_take_the_place_of_a_users_file(tiny_scene: Path, tmp_path: Path, start):
+    own = tmp_path / "pipeline.yaml"
+    own.write_bytes(shipped()["smoke"].read_bytes())
+    for act in (lambda job: job.describe(), lambda job: job.run()):
+        with pytest.raises(ConfigError, match=r"pipeline.yaml: is not that of a run.*give another folder"):
+            act(Job.open(str(own), tiny_scene, tmp_path, start=start))
+    assert own.read_bytes() == shipped()["smoke"].read_bytes()
+    assert list(tmp_path.iterdir()) == [own]
+
+
+@pytest.mark.parametrize("sign", ["status.json", "checkpoints/step_000004.npz", "its first line"])
+def test_what_a_run_wrote_is_begun_again(tmp_path: Path, sign):
+    (tmp_path / "pipeline.yaml").write_text("# resolved from x.yaml\n" if sign == "its first line" else "name: x\n")
+    if sign != "its first line":
+        (tmp_path / sign).parent.mkdir(exist_ok=True)
+        (tmp_path / sign).write_bytes(b"{}")
+    check_run_folder(tmp_path, "restart")

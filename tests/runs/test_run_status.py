@@ -1,0 +1,133 @@
+"""`clsplat status`: what is known of a run from its files, here and elsewhere."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from clsplat.runs import status as reading
+from clsplat.training.status import StatusFile
+from clsplat.training.status_schema import Amount
+from tests.support.refusals import refusal
+from tests.support.runs import write_status
+
+pytestmark = pytest.mark.slow
+
+
+def put(folder: Path, **values) -> dict:
+    """Write a status of a run whose process has ended, and return what is found."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    killed = {"step": 7, "steps": 9, "state": "running", "process": gone.pid, "time": time.time() - 200}
+    write_status(folder, **{**killed, **values})
+    return reading.run_status(folder)
+
+
+def test_a_process_that_is_gone_was_killed(tmp_path):
+    found = put(tmp_path)
+    assert found["state"] == "killed"
+    assert "silent" not in found
+
+
+@pytest.mark.parametrize("elsewhere", [{"host": "another"}, {"pid_namespace": "pid:[1]"}])
+def test_a_run_elsewhere_is_judged_by_its_heartbeat_alone(elsewhere, tmp_path):
+    found = put(tmp_path, **elsewhere)
+    assert found["state"] == "running"
+    assert 199 < found["silent"] < 300
+    place = f"it runs on {elsewhere.get('host', StatusFile(tmp_path).now.host)}"
+    assert f"\n  no sign of life for {found['silent']} s; {place}" in reading.status_text(found)
+    assert "no sign" not in reading.status_text(put(tmp_path, time=time.time() - 2, **elsewhere))
+
+
+def test_a_process_that_is_stopped_shows_no_sign_of_life(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        found = put(tmp_path, process=process.pid)
+        process.communicate(b"\n")
+    assert f"no sign of life for {found['silent']} s; process {process.pid}" in reading.status_text(found)
+
+
+def test_the_lines_name_the_stage_and_what_is_left(tmp_path):
+    amount = Amount(done=3, total=20, unit="views")
+    found = put(tmp_path, host="a", time=time.time(), stage="evaluate", progress=amount, seconds_left=71.6)
+    assert reading.status_text(found).splitlines()[0] == (
+        f"{tmp_path}: running at step 7 of 9, evaluate, 3 of 20 views, 72 s left"
+    )
+
+
+def test_the_lines_name_the_photographs_that_are_left_out(tmp_path):
+    found = put(tmp_path, state="done", progress=None)
+    features, cameras = {"damaged": {"b.jpg": "cut"}}, {"registered": 3, "not_registered": [], "error_px": 0.5}
+    found["metrics"] = {"preparation": {"find_features": features, "map_cameras": cameras}}
+    assert "3 of 4 photographs placed, 0.50 px; left out: b.jpg (cut)" in reading.status_text(found)
+
+
+def test_clock_that_is_ahead_gives_no_negative_time_and_is_noted(tmp_path):
+    found = put(tmp_path, host="a", time=time.time() + 500)
+    assert found["silent"] == 0
+    assert 490 < found["ahead"] <= 500
+    assert f"\n  its clock is ahead by {found['ahead']} s; it runs on a: " in reading.status_text(found)
+    found = put(tmp_path, host="a", time=time.time() + 5)
+    assert "ahead" not in found
+    assert "its clock" not in reading.status_text(found)
+
+
+@pytest.mark.parametrize("state", ["killed", "failed", "interrupted"])
+def test_the_advice_is_a_command_that_works(state, tmp_path):
+    more = {} if state == "killed" else {"state": state, "message": "stopped at step 7; --resume continues from there"}
+    (tmp_path / "pipeline.yaml").touch()
+    text = reading.status_text(put(tmp_path, **more))
+    assert f"no checkpoint was saved; `clsplat resume {tmp_path}` begins it again" in text
+    gone = reading.status_text(put(tmp_path, checkpoint="checkpoints/step_000005.npz", **more))
+    assert f"are gone; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` begins" in gone
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "step_000007.npz").touch()
+    text = reading.status_text(put(tmp_path, **more))
+    assert f"`clsplat resume {tmp_path}` goes on with it" in text
+    assert "--restart" not in text
+
+
+def test_the_step_is_that_of_the_last_report_where_it_is_later(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train"}\n')
+    assert ": failed at step 8 of 9" in reading.status_text(put(tmp_path, state="failed"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("time", "1e999"),
+        ("time", "NaN"),
+        ("time", "9" * 400),
+        ("seconds_left", "9" * 4000),
+        ("step", "9" * 4000),
+        ("cells", "[]"),
+        ("host", "{}"),
+        ("message", "[1]"),
+        ("state", '"x"'),
+    ],
+)
+def test_a_damaged_status_is_refused(name, value, tmp_path):
+    put(tmp_path, host="a")
+    path = tmp_path / "status.json"
+    status = {**json.loads(path.read_text()), name: "HERE"}
+    path.write_text(json.dumps(status).replace('"HERE"', value))
+    message = refusal(reading.run_status, tmp_path)
+    assert message.startswith(f"{path}: damaged ({name}: ")
+
+
+def test_a_status_of_a_newer_version_is_refused(tmp_path):
+    put(tmp_path)
+    path = tmp_path / "status.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "format": 2}))
+    assert "of a newer clsplat" in refusal(reading.run_status, tmp_path)
+
+
+def test_no_line_holds_what_a_terminal_obeys(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train", "loss": ' + "9" * 4000 + "}\n")
+    found = put(tmp_path, host="a", stage="\x1b[2J\x1b[31mhi", silent="x")
+    text = reading.status_text(found)
+    assert "\x1b" not in text
+    assert "[31mhi" in text
+    assert max(map(len, text.splitlines())) <= 1010

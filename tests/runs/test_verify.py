@@ -1,0 +1,306 @@
+"""`clsplat check RUN`: whatever changes in a run folder is noticed, from its files alone."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+import clsplat
+from clsplat.errors import DataError
+from clsplat.opencl import device
+from clsplat.runs.verify import verify
+from tests.support.commands import clsplat as command
+
+pytestmark = pytest.mark.slow
+
+SET = {"optimize.steps": 20, "init.count": 60}
+TINY = """
+name: two
+matrix: {{set: {{seed: [1, 2]}}}}
+scene: {{path: '{scene}'}}
+stages:
+  - init: {{count: 50}}
+  - optimize: {{steps: 4, losses: [l1], during: [{{checkpoint: {{every: 2}}}}]}}
+  - evaluate
+  - export
+"""
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return clsplat.run("smoke", tiny_scene, tmp_path_factory.mktemp("runs") / "run", set=SET)
+
+
+@pytest.fixture
+def copy(finished: Path, tmp_path: Path) -> Path:
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def damaged(out: Path) -> dict[str, str]:
+    """The files that are not whole, and why."""
+    found = clsplat.check(out)
+    assert found["whole"] == all(one["whole"] for one in found["objects"])
+    return {one["file"]: one["detail"] for one in found["objects"] if not one["whole"]}
+
+
+def test_a_status_of_a_newer_version_is_not_damaged(copy):
+    """A key that is new does not change the format; one of another format is not judged."""
+    path = copy / "status.json"
+    status = json.loads(path.read_text())
+    newer = {**status, "new": 1, "progress": {"done": 1, "total": 2, "unit": "steps", "new": "x"}}
+    jsonschema.validate(newer, clsplat.status_schema())
+    path.write_text(json.dumps(newer))
+    assert damaged(copy) == {}
+    assert clsplat.status(copy)["new"] == 1
+    path.write_text(json.dumps({**status, "format": 2, "step": "of words"}))
+    assert damaged(copy) == {}
+    details = {one["file"]: one["detail"] for one in clsplat.check(copy)["objects"]}
+    assert details["status.json"] == "not checked further: format 2, of a newer clsplat"
+    for fault in ({"step": "of words"}, {"format": 0}, {"format": "1"}):
+        path.write_text(json.dumps({**status, **fault}))
+        assert list(damaged(copy)) == ["status.json"]
+    for name in ("format", "state", "version"):
+        path.write_text(json.dumps({key: value for key, value in status.items() if key != name}))
+        assert damaged(copy)["status.json"] == f"{name}: Field required"
+
+
+def test_complete_run_has_a_line_per_file_and_needs_no_device(finished, monkeypatch):
+    monkeypatch.setattr(device, "Device", lambda *arguments: pytest.fail("opens a device"))
+    assert damaged(finished) == {}
+    done = command("check", finished)
+    lines = done.stdout.splitlines()
+    assert lines[-1] == f"{finished}: done; all {len(lines) - 1} files are whole"
+    text = "\n".join(lines)
+    names = ["pipeline.yaml", "status.json, done", "checkpoints/step_000020.npz, step 20, ", "metrics.jsonl, "]
+    names += ["metrics.json, ", "point_cloud.ply, ", "renders/test/", "report.html", "checksums.json, of 8 files"]
+    names += ["viewer.html"]
+    assert [name for name in names if name not in text] == []
+    data = json.loads(command("check", finished, "--json").stdout)
+    assert data == clsplat.check(finished)
+    assert (data["state"], data["whole"]) == ("done", True)
+
+
+def test_checksums_are_those_of_sha256sum(finished):
+    sums = json.loads((finished / "checksums.json").read_text())
+    import hashlib
+
+    for name, value in sums.items():
+        assert hashlib.sha256((finished / name).read_bytes()).hexdigest() == value
+    assert {"pipeline.yaml", "metrics.json", "metrics.jsonl", "point_cloud.ply", "report.html"} < set(sums)
+
+
+def test_a_changed_byte_in_any_file_is_noticed(finished, copy):
+    files = [one["file"] for one in clsplat.check(finished)["objects"] if one["file"] != "status.json"]
+    assert len(files) > 9
+    for name in files:
+        data = (copy / name).read_bytes()
+        place = len(data) // 2
+        (copy / name).write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        found = damaged(copy)
+        assert name in found or name == "checksums.json", name
+        assert found, name
+        (copy / name).write_bytes(data)
+    assert damaged(copy) == {}
+
+
+@pytest.mark.parametrize("content", [None, b"", b"[", b"\xff\x00", b"[]", b"1"])
+def test_a_file_that_is_gone_or_no_such_file_is_noticed(content, finished, copy):
+    older = min(path.relative_to(finished).as_posix() for path in finished.glob("checkpoints/*"))
+    for one in clsplat.check(finished)["objects"]:
+        path = copy / one["file"]
+        data = path.read_bytes()
+        path.unlink() if content is None else path.write_bytes(content)
+        found = damaged(copy)
+        if not (content is None and one["file"] == older):
+            assert found, one["file"]
+        path.write_bytes(data)
+
+
+def test_damage_ends_with_exit_code_7_and_one_line(copy):
+    (copy / "point_cloud.ply").write_bytes((copy / "point_cloud.ply").read_bytes()[:-4])
+    (copy / "checkpoints" / "step_000020.npz").write_bytes(b"")
+    done = command("check", copy, expect=7)
+    assert "DAMAGED  point_cloud.ply, differs from its checksum" in done.stdout
+    assert "files are damaged or missing: checkpoints/step_000020.npz, point_cloud.ply; " in done.stderr
+    data = json.loads(command("check", copy, "--json", expect=7).stdout)
+    assert data["whole"] is False
+
+
+def test_a_run_that_was_killed_is_whole_without_its_outputs(copy):
+    for name in ("checksums.json", "metrics.json", "point_cloud.ply", "report.html"):
+        (copy / name).unlink()
+    status = json.loads((copy / "status.json").read_text())
+    (copy / "status.json").write_text(json.dumps({**status, "state": "running"}))
+    assert damaged(copy) == {}
+    (copy / "status.json").write_text(json.dumps({**status, "state": "done"}))
+    gone = damaged(copy)
+    assert set(gone) == {"checksums.json", "metrics.json", "point_cloud.ply", "report.html"}
+    assert gone["report.html"] == "is missing"
+
+
+@pytest.mark.parametrize("name", ["inputs.json", "checksums.json", "checkpoints/step_000020.npz", "report.html"])
+def test_what_a_run_that_is_done_must_have_is_missed(name, copy):
+    (copy / name).unlink()
+    assert set(damaged(copy)) == {name}
+
+
+def test_missing_renders_are_noticed_with_and_without_checksums(copy):
+    shutil.rmtree(copy / "renders")
+    assert all(name.startswith("renders/test/") for name in damaged(copy))
+    (copy / "checksums.json").unlink()
+    assert set(damaged(copy)) == {"checksums.json", "renders"}
+
+
+def test_a_list_without_a_declared_output_is_damaged(copy):
+    (copy / "checksums.json").write_text("{}")
+    names = ["pipeline.yaml", "metrics.jsonl", "metrics.json", "point_cloud.ply", "viewer.html", "report.html"]
+    assert damaged(copy) == {"checksums.json": f"lacks {', '.join(map(repr, names))}"}
+    (copy / "checksums.json").write_text('{"../a": "", "/b": ""}')
+    assert damaged(copy)["checksums.json"].startswith(
+        "'../a' is no file of the run; '/b' is no file of the run; lacks "
+    )
+
+
+KINDS = {"a folder": Path.mkdir, "a pipe": getattr(os, "mkfifo", None), "a link that leads to nothing": None}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_in_the_place_of_a_file_is_told(kind, finished, copy):
+    if kind == "a pipe" and not hasattr(os, "mkfifo"):
+        pytest.skip("this system has no pipes with names")
+    make = KINDS[kind] or (lambda path: path.symlink_to("nowhere"))
+    files = [one["file"] for one in clsplat.check(finished)["objects"]]
+    for name in files:
+        (copy / name).unlink()
+        make(copy / name)
+        found = damaged(copy)
+        assert found.keys() == {name}
+        assert found[name].startswith(f"is {kind}"), (name, found[name])
+        (copy / name).rmdir() if kind == "a folder" else (copy / name).unlink()
+        shutil.copyfile(finished / name, copy / name)
+    (copy / "checksums.json").unlink()
+    (copy / "metrics.jsonl").unlink()
+    make(copy / "metrics.jsonl")
+    assert damaged(copy)["metrics.jsonl"].startswith(f"is {kind}")
+    shutil.rmtree(copy / "renders")
+    (copy / "renders").write_text("")
+    assert damaged(copy)["renders"] == "is a file; expected a folder"
+
+
+def test_every_file_that_is_gone_is_named(finished, copy):
+    """The list of checksums tells them, or the pipeline, or what every run has."""
+    files = {one["file"] for one in clsplat.check(finished)["objects"]}
+    outputs = {name for name in files if name.endswith((".ply", ".html", ".png"))}
+    of_every_run = {"inputs.json", "metrics.json", "metrics.jsonl"}
+    newest, renders = {"checkpoints/step_000020.npz"}, {"renders"}
+    pages = {name for name in outputs if not name.startswith("renders/")}
+    for kept, told in (
+        ({"checksums.json", "pipeline.yaml"}, of_every_run | outputs | {"status.json"}),
+        ({"checksums.json", "status.json"}, of_every_run | outputs | newest | {"pipeline.yaml"}),
+        ({"pipeline.yaml", "status.json"}, of_every_run | pages | renders | newest | {"checksums.json"}),
+        ({"status.json"}, of_every_run | newest | {"pipeline.yaml", "checksums.json"}),
+    ):
+        shutil.rmtree(copy)
+        shutil.copytree(finished, copy)
+        for name in files - kept:
+            (copy / name).unlink()
+        for folder in (copy / "renders" / "test", copy / "renders"):
+            folder.rmdir()
+        assert damaged(copy).keys() == told, kept
+
+
+def test_a_run_without_checksums_is_not_called_whole(copy):
+    (copy / "checksums.json").unlink()
+    done = command("check", copy, expect=7)
+    assert "checksums.json is missing, as in runs of earlier versions" in done.stderr
+    assert "whole" not in done.stderr
+
+
+def test_every_file_has_one_line(finished):
+    files = [one["file"] for one in clsplat.check(finished)["objects"]]
+    assert len(files) == len(set(files))
+
+
+def test_a_damaged_note_of_prepared_photographs_is_noticed(copy):
+    (copy / "prepared.json").write_text('{"inputs": "a", "folder": "b"}')
+    assert damaged(copy) == {}
+    (copy / "prepared.json").write_text("{}")
+    assert set(damaged(copy)) == {"prepared.json"}
+
+
+def test_a_run_whose_process_is_gone_is_called_killed(copy):
+    status = json.loads((copy / "status.json").read_text())
+    (copy / "status.json").write_text(json.dumps({**status, "state": "running", "process": 2**22 + 1}))
+    assert clsplat.check(copy)["state"] == clsplat.status(copy)["state"] == "killed"
+
+
+def test_the_remedy_is_one_that_works(copy):
+    (copy / "point_cloud.ply").write_bytes(b"")
+    assert f"`clsplat resume {copy}`" in command("check", copy, expect=7).stderr
+    for path in (copy / "checkpoints").iterdir():
+        path.write_bytes(b"")
+    said = command("check", copy, expect=7).stderr
+    assert f"`clsplat run {copy}/pipeline.yaml --out {copy} --restart`" in said
+    assert "resume" not in said
+
+
+def test_a_damaged_checkpoint_is_told_in_plain_words(copy):
+    path = copy / "checkpoints" / "step_000020.npz"
+    data = bytearray(path.read_bytes())
+    path.write_bytes(b"")
+    assert damaged(copy)["checkpoints/step_000020.npz"] == "is empty"
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert damaged(copy)["checkpoints/step_000020.npz"].startswith("differs from its checksum (")
+
+
+def test_a_dry_resume_says_where_it_would_go_on(copy):
+    before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
+    assert "step 20" in command("resume", copy, "--dry-run").stdout
+    assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before
+
+
+def test_a_path_without_anything_may_have_meant_a_run():
+    assert "expected a pipeline, a model, or the folder of a run" in command("check", "runs/nosuch", expect=2).stderr
+
+
+def test_the_sums_are_those_of_the_run_that_ended_last(copy):
+    (copy / "point_cloud.ply").write_bytes(b"")
+    assert damaged(copy)
+    (copy / "checkpoints" / "step_000020.npz").unlink()
+    clsplat.resume(copy)
+    assert damaged(copy) == {}
+
+
+def test_a_matrix_is_checked_with_its_cells(tiny_scene, tmp_path):
+    (tmp_path / "two.yaml").write_text(TINY.format(scene=tiny_scene))
+    out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
+    assert damaged(out) == {}
+    cell = next(path for path in sorted(out.iterdir()) if path.is_dir())
+    (cell / "point_cloud.ply").write_bytes(b"ply")
+    assert damaged(out) == {f"{cell.name}/point_cloud.ply": "differs from its checksum"}
+    assert "cells" in clsplat.check(tmp_path / "two.yaml")
+    assert f"`clsplat resume {cell}`" in command("check", out, expect=7).stderr
+    shutil.rmtree(cell)
+    (out / "compare.html").unlink()
+    found = damaged(out)
+    assert {f"{cell.name}/pipeline.yaml", "compare.html"} <= set(found)
+    assert f"`clsplat resume {out}`" in command("check", out, expect=7).stderr
+    (out / "pipeline.yaml").unlink()
+    assert "inputs.json" not in damaged(out), "which is of a run, not of a matrix"
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"holds neither pipeline.yaml nor status.json"):
+        verify(tmp_path)
+    assert "expected the folder of a run" in command("check", tmp_path, expect=3).stderr
+
+
+def test_the_schema_of_a_status_describes_every_key():
+    schema = clsplat.status_schema()
+    for part in (schema, *schema["$defs"].values()):
+        assert [name for name, value in part["properties"].items() if "description" not in value] == []

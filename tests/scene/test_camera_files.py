@@ -1,0 +1,340 @@
+"""Cameras written for other programs come back: poses, lenses, distortion, points, the split."""
+
+import json
+import logging
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import clsplat
+from clsplat import cli
+from clsplat.cameras import inria
+from clsplat.cameras.nerfstudio import DISTORTION
+from clsplat.errors import ConfigError, DataError
+from clsplat.scene.exif import CameraExposure, write_exposures
+from clsplat.scene.exposures import camera_exposures
+from clsplat.scene.lens import MODELS, Lens
+from clsplat.scene.quaternion import rotation_matrix
+from clsplat.scene.reprojection import with_cameras
+from clsplat.scene.scene import PointCloud, make_scene
+from clsplat.scene.tracks import Tracks
+from clsplat.scene.view import View
+from clsplat.stages.cameras import Cameras
+from tests.support.commands import clsplat as command
+from tests.support.data_sets import data_set
+
+LENSES = {  # parameters after the focal lengths and the middle
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": (0.05,),
+    "RADIAL": (0.05, -0.02),
+    "OPENCV": (0.05, -0.02, 1e-3, -2e-3),
+    "FULL_OPENCV": (0.05, -0.02, 1e-3, -2e-3, 0.01, 0.02, -0.01, 0.003),
+    "OPENCV_FISHEYE": (0.02, -0.01, 0.003, 0.001),
+    "SIMPLE_RADIAL_FISHEYE": (0.02,),
+    "RADIAL_FISHEYE": (0.02, -0.01),
+    "FOV": (0.4,),
+    "THIN_PRISM_FISHEYE": (0.02, -0.01, 1e-3, -2e-3, 0.001, 0.002, 1e-3, 2e-3),
+}
+SIZE = 60, 40
+
+
+def lens_of(model, i=0):
+    focals = (61.25 + i / 7, 63.5)[: MODELS[model][0]]
+    return Lens(*SIZE, model, (*focals, 31.125, 18.75 + i / 3, *LENSES[model]))
+
+
+@pytest.fixture
+def scene_of(rng, tmp_path):
+    """A function that makes a dataset of a lens: five views, two of them for testing, in two folders."""
+
+    def make(model, lenses=1):
+        views = []
+        for i in range(5):
+            quaternion = rng.normal(size=4)
+            rotation = rotation_matrix(*(quaternion / np.linalg.norm(quaternion)))
+            pose = np.column_stack([rotation, rng.normal(size=3) * 3])
+            lens = lens_of(model, i % lenses)
+            name = f"left/ä_{i}.png" if i < 3 else f"right/{i}.png"
+            file = tmp_path / "photographs" / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(f"photograph {i}".encode())
+            camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+            views.append(View(name, camera, pose, file, lens=distortion))
+        points = PointCloud(rng.normal(size=(7, 3)).astype(np.float32), np.float32(rng.integers(0, 256, (7, 3)) / 255))
+        return make_scene(tmp_path / "photographs", views, {0, 3}, points)
+
+    return make
+
+
+def same(old, new, prefix=""):
+    assert [prefix + view.name for view in old.views] == [view.name for view in new.views]
+    for a, b in zip(old.views, new.views, strict=True):
+        np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=4e-15)
+        assert b.camera == a.camera
+        assert (b.lens is None) == (a.lens is None)
+        assert b.image_path.read_bytes() == a.image_path.read_bytes()
+    np.testing.assert_array_equal(new.points.positions, old.points.positions)
+    np.testing.assert_array_equal(new.points.colours, old.points.colours)
+
+
+@pytest.mark.parametrize("lenses", [1, 3])
+@pytest.mark.parametrize("model", LENSES)
+def test_colmap_gives_back_what_it_got(model, lenses, scene_of, tmp_path):
+    scene = scene_of(model, lenses)
+    files = clsplat.write_cameras(scene, tmp_path / "out", "colmap", images="copy")
+    assert [file.name for file in files] == ["cameras.txt", "images.txt", "points3D.txt"]
+    assert len((tmp_path / "out/sparse/0/cameras.txt").read_text().splitlines()) == 1 + lenses
+    found = clsplat.read_scene(tmp_path / "out")
+    same(scene, found)
+    assert [view.lens for view in found.views] == [view.lens for view in scene.views]
+
+
+@pytest.mark.parametrize("lenses", [1, 3])
+@pytest.mark.parametrize("model", DISTORTION)
+def test_nerfstudio_gives_back_what_it_got(model, lenses, scene_of, tmp_path, rng):
+    scene = scene_of(model, lenses)
+    clsplat.write_cameras(scene, tmp_path / "out", "nerfstudio", images="copy")
+    found = clsplat.read_scene(tmp_path / "out")
+    same(scene, found, "images/")
+    assert (found.train, found.test) == (scene.train, scene.test)
+    rays = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.ones(20)])
+    for a, b in zip(scene.views, found.views, strict=True):
+        if a.lens is not None:
+            np.testing.assert_allclose(b.lens.project(rays), a.lens.project(rays), rtol=1e-13)
+
+
+@pytest.mark.parametrize("model", sorted(LENSES.keys() - DISTORTION.keys()))
+def test_a_lens_that_nerfstudio_does_not_know_is_refused(model, scene_of, tmp_path):
+    with pytest.raises(DataError, match=f"no camera model {model}; write colmap, or `clsplat data undistort` first"):
+        clsplat.write_cameras(scene_of(model), tmp_path / "out", "nerfstudio")
+    assert not (tmp_path / "out").exists()
+
+
+def test_nerfstudio_finds_its_validation_views_and_one_model(scene_of, tmp_path):
+    """It reads `camera_model` from the top alone, and asks for the views of `val_filenames` as it trains."""
+    clsplat.write_cameras(scene_of("OPENCV_FISHEYE", 3), tmp_path / "a", "nerfstudio")
+    table = json.loads((tmp_path / "a/transforms.json").read_text())
+    assert table["camera_model"] == "OPENCV_FISHEYE"
+    assert not any("camera_model" in frame for frame in table["frames"])
+    assert all({"k1", "fl_x", "cx"} <= frame.keys() for frame in table["frames"]), "all of a lens, or nothing"
+    assert table["val_filenames"] == table["test_filenames"] == ["images/left/ä_0.png", "images/right/3.png"]
+    scene = scene_of("PINHOLE")
+    clsplat.write_cameras(make_scene(scene.path, scene.views, set(), None), tmp_path / "b", "nerfstudio")
+    assert not [key for key in json.loads((tmp_path / "b/transforms.json").read_text()) if "filenames" in key]
+
+
+def test_two_kinds_of_lenses_are_refused_for_nerfstudio(scene_of, tmp_path):
+    views = [scene_of("OPENCV").views[0], scene_of("OPENCV_FISHEYE").views[4]]
+    with pytest.raises(DataError, match=r"right/4\.png: OPENCV_FISHEYE, and others are OPENCV; nerfstudio takes one"):
+        clsplat.write_cameras(make_scene(tmp_path, views, set(), None), tmp_path / "out", "nerfstudio")
+
+
+def test_blank_in_a_name_is_refused_for_colmap_before_training(tiny_scene, scene_of, tmp_path):
+    scene = scene_of("PINHOLE")
+    views = [replace(scene.views[0], name="IMG 1.png"), *scene.views[1:]]
+    blank = make_scene(scene.path, views, {0}, scene.points)
+    with pytest.raises(DataError, match=r"'IMG 1\.png': COLMAP reads a name up to its first blank; rename"):
+        clsplat.write_cameras(blank, tmp_path / "out", "colmap")
+    stage = SimpleNamespace(original=blank)
+    with pytest.raises(DataError, match="first blank"):
+        Cameras(formats=["colmap"]).check_in(stage)
+    Cameras(formats=["inria", "nerfstudio"]).check_in(stage)
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+def test_cameras_json_holds_the_undistorted_cameras(model, scene_of, tmp_path, caplog):
+    scene = scene_of(model, 3)
+    with caplog.at_level(logging.WARNING, "clsplat"):
+        clsplat.write_cameras(scene, tmp_path, "inria")
+    assert "the middle of the image for the principal point, which is up to" in caplog.text
+    found = inria.read(tmp_path / "cameras.json")
+    for a, b in zip(scene.views, found, strict=True):
+        assert (b.name, b.camera) == (a.name, a.camera)
+        np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-14)
+    first = json.loads((tmp_path / "cameras.json").read_text())[0]
+    np.testing.assert_allclose(first["position"], scene.views[0].position)
+    np.testing.assert_allclose(np.array(first["rotation"])[:, 2], scene.views[0].world_to_camera[2, :3])
+
+
+def test_distorted_photographs_do_not_join_pinhole_cameras(scene_of, tmp_path):
+    with pytest.raises(DataError, match=r"inria holds cameras of undistorted photographs, .*`clsplat data undistort`"):
+        clsplat.write_cameras(scene_of("OPENCV"), tmp_path / "a", "inria", images="copy")
+    assert not (tmp_path / "a").exists()
+    clsplat.write_cameras(scene_of("PINHOLE"), tmp_path / "b", "inria", images="copy")
+    assert (tmp_path / "b/images/right/4.png").is_file()
+
+
+FAULTS = {
+    "a table": (lambda d: {"frames": d}, "expected a list of 1 to"),
+    "nothing": (lambda d: [], "expected a list of 1 to"),
+    "no focal length": (lambda d: [{**d[0], "fx": 0}], r"\[0\]: the camera is 60x40 with focal lengths 0"),
+    "no rotation": (lambda d: [{**d[0], "rotation": [[0] * 3] * 3}], "no rotation"),
+    "text": (lambda d: [{**d[0], "position": "x"}], "position is 'x'"),
+    "ragged": (lambda d: [{**d[0], "rotation": [[1], [2, 3]]}], "rotation is"),
+    "large": (lambda d: [{**d[0], "width": 1e9}], "sizes of at most"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
+    clsplat.write_cameras(scene_of("PINHOLE"), tmp_path, "inria")
+    change, message = FAULTS[fault]
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps(change(json.loads(file.read_text()))))
+    with pytest.raises(DataError, match=message):
+        inria.read(file)
+
+
+@pytest.mark.parametrize(("form", "lines"), [("colmap", 1), ("inria", 1), ("nerfstudio", 0)])
+def test_a_lost_split_is_said_in_a_line(form, lines, scene_of, tmp_path, caplog):
+    clsplat.write_cameras(scene_of("PINHOLE"), tmp_path, form)
+    words = f"{tmp_path}: {form} does not keep which views are for testing, 2 of 5; nerfstudio does"
+    assert [record.levelname for record in caplog.records if record.getMessage() == words] == ["WARNING"] * lines
+
+
+@pytest.mark.parametrize("form", ["colmap", "nerfstudio", "inria"])
+def test_files_that_are_there_stay(form, scene_of, tmp_path):
+    scene = scene_of("PINHOLE")
+    first = clsplat.write_cameras(scene, tmp_path / "a", form)
+    again = clsplat.write_cameras(scene, tmp_path / "b", form)
+    assert [a.read_bytes() for a in first] == [b.read_bytes() for b in again], "the same bytes"
+    with pytest.raises(ConfigError, match="exists; give another folder"):
+        clsplat.write_cameras(scene, tmp_path / "a", form)
+
+
+def test_what_cannot_be_written_is_refused(scene_of, tmp_path):
+    scene = scene_of("PINHOLE")
+    with pytest.raises(ConfigError, match="no format 'meshroom'; there are colmap, nerfstudio, inria"):
+        clsplat.write_cameras(scene, tmp_path / "out", "meshroom")
+    with pytest.raises(ConfigError, match="no images 'link'"):
+        clsplat.write_cameras(scene, tmp_path / "out", images="link")
+    view = View("two\nlines", scene.views[0].camera, scene.views[0].world_to_camera)
+    alone = make_scene(tmp_path, [view], set(), None)
+    with pytest.raises(DataError, match="a name in one line of text"):
+        clsplat.write_cameras(alone, tmp_path / "out")
+    nameless = make_scene(tmp_path, [View("a", view.camera, view.world_to_camera)], set(), None)
+    with pytest.raises(DataError, match="has no photograph to copy"):
+        clsplat.write_cameras(nameless, tmp_path / "out", images="copy")
+    assert not (tmp_path / "out").exists()
+
+
+def with_tracks(scene, rng):
+    """The scene whose points lie before all cameras; each photograph shows four of them, a little off."""
+    views = [
+        replace(view, world_to_camera=np.column_stack([np.eye(3), [i / 10, 0, 0]]))
+        for i, view in enumerate(scene.views)
+    ]
+    positions = np.column_stack([rng.uniform(-0.2, 0.2, (7, 2)), rng.uniform(2, 3, 7)]).astype(np.float32)
+    seen = {view.name: np.sort(rng.choice(7, 4, replace=False)) for view in views}
+    tracks = Tracks(positions, seen, {view.name: rng.normal(0, 1, (4, 2)) for view in views})
+    return replace(scene, views=tuple(views), points=replace(scene.points, positions=positions), tracks=tracks)
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
+def test_colmap_keeps_which_points_photographs_show_and_where(model, scene_of, tmp_path, rng):
+    scene = with_tracks(scene_of(model), rng)
+    clsplat.write_cameras(scene, tmp_path / "out", "colmap", images="copy")
+    found = clsplat.read_scene(tmp_path / "out").tracks
+    np.testing.assert_array_equal(found.positions, scene.tracks.positions)
+    for view in scene.views:
+        np.testing.assert_array_equal(found.seen[view.name], scene.tracks.seen[view.name])
+        np.testing.assert_allclose(found.misses[view.name], scene.tracks.misses[view.name], atol=1e-9)
+    lines = (tmp_path / "out/sparse/0/points3D.txt").read_text().splitlines()[1:]
+    images = (tmp_path / "out/sparse/0/images.txt").read_text().splitlines()[1:]
+    for line in lines:
+        point, *words = line.split()
+        for image, at in np.array(words[7:], int).reshape(-1, 2):
+            assert images[2 * image - 1].split()[3 * at + 2] == point, "both files tell the same"
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+def test_learned_cameras_show_points_where_photographs_did(model, scene_of, tmp_path, rng):
+    scene = with_tracks(scene_of(model), rng)
+    learned = [
+        replace(
+            view,
+            world_to_camera=view.world_to_camera + np.column_stack([np.zeros((3, 3)), [0.1, 0.05, 0]]),
+            camera=view.camera.zoomed(1.1),
+        )
+        for view in scene.views
+    ]
+    for name, one in (("a", scene), ("b", with_cameras(scene, learned))):
+        clsplat.write_cameras(one, tmp_path / name, "colmap", images="copy")
+    places = [
+        [
+            np.array(line.split(), float)
+            for line in (tmp_path / name / "sparse/0/images.txt").read_text().splitlines()[2::2]
+        ]
+        for name in "ab"
+    ]
+    np.testing.assert_allclose(places[1], places[0], atol=1e-9)
+    (one, *_), found = scene.views, clsplat.read_scene(tmp_path / "b").tracks
+    assert np.abs(found.misses[one.name] - scene.tracks.misses[one.name]).max() > 1, "px"
+
+
+@pytest.mark.parametrize("form", ["colmap", "nerfstudio"])
+def test_exposures_lie_beside_copied_photographs(form, scene_of, tmp_path, rng, caplog):
+    scene = with_tracks(scene_of("PINHOLE"), rng)
+    noted = {view.name: CameraExposure(0.01 * (i + 1), 2.0, 100.0) for i, view in enumerate(scene.views[1:])}
+    write_exposures(tmp_path / "photographs", noted)
+    clsplat.write_cameras(scene, tmp_path / "out", form, images="copy")
+    found = clsplat.read_scene(tmp_path / "out")
+    told = dict(zip([view.name for view in found.views], camera_exposures(found.views), strict=True))
+    prefix = "images/" if form == "nerfstudio" else ""
+    assert told == {prefix + view.name: noted.get(view.name) for view in scene.views}
+    assert (found.tracks is None) == (form == "nerfstudio")
+    said = "nerfstudio does not keep which points the photographs show; colmap does"
+    assert (said in caplog.text) == (form == "nerfstudio")
+    clsplat.write_cameras(scene, tmp_path / "alone", form)
+    assert not (tmp_path / "alone/images").exists()
+
+
+def test_a_blender_scene_becomes_one_of_colmap(tiny_scene, tmp_path):
+    clsplat.write_cameras(tiny_scene, tmp_path / "out", images="copy")
+    old, new = clsplat.read_scene(tiny_scene), clsplat.read_scene(tmp_path / "out")
+    found = {view.name: view for view in new.views}
+    assert found.keys() == {f"{view.name}.png" for view in old.views}
+    for view in old.views:
+        np.testing.assert_allclose(found[f"{view.name}.png"].world_to_camera, view.world_to_camera, atol=1e-14)
+        np.testing.assert_array_equal(found[f"{view.name}.png"].photograph(), view.photograph())
+
+
+@pytest.mark.slow
+def test_the_command_takes_a_dataset_and_a_run(few_steps, tiny_scene, tmp_path):
+    command("data", "cameras", few_steps, tmp_path / "run", "--format", "nerfstudio", "--images", "copy")
+    command("data", "cameras", tiny_scene, tmp_path / "set", "--format", "nerfstudio", "--images", "copy")
+    files = [
+        sorted(path.relative_to(tmp_path / name) for path in (tmp_path / name).rglob("*")) for name in ("run", "set")
+    ]
+    assert files[0] == files[1]
+    assert (tmp_path / "run/transforms.json").read_bytes() == (tmp_path / "set/transforms.json").read_bytes()
+    told = command("data", "cameras", tmp_path / "none", tmp_path / "x", expect=3).stderr
+    assert "no such folder" in told
+
+
+@pytest.mark.parametrize(("format_", "images"), [("nerfstudio", "none"), ("colmap", "none"), ("colmap", "copy")])
+def test_a_folder_without_photographs_is_told(format_, images, tiny_scene, tmp_path):
+    words = ["data", "cameras", str(tiny_scene), str(tmp_path / "out"), "--format", format_, "--images", images]
+    told = CliRunner().invoke(cli.app, words).output
+    assert ("with --images copy" in told) == (images == "none")
+
+
+@pytest.mark.parametrize("name", ["fox_opencv", "fox_nerfstudio", "brighton"])
+def test_data_sets_come_back_from_both(name, tmp_path):
+    scene = clsplat.read_scene(data_set(name))
+    for form in ("colmap", "nerfstudio"):
+        clsplat.write_cameras(scene, tmp_path / form, form, images="copy")
+        found = clsplat.read_scene(tmp_path / form)
+        assert len(found.views) == len(scene.views)
+        for a, b in zip(scene.views, found.views, strict=True):
+            turn = a.world_to_camera[:, :3]
+            rounding = np.abs(turn @ turn.T - np.eye(3)).max() if form == "colmap" else 0  # a quaternion has none
+            np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=2e-13 + 10 * rounding)
+            assert b.camera == a.camera
+            assert b.image_path.name == a.image_path.name
+        shutil.rmtree(tmp_path / form)

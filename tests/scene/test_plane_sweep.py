@@ -1,0 +1,262 @@
+"""The plane sweep finds surfaces: a textured wall, a ray-cast table, and those that structure from motion found."""
+
+import re
+import shutil
+from dataclasses import replace
+from math import cos, sin, tan
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from clsplat.errors import DataError
+from clsplat.scene.detail import MAX_SPACING, laplacian_chance, spacing
+from clsplat.scene.detect import read_scene
+from clsplat.scene.middle import centre_of
+from clsplat.scene.plane_sweep import MAX_DEPTH, MIN_DEPTH, PLANES, Surface, swept_points
+from clsplat.scene.scene import Camera, PointCloud, View
+from clsplat.scene.transparency import opaque_pixels
+from clsplat.scene.view import load_image
+from clsplat.stages.init import Init, from_points
+from data_tools.casting import camera_pose
+from data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, STILL_LIFE, write_png
+from tests.support.data_sets import data_set
+from tests.support.runs import train
+
+DEPTH = 4.0
+SIDE = 96  # px of the ray-cast photographs
+
+
+def wall_views(rng, count=6):
+    """Views of a wall z = 4 with smooth noise on it, and their photographs by name."""
+    texture = cv2.GaussianBlur(rng.random((400, 400, 3)).astype(np.float32), (0, 0), 3)
+    texture = (texture - texture.min()) / np.ptp(texture) * 255
+    camera = Camera(120, 90, 100, 100, 60, 45)
+    views, photographs = [], {}
+    for i in range(count):
+        centre = np.array([0.25 * i - 0.6, 0.1 * (i % 2), 0])
+        views.append(View(str(i), camera, np.column_stack([np.eye(3), -centre]), Path("none")))
+        columns, rows = np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5)
+        x, y = (columns - 60) / 100 * DEPTH + centre[0], (rows - 45) / 100 * DEPTH + centre[1]
+        maps = (200 + 50 * x).astype(np.float32), (200 + 50 * y).astype(np.float32)
+        photographs[str(i)] = cv2.remap(texture, *maps, cv2.INTER_LINEAR).astype(np.uint8)
+    return views, photographs
+
+
+def test_a_wall_is_found_where_it_is(rng):
+    views, photographs = wall_views(rng)
+    points = swept_points(views, np.array([0, 0, DEPTH]), lambda view: photographs[view.name], 5000, 0)
+    assert len(points) == 5000
+    depth = points.positions[:, 2]
+    assert np.mean(np.abs(depth - DEPTH) < 0.05 * DEPTH) > 0.95
+    row = (45 + 100 * (points.positions[:, 1] - 0) / depth).astype(int)  # seen by the view at (-0.1, 0, 0)
+    column = (60 + 100 * (points.positions[:, 0] + 0.1) / depth).astype(int)
+    seen = (row >= 0) & (row < 90) & (column >= 0) & (column < 120)
+    difference = np.abs(points.colours[seen] * 255 - photographs["2"][row[seen], column[seen]])
+    assert np.median(difference) < 12
+
+
+def test_the_same_points_every_time(rng):
+    views, photographs = wall_views(rng)
+    first, second = (swept_points(views, np.array([0, 0, 4.0]), lambda v: photographs[v.name], 700, 3) for _ in "ab")
+    np.testing.assert_array_equal(first.positions, second.positions)
+    np.testing.assert_array_equal(first.colours, second.colours)
+
+
+def test_photographs_that_have_nothing_in_common(rng):
+    views, photographs = wall_views(rng)
+    noise = {name: rng.integers(0, 256, image.shape).astype(np.uint8) for name, image in photographs.items()}
+    assert len(swept_points(views, np.array([0, 0, 4.0]), lambda view: noise[view.name], 5000, 0)) < 2500
+    assert len(swept_points(views[:1], np.array([0, 0, 4.0]), lambda view: noise[view.name], 5000, 0)) == 0
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """Views of the still life, [H, W, 4] photographs on disk, and exact depths by name, [H, W]; infinite: the sky."""
+    folder, world = tmp_path_factory.mktemp("table"), replace(STILL_LIFE, grid=2)
+    focal = 0.5 * SIDE / tan(0.5 * world.camera_angle_x)
+    camera, views, depths = Camera(SIDE, SIDE, focal, focal, SIDE / 2, SIDE / 2), [], {}
+    for i in range(5):
+        around, up = 0.12 * i, 0.35 + 0.06 * (i % 2)
+        backward = np.array([cos(around) * cos(up), sin(around) * cos(up), sin(up)])
+        pose = camera_pose(LOOK_AT + CAMERA_DISTANCE * backward, backward)
+        write_png(folder / f"{i}.png", world.photograph(pose, SIDE))
+        flipped = np.linalg.inv(pose @ np.diag([1, -1, -1, 1]))[:3]
+        views.append(View(str(i), camera, flipped, folder / f"{i}.png"))
+        y, x = np.indices((SIDE, SIDE)).reshape(2, -1) + 0.5
+        origin, directions = world.camera_rays(pose, SIDE, x, y)
+        depths[str(i)] = (world.trace(origin, directions)[0] * -(pose[:3, 2] @ directions)).reshape(SIDE, SIDE)
+    return views, depths
+
+
+def before_a_sky(view):
+    return load_image(view, (0.55, 0.7, 0.9))
+
+
+def detailed(table, shown, chance=laplacian_chance):
+    return swept_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, chance, shown=shown)
+
+
+def test_pixels_of_detail_lie_at_exact_depths(table):
+    """The median error is below half of the distance between planes, in inverse depth."""
+    views, depths = table
+    points = detailed(table, lambda view: np.isfinite(depths[view.name]) & (view.name == "2"))
+    assert len(points) > 500
+    place = points.positions @ views[2].world_to_camera[:, :3].T + views[2].world_to_camera[:, 3]
+    column, row = np.floor(place[:, :2] / place[:, 2:] * views[2].camera.fx + SIDE / 2).astype(int).T
+    step = (1 / MIN_DEPTH - 1 / MAX_DEPTH) / (PLANES - 1) / CAMERA_DISTANCE
+    exact = depths["2"][row, column]
+    assert np.median(np.abs(1 / place[:, 2] - 1 / exact)) < step / 2
+    chance = laplacian_chance(before_a_sky(views[2]) / 255)[row, column]
+    sizes = place[:, 2] / views[2].camera.fx * np.minimum(1 / np.sqrt(chance), SIDE / 10)
+    np.testing.assert_allclose(points.sizes, sizes, rtol=1e-4)
+
+
+def test_a_sky_gives_no_points_of_detail(table):
+    inner = {name: cv2.erode(np.isinf(depth).astype(np.uint8), np.ones((5, 5))) > 0 for name, depth in table[1].items()}
+    assert len(detailed(table, lambda view: inner[view.name])) == 0
+    assert len(detailed(table, lambda view: inner[view.name], chance=None)) > 500, "the sweep alone finds some"
+
+
+def test_transparent_pixels_give_no_points(table):
+    shown = {view.name: opaque_pixels(view) for view in table[0]}
+    assert not any((shown[name] & np.isinf(depth)).any() for name, depth in table[1].items())
+    assert 500 < len(detailed(table, opaque_pixels)) < len(detailed(table, lambda view: None))
+
+
+def test_pixels_that_a_mask_leaves_out_give_no_points(table, tmp_path):
+    left = np.zeros((SIDE, SIDE, 4), np.uint8)
+    left[:, : SIDE // 2] = 255
+    write_png(tmp_path / "mask.png", left)
+    view = table[0][0]
+    np.testing.assert_array_equal(
+        opaque_pixels(replace(view, mask_path=tmp_path / "mask.png")), opaque_pixels(view) & (left[:, :, 0] > 0)
+    )
+
+
+def test_detail_gets_more_points(rng):
+    views, photographs = wall_views(rng)
+    blurred = {name: cv2.GaussianBlur(image, (0, 0), 4) for name, image in photographs.items()}
+    half = np.arange(120) < 60
+    mixed = {name: np.where(half[:, None], image, blurred[name]) for name, image in photographs.items()}
+    centre, load = np.array([0, 0, DEPTH]), lambda view: mixed[view.name]
+    sides = [np.broadcast_to(half, (90, 120)), np.broadcast_to(~half, (90, 120))]
+
+    def shares(chance):
+        return [len(swept_points(views, centre, load, 10**6, 0, chance, shown=lambda view, s=s: s)) for s in sides]
+
+    (sharp, soft), (all_sharp, all_soft) = shares(laplacian_chance), shares(None)
+    assert sharp / all_sharp > 3 * soft / all_soft > 0
+
+
+def test_the_chance_of_a_pixel(rng):
+    image = rng.random((5, 7, 3)) * 0.3
+    chance = laplacian_chance(image)
+    for row, column in np.ndindex(5, 7):
+        around = [
+            (max(row - 1, 0), column),
+            (min(row + 1, 4), column),
+            (row, max(column - 1, 0)),
+            (row, min(column + 1, 6)),
+        ]
+        sums = [sum(image[place][k] for place in around) - 4 * image[row, column][k] for k in range(3)]
+        assert chance[row, column] == pytest.approx(min(1, sum(map(abs, sums))))
+    assert 0 < chance.min() < 1 == chance.max()
+    assert not laplacian_chance(np.full((4, 4, 3), 0.4)).any()
+    np.testing.assert_allclose(spacing(np.array([1, 0.25, 1e-9]), 160), [1, 2, MAX_SPACING * 160])
+
+
+def test_what_the_scene_has_is_not_new():
+    """Of four pixels at depth 2: a point in it, one behind it, one before it, none; a plane is 0.1 of inverse depth."""
+    view = View("a", Camera(4, 1, 1, 1, 2, 0.5), np.eye(4)[:3])
+    surface = Surface(view, np.zeros((1, 4, 3)), np.full((1, 4), 0.5), 0.1)
+    depths, columns = np.array([2.3, 3.0, 1.0]), np.array([0, 1, 2])
+    points = np.stack([(columns - 1.5) * depths, 0 * depths, depths], axis=1)
+    behind = np.array([[0, 0, -1.0]])
+    for order in (points, points[::-1], np.concatenate([points, behind, [[1.5 * 9, 0, 9], [-0.5 * 9, 0, 9]]])):
+        assert surface.is_new(order).tolist() == [[False, True, False, True]]
+
+
+def test_what_the_scene_lacks_is_added(rng):
+    views, photographs = wall_views(rng)
+    centre, load = np.array([0, 0, DEPTH]), lambda view: photographs[view.name]
+    alone = swept_points(views, centre, load, 10**6, 0).positions
+    left = alone[alone[:, 0] < 0].astype(np.float64)
+    new = swept_points(views, centre, load, 10**6, 0, beside=left).positions
+    assert len(new) < 0.6 * len(alone)
+    assert np.mean(new[:, 0] > -0.1) > 0.95
+
+
+def test_points_of_detail_are_the_same_every_time(table):
+    first, second = (detailed(table, lambda view: None) for _ in "ab")
+    for name in ("positions", "colours", "sizes"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    some = swept_points(table[0], LOOK_AT, before_a_sky, 700, 0, laplacian_chance)
+    assert len(some) == len(some.sizes) == 700 < len(first)
+    assert np.median(some.sizes) > 1.5 * np.median(first.sizes), "fewer points are larger"
+
+
+def test_sizes_that_are_known_are_those_of_gaussians():
+    places, grey = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32), np.full((3, 3), 0.5, np.float32)
+    known = PointCloud(places[:1], grey[:1]).joined(PointCloud(places[1:], grey[1:], sizes=np.array([0.2, 0.3])))
+    scales = from_points(known, 0.1, 0, scale=2.0)["log_scales"]
+    np.testing.assert_allclose(np.exp(scales), np.repeat([[2.0], [0.4], [0.6]], 3, axis=1), rtol=1e-6)
+
+
+@pytest.mark.large
+def test_real_surfaces():
+    """Nine tenths of what structure from motion found has a swept point within three hundredths of its distance."""
+    scene = read_scene(data_set("fox"))
+    views = scene.split("train")
+    centre = centre_of(views)
+    points = swept_points(views, centre, load_image, 100_000, 0)
+    distance = np.median([np.linalg.norm(view.position - centre) for view in views])
+    gaps, _ = cKDTree(points.positions).query(scene.points.positions)
+    assert np.quantile(gaps, 0.9) < 0.03 * distance
+
+
+@pytest.mark.parametrize(
+    ("more", "found", "alpha", "joined"), [(1, 70, False, 70), (1, 0, False, 0), (0, 70, False, 0), (1, 70, True, 0)]
+)
+def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, caplog, more, found, alpha, joined):
+    """more: than the scene's points are enough."""
+    own, file = len(read_scene(tiny_scene).points), tmp_path / "start.yaml"
+    cloud = PointCloud(np.random.default_rng(0).random((found, 3), np.float32), np.zeros((found, 3), np.float32))
+    monkeypatch.setattr("clsplat.stages.first_points.swept_points", lambda *arguments: cloud)
+    monkeypatch.setattr("clsplat.stages.init.is_transparent", lambda scene: alpha)
+    stages = f"[{{init: {{fewest: {own + more}}}}}, {{optimize: {{steps: 1, losses: [l1]}}}}, export]"
+    file.write_text(f"name: start\nstages: {stages}\n")
+    caplog.set_level("INFO", "clsplat")
+    run = train(tiny_scene, tmp_path / "run", pipeline=str(file))
+    log = caplog.text
+    swept = bool(more) and not alpha
+    assert f"{own + joined:,} Gaussians from the scene's points{' and a sweep' if swept else ''}" in log
+    assert run.model.gaussians.count == own + joined
+
+
+@pytest.mark.parametrize("detail", ["uniform", "laplacian"])
+def test_points_and_sweep(tiny_scene, tmp_path, caplog, detail):
+    scene = read_scene(tiny_scene)
+    caplog.set_level("INFO", "clsplat")
+    sets = ("init.source=points+sweep", f"init.detail={detail}", "init.swept=60", "optimize.steps=1")
+    train(tiny_scene, tmp_path / "run", *sets)
+    found = re.search(r"([\d,]+) Gaussians from the scene's points and a sweep", caplog.text)
+    assert found
+    expected = Init(source="points+sweep", swept=60).expected_count(scene)
+    assert len(scene.points) < int(found[1].replace(",", "")) <= expected == len(scene.points) + 60
+
+
+def test_a_sweep_that_adds_nothing_is_told(tiny_scene, tmp_path, monkeypatch, caplog):
+    nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+    monkeypatch.setattr("clsplat.stages.first_points.swept_points", lambda *arguments: nothing)
+    run = train(tiny_scene, tmp_path / "run", "init.source=points+sweep", "optimize.steps=1")
+    assert "agree on no points beside the scene's" in caplog.text
+    assert run.model.gaussians.count == len(read_scene(tiny_scene).points)
+
+
+def test_points_and_sweep_need_points(tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "bare", ignore=shutil.ignore_patterns("points3d.ply"))
+    with pytest.raises(DataError, match=r"no points to start from; use init: \{source: sweep\}"):
+        train(tmp_path / "bare", tmp_path / "run", "init.source=points+sweep")

@@ -1,0 +1,96 @@
+"""Metadata of a PNG change no pixel and print no line; a damaged one is named with the place of the fault."""
+
+import struct
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError
+from clsplat.scene.images import read_image
+from clsplat.scene.png import pixels_only
+
+RNG = np.random.default_rng(0)
+KINDS = {
+    "grey": RNG.integers(0, 256, (9, 7), dtype=np.uint8),
+    "colour": RNG.integers(0, 256, (9, 7, 3), dtype=np.uint8),
+    "alpha": RNG.integers(0, 256, (9, 7, 4), dtype=np.uint8),
+    "16 bits": RNG.integers(0, 65536, (9, 7, 3), dtype=np.uint16),
+}
+METADATA = {
+    "a bad colour profile": (b"iCCP", b"sRGB\0\0" + zlib.compress(b"x" * 200)),
+    "a gamma of 0": (b"gAMA", b"\0\0\0\0"),
+    "a gamma": (b"gAMA", struct.pack(">I", 100_000)),
+    "sRGB": (b"sRGB", b"\0"),
+    "primaries": (b"cHRM", struct.pack(">8I", *[31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000])),
+    "a text": (b"tEXt", b"a\0b"),
+    "a date that is none": (b"tIME", b"\xff" * 7),
+    "a background": (b"bKGD", b"\0" * 6),
+}
+
+
+def chunk(kind: bytes, content: bytes, wrong: int = 0) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content) ^ wrong)
+
+
+def encoded(pixels: np.ndarray) -> bytes:
+    return cv2.imencode(".png", pixels)[1].tobytes()
+
+
+def with_chunk(data: bytes, more: bytes) -> bytes:
+    return data[:33] + more + data[33:]  # after IHDR
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("what", METADATA)
+@pytest.mark.parametrize("wrong", [0, 1], ids=["right", "wrong checksum"])
+def test_metadata_change_no_pixel_and_print_nothing(kind, what, wrong, tmp_path, capfd):
+    data = encoded(KINDS[kind])
+    (tmp_path / "a.png").write_bytes(data)
+    plain = read_image(tmp_path / "a.png")
+    (tmp_path / "a.png").write_bytes(with_chunk(data, chunk(*METADATA[what], wrong) * 2))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), plain)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_a_valid_file_shows_is_independent_of_cut_metadata():
+    data = with_chunk(encoded(KINDS["colour"]), chunk(*METADATA["a gamma"]) + chunk(*METADATA["primaries"]))
+    whole, cut = (cv2.imdecode(np.frombuffer(one, np.uint8), -1) for one in (data, pixels_only(data)))
+    np.testing.assert_array_equal(whole, cut)
+    assert len(pixels_only(data)) < len(data)
+
+
+def test_transparency_of_a_palette_and_orientation_stay():
+    for kind in (b"tRNS", b"eXIf"):
+        data = with_chunk(encoded(KINDS["colour"]), chunk(kind, b"\0\1\0\1\0\1"))
+        assert pixels_only(data) == data
+
+
+@pytest.mark.parametrize("name", ["IHDR", "IDAT"])
+def test_a_damaged_chunk_is_named_with_its_place(name, tmp_path, capfd):
+    data = bytearray(encoded(KINDS["colour"]))
+    at = data.index(name.encode())
+    length = struct.unpack_from(">I", data, at - 4)[0]
+    data[at + 4 + length] ^= 1  # of the checksum
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(DataError, match=rf"a.png: not .*byte {at - 4}: the checksum of the chunk '{name}' is wrong"):
+        read_image(tmp_path / "a.png")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".webp"])
+def test_a_cut_image_prints_nothing(suffix, tmp_path: Path, capfd):
+    data = cv2.imencode(suffix, KINDS["colour"])[1].tobytes()
+    for length in range(0, len(data), 7):
+        (tmp_path / "a").write_bytes(data[:length])
+        with suppress(DataError):
+            read_image(tmp_path / "a")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_chunk_whose_name_is_no_text_is_named_in_one_line():
+    with pytest.raises(ValueError, match=r"the checksum of the chunk 'A\\r\\n ' is wrong"):
+        pixels_only(with_chunk(encoded(KINDS["grey"]), chunk(b"A\r\n ", b"", wrong=1)))

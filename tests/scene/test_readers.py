@@ -1,0 +1,149 @@
+"""The list of dataset readers: shipped ones and those of plug-ins."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.inspect.inspection import Inspection
+from clsplat.scene import Camera, PointCloud, Reader, Scene, View, make_scene
+from clsplat.scene.colmap import ColmapReader
+from clsplat.scene.detect import format_names, holds_scene, read_scene, readers
+from tests.support.orbit_scene import orbit, photograph, write
+from tests.support.refusals import refusal
+
+SHIPPED = ["multi-camera video", "COLMAP", "Blender", "multi-scale Blender", "nerfstudio"]
+
+
+@pytest.fixture(autouse=True)
+def _forget_readers() -> Iterator[None]:
+    defined = list(Reader.defined)
+    yield
+    Reader.defined[:] = defined
+
+
+class OneFile(Reader):
+    """Of the tests below: a base class that is abstract."""
+
+    def matches(self, path: Path) -> bool:
+        return (path / self.expects).is_file()
+
+
+def test_shipped_readers_come_in_order_of_precedence():
+    assert [reader.name for reader in readers()] == SHIPPED
+    assert format_names() == "multi-camera video, COLMAP, Blender, multi-scale Blender or nerfstudio"
+
+
+def test_readers_of_plugins_follow_in_order_of_definition():
+    class Second(OneFile):
+        name, expects = "second", "b"
+
+        def read(self, path: Path, holdout: int) -> Scene:
+            raise AssertionError
+
+    class First(Second):  # takes the place of the class that it extends
+        name = "first"
+
+    class Third(First):
+        name = "third"
+
+    class Other(OneFile):
+        name, expects = "other", "c"
+        read = Second.read
+
+    assert [reader.name for reader in readers()] == [*SHIPPED, "third", "other"]
+
+
+def test_a_reader_that_extends_a_shipped_one_takes_its_place():
+    class Wider(ColmapReader):
+        name = "wider"
+
+    assert [reader.name for reader in readers()] == [SHIPPED[0], "wider", *SHIPPED[2:]]
+
+
+def test_a_reader_that_is_defined_again_replaces_the_one_before():
+    def define() -> type[Reader]:
+        class Own(OneFile):
+            name, expects = "own", "o"
+            read = ColmapReader.read
+
+        return Own
+
+    first, second = define(), define()
+    assert first is not second
+    assert [type(reader) for reader in readers()][len(SHIPPED) :] == [second]
+
+
+def test_a_reader_without_a_name_is_refused_in_a_sentence(tmp_path):
+    class Nameless(OneFile):
+        def read(self, path: Path, holdout: int) -> Scene:
+            raise AssertionError
+
+    with pytest.raises(ConfigError, match="Nameless has no name and no expects; add it to the class"):
+        read_scene(tmp_path)
+
+
+@pytest.fixture
+def grid(tmp_path: Path) -> Path:
+    """A folder of four photographs for the reader of the next tests only."""
+    for i in range(4):
+        photograph(tmp_path / f"{i}.png")
+    (tmp_path / "grid.txt").write_text("4")
+    return tmp_path
+
+
+def test_matching_and_reading_are_enough_for_inspection(grid):
+    assert not holds_scene(grid)
+
+    class Grid(OneFile):
+        name, expects = "grid", "grid.txt"
+
+        def read(self, path: Path, holdout: int) -> Scene:
+            if not (path / "grid.txt").read_text():
+                raise DataError(f"{path / 'grid.txt'}: is empty; write the number of photographs")
+            poses = np.stack([np.eye(3, 4)] * 4)
+            poses[:, 0, 3] = range(4)
+            camera = Camera(64, 48, 60, 60, 32, 24)
+            views = [View(f"{i}.png", camera, pose, path / f"{i}.png") for i, pose in enumerate(poses)]
+            cloud = PointCloud(np.float32([[0, 0, 5], [1, 0, 5]]), np.float32([[1, 0, 0.2], [0, 0, 0]]))
+            return make_scene(path, views, {0}, cloud)
+
+    assert holds_scene(grid)
+    inspection = Inspection.of(grid)
+    facts, parts = inspection.facts, inspection.parts
+    assert inspection.trainable
+    assert (facts.kind, facts.registered, facts.on_disk, facts.train, facts.test) == ("grid", 4, 4, 3, 1)
+    assert (facts.points.count, facts.points.error_mean) == (2, None)
+    assert parts.points.rgb.tolist() == [[255, 0, 51], [0, 0, 0]]
+    (grid / "3.png").unlink()
+    assert Inspection.of(grid).facts.missing == ["3.png"]
+    (grid / "grid.txt").write_text("")
+    inspection = Inspection.of(grid)
+    assert (inspection.facts.kind, inspection.facts.registered) == ("grid", 0)
+    assert "grid.txt: is empty" in inspection.verdict
+
+
+def test_a_folder_that_no_reader_knows_names_them_all(tmp_path):
+    message = refusal(read_scene, tmp_path)
+    assert all(f"{reader.name} ({reader.expects})" in message for reader in readers())
+
+
+def test_the_first_reader_that_matches_is_taken(tmp_path):
+    path = write(tmp_path / "scene", orbit())
+    (path / "transforms.json").write_text("damaged")
+    assert len(read_scene(path).views) == 24
+    assert Inspection.of(path).facts.kind == "COLMAP"
+
+
+@pytest.mark.parametrize("changes", [{"width": 0}, {"fx": -1.0}, {"fy": float("nan")}, {"cx": float("inf")}])
+def test_a_camera_that_is_impossible_is_refused_whoever_read_it(tmp_path, changes):
+    camera = Camera(**{"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, **changes})
+    view = View("a.png", camera, np.eye(3, 4), tmp_path / "a.png")
+    assert "'a.png': the camera is" in refusal(make_scene, tmp_path, [view], set(), None)
+
+
+@pytest.mark.parametrize("pose", [np.zeros((3, 4)), np.full((3, 4), np.nan), np.eye(4)])
+def test_invalid_pose_is_a_data_error_whoever_read_it(pose):
+    assert "the pose of 'a.png'" in refusal(View, "a.png", Camera(64, 48, 60.0, 60.0, 32.0, 24.0), pose)

@@ -1,0 +1,187 @@
+"""How far points are from where photographs show them: measured, kept, and what follows from it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.inspect.findings import POSES, POSES_ERROR
+from clsplat.inspect.inspection import Inspection
+from clsplat.pipeline.choosing import choose
+from clsplat.pipeline.loading import load
+from clsplat.runs.description import describe
+from clsplat.runs.single import run_pipeline
+from clsplat.scene.capture import measured
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import write_image
+from clsplat.scene.reprojection import misses, reprojection_errors, within
+from clsplat.scene.tracks import Tracks
+from clsplat.scene.view import View
+from clsplat.views.colours import Auto
+from clsplat.views.poses import Poses
+from data_tools.undistort import undistort_scene
+from tests.support.camera_rings import STRONG
+from tests.support.outdoor_scene import Yard, missing
+from tests.support.runs import FEW
+
+VECTOR = np.array([1.2, -0.9])  # px, 1.5 long
+OFFSET = np.array([0.1, 0.2, 0.3])
+
+OF_POSES = "{keys: [optimize.poses], by: photographs, values: [[0, {start: 1}]], since: x}"
+STATE = ("status.json", "log.txt")  # which tell of the refusal
+
+
+@pytest.mark.parametrize("lens", [None, STRONG])
+def test_distances_are_from_where_the_camera_shows_a_point(rng, lens):
+    view = View("a.png", STRONG.pinhole, np.column_stack([np.eye(3), OFFSET]), lens=lens)
+    points = np.column_stack([*rng.uniform(-0.4, 0.4, (2, 7)), np.full(7, 2.0)])
+    seen, camera = points + OFFSET, view.camera
+    straight = seen[:, :2] / seen[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    places = lens.project(seen) if lens else straight
+    points[3, 2] = -5
+    found = misses(view, points, places + VECTOR)
+    assert np.isnan(found[3]).all(), "behind the camera"
+    np.testing.assert_allclose(np.delete(found, 3, axis=0), np.tile(VECTOR, (6, 1)), atol=1e-9)
+    straight[:4] = [[1e7, 1e7], [-1e308, 0], [np.inf, 0], [np.nan, 1]]
+    assert np.isnan(misses(view, points, straight)[:4]).all(), "outside the photograph"
+
+
+def test_the_mean_is_over_points_and_then_over_their_photographs():
+    view = View("a", STRONG.pinhole, np.eye(3, 4))
+    seen = {"a": np.array([0, 2]), "b": np.array([2])}
+    tracks = Tracks(np.zeros((3, 3)), seen, {"a": np.array([[3.0, 4], [1, 0]]), "b": np.array([[0, 3.0]])})
+    assert reprojection_errors(tracks, [view, replace(view, name="b")]) == pytest.approx([5, 2])
+    assert reprojection_errors(tracks, [replace(view, name="b").resized(2)]) == pytest.approx([1.5]), "at its size"
+    assert reprojection_errors(tracks, [replace(view, name="c")]) is None
+    assert reprojection_errors(replace(tracks, misses={}), [view]) is None
+    assert reprojection_errors(None, [view]) is None
+
+
+def test_points_a_pixel_away_or_more_tell_no_depth():
+    """At the size of training; what is not known stays, and so do other photographs."""
+    view, rows = View("a", STRONG.pinhole, np.eye(3, 4)), np.array([1, 3, 5, 6])
+    missed = {"a": np.array([[0.6, 0.8], [0.5, 0], [np.nan, 0], [0, 2.1]]), "b": np.array([[9.0, 9]])}
+    tracks = Tracks(np.zeros((7, 3)), {"a": rows, "b": rows[:1], "c": rows}, missed)
+    found = within(tracks, [view, replace(view, name="c")])
+    assert {name: seen.tolist() for name, seen in found.seen.items()} == {"a": [3, 5], "b": [1], "c": [1, 3, 5, 6]}
+    np.testing.assert_array_equal(found.misses["a"], missed["a"][1:3])
+    assert within(tracks, [view.resized(2)]).seen["a"].tolist() == [1, 3, 5]
+    assert within(tracks, [view.resized(2), view, view.resized(4)]).seen["a"].tolist() == [3, 5], "in several sizes"
+
+
+def test_it_is_reported_at_training_size_without_test_views(tmp_path, rng):
+    plain = read_scene(Yard(rng).write(tmp_path / "plain"), 6)
+    tested = tuple(view.name for view in plain.split("test"))
+    again = read_scene(missing(tmp_path / "again", VECTOR, rng, exact=tested), 6)
+    assert measured(again)["reprojection_error"] == pytest.approx(1.5, rel=1e-5)
+    assert measured(again.downscaled(2))["reprojection_error"] == pytest.approx(0.75, rel=1e-5)
+    assert "reprojection_error" not in measured(plain), "places that were computed from cameras tell nothing"
+
+
+def test_undistorted_scenes_keep_it(tmp_path, rng):
+    undistort_scene(missing(tmp_path / "scene", VECTOR, rng), tmp_path / "small", 32)
+    assert measured(read_scene(tmp_path / "small", 0))["reprojection_error"] == pytest.approx(0.75, rel=1e-5)
+
+
+def test_places_in_text_that_are_no_numbers_are_not_known(tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n35 24 7 ? 3 5\n")
+    (tmp_path / "points3D.txt").write_text("7 0 0 1 9 9 9 0.5 1 0\n5 1 0 1 9 9 9 0.5 1 1\n")
+    write_image(tmp_path / "images" / "a.png", np.zeros((48, 64, 3), np.uint8))
+    tracks = read_scene(tmp_path, 0).tracks
+    assert tracks is not None
+    assert tracks.seen["a.png"].tolist() == [1, 0]
+    np.testing.assert_array_equal(tracks.misses["a.png"], [[np.nan, np.nan], [3, 0]])
+
+
+@pytest.mark.parametrize(("error", "learned"), [(0.4, False), (0.99, False), (1.0, True), (3.0, True)])
+def test_the_recipe_for_photographs_learns_poses_from_a_pixel_on(error, learned):
+    settings = load("photos").settings
+    chosen = choose(settings, {"photographs": 60, "reprojection_error": error})
+    assert chosen.training.poses == (Poses(start=500) if learned else None)
+    assert chosen.training.colours == Auto(**({} if learned else {"above": 0.2}))
+    if not learned:
+        assert chosen.training.model_copy(update={"colours": None}) == load("fast").settings.training
+    (told,) = [one.told for one in chosen.choices if "optimize.poses" in one.keys]
+    assert f"{error:g} px are between a point and where photographs show it" in told
+    without = choose(settings, {"photographs": 60})
+    assert without.training.poses is None
+
+
+@pytest.mark.parametrize(("length", "level"), [(0.5, None), (1.5, "note"), (2.5, "warning")])
+def test_inspect_says_what_to_set(tmp_path, rng, length, level):
+    inspection = Inspection.of(missing(tmp_path / "scene", length * VECTOR / 1.5, rng))
+    assert inspection.facts.points is not None
+    assert inspection.facts.points.error_mean == pytest.approx(length, rel=1e-5)
+    found = [one for one in inspection.findings if "reprojection" in one.fault]
+    assert [one.level for one in found] == ([] if level is None else [level])
+    assert all('--set "optimize.poses={start: 500}"' in one.remedy for one in found)
+
+
+def test_inspect_says_what_the_recipe_for_photographs_does():
+    (of_poses,) = [one for one in load("photos").settings.choices if "optimize.poses" in one.keys]
+    bound, value, _ = of_poses.values[1]
+    assert (bound, f"optimize.poses={{start: {value['start']}}}") == (POSES_ERROR, POSES)
+
+
+@pytest.mark.parametrize(
+    ("of_step", "reason"),
+    [
+        ("optimize.background=random", "optimize.background is drawn, which a sky does not go with"),
+        ("optimize.poses={start: 1}", "optimize.poses are learned, which a sky does not go with"),
+    ],
+)
+def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rng, caplog):
+    folder, (name, value) = missing(tmp_path / "scene", VECTOR, rng), of_step.split("=", 1)
+    caplog.set_level("INFO", "clsplat")
+    asked = load("smoke", [f"scene.path='{folder}'", f"{name}={value}", "model.background=auto"])
+    describe(asked, tmp_path / "run", None, "new")
+    assert f"model.background: off, since {reason}" in caplog.messages
+
+
+def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
+    for recipe in ("smoke", "photos"):  # whose choices have a key for either
+        with pytest.raises(ConfigError, match="not learned together with poses"):
+            load(recipe, ["optimize.poses={start: 1}", "model.background=directions"])
+        with pytest.raises(ConfigError, match="a drawn one is for models without a sky"):
+            load(recipe, ["optimize.background=random", "model.background=directions"])
+    load("photos", ["model.background=directions"])  # whose choices may learn poses
+
+
+@pytest.mark.slow
+def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
+    """With photographs that choose the steps, and a training on all of them after that."""
+    folder = missing(tmp_path / "scene", VECTOR, rng)
+    (of_poses,) = [one for one in load("photos").settings.choices if "optimize.poses" in one.keys]
+    asked = [f"scene.path='{folder}'", *FEW, "scene.validation=auto", "optimize.keep=best", "optimize.refit=true"]
+    asked += ["model.background={type: auto, photographs: 0.25}"]
+    asked += [f"choices=[{json.dumps(of_poses.undone().model_dump(mode='json', exclude_defaults=True))}]"]
+    run_pipeline(load("smoke", asked), tmp_path / "run", None, "new")
+    written = load(str(tmp_path / "run" / "pipeline.yaml")).settings
+    assert written.training.poses == Poses(start=500)
+    background = written.model.background
+    assert (background.chosen, background.reason) == ("off", "optimize.poses are learned, which a sky does not go with")
+    assert (tmp_path / "run" / "view_poses.json").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        (["optimize.during.0={snapshot: {every: 2, view: nosuch}}"], "the scene has no view 'nosuch'"),
+        (["optimize.losses=[l1, {type: inverse_depth, folder: nosuch}]"], "no such file; expected the depth map of"),
+        (["optimize.losses=[l1, inverse_depth]", "optimize.poses={start: 1}"], "does not go with optimize.poses"),
+        ([f"choices=[{OF_POSES}]", "model.background=directions"], "not learned together with poses"),
+    ],
+)
+def test_what_a_run_can_know_is_refused_before_anything_changes(changes, fault, tmp_path, rng):
+    folder, out = missing(tmp_path / "scene", VECTOR, rng), tmp_path / "run"
+    asked = [f"scene.path='{folder}'", *FEW]
+    run_pipeline(load("smoke", asked), out, None, "new")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name not in STATE}
+    for begin in (describe, run_pipeline):
+        with pytest.raises((ConfigError, DataError), match=fault):
+            begin(load("smoke", [*asked, *changes]), out, None, "restart")
+    assert {path: path.read_bytes() for path in before} == before

@@ -1,0 +1,281 @@
+"""Which photographs a run trains on, chooses by and is tested on, and those that a dataset names and does not have."""
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.loading import load
+from clsplat.runs.description import describe
+from clsplat.runs.scenes import RunScene
+from clsplat.scene.choice import Choice
+from clsplat.scene.detect import read_scene
+from clsplat.scene.identity import Identity
+from clsplat.scene.scene import Scene
+from clsplat.scene.split import Split
+from clsplat.scene.tracks import Tracks
+from tests.support.transforms_scene import LENS, frames, write
+
+LETTERS = "abcdefghijklmnopqrstuvwx"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A nerfstudio scene of 24 photographs, images/a.png to images/x.png."""
+    write(tmp_path, **LENS, frames=frames(*(f"images/{letter}.png" for letter in LETTERS)))
+    return tmp_path
+
+
+def letters(scene: Scene, split: str) -> str:
+    return "".join(Path(view.name).stem for view in scene.split(split))
+
+
+def test_every_nth_from_an_offset_on_is_for_testing(folder):
+    scene = read_scene(folder, Split(Choice(every=8, offset=4)))
+    assert letters(scene, "test") == "emu"
+    assert len(scene.train) == 21
+    assert scene.extent == pytest.approx(read_scene(folder, 8).extent, rel=1)
+
+
+@pytest.mark.parametrize(
+    "split", [{"holdout": Choice(every=3, offset=1)}, {"train": Choice(every=2)}, {"validation": 2}]
+)
+def test_a_split_leaves_the_rest_of_a_scene_as_it_is(folder, split):
+    scene = replace(read_scene(folder), tracks=Tracks(np.zeros((1, 3)), {}))
+    found = Split(**split).applied(scene)
+    assert (found.tracks, found.points, found.background) == (scene.tracks, scene.points, scene.background)
+    assert {view.name for view in found.views} <= {view.name for view in scene.views}
+
+
+@pytest.mark.parametrize("listed", ["b", "b.png", "images/b.png", "images/b", "images\\b.png", "b.jpg", "images/b.JPG"])
+def test_a_listed_name_may_be_the_end_of_a_path(folder, listed):
+    assert letters(read_scene(folder, Split(Choice(names=[listed, "q"]))), "test") == "bq"
+
+
+def test_a_photograph_is_meant_before_one_of_another_kind(tmp_path):
+    write(tmp_path, **LENS, frames=frames("a/1.png", "a/1.jpg", "c.png"))
+    scene = read_scene(tmp_path, Split(Choice(names=["1.jpg"])))
+    assert [view.name for view in scene.split("test")] == ["a/1.jpg"]
+
+
+@pytest.mark.parametrize("listed", ["1.jpg", "1", "1.png"])
+def test_a_whole_path_is_meant_before_the_end_of_another(tmp_path, listed):
+    write(tmp_path, **LENS, frames=frames("1.png", "a/1.png", "c.png"))
+    scene = read_scene(tmp_path, Split(Choice(names=[listed])))
+    assert [view.name for view in scene.split("test")] == ["1.png"]
+
+
+def test_a_name_that_means_one_elsewhere_of_another_kind_is_told(tmp_path, caplog):
+    write(tmp_path, **LENS, frames=frames("a/1.png", "c.png"))
+    caplog.set_level("INFO", "clsplat")
+    scene = read_scene(tmp_path, Split(Choice(names=["1.jpg"])))
+    assert [view.name for view in scene.split("test")] == ["a/1.png"]
+    assert "'1.jpg' means 'a/1.png'" in caplog.text
+    caplog.clear()
+    read_scene(tmp_path, Split(Choice(names=["c.jpg"])))
+    assert "means" not in caplog.text
+
+
+def test_a_file_lists_test_views(folder):
+    (folder / "test.txt").write_text("# of the paper\nc.png\n\n x.png \n")
+    assert letters(read_scene(folder, Split(Choice(file="test.txt"))), "test") == "cx"
+
+
+def test_file_may_lie_with_the_photographs_before_preparation(folder, tmp_path_factory):
+    lists = tmp_path_factory.mktemp("photographs")
+    (lists / "test.txt").write_text("d\n")
+    assert letters(read_scene(folder, Split(Choice(file="test.txt"), folder=lists)), "test") == "d"
+
+
+@pytest.mark.parametrize(
+    ("choice", "fault"),
+    [
+        (Choice(names=["bb.png"]), "no photograph is called 'bb.png'; did you mean 'b.png'?"),
+        (Choice(names=["b.gif"]), "no photograph is called 'b.gif'"),
+        (Choice(file="test.txt"), "test.txt: cannot be read"),
+        (
+            Choice(names=list(LETTERS)),
+            "scene.holdout takes all 24 photographs for testing; expected some to train with",
+        ),
+        (Choice(every=1), "scene.holdout takes all 24 photographs"),
+    ],
+)
+def test_a_list_that_is_wrong_is_refused(folder, choice, fault):
+    with pytest.raises(DataError, match=fault.replace("?", r"\?")):
+        read_scene(folder, Split(choice))
+
+
+@pytest.mark.parametrize("split", [Split(8, Choice(names=["a", "i"])), Split(8, None, Choice(names=["a", "b"]))])
+def test_a_test_photograph_in_another_list_is_named(folder, split):
+    with pytest.raises(
+        DataError, match=r"scene\.(train|validation): the list of names: '[ai]' is held out for testing"
+    ):
+        read_scene(folder, split)
+
+
+def test_a_photograph_that_is_left_out_is_named_in_another_list(folder):
+    fault = "scene.validation: the list of names: 'c' is left out by scene.train; .* or put it into scene.train"
+    for train in (Choice(every=2), Choice(names=["b", "d"])):
+        with pytest.raises(DataError, match=fault):
+            read_scene(folder, Split(8, train, Choice(names=["c"])))
+
+
+def test_photograph_held_out_by_number_is_not_called_left_out(folder):
+    names = [f"images/{letter}.jpg" for letter in LETTERS]
+    Split(8, Choice(names=["b", "d"]), Choice(names=["a"])).check(folder, names)  # the placed ones decide
+    with pytest.raises(DataError, match=r"'c' is left out by scene\.train"):
+        Split(8, Choice(names=["b", "d"]), Choice(names=["c"])).check(folder, names)
+
+
+def test_a_name_that_two_photographs_end_in_is_refused(tmp_path):
+    write(tmp_path, **LENS, frames=frames("a/1.png", "b/1.png", "c.png"))
+    with pytest.raises(DataError, match=r"'1.png' means 'a/1.png' and 'b/1.png'; give more of the path"):
+        read_scene(tmp_path, Split(Choice(names=["1.png"])))
+
+
+def test_the_split_of_a_dataset_stands_unless_names_are_given(folder):
+    table = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").write_text(json.dumps({**table, "test_filenames": ["images/a.png"]}))
+    assert letters(read_scene(folder, Split(Choice(every=8, offset=4))), "test") == "a"
+    assert letters(read_scene(folder, Split(Choice(names=["b"]))), "test") == "b"
+
+
+def test_a_sparse_capture_is_every_nth_of_the_training_views(folder):
+    whole = read_scene(folder, 8)
+    scene = read_scene(folder, Split(8, Choice(every=4)))
+    assert letters(scene, "test") == letters(whole, "test") == "aiq"
+    assert letters(scene, "train") == letters(whole, "train")[::4] == "bfkotx"
+    assert len(scene.views) == 9, "the others are no views of the scene"
+
+
+@pytest.mark.parametrize(
+    ("train", "fold"),
+    [(None, "fox"), (Choice(every=4), "ft"), (Choice(names=["b", "c", "d", "e"]), "ce")],
+    ids=["21 training views", "6", "4"],
+)
+def test_fold_is_every_8th_training_view_and_at_least_two(folder, train, fold):
+    scene = read_scene(folder, Split(8, train, "auto"))
+    assert letters(scene, "validation") == fold
+    assert not {*scene.train} & {*scene.validation}
+    assert not {*scene.test} & {*scene.validation}
+    without = read_scene(folder, Split(8, train))
+    assert letters(scene.with_fold(), "train") == letters(without, "train")
+    assert scene.with_fold().validation == ()
+    assert scene.extent == without.extent, "the cameras are known, and only photographs are kept out"
+    halved = scene.downscaled(2)
+    assert letters(halved, "validation") == fold
+
+
+def test_a_fold_may_be_given(folder):
+    assert letters(read_scene(folder, Split(0, None, Choice(every=8, offset=4))), "validation") == "emu"
+    assert letters(read_scene(folder, Split(0, None, 12)), "validation") == "am"
+
+
+def test_a_fold_of_three_photographs_or_of_all_is_refused(folder):
+    with pytest.raises(DataError, match="has 3 training photographs; expected 4 or more to keep some for validation"):
+        read_scene(folder, Split(8, Choice(names=["b", "c", "d"]), "auto"))
+    with pytest.raises(DataError, match="takes 24 of 24 training photographs"):
+        read_scene(folder, Split(0, None, 1))
+
+
+def test_a_run_knows_a_scene_whose_fold_is_another(folder):
+    whole, fold = (Identity.of(read_scene(folder, Split(8, None, one)), {}) for one in (0, "auto"))
+    assert whole.digest != fold.digest
+    assert fold.changes(whole) == ["the split of 3 views (images/f.png, images/o.png, images/x.png)"]
+    assert Identity.from_data(json.loads(json.dumps(fold.data()))) == fold
+    before = {key: value for key, value in whole.data().items() if key != "validation"}
+    assert Identity.from_data(before) == whole, "a record of an earlier version"
+
+
+def test_listed_names_of_missing_photographs_are_skipped(folder, caplog):
+    caplog.set_level(logging.INFO)
+    for letter in "cx":
+        (folder / f"images/{letter}.png").unlink()
+    (folder / "names.txt").write_text("a\nc\nimages/x.jpg\nd\n")
+    for choice in (Choice(names=["a", "c", "c", "x.png", "d"]), Choice(file="names.txt")):
+        caplog.clear()
+        scene = read_scene(folder, Split(choice, missing="skip"))
+        assert letters(scene, "test") == "ad"
+        assert "skipped 2 names whose photograph is missing" in caplog.text
+        assert letters(read_scene(folder, Split(0, validation=choice, missing="skip")), "validation") == "ad"
+        assert letters(read_scene(folder, Split(0, train=choice, missing="skip")), "train") == "ad"
+    with pytest.raises(DataError, match="no photograph is called 'z'"):
+        read_scene(folder, Split(Choice(names=["a", "c", "z"]), missing="skip"))
+    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of .* name others, whose photographs are there"):
+        read_scene(folder, Split(Choice(names=["c"]), missing="skip"))
+    with pytest.raises(DataError, match=r"scene\.train leaves no photograph"):
+        read_scene(folder, Split(0, train=Choice(names=["c"]), missing="skip"))
+
+
+def test_missing_photographs_are_refused_with_the_skip_setting(folder, caplog):
+    for letter in "bc":
+        (folder / "images" / f"{letter}.png").unlink()
+    with pytest.raises(DataError, match=r"2 of 24 .* missing: .*put them back, or --set scene\.missing=skip"):
+        read_scene(folder)
+    caplog.set_level(logging.WARNING, "clsplat")
+    scene = read_scene(folder, Split(8, missing="skip"))
+    assert len(scene.views) == 22
+    assert letters(scene, "test") == "aks", "every 8th of those that are there"
+    assert "2 of 24 image files are missing" in caplog.text
+    assert len(caplog.records) == 1
+
+
+def test_a_dataset_without_any_photograph_is_refused(folder):
+    for file in (folder / "images").iterdir():
+        file.unlink()
+    with pytest.raises(DataError, match=r"24 of 24 image files are missing: .*put them back$"):
+        read_scene(folder, Split(missing="skip"))
+
+
+@pytest.mark.parametrize(
+    ("setting", "fault"),
+    [
+        ("holdout=-1", "expected a number, {every, offset}, {names: […]} or {file: …}, got -1"),
+        ("holdout={every: 8, offset: 8}", "expected an offset below every, 8"),
+        ("holdout={every:8,offset:4}", "or {file: …} (YAML needs a blank after each colon)"),
+        ("validation={every:8}", "or {file: …} (YAML needs a blank after each colon)"),
+        ("holdout={every: 8, offset: -1}", "expected an offset of 0 or more, not -1"),
+        ("holdout={offset: 4}", "expected every beside offset, as in {every: 8, offset: 4}"),
+        ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
+        ("holdout={names: [42]}", "expected names of photographs as text: put numbers in quotes, as in '0042'"),
+        ("holdout={names: [a, '']}", "expected names of photographs that are not empty"),
+        ("train={names: [1.5]}", "put numbers in quotes, as in '0042', got 1.5"),
+        ("validation=best", "or auto, got 'best'"),
+        ("missing=ignore", "'refuse' or 'skip'"),
+    ],
+)
+def test_a_choice_that_is_wrong_is_explained(setting, fault):
+    with pytest.raises(ConfigError) as raised:
+        load("splat_7k", [f"scene.{setting}"])
+    assert fault in str(raised.value)
+
+
+@pytest.mark.parametrize(("count", "warned"), [(1, "is trained on 1 photograph:"), (2, "on 2 photographs:"), (3, "")])
+def test_fewer_than_three_photographs_give_a_warning_first(tiny_scene, caplog, count, warned):
+    scene = read_scene(tiny_scene, Split(0))
+    RunScene.of(SceneSettings(path=str(tiny_scene)), replace(scene, train=scene.train[:count]))
+    told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(told) == bool(warned)
+    assert all(f"{warned} a model of fewer than 3 fits these" in text for text in told)
+
+
+def test_every_nth_that_takes_none_for_testing_is_refused(folder):
+    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of 24 photographs .* lower its offset, or set"):
+        read_scene(folder, Split(Choice(every=100, offset=99)))
+
+
+def test_without_test_views_a_dry_run_has_no_lines_of_them(folder, tmp_path):
+    def described(holdout: int) -> str:
+        return describe(
+            load("splat_7k", [f"scene.path={folder}", f"scene.holdout={holdout}"]), tmp_path / "r", None, "new"
+        )
+
+    assert "evaluate       1 test view at 1/1" in described(24)
+    without = described(0)
+    assert "  evaluate " not in without
+    assert "  render" not in without

@@ -1,0 +1,60 @@
+"""The time of a view: in [0, 1], kept by all that copies a view, and a part of what a scene is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.errors import PoseError
+from clsplat.scene.camera import Camera
+from clsplat.scene.identity import Identity
+from clsplat.scene.scene import make_scene
+from clsplat.scene.view import View
+from clsplat.video.camera_path import spread
+from clsplat.video.film import still
+
+CAMERA = Camera(40, 30, 50.0, 50.0, 20.0, 15.0)
+
+
+def moment(time, name="a"):
+    return View(name, CAMERA, np.eye(4)[:3], time=time)
+
+
+def scene_at(path, *times):
+    return make_scene(path, [moment(time, f"v{i}") for i, time in enumerate(times)], set(), None)
+
+
+@pytest.mark.parametrize("time", [0, 1, 0.25, np.float32(0.5), None])
+def test_a_time_from_0_to_1_is_kept(time):
+    assert moment(time).time == time
+    assert time is None or type(moment(time).time) is float
+
+
+@pytest.mark.parametrize("time", [-0.1, 1.5, np.nan, np.inf, "0.5", True])
+def test_invalid_time_is_refused_with_name_and_expectation(time):
+    with pytest.raises(PoseError, match=r"the time of 'a' is .*; expected a number from 0"):
+        moment(time)
+
+
+def test_what_copies_a_view_keeps_its_time(tmp_path):
+    view = moment(0.75)
+    scene = make_scene(tmp_path, [view], set(), None)
+    copies = [view.resized(2), still(view, (20, 20)), *spread([view], 3), scene.with_alpha("mask").views[0]]
+    copies += scene.downscaled(2).views
+    assert [copy.time for copy in copies] == [0.75] * len(copies)
+    assert [between.time for between in spread([moment(0.25), view], 3)] == [0.25, 0.5, 0.75]
+    assert [between.time for between in spread([moment(None), view], 3)] == [None] * 3
+
+
+def test_scenes_that_differ_in_a_time_are_two_scenes(tmp_path):
+    one, other = (Identity.of(scene_at(tmp_path, 0.0, time), {}) for time in (0.5, 0.75))
+    assert one.digest != other.digest
+    assert other.changes(one) == ["the time of 1 view (v1)"]
+    assert Identity.from_data(other.data()) == other
+
+
+def test_a_scene_that_does_not_move_is_the_scene_that_it_was(tmp_path):
+    still_one = scene_at(tmp_path, None, None)
+    assert set(Identity.of(still_one, {}).train["v0"]) == {"photograph", "mask", "camera"}
+    moving = replace(still_one, views=tuple(replace(view, time=0.5) for view in still_one.views))
+    assert Identity.of(moving, {}).changes(Identity.of(still_one, {})) == ["the time of 2 views (v0, v1)"]

@@ -1,0 +1,100 @@
+"""What a run's page advises: by figures of views, and by where the cameras stand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from clsplat.metrics.views import ViewMetrics
+from clsplat.render.backdrops import Auto, Directions
+from clsplat.report.advice import FEW, far_below, of_capture, of_sky, of_test_views, of_training_views, widest_gap
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
+
+CAMERA = Camera(40, 30, 40.0, 40.0, 20.0, 15.0)
+
+
+def around(degrees: list[float], outward: bool = False) -> list[View]:
+    """Views on a circle around the origin that look at it, or away from it, named after their angles."""
+    found = []
+    for angle in degrees:
+        eye = 3 * np.array([math.cos(math.radians(angle)), math.sin(math.radians(angle)), 0.2])
+        target = 2 * eye if outward else np.zeros(3)
+        found.append(View.looking_at(eye, target, np.array([0.0, 0.0, 1.0]), CAMERA, f"at {angle:g}"))
+    return found
+
+
+def measured(psnr: list[float], gained: float = 0.0) -> list[ViewMetrics]:
+    return [ViewMetrics(f"{i}.jpg", one, 0.9, {}, {"psnr_colour": one + gained}) for i, one in enumerate(psnr)]
+
+
+def test_views_far_below_the_median_are_named_the_worst_first():
+    assert far_below({}) == []
+    assert far_below({"a": 30.0, "b": 25.0, "c": 31.0}) == []
+    assert far_below({"a": 30.0, "b": 24.9, "c": 31.0, "d": 12.0, "e": 30.0}) == ["d", "b"]
+
+
+def test_training_photographs_that_disagree_are_named():
+    (text,) = of_training_views(measured([30, 31, 10, 30]), has_colours=False)
+    assert text.startswith("2.jpg disagrees with the others")
+    (text,) = of_training_views(measured([30] * 9 + [10, 11, 12, 13, 14]), has_colours=False)
+    assert text.startswith("9.jpg, 10.jpg, 11.jpg and 2 more disagree with")
+    assert not [*of_training_views([], has_colours=False)]
+
+
+@pytest.mark.parametrize(("gained", "has_colours", "said"), [(0.9, False, 0), (1.5, False, 1), (1.5, True, 0)])
+def test_colours_that_differ_are_said_where_none_are_trained(gained, has_colours, said):
+    texts = [*of_training_views(measured([30, 30, 31], gained), has_colours)]
+    assert len(texts) == said
+    assert all("1.5 dB nearer" in text and "optimize.colours=gain" in text for text in texts)
+
+
+def test_photographs_whose_colors_cannot_be_fitted_are_ignored():
+    found = [*measured([30, 30], 1.5), ViewMetrics("half.jpg", 30, 0.9, {}, {"psnr_affine": 90.0})]
+    assert "1.5 dB nearer" in "".join(of_training_views(found, has_colours=False))
+    assert not [*of_training_views(found[2:], has_colours=False)]
+
+
+def test_test_views_that_are_much_worse_are_named():
+    (text,) = of_test_views({"a": 22.0, "b": 16.0, "c": 26.0})
+    assert text.startswith("b: much worse")
+
+
+def test_a_sky_that_was_added_is_said_with_its_reason():
+    added = Auto(chosen="on", reason="25 of 25 photographs show one; 25% of them")
+    (text,) = of_sky(added)
+    assert text.startswith("a sky was added, since 25 of 25 photographs show one; ")
+    assert not [text for other in (None, Directions(), Auto(), Auto(chosen="off")) for text in of_sky(other)]
+
+
+def test_few_photographs_are_said():
+    assert "1 training photograph: few" in "".join(of_capture(around([0]), around([0])))
+    many = around([i * 360 / FEW for i in range(FEW)])
+    assert not [*of_capture(many, many)]
+
+
+@pytest.mark.parametrize("turn", [0, 100, 250])
+def test_the_widest_gap_around_a_scene_is_found(turn):
+    angles = [turn + 12 * i for i in range(26)]  # 300 degrees, and 60 without any
+    degrees, one, other = widest_gap(around(angles))
+    assert degrees == pytest.approx(60, abs=1)
+    assert (one, other) == (f"at {angles[-1]:g}", f"at {angles[0]:g}")
+
+
+@pytest.mark.parametrize(
+    "views",
+    [
+        around([0, 10]),
+        around([12 * i for i in range(30)]),  # all around
+        around([10 * i for i in range(13)]),  # from one side
+        around([0, 90, 180, 270]),  # evenly
+        around([12 * i for i in range(26)], outward=True),
+    ],
+    ids=["two", "all around", "one side", "evenly", "outward"],
+)
+def test_no_gap_is_told_where_none_stands_out(views):
+    assert widest_gap(views) is None
+
+
+def test_cameras_at_one_place_have_no_gap():
+    assert widest_gap([around([0])[0]] * 5) is None

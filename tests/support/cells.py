@@ -1,0 +1,63 @@
+"""Cells of a sweep, and an engine whose cells end as a test wants."""
+
+import os
+from pathlib import Path
+
+from clsplat.cluster.cell import Cell
+from clsplat.cluster.child import FILE, OUT, PYTHON
+from clsplat.cluster.drive import Wanted
+from clsplat.cluster.engine import Lost
+from clsplat.cluster.fingerprint import Scenes
+from clsplat.cluster.probe import Place
+from clsplat.cluster.task import Outcome
+from clsplat.pipeline.loading import load
+
+KILLS = int(os.environ.get("CLSPLAT_KILLS", "0"))
+
+
+SPEC = {"pipeline": {"name": "a", "seed": 0}, "scene": "s", "code": "c", "bits": "b"}
+
+
+CELL = Cell("first", SPEC, "name: a\n")
+
+
+WRITES = "import sys, pathlib; pathlib.Path(sys.argv[2], 'point_cloud.ply').write_bytes(b'bits')"
+
+
+def command(code: str) -> list[str]:
+    """A command in the place of a run: it gets the pipeline file and the run folder."""
+    return [PYTHON, "-S", "-c", code, FILE, OUT]
+
+
+def keys(pipeline: str, scene: Path, folder: Path, *changes: str) -> str:
+    checked = load(pipeline, [f"scene.path={scene}", *changes])
+    return Cell.of("x", checked, Scenes(folder).known(checked).digest, "b").key
+
+
+class Fake:
+    """An engine whose cells end as they were told to; a Lost is raised."""
+
+    def __init__(self, *ends: Outcome | type[Lost], places: tuple[Place, ...] = (Place("w", "d", "b"),)) -> None:
+        self.ends, self._places, self.started = list(ends), places, []
+
+    def places(self):
+        return list(self._places)
+
+    def may_join(self, waited):
+        return False
+
+    def start(self, cell, place, terms):
+        self.started.append((cell.name, place.device, cell.spec["bits"]))
+        end = self.ends.pop(0)
+
+        class Ticket:
+            def outcome(self):
+                if end is Lost:
+                    raise Lost
+                return end
+
+        return Ticket()
+
+
+def wanted(*costs: float) -> list[Wanted]:
+    return [Wanted(Cell(f"{cost:g}", {**SPEC, "scene": str(cost)}, ""), cost) for cost in costs]

@@ -1,0 +1,52 @@
+"""What a cell costs beside its run: a thousand empty ones on eight workers.
+
+python -m tests.support.empty_cells [CELLS] [WORKERS]
+"""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+
+from clsplat.cluster import scheduler
+from clsplat.cluster.cell import Cell
+from clsplat.cluster.child import OUT
+from clsplat.cluster.drive import Drive, Wanted
+from clsplat.cluster.probe import Place
+from clsplat.cluster.store import Store
+from clsplat.cluster.task import Terms
+from clsplat.pipeline.execution import Execution
+from tests.support.cells import SPEC
+
+
+def measure(cells: int, workers: int, folder: Path) -> None:
+    """Print the time a cell, the memory of the driver along the way, and the events."""
+    places = [Place("local", f"device {number}", "b") for number in range(workers)]
+    scheduler.places = lambda worker, devices, packing: places
+    store, memory, process = Store(folder), [], psutil.Process()
+    engine = scheduler.engine(Execution(engine="local"), store, None)
+    engine.command_of = lambda device: ["touch", OUT]
+    wanted = [Wanted(Cell(f"cell {i}", {**SPEC, "scene": str(i)}, ""), 1) for i in range(cells)]
+    drive = Drive(store, engine, True, Terms(store.now()))
+
+    def ended(cell: Cell, outcome: object) -> None:
+        if len(memory) % max(1, cells // 10) == 0:
+            print(f"{len(memory)} cells, driver {process.memory_info().rss >> 20} MiB")
+        memory.append(process.memory_info().rss)
+
+    drive.ended = ended
+    begin = time.perf_counter()
+    drive.run(wanted)
+    seconds = time.perf_counter() - begin
+    engine.close()
+    told = [event["event"] for event in store.events()]
+    print(f"{cells} cells on {workers} workers: {seconds:.1f} s, {1000 * seconds / cells:.1f} ms each")
+    print({event: told.count(event) for event in sorted(set(told))})
+
+
+if __name__ == "__main__":
+    numbers = [int(word) for word in sys.argv[1:]]
+    with tempfile.TemporaryDirectory() as name:
+        measure(*(numbers or (1000, 8)), Path(name))

@@ -1,0 +1,41 @@
+"""A run with a live page, and a thread beside it."""
+
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+
+from clsplat.live.live import Live
+from clsplat.pipeline.loading import load
+from clsplat.runs import folders, opening, runner
+from clsplat.runs.failures import failures_recorded
+from clsplat.training.run import Run
+from tests.support.runs import FEW
+
+
+def trained(live: Live, scene: Path, out: Path, *overrides: str) -> Run:
+    checked = load("smoke", [f"scene.path='{scene}'", *FEW, *overrides])
+    with folders.opened(out, "new", step=0) as status, failures_recorded(status):
+        live.follow(status)
+        run = opening.open_run(checked, out, None, "new", status)
+        with live.showing(run):
+            runner.execute(checked, run, "new", live.reporting(lambda progress: None))
+    return run
+
+
+@contextmanager
+def beside(act):
+    """Run a function in a thread; fail where it fails."""
+    faults = []
+
+    def guarded():
+        try:
+            act()
+        except BaseException as error:
+            faults.append(error)
+
+    thread = threading.Thread(target=guarded)
+    thread.start()
+    yield
+    thread.join(60)
+    assert not thread.is_alive()
+    assert not faults, faults

@@ -1,0 +1,138 @@
+"""Places of files: runs are compared, and cells named, by what their files hold."""
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from clsplat.cluster import fingerprint
+from clsplat.cluster.batch import wanted_cell
+from clsplat.cluster.cell import Cell
+from clsplat.cluster.fingerprint import Scenes
+from clsplat.cluster.task import run_cell
+from clsplat.errors import ConfigError, DataError
+from clsplat.pipeline import matrix
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.places import content_of, contents
+from clsplat.stages.video import Video
+from tests.support.cells import CELL, WRITES, command, keys
+from tests.support.runs import FEW, killed, train
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def from_model(model: Path | str, scene: Path, notes: Path) -> str:
+    return keys("smoke", scene, notes, "init.source=model", f"init.file='{model}'")
+
+
+def test_a_key_has_the_content_of_the_model_that_a_folder_holds(few_steps, tiny_scene, tmp_path):
+    one, other = (tmp_path / name for name in ("one", "other"))
+    for folder in (one, other):
+        folder.mkdir()
+        for name in ("point_cloud.ply", "metrics.json"):
+            shutil.copy(few_steps / name, folder / name)
+    key = from_model(one, tiny_scene, tmp_path / "notes")
+    assert from_model(other, tiny_scene, tmp_path / "notes") == key
+    (other / "point_cloud_sky.json").write_text("{}")
+    assert from_model(other, tiny_scene, tmp_path / "notes") != key, "it has a sky now"
+    (one / "point_cloud.ply").write_bytes(b"another")
+    assert from_model(one, tiny_scene, tmp_path / "notes") != key
+    (one / "point_cloud.ply").unlink()
+    with pytest.raises(DataError, match="one: holds no model; expected a file, or the folder of a finished run"):
+        from_model(one, tiny_scene, tmp_path / "notes")
+
+
+def test_what_cannot_be_read_is_told(few_steps, tiny_scene, tmp_path, monkeypatch):
+    assert content_of(tmp_path / ("m" * 300)) == ""
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("clsplat.pipeline.places.model_at", refuse)
+    with pytest.raises(DataError, match=r"few: cannot be read \(Permission denied\); give another file"):
+        content_of(few_steps)
+    assert contents(load("smoke", [f"scene.path={tiny_scene}", f"init.file='{few_steps}'"])) == {}
+
+
+def test_a_list_of_names_is_the_one_in_the_folder_of_the_dataset(tiny_scene, tmp_path, monkeypatch):
+    scene = tmp_path / "scene"
+    shutil.copytree(tiny_scene, scene)
+    (scene / "list.txt").write_text("train/r_000\n")
+    (tmp_path / "list.txt").write_text("train/r_000\n")
+    monkeypatch.chdir(tmp_path)
+    checked = load("smoke", [f"scene.path={scene}", "scene.holdout={file: list.txt}"])
+    cell = Cell.of("x", checked, "s", "b")
+    (tmp_path / "list.txt").write_text("train/r_001\n")
+    assert Cell.of("x", checked, "s", "b").key == cell.key
+    assert cell.files.keys() == {str(scene / "list.txt")}
+
+
+def test_the_name_of_a_camera_path_is_no_file(tmp_path, monkeypatch):
+    write(tmp_path / "ellipse", "a file of that name")
+    monkeypatch.chdir(tmp_path)
+    assert Video().place_of("path", None) is None
+    assert Video(path="mine.json").place_of("path", None) == Path("mine.json")
+
+
+def test_a_sweep_names_its_cells_as_they_are_named_here(tiny_scene, store, tmp_path):
+    found = wanted_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
+    assert found.on("b").key == keys("smoke", tiny_scene, tmp_path)
+
+
+def test_a_cell_reads_the_same_files_in_whatever_folder_it_runs(tiny_scene, store, terms, tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    for folder, text in ((tmp_path, b"of the sweep"), (tmp_path / "elsewhere", b"of the worker")):
+        (folder / "m.ply").write_bytes(text)
+    monkeypatch.chdir(tmp_path)
+    options = [f"scene.path={os.path.relpath(tiny_scene)}", "init.source=model", "init.file=m.ply"]
+    cell = Cell.from_json(Cell.of("x", load("smoke", options), "s", "b").json())
+    monkeypatch.chdir("elsewhere")
+    placed = load(str(write(tmp_path / "cell.yaml", cell.text))).settings
+    assert Path(placed.stages[0].file) == tmp_path / "m.ply"
+    assert Path(placed.scene.path).samefile(tiny_scene)
+    reads = "import sys, pathlib; assert '" + str(tmp_path / "m.ply") + "' in pathlib.Path(sys.argv[1]).read_text()"
+    assert run_cell(cell, store, command(reads), terms).state == "published"
+    (tmp_path / "m.ply").write_bytes(b"another")
+    outcome = run_cell(replace(cell, spec={**cell.spec, "bits": "c"}), store, command(WRITES), terms)
+    assert (outcome.state, outcome.exit_code) == ("failed", 3)
+    assert f"{tmp_path / 'm.ply'} is not what it was where the sweep began" in outcome.message
+
+
+def test_a_file_that_changes_while_a_cell_runs_fails_it(store, terms, tmp_path):
+    file = write(tmp_path / "m.ply", "as it was")
+    cell = replace(CELL, files={str(file): content_of(file)})
+    changes = f"import pathlib; pathlib.Path({str(file)!r}).write_text('another')"
+    outcome = run_cell(cell, store, command(changes), terms)
+    assert (outcome.state, outcome.exit_code) == ("failed", 3)
+
+
+def test_run_resumes_with_a_moved_file_but_not_another(tiny_scene, tmp_path, caplog):
+    lists = [write(tmp_path / f"{name}.txt", f"train/r_00{view}\n") for name, view in zip("abc", "001", strict=True)]
+    chosen = [f"scene.holdout={{file: '{path}'}}" for path in lists]
+    train(tiny_scene, tmp_path / "run", *FEW, chosen[0])
+    killed(tmp_path / "run", tmp_path / "killed")
+    lists[0].unlink()
+    with pytest.raises(ConfigError, match=r"made with other settings: scene\.holdout\.file was"):
+        train(tiny_scene, tmp_path / "killed", *FEW, chosen[2], resume=True)
+    with caplog.at_level("INFO", "clsplat"):
+        train(tiny_scene, tmp_path / "killed", *FEW, chosen[1], resume=True)
+    assert (tmp_path / "killed" / "point_cloud.ply").read_bytes() == (tmp_path / "run" / "point_cloud.ply").read_bytes()
+    assert "resumed at step 8" in caplog.text
+
+
+def test_libraries_that_change_results_are_in_keys(tiny_scene, tmp_path, monkeypatch):
+    before = fingerprint.code_digest.__wrapped__()
+    monkeypatch.setattr("zlib.ZLIB_RUNTIME_VERSION", "0")
+    assert fingerprint.code_digest.__wrapped__() != before
+    tools = fingerprint.tools_digest.__wrapped__()
+    monkeypatch.setattr(fingerprint, "version", lambda name: "0")
+    assert fingerprint.tools_digest.__wrapped__() != tools
+    shutil.copytree(tiny_scene / "train", tmp_path / "photographs")
+    scenes = [tmp_path / "photographs", tiny_scene]
+    specs = [Cell.of("x", load("photos", [f"scene.path={scene}"]), "s", "b").spec for scene in scenes]
+    assert ["tools" in spec for spec in specs] == [True, False]

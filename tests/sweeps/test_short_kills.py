@@ -1,0 +1,49 @@
+"""The short form of the kills: a run that is killed in its training, and the cell that goes on from its checkpoint."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from clsplat.cluster.batch import wanted_cell
+from clsplat.cluster.child import FILE, OUT, PYTHON
+from clsplat.cluster.fingerprint import Scenes
+from clsplat.cluster.store import Store
+from clsplat.cluster.task import Terms, run_cell
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.matrix import Cell
+from tests.support.runs import FEW
+
+pytestmark = pytest.mark.slow
+
+RUN = """
+import os, signal, sys
+from clsplat.training import checkpoint
+save = checkpoint.save
+
+def killed(run, *more):  # by whatever kills without a word, at a place that does not depend on time
+    begun_anew, path = run.step == 4, save(run, *more)
+    if begun_anew:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return path
+
+checkpoint.save = killed
+sys.argv = ["clsplat", "--attended", "run", sys.argv[1], "--out", sys.argv[2], "--resume"]
+from clsplat.__main__ import main
+main()
+"""
+
+
+def test_killed_run_resumes_and_its_cell_has_undisturbed_bits(
+    tiny_scene: Path, few_steps: Path, store: Store, terms: Terms
+):
+    """CLSPLAT_KILLS=20 kills workers, runs, drivers and schedulers, over six cells."""
+    checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
+    cell = wanted_cell(Cell("few", checked), Scenes(store.scenes), store).on("b")
+    outcome = run_cell(cell, store, [PYTHON, "-c", RUN, FILE, OUT], terms)
+    assert outcome.state == "published", outcome.message
+    ends = [event["exit_code"] for event in store.events() if event["event"] == "end"]
+    begun = [event["from"] for event in store.events() if event["event"] == "start"]
+    assert (ends, begun) == ([-9, 0], [None, "step_000004.npz"])
+    models = [folder / "point_cloud.ply" for folder in (few_steps, store.folder(cell.key).result)]
+    assert len({hashlib.sha256(model.read_bytes()).hexdigest() for model in models}) == 1

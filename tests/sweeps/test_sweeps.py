@@ -1,0 +1,404 @@
+"""Sweeps: a matrix through a store, its folder as without one, and the engines that run its cells."""
+
+import json
+import os
+import shutil
+import subprocess
+from contextlib import suppress
+from pathlib import Path
+from unittest.mock import ANY
+
+import pytest
+
+from clsplat.api import commands, sweeps
+from clsplat.cluster import batch, engine, single
+from clsplat.cluster.cell import Cell
+from clsplat.cluster.drive import Drive, Wanted
+from clsplat.cluster.fingerprint import code_digest
+from clsplat.cluster.overview import store_status
+from clsplat.cluster.probe import Place
+from clsplat.cluster.store import Store
+from clsplat.cluster.task import Terms
+from clsplat.errors import ClsplatError, ConfigError, DeviceError
+from clsplat.pipeline.execution import Execution, Tls, options, values_of
+from clsplat.pipeline.schema import json_schema
+from clsplat.runs.experiment import Job
+from tests.support.cells import SPEC, WRITES, command
+from tests.support.pipelines import STAGES
+
+psutil = pytest.importorskip("psutil", exc_type=ImportError)  # of Dask
+
+PLACE = Place("inline", "a device", "b")
+
+
+@pytest.fixture
+def file(tiny_scene: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "x.yaml"
+    path.write_text(
+        f"name: sweep\nmatrix: {{scenes: ['{tiny_scene}'], seeds: [0, 1]}}\n"
+        f"execution: {{engine: inline, store: '{tmp_path / 'store'}'}}\n{STAGES}"
+    )
+    return path
+
+
+@pytest.fixture
+def runs(few_steps: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """What stands for a run: it takes a finished one, but for the seeds that end otherwise, by `seed: N`."""
+    ends: dict[str, str] = {}
+
+    def run_command(device, plugins):
+        code = f"import sys, shutil\ntext, ends = open(sys.argv[1]).read(), {ends!r}\n"
+        code += "for seed, code in ends.items():\n    if seed in text: sys.exit(code)\n"
+        return command(code + f"shutil.copytree({str(few_steps)!r}, sys.argv[2], dirs_exist_ok=True)")
+
+    monkeypatch.setattr(engine, "run_command", run_command)
+    monkeypatch.setattr(single, "run_command", run_command)
+    for module in (batch, single):
+        monkeypatch.setattr(module, "places", lambda worker, devices=None: [PLACE])
+    return ends
+
+
+def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_steps, tmp_path):
+    out = commands.run(file, out=tmp_path / "out")
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["tiny-seed=0", "tiny-seed=1"]
+    assert "sweep: 2 runs" in (out / "compare.html").read_text()
+    status = json.loads((out / "status.json").read_text())
+    assert (status["state"], status["cells"], status["done"], status["failed"]) == ("done", 2, 2, {})
+    model = out / "tiny-seed=0" / "point_cloud.ply"
+    assert model.read_bytes() == (few_steps / "point_cloud.ply").read_bytes()
+    store = Store(tmp_path / "store")
+    (key,) = [key for _, cells in store.sweeps() for name, key in cells.items() if name == "tiny-seed=0"]
+    result = store.folder(key).result
+    assert os.path.samefile(model, result / "point_cloud.ply")
+    assert not os.path.samefile(model.with_name("metrics.jsonl"), result / "metrics.jsonl"), "a run appends to it"
+    shutil.rmtree(out / "tiny-seed=1")
+    (out / "tiny-seed=0" / "metrics.json").unlink()  # as a kill while it was placed would leave it
+    runs["seed"] = "it is not run again"
+    assert commands.resume(out) == out, "with the execution that its file names"
+    for cell in ("tiny-seed=0", "tiny-seed=1"):
+        assert (out / cell / "metrics.json").is_file()
+    assert [event["event"] for event in store.events()].count("start") == 2
+
+
+def test_run_continued_in_a_matrix_folder_is_not_shown_as_cell(file, runs, few_steps, tmp_path):
+    out = commands.run(file, out=tmp_path / "out")
+    one = out / "tiny-seed=0"
+    model, expected = one / "point_cloud.ply", (few_steps / "point_cloud.ply").read_bytes()
+    model.unlink()
+    model.write_bytes(b"another")
+    commands.run(file, out=out, start="resume")
+    assert model.read_bytes() == expected
+    pipeline = one / "pipeline.yaml"
+    pipeline.unlink()
+    pipeline.write_text((few_steps / "pipeline.yaml").read_text() + "# trained for longer\n")
+    (one / "checkpoints" / "step_000020.npz").write_bytes(b"later")
+    with pytest.raises(ClsplatError, match=r"seed=0: was trained on with other settings .*; move that folder") as error:
+        commands.run(file, out=out, start="resume")
+    assert error.value.exit_code == 2
+    assert "# trained" in pipeline.read_text(), "it stays"
+    commands.run(file, out=out, start="restart")
+    assert pipeline.read_bytes() == (few_steps / "pipeline.yaml").read_bytes()
+    assert not (one / "checkpoints" / "step_000020.npz").exists()
+
+
+def test_a_cell_that_fails_leaves_the_others_and_its_exit_code(file, runs, tmp_path):
+    runs["seed: 1"] = 3
+    with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .* exit code 3") as error:
+        commands.run(file, out=tmp_path / "out")
+    assert error.value.exit_code == 3
+    assert "tiny-seed=1 failed and is not shown" in (tmp_path / "out" / "compare.html").read_text()
+    assert commands.status(tmp_path / "store")["counts"] == {"failed": 1, "published": 1}
+
+
+def test_a_scene_that_cannot_be_read_fails_its_cells_alone(file, runs, tmp_path):
+    (tmp_path / "empty").mkdir()
+    file.write_text(file.read_text().replace("scenes: [", f"scenes: ['{tmp_path / 'empty'}', "))
+    with pytest.raises(ClsplatError, match=r"2 of 4 cells failed; the first, empty-seed=0: ") as error:
+        commands.run(file, out=tmp_path / "out")
+    assert error.value.exit_code == 3
+    assert json.loads((tmp_path / "out" / "status.json").read_text())["done"] == 4
+    assert commands.status(tmp_path / "store")["counts"] == {"published": 2}
+
+
+def test_a_queue_runs_a_cell_by_its_number(file, runs, tmp_path):
+    result = sweeps.run_cell(file, tmp_path / "store", index=1)
+    assert sweeps.run_cell(file, tmp_path / "store", index=1) == result
+    spec = json.loads((result.parent / "spec.json").read_text())
+    assert (spec["pipeline"]["seed"], spec["bits"]) == (1, "b")
+    with pytest.raises(ConfigError, match="expected --index from 0 to 1"):
+        sweeps.run_cell(file, tmp_path / "store")
+    runs["seed: 0"] = 6
+    with pytest.raises(ClsplatError, match="cell tiny-seed=0: its process ended with exit code 6") as error:
+        sweeps.run_cell(file, tmp_path / "store", index=0)
+    assert error.value.exit_code == 6
+
+
+def test_another_execution_replaces_the_files_and_is_noted(file, tmp_path):
+    on = tmp_path / "lab.yaml"
+    on.write_text("engine: inline\n")
+    job = Job.open(str(file), out=tmp_path / "out", execution=values_of(on))
+    assert job.work.execution.keeps is None
+    assert "engine: inline" in job.work.text
+    assert "store" not in job.work.text
+    with pytest.raises(ConfigError, match="--on is for a file with `matrix:`"):
+        Job.open("smoke", execution=values_of(on))
+
+
+def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
+    ran = []
+    monkeypatch.setattr(Job, "run", lambda job, *options: ran.append(options))
+    on = tmp_path / "lab.yaml"
+    on.write_text("engine: inline\n")
+    commands.run(file, out=tmp_path / "out", on=on)
+    assert ran == [(None, None, None)]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("engin: local", "x.yaml:3: execution.engin: unknown key 'engin'"),
+        ("retries: 0", "x.yaml:3: execution.retries: expected a value of at least 1"),
+        ("store: ''", "x.yaml:3: execution.store: expected the path of a folder, got ''"),
+        ("retries: 2", "retries has no effect with engine inline: expected a store too"),
+        ("placement: {bits: any}", "placement has no effect with engine inline: expected a store too"),
+        ("devices: [pocl]", "devices has no effect with engine inline: expected a store too"),
+        ("engine: local, tls: {ca: a, cert: b, key: c}", "tls has no effect with engine local: certificates are for"),
+        ("engine: slurm, insecure: true", "slurm: expected slurm: {jobs: …, cores: …, memory: …, walltime: …}"),
+        (
+            "engine: slurm, slurm: {jobs: 2, cores: 4, memory: 8GB, walltime: '1:00:00'}",
+            "slurm: expected tls: ",
+        ),
+        ("engine: local, slurm: {jobs: 2, cores: 4, memory: 8GB, walltime: '1:00:00'}", "slurm has no effect with"),
+        ("engine: local, insecure: true", "insecure has no effect with engine local: it is for an engine dask://"),
+        (
+            "engine: dask://127.0.0.1:1, devices: [a]",
+            "devices has no effect with engine dask://127.0.0.1:1: a",
+        ),
+        ("engine: dask://far:1", "expected tls:// for another machine, or insecure: true"),
+        ("engine: tls://far:1", "tls://far:1: expected tls: "),
+        ("engine: ray", "x.yaml:3: execution.engine: expected inline, local, slurm, or the address of a scheduler"),
+        (
+            "engine: dask://h:99999",
+            "x.yaml:3: execution.engine: expected inline, local, slurm, or the address of a scheduler",
+        ),
+    ],
+)
+def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
+    file = tmp_path / "x.yaml"
+    file.write_text(f"name: a\nmatrix: {{seeds: [0]}}\nexecution: {{{text}}}\n{STAGES}")
+    for call in (commands.check, commands.run):
+        with pytest.raises(ConfigError, match=words):
+            call(file)
+    on = tmp_path / "lab.yaml"
+    on.write_text(f"{{{text}}}\n")
+    with pytest.raises(ConfigError, match=f"lab.yaml:1: .*{words.removeprefix('x.yaml:3: execution.')}"):
+        values_of(on)
+
+
+def test_the_schema_of_pipeline_files_has_the_keys_of_execution():
+    assert json_schema()["properties"]["execution"] == {"$ref": "#/$defs/Execution"}
+    assert {"Execution", "Placement", "Tls"} <= json_schema()["$defs"].keys()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"engine": "dask://far:1"}, r"expected tls:// for another machine, or insecure: true \(--insecure\)"),
+        ({"engine": "tls://far:1"}, r"\(--tls-ca, --tls-cert and --tls-key\)"),
+        ({"engine": "tls://far:1", "tls": {"ca": "a", "key": "b"}}, "^--tls-cert: 'cert' is missing"),
+        ({"engine": "tcp://10.0.0.1:8786"}, r"^--scheduler: .*dask://HOST:PORT \(where Dask says tcp://\)"),
+    ],
+)
+def test_a_wrong_option_of_a_worker_is_named(given, words):
+    with pytest.raises(ConfigError, match=words):
+        options(given)
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Tls:
+    """A certificate that has signed itself."""
+    folder = tmp_path_factory.mktemp("tls")
+    if not (openssl := shutil.which("openssl")):
+        pytest.skip("needs openssl")
+    curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
+    words = ["req", "-x509", *curve, "-days", "2", "-subj", "/CN=localhost"]
+    for name, locked in {"a": ["-nodes"], "b": ["-passout", "pass:word"]}.items():
+        files = ["-keyout", f"{folder}/{name}.key", "-out", f"{folder}/{name}.pem"]
+        subprocess.run([openssl, *words, *locked, *files], check=True, capture_output=True)
+    (folder / "no.pem").write_text("no certificate")
+    return Tls(ca=f"{folder}/a.pem", cert=f"{folder}/a.pem", key=f"{folder}/a.key")
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"ca": "gone.pem"}, r"tls.ca \(--tls-ca\): .*gone.pem: .*No such file"),
+        ({"key": "gone.pem"}, r"tls.key \(--tls-key\): .*gone.pem: .*No such file"),
+        ({"ca": "no.pem"}, r"tls.ca \(--tls-ca\): .*no.pem: expected a certificate in PEM"),
+        ({"cert": "b.pem"}, r"b.pem, .*a.key: expected .* \(KEY_VALUES_MISMATCH\)"),
+        ({"cert": "b.pem", "key": "b.key"}, "b.pem, .*b.key: expected .*, without a password"),
+    ],
+)
+def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
+    library = pytest.importorskip("clsplat.cluster.library")
+    folder = Path(authority.ca).parent
+    assert library.security(authority).require_encryption
+    with pytest.raises(ConfigError, match=words):
+        library.security(authority.model_copy(update={key: str(folder / name) for key, name in changed.items()}))
+
+
+def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeypatch):
+    pytest.importorskip("clsplat.cluster.library")
+    monkeypatch.setattr("clsplat.cluster.offer.places", lambda *words: pytest.fail("a device is proved"))
+    with pytest.raises(ConfigError, match=r"tls.ca \(--tls-ca\): gone.pem"):
+        sweeps.work_for("tls://127.0.0.1:1", tls=("gone.pem", authority.cert, authority.key))
+
+
+def test_a_device_is_not_chosen_for_a_scheduler(file, tmp_path):
+    on = tmp_path / "lab.yaml"
+    on.write_text("engine: dask://127.0.0.1:1\n")
+    with pytest.raises(ConfigError, match="--device: a scheduler has the devices that its workers offer"):
+        commands.run(file, out=tmp_path / "out", on=on, device="pocl")
+
+
+def test_a_scheduler_of_this_machine_needs_no_tls():
+    for address in ("dask://127.0.0.1:1", "dask://localhost:1"):
+        assert Execution(engine=address).is_local
+
+
+class FakeClient:
+    """The client of a scheduler, with workers by their addresses."""
+
+    def __init__(self, **workers: str) -> None:
+        """workers: the version of the program of each."""
+        self.status = "running"
+        told = {name: {"metrics": {"clsplat": self.told(code)}} for name, code in workers.items()}
+        self.info = {"workers": told}
+
+    @staticmethod
+    def told(code: str) -> str:
+        return json.dumps({"host": "h", "device": "d", "bits": "b", "limits": [8, 4], "unified": False, "code": code})
+
+    def scheduler_info(self, n_workers):
+        return self.info
+
+    def submit(self, *words, **options):
+        raise RuntimeError("the client is closed")
+
+
+def test_workers_of_another_version_alone_end_a_sweep(tmp_path, monkeypatch):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    monkeypatch.setattr(scheduler, "ALONE", -1.0)
+    with pytest.raises(DeviceError, match=r"no worker of this version for .* \(1 of another version get no cells\)"):
+        scheduler.Cluster(FakeClient(old="another"), Store(tmp_path)).places()
+    jobs = type("Jobs", (), {"scale": lambda *count: None})()
+    waits = [True, False]
+    queue = scheduler.Cluster(FakeClient(), Store(tmp_path), jobs, jobs=(2, lambda: waits.pop(0)))
+    assert queue.places() == [], "its jobs wait"
+    queue._looked = -scheduler.LOOK
+    with pytest.raises(DeviceError, match=r"no worker .*; no job waits; .*slurm has what they printed"):
+        queue.places()
+
+
+@pytest.mark.parametrize("starter", ["nobody", "this machine", "a queue"])
+def test_a_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, starter):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    client, sent = FakeClient(), []
+    monkeypatch.setattr(client, "submit", lambda *words, **options: sent.append(options["workers"]))
+    found, starts = [PLACE] if starter == "this machine" else None, starter != "nobody"
+    scheduler.Cluster(client, Store(tmp_path), object() if starts else None, found).start(
+        Cell("a", SPEC, ""), PLACE, Terms(0.0)
+    )
+    assert sent == [None if found else [PLACE.worker]], "the workers of this machine have the same devices"
+
+
+def test_a_worker_that_is_gone_gets_no_cell(tmp_path):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    client = FakeClient(one=code_digest())
+    cluster = scheduler.Cluster(client, Store(tmp_path))
+    assert [place.worker for place in cluster.places()] == ["one"]
+    client.info = {"workers": {}}
+    cluster._looked = -scheduler.LOOK
+    assert cluster.places() == []
+
+
+def test_a_scheduler_that_ended_is_told_with_what_to_do(tmp_path):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    client = FakeClient()
+    cluster = scheduler.Cluster(client, Store(tmp_path))
+    client.info, client.status = {}, "closed"
+    for call in (cluster.places, lambda: cluster.start(Cell("a", SPEC, ""), PLACE, Terms(0.0))):
+        with pytest.raises(DeviceError, match=r"the scheduler ended; .* with --resume"):
+            call()
+
+
+def listening() -> set[str]:
+    """The addresses on which this process and those that it has started listen."""
+    this, found = psutil.Process(), []
+    for process in (this, *this.children(recursive=True)):
+        with suppress(psutil.NoSuchProcess):  # it has ended
+            found += process.net_connections("inet")
+    return {one.laddr.ip for one in found if one.status == psutil.CONN_LISTEN}
+
+
+def test_local_engine_runs_cells_in_parallel_on_loopback_alone(tmp_path, monkeypatch):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    library = pytest.importorskip("clsplat.cluster.library")
+    places = [Place("local", "one", "b"), Place("local", "two", "b")]
+    monkeypatch.setattr(scheduler, "places", lambda worker, devices, packing: places)
+    store, ended, seen = Store(tmp_path / "store"), [], set()
+    before = {key: library.dask.config.get(key) for key in library.SETTINGS}
+    cluster = scheduler.engine(Execution(engine="local"), store, None)
+    try:
+        cluster.command_of = lambda device: command(WRITES + f"; print({device!r})")
+        cells = [Wanted(Cell(f"cell {i}", {**SPEC, "scene": str(i)}, ""), i) for i in range(4)]
+        drive = Drive(store, cluster, True, Terms(store.now()), ended=lambda *end: ended.append(end))
+        drive.look = lambda: seen.update(listening())
+        drive.run(cells)
+    finally:
+        cluster.close()
+    assert {cell.name: outcome.state for cell, outcome in ended} == {f"cell {i}": "published" for i in range(4)}
+    assert seen == {"127.0.0.1"}
+    assert {key: library.dask.config.get(key) for key in before} == before, "what this process had set"
+    assert len({event["worker"] for event in store.events() if event["event"] == "start"}) == 1
+
+
+def test_a_cell_whose_spec_was_changed_fails_alone(file, runs, tmp_path):
+    commands.run(file, out=tmp_path / "out")
+    store = Store(tmp_path / "store")
+    (key,) = [cells["tiny-seed=1"] for _, cells in store.sweeps()]
+    (store.folder(key).path / "spec.json").write_text("{}")
+    runs["seed"] = "no cell is run again"
+    with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .*remove .*: its cell runs"):
+        commands.run(file, out=tmp_path / "out", start="resume")
+
+
+def test_damaged_records_of_a_store_do_not_stop_who_looks(file, runs, tmp_path):
+    commands.run(file, out=tmp_path / "out")
+    store = Store(tmp_path / "store")
+    before = store_status(store.root)
+    (store.root / "events" / "x.jsonl").write_text('3\n[1]\n{"time": "x"}\n{"time": null}\n{"ti')
+    (store.root / "events" / "y.jsonl").mkdir()
+    assert store_status(store.root) == {**before, "time": ANY}
+    for damage in ("[1]", '{"pipeline": 3}'):
+        for folder in store.folders():
+            (folder.path / "spec.json").write_text(damage)
+        assert store_status(store.root)["counts"] == before["counts"]
+
+
+def test_a_page_is_of_a_store_and_never_over_a_file_of_a_run(few_steps, store, tmp_path):
+    store.now()
+    (store.root / "cells").mkdir()
+    commands.status(store.root, tmp_path / "page.html")
+    assert "no cells" in (tmp_path / "page.html").read_text()
+    for folder, html, words in (
+        (few_steps, tmp_path / "page.html", "--html: .* is no store of cells"),
+        (store.root, tmp_path / "page.txt", "ends in .html"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            commands.status(folder, html)
+
+
+def test_a_single_pipeline_has_no_cell_by_number(runs, tmp_path):
+    with pytest.raises(ConfigError, match="leave --index out"):
+        single.run_one("smoke", tmp_path / "store", index=1)

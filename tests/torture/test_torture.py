@@ -1,0 +1,95 @@
+"""A few kills of the long form, and a kill at the n-th file of a run: resumed, it ends with the same bits."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from clsplat.conformance import uses
+from data_tools.synthetic import Options, write_dataset
+from tests.torture import __main__ as torture
+from tests.torture import each_file, kills
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="attempts are forked")]
+
+SCRIPT = """
+import json, sys
+from pathlib import Path
+from tests.torture.kills import kills
+*_, tally = kills(Path(sys.argv[1]), Path(sys.argv[2]), 2)
+print(json.dumps(tally))
+"""
+
+
+def test_a_few_kills(tmp_path):
+    """In a process that has opened no device: one that has cannot be forked."""
+    write_dataset(tmp_path / "scene", Options(size=40, train=8, test=2, seed=0), workers=1)
+    command = [sys.executable, "-c", SCRIPT, tmp_path / "scene", tmp_path / "runs"]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    tally = json.loads(done.stdout.splitlines()[-1])
+    assert tally["killed"] >= 2
+    assert tally["equal"] == tally["finished"] > 0
+
+
+@pytest.mark.parametrize("kind", [kills.Attempt, each_file.AtFile])
+def test_no_attempt_proves_the_device_again(kind, tmp_path):
+    class Seen(kind):
+        def _train(self, scene: Path, out: Path, recipe: str) -> None:
+            out.write_text(uses.forget_after_sudden_ends.__module__)
+
+    out = tmp_path / "run"
+    Seen(tmp_path, out, *(["smoke"] if kind is kills.Attempt else [])).wait()
+    assert out.read_text() == kills.__name__
+
+
+def test_a_file_that_an_earlier_kill_has_left_counts_once(monkeypatch, tmp_path):
+    class Attempt:
+        """The first kill meets a write; the second comes before the sweep."""
+
+        ends, code = iter((True, True, False)), 0
+
+        def __init__(self, scene: Path, out: Path, recipe: str) -> None:
+            out.mkdir(exist_ok=True)
+            self.out = out
+
+        def wait(self) -> None:
+            pass
+
+        def killed_after(self, seconds: float) -> bool:
+            (self.out / ".status.json.7-0.partial").touch()
+            return next(self.ends)
+
+    monkeypatch.setattr(kills, "Attempt", Attempt)
+    monkeypatch.setattr(kills, "identity", lambda out: "the same")
+    *_, tally = kills.kills(tmp_path, tmp_path, 2)
+    assert (tally["killed"], tally["in a write"]) == (2, 1)
+
+
+def test_a_row_counts_the_cases_that_its_tests_have_tried(tmp_path):
+    """And not the number of examples that was asked for, where there are as many as there are writes."""
+    (tmp_path / "test_three.py").write_text(
+        "def test_three(record_property):\n    record_property('cases', 3)\ndef test_two(record_property):\n"
+        "    record_property('cases', 2)\n"
+    )
+    (tmp_path / "test_none.py").write_text("def test_none():\n    pass\n")
+    assert torture.tested("a", "holds", 1, str(tmp_path / "test_three.py")).cases == 5
+    assert torture.tested("a", "holds", 7, str(tmp_path / "test_none.py")).cases == 7
+
+
+CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 4  # of each moment; `make torture` tries every file
+
+
+def test_whichever_file_is_being_written_nothing_is_lost(tiny_scene, tmp_path, record_property):
+    """In a process that has opened no device: one that has cannot be forked."""
+    command = [sys.executable, "-m", "tests.torture.each_file", tiny_scene, tmp_path / "runs", str(CASES)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert len(found) >= 8
+    assert [case for case in found if case[2:] != [True, 0, True]] == []
+    record_property("cases", len(found))

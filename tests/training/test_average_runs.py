@@ -1,0 +1,173 @@
+"""Whole runs that end with the average of their last steps, and that start from a hull."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat import Trainer
+from clsplat.errors import ConfigError
+from clsplat.formats.splats import PARAMETERS
+from clsplat.formats.table import read as read_ply
+from clsplat.pipeline.loading import load
+from clsplat.training import checkpoint
+from clsplat.training.run import Run
+from tests.support.runs import train
+from tests.support.silhouettes import RADIUS, SIZE, ball, ring
+
+pytestmark = pytest.mark.slow
+
+STEPS = 30
+AVERAGED = f"""
+name: averaged
+stages:
+  - init: {{source: random, count: 1000, opacity: 0.3}}
+  - optimize:
+      steps: {STEPS}
+      losses: [l1]
+      during:
+        - densify: {{every: 5, stop: 16, rules: [{{type: clone, gradient_above: 1.0e-9, size_below: 1}}]}}
+        - add_to_average: {{every: 2, start: 16}}
+        - checkpoint: {{every: 1, keep: 99}}
+  - take_average
+  - export: {{file: point_cloud.ply}}
+"""
+
+
+@pytest.fixture
+def pipeline(tmp_path):
+    file = tmp_path / "averaged.yaml"
+    file.write_text(AVERAGED)
+    return str(file)
+
+
+def test_run_ends_with_the_average_of_the_added_steps(tiny_scene, tmp_path, pipeline):
+    """Those at 18, 20, ... 28: no edit follows the last step."""
+    run = train(tiny_scene, tmp_path / "run", pipeline=pipeline)
+    of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.saved(run.out)}
+    found = read_ply(run.out / "point_cloud.ply").parameters
+    for name in PARAMETERS:
+        steps = [checkpoint.load(of_step[step])[1][f"gaussians/{name}"].astype(float) for step in range(18, 30, 2)]
+        np.testing.assert_allclose(found[name], np.mean(steps, axis=0), rtol=0, atol=1e-5, err_msg=name)
+    last = checkpoint.load(of_step[STEPS])[1]["gaussians/means"]
+    assert np.abs(found["means"] - last).max() > 1e-4, "it is not the last step"
+    assert not [table for table in run.model.gaussians.tables if table.startswith("average/")]
+
+
+def test_it_is_the_same_after_a_stop_and_when_it_is_done_again(tiny_scene, tmp_path, pipeline):
+    whole = train(tiny_scene, tmp_path / "whole", pipeline=pipeline).out
+    expected = (whole / "point_cloud.ply").read_bytes()
+    again = tmp_path / "again"
+    shutil.copytree(whole, again)
+    (again / "point_cloud.ply").unlink()
+    train(tiny_scene, again, pipeline=pipeline, resume=True)
+    assert (again / "point_cloud.ply").read_bytes() == expected
+    for path in checkpoint.saved(again):
+        if int(path.stem.removeprefix("step_")) > 21:
+            path.unlink()
+    (again / "point_cloud.ply").unlink()
+    train(tiny_scene, again, pipeline=pipeline, resume=True)
+    assert (again / "point_cloud.ply").read_bytes() == expected
+
+
+def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, pipeline):
+    longer = train(tiny_scene, tmp_path / "longer", "optimize.steps=40", pipeline=pipeline).out
+    run = train(tiny_scene, tmp_path / "run", pipeline=pipeline).out
+    train(tiny_scene, run, "optimize.steps=40", pipeline=pipeline, resume=True)
+    assert (run / "point_cloud.ply").read_bytes() == (longer / "point_cloud.ply").read_bytes()
+
+
+def test_an_average_that_nothing_adds_to_is_refused(tmp_path, pipeline):
+    with pytest.raises(
+        ConfigError, match="which add_to_average makes at every 2 steps after step 30; the training ends"
+    ):
+        load(pipeline, ["optimize.add_to_average.start=30"])
+    with pytest.raises(
+        ConfigError, match=r"the training ends before: set add_to_average\.every below 30"
+    ):  # no edit follows the last step
+        load(pipeline, ["optimize.add_to_average.every=30", "optimize.add_to_average.start=0"])
+
+
+def test_the_figures_of_the_error_are_those_of_all_overrides():
+    told = r"optimize\.steps=40: .* at every 50 steps after step 10; .* set add_to_average\.every below 40, or"
+    with pytest.raises(ConfigError, match=told):
+        load("photos", ["optimize.steps=40", "add_to_average.start=10"])
+    with pytest.raises(ConfigError, match=r"optimize\.steps=40: .* after step 60; .*\.start earlier"):
+        load("photos", ["optimize.steps=40", "add_to_average.every=20", "add_to_average.start=60"])
+    load("photos", ["optimize.steps=40", "add_to_average.start=10", "add_to_average.every=20"])
+    with pytest.raises(ConfigError, match=r"--set add_to_average\.start=-1: "):
+        load("photos", ["optimize.steps=40", "add_to_average.start=-1"])
+
+
+STAGES = {
+    "twice": "[{init: {}}, TRAIN, take_average, take_average]",
+    "another training": "[{init: {}}, TRAIN, take_average, {optimize: {steps: 3, losses: [l1]}}, take_average]",
+    "another model": "[{init: {}}, TRAIN, {init: {}}, take_average]",
+}
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_an_average_is_taken_once(tmp_path, name):
+    train_it = "{optimize: {steps: 9, losses: [l1], during: [{add_to_average: {every: 2}}]}}"
+    file = tmp_path / "x.yaml"
+    file.write_text(f"name: x\nstages: {STAGES[name].replace('TRAIN', train_it)}\n")
+    with pytest.raises(ConfigError, match="take_average needs 'average'"):
+        load(str(file))
+
+
+def test_a_trainer_takes_the_average_with_its_last_step(tiny_scene, tmp_path, pipeline):
+    run = train(tiny_scene, tmp_path / "run", pipeline=pipeline)
+    trainer = Trainer(tiny_scene, pipeline)
+    for _ in range(STEPS):
+        trainer.step()
+    trainer.model.save(tmp_path / "model.ply")
+    assert (tmp_path / "model.ply").read_bytes() == (run.out / "point_cloud.ply").read_bytes()
+    with pytest.raises(StopIteration):
+        trainer.step()
+
+
+def ball_scene(folder: Path, channels: int) -> Path:
+    """A ball from eleven sides, and one side as the test, with alpha where there are four channels."""
+    frames = []
+    folder.mkdir()
+    for view in ring(12):
+        cv2.imwrite(str(folder / f"{view.name}.png"), ball(view)[:, :, [2, 1, 0, 3][:channels]])
+        pose = np.linalg.inv(np.vstack([view.world_to_camera, [0, 0, 0, 1]])) * [1, -1, -1, 1]
+        frames.append({"file_path": view.name, "transform_matrix": pose.tolist()})
+    angle = 2 * math.atan(0.5 * SIZE / 150)
+    for split, own in (("train", frames[:-1]), ("test", frames[-1:])):
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": own}))
+    return folder
+
+
+STILL = (
+    "init.source=auto",
+    "init.count=300",
+    "optimize.steps=20",
+    "optimize.densify.stop=1",
+    "optimize.rates.means=1e-9",
+)
+
+
+def distances(run: Run) -> np.ndarray:
+    return np.linalg.norm(read_ply(run.out / "point_cloud.ply").parameters["means"], axis=1)
+
+
+def test_a_start_on_the_hull(tmp_path, pipeline):
+    """`transparent: hull` is for photographs with alpha; `auto` alone takes random points, as published."""
+    scene = ball_scene(tmp_path / "scene", 4)
+    found = distances(train(scene, tmp_path / "hull", *STILL, "init.transparent=hull", pipeline=pipeline))
+    assert np.abs(found - RADIUS).max() < 0.1
+    found = distances(train(scene, tmp_path / "random", *STILL, pipeline=pipeline))
+    assert np.abs(found - RADIUS).max() > 0.5
+
+
+def test_photographs_without_transparency_have_no_hull(tmp_path, pipeline, caplog):
+    scene = ball_scene(tmp_path / "scene", 3)
+    run = train(scene, tmp_path / "run", *STILL, "init.source=hull", pipeline=pipeline)
+    assert "the photographs' silhouettes give 0 points only; starting from random ones" in caplog.text
+    assert run.model.gaussians.count == 300

@@ -1,0 +1,405 @@
+"""Trainings that leave the model which is best at photographs kept out of them, and what that model is told to be."""
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat import Trainer
+from clsplat.errors import ConfigError, DataError
+from clsplat.formats.splats import PARAMETERS
+from clsplat.formats.table import read as read_ply
+from clsplat.pipeline.loading import load
+from clsplat.report.charts import NAMES
+from clsplat.report.parting import is_by_heart, parting
+from clsplat.runs.experiment import Job
+from clsplat.runs.refitting import as_trained
+from clsplat.runs.summary import summary
+from clsplat.training import checkpoint, kept
+from clsplat.training.archive import split
+from clsplat.training.kept import Best, Measured
+from tests.support.runs import digest, train
+
+pytestmark = pytest.mark.slow
+
+BEST = 12  # step after which a rate spoils the model
+WORSE = f"""
+name: worse
+scene: {{validation: auto}}
+stages:
+  - init: {{source: auto, count: 200, opacity: 0.3}}
+  - optimize:
+      steps: 40
+      keep: best
+      rates: {{means: [[{BEST}, 1.0e-3], [{BEST + 1}, 0.3]], log_scales: 0.02, logit_opacity: 0.05, sh_base: 0.02}}
+      losses: [l1]
+      log_every: 4
+      during:
+        - densify:
+            every: 5
+            start: {BEST}
+            stop: 26
+            rules: [{{type: clone, gradient_above: 1.0e-9, size_below: 1}}]
+        - evaluate: {{every: 4, split: validation}}
+        - evaluate: {{every: 4, split: test}}
+        - checkpoint: {{every: 2, keep: 99}}
+  - evaluate: {{split: test}}
+  - export: {{file: point_cloud.ply}}
+  - report
+"""
+PATIENT = ("optimize.patience=3",)
+REFIT = (*PATIENT, "optimize.refit=true")
+TIMES = {"ms", "stages", "train_seconds", "cpu_seconds", "device_memory", "seconds", "scene"}
+
+
+@pytest.fixture(scope="module")
+def pipeline(tmp_path_factory) -> str:
+    file = tmp_path_factory.mktemp("pipeline") / "worse.yaml"
+    file.write_text(WORSE)
+    return str(file)
+
+
+@pytest.fixture(scope="module")
+def best(tiny_scene, tmp_path_factory, pipeline) -> Path:
+    return train(tiny_scene, tmp_path_factory.mktemp("best") / "run", pipeline=pipeline).out
+
+
+@pytest.fixture(scope="module")
+def refit(tiny_scene, tmp_path_factory, pipeline) -> Path:
+    return train(tiny_scene, tmp_path_factory.mktemp("refit") / "run", *REFIT, pipeline=pipeline).out
+
+
+def metrics(out: Path) -> dict:
+    return json.loads((out / "metrics.json").read_text())
+
+
+def lines(out: Path, name: str = "metrics.jsonl") -> list[dict]:
+    found = [json.loads(line) for line in (out / name).read_text().splitlines()]
+    return [{key: value for key, value in line.items() if key not in TIMES} for line in found]
+
+
+def psnr_of(out: Path, split: str, name: str = "metrics.jsonl") -> dict[int, float]:
+    found = [line for line in lines(out, name) if line["kind"] == "evaluate" and line["split"] == split]
+    return {line["step"]: line["psnr"] for line in found}
+
+
+def equal_ends(one: Path, other: Path) -> None:
+    assert digest(one) == digest(other)
+    first, second = ({k: v for k, v in metrics(out).items() if k not in TIMES} for out in (one, other))
+    assert first == second
+    assert lines(one) == lines(other)
+
+
+# ---- the best model
+
+
+def test_training_leaves_the_best_model_on_validation_views(best):
+    measured = psnr_of(best, "validation")
+    assert sorted(measured) == list(range(4, 41, 4))
+    assert max(measured, key=measured.__getitem__) == BEST
+    found = read_ply(best / "point_cloud.ply").parameters
+    _, expected = checkpoint.load(best / "checkpoints" / f"step_{BEST:06d}.npz")
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(found[name], expected[f"gaussians/{name}"], err_msg=name)
+    assert len(found["means"]) < len(checkpoint.load(best / "checkpoints" / "step_000040.npz")[1]["gaussians/means"])
+
+
+def test_its_metrics_are_those_of_that_model(best):
+    found = metrics(best)
+    assert found["kept"]["step"] == BEST
+    assert found["kept"]["ended"] == found["steps"] == 40
+    assert found["kept"]["evaluations"] == 10
+    assert found["validation"]["1"]["psnr"] == found["kept"]["validation"] == psnr_of(best, "validation")[BEST]
+    assert found["validation"]["1"]["views"] == 2
+    assert found["train"]["1"]["psnr"] == found["kept"]["train"] == psnr_of(best, "train")[BEST]
+    assert found["train"]["1"]["views"] == 6
+    assert found["test"]["1"]["psnr"] == psnr_of(best, "test")[BEST]
+    assert f"kept     {BEST} steps, the best model" in "\n".join(summary(best))
+    assert summary(best)[-1].endswith("in a browser"), "more steps were no better"
+
+
+def test_its_page_shows_the_three_splits_and_the_best_step(best):
+    page = (best / "report.html").read_text()
+    for text in (*NAMES.values(), f"the model of step {BEST} is the best", "That model is kept"):
+        assert text in page
+
+
+@pytest.mark.parametrize("last", [2, BEST, 16, 38, 40])
+def test_a_run_that_goes_on_from_any_checkpoint_ends_the_same(tiny_scene, tmp_path, pipeline, best, last):
+    out = shutil.copytree(best, tmp_path / "run")
+    for path in checkpoint.saved(out):
+        if int(path.stem.removeprefix("step_")) > last:
+            path.unlink()
+    for name in ("point_cloud.ply", "metrics.json", "report.html", "checksums.json"):
+        (out / name).unlink()
+    train(tiny_scene, out, pipeline=pipeline, resume=True)
+    equal_ends(out, best)
+
+
+def test_patience_ends_a_training(tiny_scene, tmp_path, pipeline, best):
+    run = train(tiny_scene, tmp_path / "run", *PATIENT, pipeline=pipeline)
+    assert run.step == BEST + 3 * 4
+    assert metrics(run.out)["kept"]["ended"] == run.step
+    assert digest(run.out) == digest(best)
+    assert checkpoint.saved(run.out)[-1].name == f"step_{run.step:06d}.npz", "of the end, to train longer"
+    longer = train(tiny_scene, run.out, "optimize.patience=99", pipeline=pipeline, resume=True)
+    assert longer.step == 40
+    assert digest(run.out) == digest(best)
+
+
+def grown(out: Path) -> dict[int, bool]:
+    """By step, whether an edit has added Gaussians."""
+    return {line["step"]: line["after"] > line["before"] for line in lines(out) if line["kind"] == "densify"}
+
+
+def test_growth_ends_where_validation_finds_no_better_model(tiny_scene, tmp_path, pipeline, best):
+    assert grown(best) == {15: True, 20: True, 25: True}
+    for patience, expected in ((1, {15: True, 20: False, 25: False}), (3, {15: True, 20: True, 25: False})):
+        out = train(tiny_scene, tmp_path / str(patience), f"densify.patience={patience}", pipeline=pipeline).out
+        assert grown(out) == expected
+        assert metrics(out)["kept"]["growth_ended"] == (20 if patience == 1 else 25)
+        assert digest(out) == digest(best), "of a step before"
+    until = train(tiny_scene, tmp_path / "until", "densify.grow_until=20", pipeline=pipeline).out
+    assert grown(until) == {15: True, 20: False, 25: False}
+    again = shutil.copytree(tmp_path / "1", tmp_path / "again")
+    for path in checkpoint.saved(again):
+        if int(path.stem.removeprefix("step_")) > 22:
+            path.unlink()
+    for name in ("point_cloud.ply", "metrics.json", "report.html", "checksums.json"):
+        (again / name).unlink()
+    train(tiny_scene, again, "densify.patience=1", pipeline=pipeline, resume=True)
+    equal_ends(again, tmp_path / "1")
+
+
+def test_a_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
+    pipeline = load(pipeline, ["densify.patience=1", "optimize.refit=true"])
+    found = Measured(step=30, train=20, validation=20)
+    best = Best(found=found, degree=0, metrics={}, evaluations=9, since=2, apart=None, last=found, growth_ended=20)
+    run = SimpleNamespace(best=best.model_copy(update={"refit": "begun"}), is_refit=True)
+    training = as_trained(pipeline, run).settings.training
+    density = next(stage for stage in training.during if stage.stage == "densify")
+    assert (training.steps, density.patience, density.grow_until) == (30, None, 20)
+
+
+def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, pipeline, best):
+    longer = train(tiny_scene, tmp_path / "longer", "optimize.steps=48", pipeline=pipeline)
+    out = shutil.copytree(best, tmp_path / "run")
+    train(tiny_scene, out, "optimize.steps=48", pipeline=pipeline, resume=True)
+    assert digest(out) == digest(longer.out)
+    assert sorted(psnr_of(out, "validation")) == list(range(4, 49, 4))
+
+
+@pytest.mark.parametrize(
+    "own", ["{every: 50, split: validation, stop: 40}", "{every: 60, split: validation, start: 60}"]
+)
+def test_measurement_never_due_is_refused_before_the_first_step(tiny_scene, tmp_path, pipeline, own):
+    during = f"optimize.during=[evaluate: {own}]"
+    with pytest.raises(ConfigError, match="needs a measurement of the validation views before the last step"):
+        train(tiny_scene, tmp_path / "run", during, pipeline=pipeline)
+
+
+def test_measurements_of_a_later_training_count_from_its_start(tmp_path):
+    during = "during: [{evaluate: {every: 8, split: validation}}]"
+    stages = "stages:\n  - {}\n  - init\n  - optimize: {{steps: {}, losses: [l1], keep: best, {}}}\n"
+    for first in ("train_field: {steps: 4, during: []}", "init\n  - optimize: {steps: 4, losses: [l1]}"):
+        (tmp_path / "x.yaml").write_text("name: x\nscene: {validation: auto}\n" + stages.format(first, 4, during))
+        assert load(str(tmp_path / "x.yaml")).settings.training
+        (tmp_path / "x.yaml").write_text("name: x\nscene: {validation: auto}\n" + stages.format(first, 3, during))
+        with pytest.raises(ConfigError, match="needs a measurement of the validation views before the last step"):
+            load(str(tmp_path / "x.yaml"))
+
+
+def test_measurement_at_another_size_is_not_used_to_choose(tiny_scene, tmp_path, pipeline):
+    during = "optimize.during=[evaluate: {every: 4, split: validation, downscales: [2]}]"
+    run = train(tiny_scene, tmp_path / "run", during, "optimize.steps=100", pipeline=pipeline)
+    assert run.best.evaluations + run.best.since == 1, "every 100 steps"
+
+
+def test_training_ended_by_patience_has_a_final_checkpoint(tiny_scene, tmp_path, pipeline):
+    """Also where `during` names the checkpoint first."""
+    during = "optimize.during=[checkpoint: {every: 40}, evaluate: {every: 4, split: validation}]"
+    run = train(tiny_scene, tmp_path / "run", during, *PATIENT, pipeline=pipeline)
+    assert run.step < 40
+    assert checkpoint.saved(tmp_path / "run")[-1].name == f"step_{run.step:06d}.npz"
+
+
+def test_without_a_measurement_of_ones_own_there_are_twenty(pipeline):
+    training = load("splat_7k", ["scene.validation=auto", "optimize.keep=best"]).settings.training
+    train_, validation, *others = training.inner
+    assert others == training.during
+    assert (validation.split, validation.every) == ("validation", 350)
+    assert (train_.split, train_.every, train_.most) == ("train", 350, 8)
+    assert load("splat_7k").settings.training.inner == training.during
+
+
+# ---- training again on all
+
+
+def test_refit_has_the_bits_of_a_run_without_validation(tiny_scene, tmp_path, pipeline, refit, best):
+    plain = ("scene.validation=0", "optimize.keep=last", f"optimize.steps={BEST}")
+    expected = train(tiny_scene, tmp_path / "plain", *plain, pipeline=pipeline).out
+    assert digest(refit) == digest(expected)
+    assert digest(refit) != digest(best)
+    found = metrics(refit)
+    assert found["steps"] == found["kept"]["step"] == BEST
+    assert found["kept"]["refit"] is True
+    assert "validation" not in found, "it has trained on those views"
+    own = [line for line in lines(refit) if line.get("split") != "validation"]
+    assert own == lines(expected), "metrics.jsonl is of the model that is left"
+    assert psnr_of(refit, "validation", "trial.jsonl") == {
+        step: psnr for step, psnr in psnr_of(best, "validation").items() if step <= BEST + 12
+    }
+    assert f"All training photographs are then trained on for {BEST} steps" in (refit / "report.html").read_text()
+
+
+@pytest.mark.parametrize("names", ["step_000006", "step_000024", "refit_000002", "refit_000012"])
+def test_a_refit_that_goes_on_from_any_checkpoint_ends_the_same(tiny_scene, tmp_path, pipeline, refit, names):
+    out = shutil.copytree(refit, tmp_path / "run")
+    files = checkpoint.saved(out)
+    assert [file.stem for file in files] == [f"step_{s:06d}" for s in range(2, 25, 2)] + [
+        f"refit_{s:06d}" for s in range(2, 13, 2)
+    ]
+    last = next(i for i, file in enumerate(files) if file.stem == names)
+    for path in files[last + 1 :]:
+        path.unlink()
+    for name in ("point_cloud.ply", "metrics.json", "report.html", "checksums.json"):
+        (out / name).unlink()
+    train(tiny_scene, out, *REFIT, pipeline=pipeline, resume=True)
+    equal_ends(out, refit)
+    assert lines(out, "trial.jsonl") == lines(refit, "trial.jsonl")
+
+
+def test_a_refit_goes_on_in_no_other_number_of_steps(tiny_scene, tmp_path, pipeline, refit):
+    out = shutil.copytree(refit, tmp_path / "run")
+    with pytest.raises(ConfigError, match="is of a refit, whose steps validation has found"):
+        train(tiny_scene, out, *REFIT, "optimize.steps=80", pipeline=pipeline, resume=True)
+
+
+@pytest.mark.parametrize("settings", [(), PATIENT, REFIT], ids=["best", "patience", "refit"])
+def test_a_trainer_has_the_bits_of_a_run(tiny_scene, tmp_path, pipeline, settings, best, refit):
+    given = {"optimize.patience": 3, "optimize.refit": True}
+    trainer = Trainer(tiny_scene, pipeline, set={key: given[key] for key in [*given][: len(settings)]})
+    steps = [report.step for report in trainer.steps()]
+    assert steps == {0: [*range(1, 41)], 1: [*range(1, 25)], 2: [*range(1, 25), *range(1, BEST + 1)]}[len(settings)]
+    trainer.model.save(tmp_path / "model.ply")
+    expected = refit if settings == REFIT else best
+    assert (tmp_path / "model.ply").read_bytes() == (expected / "point_cloud.ply").read_bytes()
+
+
+# ---- what is not looked at
+
+
+@pytest.mark.parametrize("split", ["validation", "test"])
+def test_photographs_that_are_kept_out_do_not_change_the_model(tiny_scene, tmp_path, pipeline, split, best):
+    """Those for validation choose the step, and nothing else; those for testing nothing."""
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    settings = load(pipeline, [f"scene.path='{scene}'"]).settings.scene
+    for view in settings.read(scene)[0].split(split):
+        cv2.imwrite(str(view.image_path), 255 - cv2.imread(str(view.image_path)))
+    run = train(scene, tmp_path / "run", pipeline=pipeline)
+    last = [checkpoint.load(out / "checkpoints" / "step_000040.npz")[1] for out in (run.out, best)]
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(last[0][f"gaussians/{name}"], last[1][f"gaussians/{name}"])
+    assert psnr_of(run.out, split) != psnr_of(best, split)
+    assert (digest(run.out) == digest(best)) == (split == "test")
+
+
+# ---- what is refused
+
+
+@pytest.mark.parametrize(
+    ("settings", "fault"),
+    [
+        (["scene.validation=0"], "expected scene.validation: auto"),
+        (["optimize.keep=last", "optimize.patience=3"], "'patience' is for 'keep: best'; give both or neither"),
+        (["optimize.keep=last", "optimize.refit=true"], "'refit' is for 'keep: best'"),
+    ],
+)
+def test_what_has_nothing_to_choose_by_is_refused(pipeline, settings, fault):
+    with pytest.raises(ConfigError, match=fault):
+        load(pipeline, settings)
+
+
+def test_other_models_at_the_end_are_refused(tmp_path):
+    head = "name: x\nscene: {validation: auto}\nstages:\n  - init: {}\n"
+    one = "  - optimize: {steps: 9, keep: best, losses: [l1], during: [{add_to_average: {every: 2}}]}\n"
+    two = "  - optimize: {steps: 9, losses: [l1]}\n  - optimize: {steps: 9, keep: best, refit: true, losses: [l1]}\n"
+    for stages, fault in ((one, "not the average of several"), (two, "expected one stage that trains, found 2")):
+        (tmp_path / "x.yaml").write_text(head + stages)
+        with pytest.raises(ConfigError, match=fault):
+            load(str(tmp_path / "x.yaml"))
+
+
+@pytest.mark.parametrize(("steps", "every"), [(7000, 350), (2019, 100), (730, 104), (350, 116), (199, 199), (12, 12)])
+def test_a_training_is_measured_near_its_end(pipeline, steps, every):
+    """A refit of a short one would be up to 99 steps shorter than it."""
+    training = load(pipeline).settings.training.model_copy(update={"steps": steps, "keep": "best"})
+    assert {one.every for one in training.measuring([])} == {every}
+    assert steps % every < 20
+
+
+def test_minutes_know_no_refit(tiny_scene, tmp_path, pipeline):
+    job = Job.open(pipeline, tiny_scene, tmp_path / "run", REFIT)
+    with pytest.raises(ConfigError, match=r"a refit trains twice, .*; add --set optimize\.refit=false"):
+        job.run(minutes=5)
+
+
+def test_a_trainer_needs_a_scene_with_validation_views(tiny_scene, pipeline):
+    import clsplat
+
+    trainer = Trainer(clsplat.read_scene(tiny_scene), pipeline)
+    with pytest.raises(ConfigError, match="expected some: set"):
+        trainer.step()
+
+
+NOW = Measured(step=8, train=30.0, validation=20.0)
+FOUND = Best(found=NOW, degree=0, metrics={}, evaluations=1, since=0, apart=None, last=NOW)
+
+
+def test_a_checkpoint_without_its_best_model_is_damaged(best):
+    state, tables = checkpoint.load(best / "checkpoints" / "step_000020.npz")
+    own, _ = split(tables, kept.FOLDER)
+    assert state.best is not None
+    assert state.best.found.step == BEST
+    kept.check(state.best, own)
+    for wrong in (
+        {name: table for name, table in own.items() if name != "means"},
+        {**own, "means": own["means"][1:]},
+        {**own, "quats": own["quats"] * np.float32(np.nan)},
+    ):
+        with pytest.raises(DataError, match="best model"):
+            kept.check(state.best, wrong)
+    with pytest.raises(DataError, match="says nothing of"):
+        kept.check(None, own)
+    assert split(checkpoint.load(best / "checkpoints" / "step_000002.npz")[1], kept.FOLDER)[0] == {}
+
+
+# ---- in words
+
+
+@pytest.mark.parametrize(
+    ("train_", "validation", "expected"),
+    [
+        (26.0, 20.0, "At step 8 the model has 26.0 dB at training views and 20.0 dB at validation views."),
+        (26.1, 20.0, "20.0 dB at validation views, more than 6 dB apart: the photographs are learnt by heart."),
+    ],
+)
+def test_six_decibels_apart_are_learnt_by_heart(train_, validation, expected):
+    assert expected in Measured(step=8, train=train_, validation=validation).told("validation")
+
+
+def test_run_without_validation_is_told_when_it_overfits(tiny_scene, tmp_path, pipeline):
+    plain = ("scene.validation=0", "optimize.keep=last", "optimize.steps=8")
+    run = train(tiny_scene, tmp_path / "run", *plain, pipeline=pipeline)
+    assert parting(run) == ""
+    assert not is_by_heart(run)
+    run.records.add(8, "evaluate", split="train", downscale=1, psnr=40.0, ssim=1.0)
+    run.records.write()
+    assert "40.0 dB at training views" in parting(run)
+    assert "dB at test views, more than 6 dB apart: the photographs are learnt by heart" in parting(run)
+    assert "`scene.validation: auto` with `optimize.keep: best`" in parting(run)
+    assert is_by_heart(run)

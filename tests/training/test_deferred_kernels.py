@@ -1,0 +1,181 @@
+"""deferred.cl against the oracle, and against updates at once."""
+
+import numpy as np
+import pytest
+
+from clsplat.conformance.checks.deferred import deferred_figures, seen_rows, trained
+from clsplat.conformance.checks.update import behind_each_fifth
+from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.errors import ConfigError
+from clsplat.gaussians.deferred import Deferred
+from clsplat.gaussians.tables import DeviceModel, Gradients
+from clsplat.opencl.device import Device
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.training.adam import Adam, Rates, Rows
+from tests.support.figures import hold
+
+
+def hide(model: DeviceModel, case: Case, step: int) -> None:
+    """Put other Gaussians behind the camera at each step: two thirds, nearly all, or all."""
+    means = case.parameters["means"].copy()
+    hidden = np.random.default_rng(step).random(len(means)) < (1.0, 0.7, 0.98)[step % 3]
+    means[hidden] -= 20 * case.view.world_to_camera[2, :3]
+    model.gaussians.set("means", means)
+
+
+def bits_after(
+    device: Device,
+    case: Case,
+    rows: Rows,
+    sh_rest: object = 1e-4,
+    from_memory: bool = False,
+    edit=None,
+    on_host: bool = False,
+):
+    """All tables, as whole numbers, after nine steps of a model of which each step sees others."""
+    rasterizer, model = Rasterizer(device, "radix"), case.model(device)
+    if on_host:
+        model.gaussians.move_to_host()
+    camera, adam = case.device_camera(device), Adam(model.gaussians)
+    weights = np.random.default_rng(5).normal(size=(3, camera.rows, camera.stride)).astype(np.float32)
+    for step in range(1, 10):
+        hide(model, case, step)
+        rates = Rates(sh_rest=sh_rest).at(step, extent=2.0)
+        frame = rasterizer.forward(model, camera, device.zeros(3))
+        pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(weights))
+        if from_memory:
+            adam.step(model, frame, rasterizer.gradients(model, frame, pixel_sums), rates, rows=rows)
+        else:
+            adam.update(model, frame, pixel_sums, rates, rows)
+        if edit:
+            edit(model, adam, step)
+    return {name: model.gaussians.get(name).view(np.uint32) for name in model.gaussians.tables}
+
+
+def assert_equal(device: Device, case: Case, **settings: object) -> None:
+    at_once = bits_after(device, case, "all", **settings)
+    for name, table in bits_after(device, case, "deferred", **settings).items():
+        np.testing.assert_array_equal(table, at_once[name], err_msg=name)
+
+
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 63, 64, 65, 150])
+def test_updates_that_wait(device, rng, count):
+    hold(deferred_figures(device, rng, count))
+
+
+@pytest.mark.parametrize("from_memory", [False, True])
+@pytest.mark.parametrize(
+    ("count", "degree", "sh_rest"),
+    [(1, 3, 1e-4), (150, 0, 1e-4), (150, 2, 1e-4), (300, 3, {"every": 2, "value": 1e-4}), (300, 3, 1e-4)],
+)
+def test_bits_are_those_of_updates_at_once(device, rng, count, degree, sh_rest, from_memory):
+    case = behind_each_fifth(with_world_filter(random_case(rng, count, degree=degree), rng))
+    assert_equal(device, case, sh_rest=sh_rest, from_memory=from_memory)
+
+
+def raise_degree(model: DeviceModel, adam: Adam, step: int) -> None:
+    model.degree = min(3, step // 3)
+
+
+def move_rows(model: DeviceModel, adam: Adam, step: int) -> None:
+    """Double the rows: the tables grow beyond their capacity."""
+    if step in (4, 6):
+        count = model.gaussians.count
+        source = model.gaussians.device.upload(np.arange(2 * count, dtype=np.uint32) % count)
+        fresh = model.gaussians.device.upload((np.arange(2 * count) >= count).astype(np.uint32))
+        model.gaussians.rearrange(source, fresh, 2 * count)
+        model.gaussians.rearrange(source, fresh, count)
+
+
+def write_rows(model: DeviceModel, adam: Adam, step: int) -> None:
+    rows = np.arange(0, model.gaussians.count, 7)
+    if step == 4:
+        model.gaussians.set_rows("sh_rest", rows, np.full((len(rows), 45), 0.5, np.float32))
+    if step == 5:
+        model.gaussians.zero_rows(["adam/sh_rest/moment1"], rows)
+    if step == 7:
+        adam.forget("sh_rest")
+
+
+def drop_bands(model: DeviceModel, adam: Adam, step: int) -> None:
+    if step == 5:
+        model.gaussians.lower_sh_degree(1)
+        model.degree = 1
+
+
+@pytest.mark.parametrize("edit", [raise_degree, move_rows, write_rows, drop_bands])
+def test_who_changes_rows_finds_them_up_to_date(device, rng, edit):
+    assert_equal(device, behind_each_fifth(random_case(rng, 100)), edit=edit)
+
+
+def test_the_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
+    case = random_case(rng, 100)
+    seen = [seen_rows(rng, 100) for _ in range(7)]
+    gradients = [rng.normal(size=(100, 45)).astype(np.float32) * mask[:, None] for mask in seen]
+    found = []
+    for longest in (1, 2, 7, 32):
+        monkeypatch.setattr("clsplat.conformance.checks.deferred.LONGEST", longest)
+        found.append(trained(device, case.model(device), seen, gradients, "deferred"))
+    for name in Deferred.names:
+        for tables in found[1:]:
+            np.testing.assert_array_equal(tables[name].view(np.uint32), found[0][name].view(np.uint32))
+
+
+def test_rows_that_no_view_sees_wait(device, rng):
+    """Their harmonics lie as they were, and whoever asks for them gets what they are."""
+    case = random_case(rng, 150)
+    model, seen = case.model(device), np.arange(150) < 16
+    gradients = np.full((150, 45), 2, np.float32) * seen[:, None]
+    adam, first = Adam(model.gaussians), np.ones((150, 45), np.float32)
+    model.gaussians.set("adam/sh_rest/moment1", first)
+    frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
+    keys = np.where(np.arange(model.gaussians.capacity) < 16, 7, 0xFFFFFFFF).astype(np.uint32)
+    frame.depth_key.set(keys)
+    of_loss = Gradients(model.gaussians)
+    planes = np.zeros(of_loss["sh_rest"].shape, np.float32)
+    planes[:, :150] = gradients.T
+    of_loss["sh_rest"].set(planes)
+    adam.step(model, frame, of_loss, Rates().at(1, 2.0), rows="deferred")
+    lying = model.gaussians.deferred.array("adam/sh_rest/moment1").get()[:, :150].T
+    np.testing.assert_array_equal((lying != first).any(axis=1), seen)
+    assert (model.gaussians.get("adam/sh_rest/moment1") != first).all()
+
+
+def test_a_penalty_on_harmonics_that_wait_is_refused(device, rng):
+    gradients = Gradients(random_case(rng, 5).model(device).gaussians)
+    assert gradients.without_deferred()["means"] is gradients["means"]
+    with pytest.raises(ConfigError, match="`update: all` with"):
+        gradients.without_deferred()["sh_rest"]
+
+
+@pytest.mark.parametrize("from_memory", [False, True])
+@pytest.mark.parametrize("rows", ["all", "seen"])
+@pytest.mark.parametrize(("count", "degree"), [(0, 3), (1, 3), (17, 2), (64, 0), (65, 3), (300, 3)])
+def test_the_bits_do_not_depend_on_where_harmonics_lie(device, rng, count, degree, rows, from_memory):
+    case = behind_each_fifth(with_world_filter(random_case(rng, count, degree=degree), rng))
+    on_device = bits_after(device, case, rows, from_memory=from_memory)
+    on_host = bits_after(device, case, rows, from_memory=from_memory, on_host=True)
+    for name, table in on_device.items():
+        np.testing.assert_array_equal(on_host[name], table, err_msg=name)
+
+
+@pytest.mark.parametrize("edit", [raise_degree, move_rows, write_rows, drop_bands])
+def test_who_changes_rows_finds_them_on_the_host(device, rng, edit):
+    case = behind_each_fifth(random_case(rng, 100))
+    on_device = bits_after(device, case, "all", edit=edit)
+    for name, table in bits_after(device, case, "all", edit=edit, on_host=True).items():
+        np.testing.assert_array_equal(table, on_device[name], err_msg=name)
+
+
+def test_needing_all_rows_explains_that_they_are_on_the_host(device, rng):
+    model = random_case(rng, 20).model(device)
+    before = model.gaussians.get("sh_rest")
+    model.gaussians.move_to_host()
+    model.gaussians.move_to_host()
+    np.testing.assert_array_equal(model.gaussians.get("sh_rest"), before)
+    with pytest.raises(ConfigError, match="lies in the memory of the host"):
+        model.gaussians["sh_rest"]
+    before[3, 7] = np.nan
+    assert model.gaussians.not_finite() == []
+    model.gaussians.set("sh_rest", before)
+    assert model.gaussians.not_finite() == ["sh_rest"]

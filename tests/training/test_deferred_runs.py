@@ -1,0 +1,260 @@
+"""Runs whose harmonics are updated when a view sees them, on the device and on the host: the bits of one at once.
+
+And runs that update only the rows that each view sees.
+"""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, MemoryLimitError
+from clsplat.formats.ply import write_ply
+from clsplat.formats.table import read as read_ply
+from clsplat.losses.base import LossValue, Penalty
+from clsplat.opencl.device import Device
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.on_host import harmonics_of
+from clsplat.pipeline.yaml_file import read_yaml
+from clsplat.runs import folders, opening, runner
+from clsplat.runs.description import describe
+from clsplat.runs.single import run_pipeline
+from clsplat.training import checkpoint
+from clsplat.training.memory import last_place
+from clsplat.training.placing import most_gaussians
+from tests.support.runs import FEW, digest, train
+
+pytestmark = pytest.mark.slow
+
+DEFERRED, HOST = "optimize.update=deferred", "rasterizer.harmonics=host"
+WAYS = {"deferred": (DEFERRED,), "host": (HOST,), "both": (DEFERRED, HOST)}
+
+
+def spread_of(few_steps, file, near):
+    """Settings of a run from 2,000 Gaussians, of which views see so many, with growth and harmonics."""
+    model = read_ply(few_steps / "point_cloud.ply").parameters
+    model, count = {name: table[:2000] for name, table in model.items()}, 2000
+    model["means"][near:, 2] += 500
+    rng = np.random.default_rng(0)
+    model["sh_rest"] = rng.normal(0, 0.05, (count, 45)).astype(np.float32)
+    write_ply(file, model, {})
+    return "init.source=model", f"init.file='{file}'", *FEW, "optimize.checkpoint.keep=9"
+
+
+@pytest.fixture(scope="module")
+def spread(few_steps, tmp_path_factory):
+    return spread_of(few_steps, tmp_path_factory.mktemp("spread") / "spread.ply", 500)
+
+
+@pytest.fixture(scope="module")
+def at_once(spread, tiny_scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "at_once"
+    train(tiny_scene, out, *spread)
+    return out
+
+
+def tables(out, step):
+    return checkpoint.load(out / "checkpoints" / f"step_{step:06d}.npz")[1]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_bits_are_those_of_updates_at_once(way, spread, at_once, tiny_scene, tmp_path):
+    """In the file, and in each checkpoint with the moments; Gaussians have been added; a run resumes."""
+    out = train(tiny_scene, tmp_path / "run", *spread, *WAYS[way]).out
+    for step in (4, 8, 12):
+        expected = tables(at_once, step)
+        for name, table in tables(out, step).items():
+            np.testing.assert_array_equal(table.view(np.uint32), expected[name].view(np.uint32), err_msg=name)
+    assert len(tables(out, 12)["gaussians/means"]) > len(tables(out, 4)["gaussians/means"])
+    for name in ("step_000012.npz", "step_000008.npz"):
+        (out / "checkpoints" / name).unlink()
+    (out / "point_cloud.ply").unlink()
+    train(tiny_scene, out, *spread, *WAYS[way], resume=True)
+    assert digest(out) == digest(at_once)
+
+
+def test_a_run_goes_on_with_its_harmonics_elsewhere(spread, at_once, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(at_once, out)
+    for path in (*sorted((out / "checkpoints").iterdir())[1:], out / "point_cloud.ply"):
+        path.unlink()
+    train(tiny_scene, out, *spread, HOST, resume=True)
+    assert digest(out) == digest(at_once)
+
+
+def test_a_plan_beyond_the_device_names_the_host(spread, tiny_scene, tmp_path):
+    """The harmonics stay where the settings say; the plan of the host needs less of the device."""
+    run = train(tiny_scene, tmp_path / "first", *spread, "optimize.steps=1")
+    count, own = run.model.gaussians.count, run.memory_plan()
+    assert run.model.gaussians.on_host is None
+    other = run.memory_plan(harmonics="host")
+    between = (other.needed(count) + own.needed(count)) // 2
+    assert other.needed(count) < between < own.needed(count)
+    assert "harmonics on the host" in other.text(count)
+    assert "harmonics on the host" not in own.text(count)
+    replace(other, memory=between).check(count)
+    with pytest.raises(MemoryLimitError, match=r"rasterizer\.harmonics=auto"):
+        replace(own, memory=between).check(count, ", or rasterizer.harmonics=auto")
+    with pytest.raises(MemoryLimitError) as refused:
+        replace(other, memory=0).check(count)
+    assert "rasterizer.harmonics" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("more", "told"), [(("rasterizer.harmonics=device",), True), ((), False)])
+def test_what_makes_room_is_told_where_it_helps(more, told, tiny_scene, tmp_path, small):
+    """Where views see all Gaussians a training is refused before its first step, and the host is no remedy."""
+    own = [f"scene.path='{tiny_scene}'", *FEW, *more]
+    with pytest.raises(MemoryLimitError) as refused:
+        run_pipeline(load("smoke", own), tmp_path / "run", Device(small(7700)), "new")
+    assert ("rasterizer.harmonics=auto" in str(refused.value)) == told
+    assert "for 7,995 Gaussians" in str(refused.value)
+
+
+@pytest.fixture(scope="module")
+def small(spread, tiny_scene, info, tmp_path_factory):
+    """Devices with memory of their own that hold about so many Gaussians in these runs."""
+    plan = train(tiny_scene, tmp_path_factory.mktemp("runs") / "first", *spread, "optimize.steps=1").memory_plan()
+    return lambda held: replace(info, memory=plan.needed(held), unified=False)
+
+
+def test_the_harmonics_move_to_the_host_where_the_device_is_full(spread, at_once, tiny_scene, tmp_path, small, caplog):
+    """2,000 Gaussians become more than 3,000; a resumed run moves them where it needs to, whatever it did before."""
+    out, own, device = tmp_path / "run", [f"scene.path='{tiny_scene}'", *spread], small(3150)
+    with caplog.at_level("INFO", "clsplat"):
+        run_pipeline(load("smoke", own), out, Device(device), "new")
+    (told,) = [one.message for one in caplog.records if "the harmonics lie on the host, as" in one.message]
+    assert not told.startswith("step 0: ")
+    assert digest(out) == digest(at_once)
+    for memory in (device.memory, 8 << 30):
+        for name in ("checkpoints/step_000012.npz", "checkpoints/step_000008.npz", "point_cloud.ply"):
+            (out / name).unlink()
+        run_pipeline(load("smoke", own), out, Device(replace(device, memory=memory)), "resume")
+        assert digest(out) == digest(at_once)
+    assert read_yaml(out / "pipeline.yaml").data["rasterizer"]["harmonics"] == "auto"
+
+
+def test_a_run_that_sees_few_goes_on_from_every_checkpoint(few_steps, tiny_scene, tmp_path, small):
+    """Growth ends above what the estimate of the host allows, and below what the views that were looked at do."""
+    own = [f"scene.path='{tiny_scene}'", *spread_of(few_steps, tmp_path / "few.ply", 200), "optimize.steps=16"]
+    device, out = small(2050), tmp_path / "run"
+    run_pipeline(load("smoke", own), out, Device(device), "new")
+    expected = digest(out)
+    with folders.opened(out, "resume", step=0) as status:
+        run = opening.open_run(load("smoke", own), out, Device(device), "resume", status)
+        checkpoint.restore(run)
+    assert run.model.gaussians.on_host is not None
+    assert run.model.gaussians.count > run.memory_plan(harmonics="host").limit
+    for step in (12, 8, 4):
+        for file in (out / "checkpoints").iterdir():
+            if int(file.stem[-6:]) > step:
+                file.unlink()
+        (out / "point_cloud.ply").unlink()
+        run_pipeline(load("smoke", own), out, Device(device), "resume")
+        assert digest(out) == expected
+
+
+def test_what_the_device_does_not_hold_begins_on_the_host(spread, tiny_scene, tmp_path, small, caplog):
+    """As where the settings say it."""
+    for name, more in (("auto", ()), ("host", (HOST,))):
+        with caplog.at_level("INFO", "clsplat"):
+            own = [f"scene.path='{tiny_scene}'", *spread, "densify.start=99", *more]
+            run_pipeline(load("smoke", own), tmp_path / name, Device(small(1900)), "new")
+    told = [one.message for one in caplog.records if "the harmonics lie on the host" in one.message]
+    assert [one.startswith("step 0: ") for one in told] == [True, True]
+    assert ["as the device holds 1," in one for one in told] == [True, False]
+    assert digest(tmp_path / "auto") == digest(tmp_path / "host")
+
+
+def test_harmonics_stay_where_views_see_all_of_them(tiny_scene, tmp_path, info):
+    """They would need more of the device than they do now; the estimate of the host does not know that."""
+    run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.steps=1")
+    own = run.memory_plan()
+    run.device.info = replace(info, memory=own.needed(run.model.gaussians.count), unified=False)
+    held = run.memory_plan(harmonics="device").limit
+    assert run.harmonics == "auto"
+    assert most_gaussians(run) == held < run.memory_plan(harmonics="host").limit
+
+
+def test_harmonics_stay_where_the_host_is_no_help(tiny_scene, info):
+    """A stage needs them on the device, there are none, or the device's memory is the host's."""
+    own = f"scene.path='{tiny_scene}'"
+    average = "optimize.during=[{add_to_average: {every: 2}}]"
+    found = [harmonics_of(load("smoke", [own, *more]).settings) for more in ([], [average], ["model.sh_degree=0"])]
+    assert found == ["auto", "device", "device"]
+    apart, shared = (replace(info, unified=unified) for unified in (False, True))
+    found = [last_place("auto", apart), last_place("auto", shared), last_place("host", shared)]
+    assert found == ["host", "device", "host"]
+
+
+def test_a_dry_run_says_that_the_harmonics_will_lie_on_the_host(tiny_scene, tmp_path):
+    own = [f"scene.path='{tiny_scene}'", HOST]
+    text = describe(load("smoke", own), tmp_path / "run", None, "new")
+    assert "harmonics on the host, in" in text
+    assert "on the host" not in describe(load("smoke", own[:1]), tmp_path / "run", None, "new")
+
+
+def test_device_holds_what_a_view_sees_of_host_harmonics(spread, tiny_scene, tmp_path):
+    """Half of these Gaussians are far apart: the last view sees some of the blocks."""
+    run = train(tiny_scene, tmp_path / "run", *spread, HOST)
+    gaussians = run.model.gaussians
+    held = {name: table.array.nbytes for name, table in gaussians.tables.items()}
+    assert set(gaussians.on_host.tables) == {"sh_rest", "adam/sh_rest/moment1", "adam/sh_rest/moment2"}
+    assert held["sh_rest"] == gaussians.on_host.block * 4 * gaussians.tables["sh_rest"].array.shape[0]
+    assert 0 < len(gaussians.on_host.held) <= gaussians.tables["sh_rest"].array.shape[0]
+
+
+def test_what_needs_all_harmonics_on_the_device_is_refused(tiny_scene):
+    own = f"scene.path='{tiny_scene}'", "optimize.during=[{add_to_average: {every: 2}}]"
+    assert load("smoke", own)
+    with pytest.raises(ConfigError, match=r"stages\[1\] optimize: add_to_average changes the harmonics of all"):
+        load("smoke", [*own, HOST])
+
+
+def test_harmonics_on_the_host_are_left_out(spread, tiny_scene, tmp_path):
+    """After the training, where no band is left, and in it, as on the device."""
+    during = "optimize.during=[{reduce_sh: {degree: 1, every: 4, stop: 5}}, {reduce_sh: {degree: 0, every: 8}}]"
+    found = [
+        train(tiny_scene, tmp_path / way, *spread[:2], "optimize.steps=10", during, f"rasterizer.harmonics={way}")
+        for way in ("device", "host")
+    ]
+    assert [run.model.gaussians.sh_degree for run in found] == [0, 0]
+    assert digest(found[0].out) == digest(found[1].out)
+
+
+class OnHarmonics(Penalty):
+    """A penalty on what waits."""
+
+    def add(self, inputs):
+        inputs.gradients["sh_rest"].fill(0)
+        return LossValue("harmonics", lambda: 0.0)
+
+
+def test_a_penalty_on_harmonics_is_refused(few_steps, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(few_steps, out)
+    checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, DEFERRED])
+    with folders.opened(out, "restart", step=0) as status:
+        run = opening.open_run(checked, out, None, "restart", status)
+        run.losses.append(OnHarmonics(weight=1.0))
+        with pytest.raises(ConfigError, match="a penalty on sh_rest"):
+            runner.execute(checked, run, "restart", lambda progress: None)
+
+
+def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, few_steps, tmp_path):
+    """From Gaussians of which each view sees a part."""
+    spread = read_ply(few_steps / "point_cloud.ply").parameters
+    spread["means"][::2] *= 6
+    write_ply(tmp_path / "spread.ply", spread, {})
+    first = ("init.source=model", f"init.file='{tmp_path / 'spread.ply'}'", *FEW)
+    seen = (*first, "optimize.update=seen", "optimize.checkpoint.keep=9")
+    train(tiny_scene, tmp_path / "all", *first)
+    train(tiny_scene, tmp_path / "seen", *seen)
+    again = train(tiny_scene, tmp_path / "again", *seen).out
+    whole = digest(tmp_path / "seen")
+    assert digest(again) == whole
+    assert digest(tmp_path / "all") != whole
+    (again / "checkpoints" / "step_000012.npz").unlink()
+    (again / "point_cloud.ply").unlink()
+    train(tiny_scene, again, *seen, resume=True)
+    assert digest(again) == whole

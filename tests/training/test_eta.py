@@ -1,0 +1,62 @@
+"""What reports say about the time that is left, and about the PSNR."""
+
+import pytest
+
+from clsplat.progress import Progress
+from clsplat.terminal import line
+from clsplat.training.forecast import VIEWS, Forecast
+
+LAST, GROWTH_END = 3000, 1600
+
+
+def count_at(step: int) -> int:
+    """Gaussians: growth from step 200 on."""
+    return 8000 + 30 * max(0, min(step, GROWTH_END) - 200)
+
+
+def seconds_at(step: int) -> float:
+    """A step has a part of its own and one by Gaussians."""
+    return 0.004 + 1e-6 * count_at(step)
+
+
+def forecast_at(step: int) -> Forecast:
+    forecast = Forecast(LAST, GROWTH_END)
+    for report in range(100, step + 1, 100):
+        seconds = sum(seconds_at(one) for one in range(report - 99, report + 1)) / 100
+        forecast.add(report, 20.0, count_at(report), seconds)
+    return forecast
+
+
+@pytest.mark.parametrize(("step", "tolerance"), [(600, 0.25), (900, 0.1), (1500, 0.1), (2000, 0.01), (3000, 0)])
+def test_the_time_left_knows_of_the_growth_to_come(step, tolerance):
+    true = sum(map(seconds_at, range(step + 1, LAST + 1)))
+    assert forecast_at(step).seconds_left == pytest.approx(true, rel=tolerance)
+
+
+def test_before_the_growth_it_is_the_least():
+    early = forecast_at(200)
+    assert not early.growth_known
+    assert early.seconds_left == pytest.approx(seconds_at(100) * (LAST - 200))
+    assert forecast_at(400).growth_known
+    progress = Progress(200, LAST, 0.1, 20.0, 8000, 12.0, early.seconds_left, early.growth_known)
+    assert line(progress).endswith("at least 0:34 left")
+
+
+def test_where_no_rule_grows_the_model_it_is_a_product():
+    forecast = Forecast.of(0, 100, [])
+    forecast.add(50, 20.0, 7, 0.5)
+    assert forecast.growth_known
+    assert forecast.seconds_left == 25
+
+
+def test_growth_ends_with_the_last_rule_before_the_last_step():
+    assert Forecast.of(0, 1000, [lambda step: step % 100 == 0 and step < 700]).growth_end == 600
+    assert Forecast.of(0, 1000, [lambda step: step % 100 == 0]).growth_end == 900, "no edit follows the last step"
+    assert Forecast.of(950, 1000, [lambda step: step % 100 == 0]).growth_end == 950
+
+
+def test_psnr_is_the_mean_over_the_last_views():
+    forecast = Forecast(LAST, 0)
+    for number in range(VIEWS + 3):
+        forecast.add(number, float(number), 1, 1.0)
+    assert forecast.psnr == pytest.approx(3 + (VIEWS - 1) / 2)

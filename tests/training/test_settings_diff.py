@@ -1,0 +1,136 @@
+"""What may change when a run goes on: a class says it, also one of a plug-in, and nothing else may."""
+
+from typing import ClassVar, Literal
+
+import pytest
+
+from clsplat.pipeline.loading import checked
+from clsplat.pipeline.settable import CADENCE
+from clsplat.pipeline.yaml_file import read_yaml
+from clsplat.settings import rebuild, resumable, variants
+from clsplat.stages import base
+from clsplat.stages.base import Scheduled, Stage
+from clsplat.stages.evaluate import Evaluate
+from clsplat.training.changes import differences, first_difference
+
+
+def kinds(before, after) -> dict[str, str | None]:
+    """The kind of each difference between two pipelines, by place."""
+    found = differences(before.resolved(), after.resolved(), after.settings)
+    return {difference.place: difference.kind for difference in found}
+
+
+@pytest.fixture
+def pipeline(tmp_path):
+    """A function from the text of stages to a checked pipeline, and overrides of it."""
+    file = tmp_path / "pipeline.yaml"
+
+    def made(stages: str, *overrides: str):
+        file.write_text(f"name: changes\nstages:{stages}")
+        return checked(file, read_yaml(file), overrides)
+
+    return made
+
+
+TRAINING = """
+- init: {count: 50, source: random}
+- optimize:
+    steps: 10
+    losses: [l1, {type: anisotropy, above: 5}]
+    during:
+    - densify: {every: 5, rules: [{type: clone}, {type: split_oversized, pixels: 2}]}
+    - evaluate: {every: 5}
+- evaluate
+- export
+"""
+CHANGES = {
+    "scene.image_budget=7": "output",
+    "optimize.log_every=7": "output",
+    "optimize.evaluate.every=7": "output",
+    "stages.2.downscales=[2]": "output",
+    "export.file=other.ply": "output",
+    "optimize.steps=20": "training",
+    "optimize.rates.quats=1e-4": "training",
+    "optimize.rates.means=1e-4": "training",
+    "optimize.losses.1.weight=[[3, 0.0], [4, 0.1]]": "training",
+    "optimize.densify.every=7": "training",
+    "optimize.densify.max_gaussians=100": "training",
+    "optimize.densify.rules.0.start=3": "training",
+    "optimize.densify.rules.0.gradient_above=1e-3": "training",
+    "optimize.densify.rules.0.size_below=0.1": "training",
+    "optimize.densify.rules.1.beta=0.25": "training",
+    "optimize.densify.rules.1.pixels=3": None,  # a table depends on it
+    "optimize.densify.rules.0.statistic=screen_grad_abs": None,
+    "optimize.densify.rules=[clone]": None,
+    "optimize.losses.1.above=6": None,
+    "optimize.losses=[l1]": None,
+    "optimize.views.order=paper": None,
+    "init.count=60": None,
+    "seed=1": None,
+    "model.sh_degree=1": None,
+    "scene.downscale=2": None,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_class_says_what_may_change(change, pipeline):
+    found = kinds(pipeline(TRAINING), pipeline(TRAINING, change))
+    assert set(found.values()) == {CHANGES[change]}, found
+
+
+def test_a_stage_of_a_plugin_says_what_of_it_may_change(pipeline, without_plugins):
+    class Shake(Scheduled):
+        stage: Literal["shake"] = "shake"
+        training_keys: ClassVar[frozenset[str]] = frozenset({"strength"})
+        output_keys: ClassVar[frozenset[str]] = frozenset({"remark"})
+
+        strength: float = 1.0
+        remark: str = ""
+        steps: int = 3
+
+        def run(self, run) -> None: ...
+
+    rebuild()
+    stages = TRAINING.replace("- evaluate: {every: 5}", "- shake: {every: 5}")
+    before = pipeline(stages)
+    for change, kind in {
+        "strength=2.0": "training",
+        "every=6": "training",
+        "remark=a": "output",
+        "steps=4": None,
+    }.items():
+        after = pipeline(stages, f"optimize.shake.{change}")
+        assert set(kinds(before, after).values()) == {kind}, change
+    assert set(kinds(pipeline(TRAINING), before).values()) == {None}, "another stage in the place of one"
+
+
+def test_stages_that_only_read_the_model_may_change_entirely():
+    for name in ("evaluate", "export", "render", "report", "checkpoint"):
+        kind = variants(Stage)[name]
+        assert {resumable(kind, key) for key in kind.model_fields if key != "stage"} == {"output"}, name
+    assert Evaluate.output_keys > base.CADENCE == frozenset(CADENCE)
+
+
+def test_first_difference():
+    old = {"a": 1, "b": {"c": [1, {"d": 2}]}}
+    assert first_difference(old, old) is None
+    assert str(first_difference(old, {"a": 1, "b": {"c": [1, {"d": 3}]}})) == "b.c[1].d was 2, is 3"
+    assert first_difference(old, {"a": 1}) is not None
+
+
+@pytest.mark.parametrize(
+    ("place", "other"),
+    [("stages.0.init.scale", 0.5), ("stages.1.optimize.during.0.densify.rules.0.opacity", "shared")],
+)
+def test_a_key_that_an_earlier_version_had_not_had_its_default(place, other, pipeline):
+    now = pipeline(TRAINING)
+    before, *keys = now.resolved(), *place.split(".")
+    at = before
+    for key in keys[:-1]:
+        at = at[int(key) if isinstance(at, list) else key]
+    del at[keys[-1]]
+    assert not list(differences(before, now.resolved(), now.settings))
+    changed = pipeline(
+        TRAINING, f"{place.replace('stages.0.', '').replace('stages.1.', '').replace('during.0.', '')}={other}"
+    )
+    assert [d.place.rpartition(".")[2] for d in differences(before, changed.resolved(), changed.settings)] == [keys[-1]]

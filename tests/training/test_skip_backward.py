@@ -1,0 +1,262 @@
+"""Steps that skip the backward pass where a view has converged: the rule, and what a skipped step leaves as it was."""
+
+import json
+import logging
+import math
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError
+from clsplat.gaussians.tables import moment_tables
+from clsplat.losses.base import ViewGradients, ViewLosses
+from clsplat.opencl.device import Array
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.stretching import stretched
+from clsplat.runs import opening
+from clsplat.training.run import Run
+from clsplat.training.skipping import Skip
+from clsplat.training.trainer import Trainer
+from tests.support.runs import FEW, digest, train
+
+pytestmark = pytest.mark.slow
+
+FROM_5 = "optimize.skip={start: 5, warm_up: 12, least: 0.25}"  # of the fifty steps of smoke, on eight photographs
+HAAR = "optimize.views.transforms=[{type: haar, learn: filter}]"
+PENALTY = "optimize.losses=[l1, {type: dssim, weight: 0.3}, {type: anisotropy, above: 2.0, weight: 0.01}]"
+NO_EDITS = ("densify.every=1000", "raise_sh.every=1000", "reset_opacity.every=1000", "optimize.evaluate.every=1000")
+
+
+# ---- the rule
+
+
+def slow_rule(skip: Skip, visits: list[tuple[str, float]]) -> list[bool]:
+    """Which of the steps after `start` are skipped: every sum from all visits before, again at every step."""
+
+    def converged(at: int) -> bool:
+        """Whether the loss of a step is not above the average of its view's earlier ones."""
+        view, loss = visits[at]
+        earlier = [value for name, value in visits[:at] if name == view]
+        ages = range(len(earlier) - 1, -1, -1)
+        weights = [skip.decay**age * (1 if age == len(earlier) - 1 else 1 - skip.decay) for age in ages]
+        return bool(earlier) and loss <= math.fsum(w * value for w, value in zip(weights, earlier, strict=True))
+
+    share = sum(not converged(at) for at in range(skip.warm_up)) / skip.warm_up
+    least = share if skip.least == "auto" else skip.least
+    skipped: list[bool] = []
+    for now in range(len(visits)):
+        whole = skipped.count(False)
+        skipped.append(now >= skip.warm_up and converged(now) and whole >= least * (now + 1))
+    return skipped
+
+
+def decisions(skip: Skip, visits: list[tuple[str, float]]) -> list[bool]:
+    """What the rule decides, step by step, with what it keeps between them."""
+    numbers: dict[str, float] = {}
+    found = []
+    for name, loss in visits:
+        before = dict(numbers)
+        visit = skip.decide(name, loss, numbers)
+        assert numbers == before
+        numbers.update(visit.numbers)
+        found.append(visit.skipped)
+    return found
+
+
+def made_up(rng: np.random.Generator, views: int, steps: int, noise: float) -> list[tuple[str, float]]:
+    """Losses of views in random order, which fall and are noisy."""
+    falling = np.exp(-np.arange(steps) / steps) * (1 + noise * rng.standard_normal(steps))
+    return [(f"view {rng.integers(views)}", float(loss)) for loss in falling]
+
+
+@pytest.mark.parametrize("least", ["auto", 0, 0.4, 1])
+@pytest.mark.parametrize(("views", "noise", "decay"), [(1, 0.1, 0.95), (7, 0.02, 0.95), (7, 0.3, 0.5), (30, 0.1, 0.0)])
+def test_the_rule_is_that_of_plain_sums(rng, least, views, noise, decay):
+    skip = Skip(start=0, warm_up=40, decay=decay, least=least)
+    visits = made_up(rng, views, 160, noise)
+    found = decisions(skip, visits)
+    assert found == slow_rule(skip, visits)
+    assert not any(found[:40])
+    assert any(found) == (least != 1)
+
+
+@pytest.mark.parametrize("least", [0.1, 0.37, 0.5, 0.9])
+def test_the_least_share_of_whole_steps_is_kept_and_used(least):
+    """Losses that only fall would all be skipped."""
+    visits = [(f"view {step % 9}", 1 / (1 + step)) for step in range(2000)]
+    found = np.array(decisions(Skip(start=0, warm_up=100, least=least), visits))
+    whole = np.cumsum(~found) / np.arange(1, len(found) + 1)
+    assert whole.min() >= least
+    assert whole[-1] == pytest.approx(max(least, 100 / 2000), abs=1e-3)
+    assert not decisions(Skip(start=0, warm_up=9), visits)[9:].count(True), "a warm-up of first visits alone"
+
+
+def test_a_loss_that_is_not_finite_changes_nothing():
+    skip, numbers = Skip(start=0, warm_up=1, least=0), {}
+    numbers.update(skip.decide("a", 1.0, numbers).numbers)
+    for loss in (math.nan, math.inf):
+        visit = skip.decide("a", loss, numbers)
+        assert (visit.skipped, dict(visit.numbers)) == (False, {})
+    assert skip.decide("a", 1.0, numbers).skipped, "a loss that is the average is not above it"
+
+
+def test_view_has_an_average_per_size_and_none_before_the_start():
+    skip = Skip(start=8)
+    numbers: dict[str, float] = {}
+    for step, width in ((8, 40), (9, 40), (10, 20), (11, 40)):
+        camera = SimpleNamespace(width=width, height=30)
+        losses = SimpleNamespace(comparison=SimpleNamespace(step=step, camera=camera), loss=float(step))
+        numbers.update(skip.visit("a.png", losses, numbers).numbers)
+    averages = {name: value for name, value in numbers.items() if name.startswith("skip/loss/")}
+    expected = {"skip/loss/40x30/a.png": 0.95 * 9 + 0.05 * 11, "skip/loss/20x30/a.png": 10.0}
+    assert averages == pytest.approx(expected)
+
+
+# ---- the setting
+
+
+@pytest.mark.parametrize("least", ["2", "-0.1", "much", "[1]", "null"])
+def test_a_share_that_is_none_is_refused(least):
+    with pytest.raises(ConfigError, match=r"optimize\.skip\.least=.*: expected 'auto' or a share from 0 to 1"):
+        load("smoke", ["optimize.skip.start=9", f"optimize.skip.least={least}"])
+
+
+def test_stretched_recipe_skips_later_with_the_same_warm_up():
+    skip = stretched(load("splat_7k", ["optimize.skip.start=4000"]).settings, 2.0).training.skip
+    assert skip == Skip(start=8000, decay=0.95, warm_up=500, least="auto")
+    assert load("splat_7k").settings.training.skip is None
+
+
+# ---- steps
+
+
+def begun(scene: Path, out: Path, *overrides: str) -> tuple[Run, Iterator[ViewLosses]]:
+    """A run before its first step, and its steps."""
+    checked = load("smoke", [f"scene.path='{scene}'", *overrides])
+    run = opening.open_run(checked, out, None)
+    checked.stages[0].run(run)
+    return run, checked.stages[1].iterate(run)
+
+
+def state(run: Run) -> dict[str, Any]:
+    """All that an update changes."""
+    gaussians = run.model.gaussians
+    tables = {name: gaussians.get(name).tobytes() for name in gaussians.tables}
+    kept = {name: value for name, value in run.numbers.items() if not name.startswith("skip/")}
+    return {**tables, "updates": dict(run.adam.updates) if run.adam else {}, **kept}
+
+
+@pytest.mark.parametrize("more", [(), (PENALTY,), (HAAR,)], ids=["losses", "a penalty", "a transform that learns"])
+def test_a_skipped_step_leaves_all_as_it_was(tiny_scene, tmp_path, more):
+    run, steps = begun(tiny_scene, tmp_path, FROM_5, *NO_EDITS, *more)
+    before, skipped = state(run), []
+    for view in steps:
+        after = state(run)
+        skipped.append(not isinstance(view, ViewGradients))
+        if skipped[-1]:
+            assert after == before
+            assert "anisotropy" not in [loss.name for loss in view.losses]
+        else:
+            changed = {name for name in after if after[name] != before.get(name)}
+            assert changed >= {"means", *moment_tables("means"), "stats/seen", "stats/screen_grad", "updates"}
+            assert "haar/scale" in changed or not more or more[0] != HAAR
+        before = after
+    assert not any(skipped[: 5 + 12])
+    assert 8 < sum(skipped) <= 0.75 * 45
+    assert run.adam.updates["means"] == run.step - sum(skipped) == 50 - sum(skipped)
+
+
+def test_each_size_of_a_resolution_schedule_has_own_averages(tiny_scene, tmp_path):
+    """Photographs are half as large up to step 19."""
+    sizes = "optimize.views.resolution={points: [[0, 2], [20, 1]], between: steps}"
+    run, steps = begun(tiny_scene, tmp_path, "optimize.skip={start: 2, warm_up: 40}", sizes, *NO_EDITS)
+    for _ in range(36):
+        next(steps)
+    averages = [name.split("/")[2] for name in run.numbers if name.startswith("skip/loss/")]
+    assert set(averages) == {"20x20", "40x40"}
+    assert len(averages) > 8, "photographs"
+
+
+def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_path, monkeypatch):
+    run, steps = begun(tiny_scene, tmp_path, FROM_5)
+    for _ in range(9):
+        next(steps)
+    before = state(run), dict(run.numbers)
+
+    def broken(trainer: Trainer, view: ViewLosses) -> ViewGradients:
+        raise MemoryError
+
+    monkeypatch.setattr(Trainer, "backward", broken)
+    with pytest.raises(MemoryError):
+        next(steps)
+    assert (run.step, (state(run), dict(run.numbers))) == (9, before)
+
+
+def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatch):
+    """A value that is read is a wait for the device."""
+    reads, get = Counter(), Array.get
+
+    def counted(array: Array) -> Any:
+        reads[name] += 1
+        return get(array)
+
+    monkeypatch.setattr(Array, "get", counted)
+    for name, settings in {"none": (), "later": ("optimize.skip.start=9",), "from 5": (FROM_5,)}.items():
+        _, steps = begun(tiny_scene, tmp_path / name, *settings, *NO_EDITS)
+        for _ in range(9):
+            next(steps)
+    assert reads["none"] == reads["later"] == reads["from 5"] - 4 * 2, "four steps, with two losses"
+
+
+# ---- runs
+
+
+def test_runs_that_skip_resume_and_repeat_to_the_bit(tiny_scene, tmp_path, caplog):
+    caplog.set_level(logging.INFO, "clsplat")
+    settings = (FROM_5, "optimize.checkpoint.keep=9", "densify.stop=30")
+    first = train(tiny_scene, tmp_path / "first", *settings)
+    (told,) = first.records.read("skip")
+    assert told["steps"] == 45
+    assert told["least"] == 0.25
+    assert 8 < told["skipped"] <= 0.75 * 45
+    line = f"{told['skipped']} of 45 steps after step 5 were skipped; at least 25.0% were to do the whole work"
+    assert caplog.text.count(line) == 1
+    whole = digest(first.out)
+    again = train(tiny_scene, tmp_path / "again", *settings)
+    assert digest(again.out) == whole
+    for step in (30, 40, 50):
+        (again.out / "checkpoints" / f"step_{step:06d}.npz").unlink()
+    (again.out / "point_cloud.ply").unlink()
+    resumed = train(tiny_scene, tmp_path / "again", *settings, resume=True)
+    assert digest(resumed.out) == whole
+    assert resumed.numbers == first.numbers
+    assert resumed.records.read("skip") == [told]
+
+
+def test_auto_takes_its_share_from_the_warm_up(tiny_scene, tmp_path):
+    """Of forty steps on eight photographs, the first visits at least."""
+    settings = ("optimize.skip={start: 2, warm_up: 40}", "optimize.steps=120", *NO_EDITS)
+    run = train(tiny_scene, tmp_path / "run", *settings)
+    (told,) = run.records.read("skip")
+    assert 8 / 40 <= told["least"] == run.numbers["skip/above"] / 40
+    assert told["steps"] == 118
+    assert 0 < told["skipped"] <= (1 - told["least"]) * 118
+
+
+def test_up_to_the_start_the_bits_are_those_without_it(tiny_scene, few_steps, tmp_path):
+    run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.skip.start=12")
+    assert digest(run.out) == digest(few_steps)
+    assert [line["steps"] for line in run.records.read("skip")] == [0]
+    assert not run.numbers
+
+
+def test_a_run_may_go_on_with_it(tiny_scene, killed_run, caplog):
+    run = train(tiny_scene, killed_run, *FEW, "optimize.skip={start: 8, warm_up: 1, least: 0}", resume=True)
+    assert caplog.text.count("from here on the bits are not those of a run without a change") == 1
+    assert json.loads((killed_run / "metrics.json").read_text())["steps"] == 12
+    assert run.numbers["skip/steps"] == 4

@@ -1,0 +1,338 @@
+"""Whole runs with a sky: a background of directions that is learned."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.errors import DataError
+from clsplat.gaussians.octahedral import sampled, texel_directions
+from clsplat.gaussians.sky import Sky, keep_sky, sky_beside
+from clsplat.gaussians.sky_splats import with_sky_splats
+from clsplat.metrics.images import psnr
+from clsplat.pipeline.choices import without_choices
+from clsplat.pipeline.loading import load
+from clsplat.reading import sha256
+from clsplat.render.backdrops import Auto
+from clsplat.runs.found import has_ended
+from clsplat.runs.model_file import evaluate
+from clsplat.runs.single import run_pipeline
+from clsplat.scene.camera import Camera
+from clsplat.scene.images import write_image
+from clsplat.scene.view import View
+from clsplat.training import checkpoint
+from clsplat.training.archive import split
+from clsplat.training.sky import FOLDER, check_tables
+from clsplat.views.sky_share import Seen, looked_at, panorama
+from data_tools.colmap_writer import write_model
+from tests.support.outdoor_scene import Yard, painted
+from tests.support.runs import FEW, digest, train
+
+pytestmark = pytest.mark.slow
+CAMERA, UP = Camera(64, 48, 60.0, 60.0, 32.0, 24.0), np.array([0.0, -1.0, 0.0])
+SKY = (*FEW, "model.background={type: directions, side: 16}")
+LONGER = ("optimize.steps=300", "reset_opacity.every=1000", "optimize.evaluate.every=1000", "scene.holdout=4")
+
+
+@pytest.fixture(scope="module")
+def with_sky(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of twelve steps with a sky; nothing is changed in it."""
+    out = tmp_path_factory.mktemp("runs") / "sky"
+    train(tiny_scene, out, *SKY)
+    return out
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> tuple[Yard, Path]:
+    found = Yard(np.random.default_rng(3))
+    return found, found.write(tmp_path_factory.mktemp("yard") / "scene")
+
+
+@pytest.fixture(scope="module")
+def learned(yard, tmp_path_factory) -> Path:
+    """A run that finds out by itself that there is a sky."""
+    out = tmp_path_factory.mktemp("runs") / "yard"
+    asked = load("smoke", [f"scene.path='{yard[1]}'", *LONGER, "model.background=auto"])
+    run_pipeline(asked, out, None, "new")
+    assert has_ended(asked, out), "the same command finds it up to date"
+    return out
+
+
+def sky_bytes(out: Path) -> bytes:
+    return (out / "point_cloud_sky.json").read_bytes()
+
+
+# ---- the oracle
+
+
+def test_a_painted_sky_is_found_again(yard, learned):
+    """From places that no photograph was taken from, where no Gaussian covers it.
+
+    The sky is infinitely far: there is no distance that Gaussians could be nearer than. Alpha finds those before it at
+    any distance, and each as much as it shows.
+    """
+    capture, model = yard[0], clsplat.load(learned)
+    renderer = clsplat.Renderer(model)
+    view = capture.views[4]  # held out
+    picture, above = renderer.render(view), capture.rays(view)[..., 1] < -0.05
+    assert above.mean() > 0.4
+    rendered, truth = (np.rint(255 * np.clip(image, 0, 1)) for image in (picture.image, painted(capture.rays(view))))
+    error = np.mean((rendered[above] - truth[above]) ** 2)
+    assert 10 * np.log10(255**2 / error) > 35
+    assert picture.alpha[above].mean() < 0.02
+    without = evaluate_without(learned, model)
+    assert evaluate(learned)["test"]["1"]["psnr"] > without + 3
+
+
+def evaluate_without(out: Path, model) -> float:
+    """PSNR of test views on black."""
+    renderer = clsplat.Renderer(model)
+    settings = load(str(out / "pipeline.yaml")).settings.scene
+    views = settings.read(settings.folder)[0].split("test")
+    found = [np.rint(255 * np.clip(renderer.render(view, 0.0).image, 0, 1)).astype(np.uint8) for view in views]
+    photographs = [np.rint(255 * view.photograph()).astype(np.uint8) for view in views]
+    return float(np.mean([psnr(a, b) for a, b in zip(found, photographs, strict=True)]))
+
+
+@pytest.mark.parametrize(
+    ("pitch", "rows", "share"),
+    [(0, 12, 0), (0, 9, 0), (0, 8, 1), (0, 6, 1), (45, 12, 1), (-45, 6, 0), (-45, 12, 0), (45, 0, 0)],
+)
+def test_a_sky_does_not_go_on_below_the_horizon(pitch, rows, share):
+    """Level, looking up at something narrow, and down at something on white; upper rows that are bright, of 12."""
+    mask = np.repeat(np.arange(12)[:, None] < rows, 16, axis=1)
+    down = np.sin(np.radians(-pitch))
+    view = View.looking_at(np.zeros(3), np.array([0, down, np.cos(np.radians(pitch))]), UP, CAMERA)
+    assert Seen(view, np.zeros((12, 16, 3), np.uint8), mask, np.ones_like(mask), UP).share == share
+
+
+def test_a_choice_is_written_with_its_reason(learned):
+    found = load(str(learned / "pipeline.yaml")).settings.model.background
+    assert isinstance(found, Auto)
+    assert found.chosen == "on"
+    assert found.reason.startswith("9 of 9 photographs show bright or blue regions above the horizon, without points")
+    assert "in 15% or more" in found.reason
+    assert f"model.background: on, since {found.reason}" in (learned / "log.txt").read_text()
+
+
+def test_without_visible_sky_the_bits_are_those_without_the_key(tiny_scene, tmp_path, few_steps, rng):
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "model.background=auto"])
+    run_pipeline(asked, tmp_path / "run", None, "new")
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
+    assert (found.chosen, found.reason) == ("off", "the photographs have transparency")
+    assert digest(tmp_path / "run") == digest(few_steps)
+    assert not (tmp_path / "run" / "point_cloud_sky.json").exists()
+    folder = Yard(rng, clear=False).write(tmp_path / "wall")
+    run = train(folder, tmp_path / "walled", *FEW, "model.background=auto")
+    assert run.sky is None
+
+
+@pytest.mark.parametrize(
+    ("alpha", "masked", "size", "chosen", "why"),
+    [
+        (255, None, 1, "on", "9 of 9 photographs show"),
+        (254, None, 1, "off", "the photographs have transparency"),
+        (254, "below", 1, "off", "the photographs have transparency"),
+        (255, "sky", 1, "off", "0 of 9 photographs show"),
+        (255, "edge", 1, "on", "9 of 9 photographs show"),
+        (255, "edge", 8, "on", "9 of 9 photographs show"),
+    ],
+)
+def test_pixels_that_count_and_are_opaque_show_a_sky(tmp_path, rng, alpha, masked, size, chosen, why):
+    """alpha: of one pixel of photographs but one, opaque elsewhere; masked: what is left out, an edge that is dark."""
+    yard, masks = Yard(rng), tmp_path / "masks"
+    folder = yard.write(tmp_path / "scene")
+    for view in yard.views:
+        pixels, counted = yard.photograph(view), np.ones((48, 64), bool)
+        if masked == "edge":
+            counted[:8], pixels[:8] = False, 40
+        elif masked:
+            counted = (yard.rays(view)[..., 1] > 0) == (masked == "sky")
+            counted[20, 30] = True
+        layer = np.full((48, 64, 1), 255, np.uint8)
+        layer[20, 30] = 255 if view.name == "1.png" else alpha
+        file = np.concatenate([pixels[..., ::-1], layer], axis=2).repeat(size, axis=0).repeat(size, axis=1)
+        cv2.imwrite(str(folder / "images" / view.name), file)
+        mask = (255 * counted.astype(np.uint8)).repeat(size, axis=0).repeat(size, axis=1)
+        write_image(masks / view.name, np.repeat(mask[..., None], 3, axis=2))
+    if size > 1:
+        views = [replace(view, camera=view.camera.downscaled(1 / size)) for view in yard.views]
+        write_model(folder / "sparse" / "0", views, yard.points, None)
+    more = [f"scene.masks={masks}"] if masked else []
+    settings = [f"scene.path='{folder}'", *FEW, "scene.holdout=4", "model.background=auto", *more]
+    run_pipeline(load("smoke", settings), tmp_path / "run", None, "new")
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
+    assert (found.chosen, found.reason.startswith(why)) == (chosen, True), found.reason
+
+
+def test_what_a_run_chose_is_no_setting_of_its_pipeline():
+    asked = load("smoke", ["model.background=auto"]).resolved()
+    chosen = load("smoke", ["model.background={type: auto, chosen: on, reason: it is blue}"]).resolved()
+    assert asked != chosen
+    assert without_choices(asked) == without_choices(chosen)
+
+
+def test_directions_without_visible_sky_are_left_to_gaussians(yard):
+    """The sky begins with the colours of the photographs."""
+    _, folder = yard
+    scene = clsplat.read_scene(folder)
+    photographs = [(view, np.rint(255 * view.photograph()).astype(np.uint8), None) for view in scene.views]
+    texels, free = panorama(list(looked_at(scene, photographs)), 32)
+    directions = texel_directions(32)
+    looked = np.abs(directions[:, 1]) < 0.4
+    assert not free[looked & (directions[:, 1] > 0.35)].any()
+    assert np.ptp(texels[~free], axis=0).max() == 0, "one colour, which stays"
+    sky = looked & (directions[:, 1] < -0.2)
+    assert free[sky].all()
+    np.testing.assert_allclose(texels[sky], painted(directions[sky]), atol=0.1)
+
+
+# ---- bits
+
+
+def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_sky, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(with_sky, out)
+    (out / "checkpoints" / "step_000012.npz").unlink()
+    for name in ("point_cloud.ply", "point_cloud_sky.json", "metrics.json", "checksums.json"):
+        (out / name).unlink()
+    train(tiny_scene, out, *SKY, resume=True)
+    train(tiny_scene, tmp_path / "again", *SKY)
+    assert digest(out) == digest(with_sky) == digest(tmp_path / "again")
+    assert sky_bytes(out) == sky_bytes(with_sky) == sky_bytes(tmp_path / "again")
+
+
+def test_the_best_model_is_left_with_the_sky_of_its_step(tiny_scene, tmp_path):
+    wild = "model.background={type: directions, side: 16, rate: {points: [[0, 0.005], [9, 5.0]], between: steps}}"
+    kept = (
+        "scene.validation=2",
+        "optimize.keep=best",
+        "optimize.evaluate.split=validation",
+        "optimize.evaluate.every=4",
+    )
+    run = train(tiny_scene, tmp_path / "run", *FEW, *kept, wild)
+    assert run.best.found.step == 8, "the last steps ruin it"
+    _, then = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
+    np.testing.assert_array_equal(sky_beside(tmp_path / "run" / "point_cloud.ply").texels, then["sky/texels"])
+
+
+# ---- where it goes
+
+
+def test_a_run_folder_is_rendered_and_measured_with_its_sky(learned):
+    measured = json.loads((learned / "metrics.json").read_text())["test"]["1"]
+    assert evaluate(learned)["test"]["1"]["psnr"] == measured["psnr"]
+    assert "point_cloud_sky.json" in json.loads((learned / "checksums.json").read_text())
+
+
+def test_a_model_file_without_its_sky_says_so(learned, tmp_path, caplog):
+    shutil.copy(learned / "point_cloud.ply", tmp_path / "alone.ply")
+    assert clsplat.load(tmp_path / "alone.ply").sky is None
+    assert "was trained with a sky, which is drawn where alone_sky.json lies beside it" in caplog.text
+    model = clsplat.load(learned)
+    model.save(tmp_path / "moved.ply")
+    np.testing.assert_array_equal(clsplat.load(tmp_path / "moved.ply").sky.texels, model.sky.texels)
+
+
+def test_another_model_of_the_same_name_does_not_take_a_sky(learned, tmp_path, caplog):
+    """Not by a file that another program wrote there, nor by our own of a model without one."""
+    model = clsplat.load(learned)
+    model.save(tmp_path / "scene.ply")
+    model.save(tmp_path / "scene.spz")
+    assert all(clsplat.load(tmp_path / name).sky for name in ("scene.ply", "scene.spz")), "they share it"
+    (tmp_path / "elsewhere").mkdir()
+    model[::2].save(tmp_path / "elsewhere" / "other.spz")
+    shutil.copy(tmp_path / "elsewhere" / "other.spz", tmp_path / "scene.spz")
+    assert clsplat.load(tmp_path / "scene.spz").sky is None
+    assert "scene_sky.json: is the sky of another model than scene.spz" in caplog.text
+    replace(model, sky=None).save(tmp_path / "scene.ply")
+    assert clsplat.load(tmp_path / "scene.ply").sky is None, "its bytes are those of the model with the sky"
+
+
+def test_an_export_of_splats_shows_the_sky_without_its_file(yard, learned, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(learned, out)
+    run_pipeline(load(str(out / "pipeline.yaml"), ["export.sky=splats"]), out, None, "resume")
+    assert not (out / "point_cloud_sky.json").exists()
+    model, before = clsplat.load(out), clsplat.load(learned)
+    assert len(model) == len(before) + 10_000
+    assert model.sky is None
+    view = yard[0].views[4]
+    found, expected = (clsplat.Renderer(one).render(view).image for one in (model, before))
+    assert np.abs(found - expected).mean() < 0.02
+
+
+def test_gaussians_of_a_sky_have_its_colours_in_all_directions(rng, learned):
+    model = clsplat.load(learned)
+    baked = with_sky_splats(model, 500)
+    added = baked[len(model) :]
+    directions = added.means - np.median(model.means, axis=0)
+    expected = np.clip(sampled(model.sky.texels, directions), 0, 1)
+    np.testing.assert_allclose(added.colours, expected, atol=2e-3)
+    assert with_sky_splats(baked) is baked
+
+
+def test_what_a_sky_cannot_be_is_said(tiny_scene, yard, tmp_path, caplog):
+    """Of transparent photographs, and as splats of a model that has none."""
+    transparent = "the photographs have transparency: what is learned and exported as a sky is the colour that"
+    nothing = "export.sky: splats changes nothing: the model has no sky"
+    few = ("optimize.steps=2", "init.count=60", "optimize.during=[]")
+    for scene, key, said in (
+        (tiny_scene, "model.background={type: directions, side: 8}", [True, False]),
+        (yard[1], "model.background={type: directions, side: 8}", [False, False]),
+        (yard[1], "model.background=null", [False, True]),
+    ):
+        caplog.clear()
+        train(scene, tmp_path / f"run{said}", *few, key, "export.sky=splats")
+        assert [text in caplog.text for text in (transparent, nothing)] == said
+
+
+def test_a_turned_model_has_a_turned_sky(rng, learned):
+    model = clsplat.load(learned)
+    turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    direction = np.array([0.3, -0.8, 0.2])
+    found = sampled(model.transformed(rotation=turn).sky.texels, turn @ direction)
+    np.testing.assert_allclose(found, sampled(model.sky.texels, direction), atol=0.02)
+    assert model.transformed(scale=2.0).sky is model.sky
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "[]",
+        '{"side": 8}',
+        '{"side": 8, "texels": [[1, 2]]}',
+        '{"side": true, "texels": []}',
+        '{"side": 8, "texels": 1}',
+    ],
+)
+def test_a_damaged_sky_is_refused(tmp_path, damage):
+    (tmp_path / "point_cloud_sky.json").write_text(damage)
+    with pytest.raises(DataError, match=r"point_cloud_sky\.json: expected"):
+        sky_beside(tmp_path / "point_cloud.ply")
+
+
+def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
+    _, tables = checkpoint.archive.read(with_sky / "checkpoints" / "step_000012.npz")
+    behind, _ = split(tables, FOLDER)
+    check_tables(behind)
+    for name, table in {"texels": behind["texels"][:-1], "biases": behind["moment1"]}.items():
+        with pytest.raises(DataError, match=f"{name} of its sky"):
+            check_tables({**behind, name: table})
+    with pytest.raises(DataError, match="not finite"):
+        check_tables({**behind, "moment2": behind["moment2"] * np.nan})
+    with pytest.raises(DataError, match="another sky"):
+        check_tables({"texels": behind["texels"], "biases": behind["biases"]})
+
+
+def test_a_sky_file_keeps_every_bit(rng, tmp_path):
+    sky = Sky(rng.normal(size=(64, 3)).astype(np.float32))
+    (tmp_path / "model.ply").write_bytes(b"a model")
+    keep_sky(sky, tmp_path / "model.ply", sha256(tmp_path / "model.ply"))
+    np.testing.assert_array_equal(sky_beside(tmp_path / "model.ply").texels, sky.texels)
+    assert replace(sky).side == 8

@@ -1,0 +1,96 @@
+"""Whole runs with what holds back a model of few photographs: dropout, and opacities that decay."""
+
+import numpy as np
+import pytest
+
+from clsplat.conformance.scenes import random_case
+from clsplat.density.statistics import SEEN, SplatStats
+from clsplat.errors import ConfigError
+from clsplat.formats.table import read as read_ply
+from clsplat.gaussians.tables import Dropout
+from clsplat.losses.base import Comparison, ViewGradients
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import choose
+from clsplat.pipeline.loading import load
+from clsplat.render.rasterizer import Rasterizer
+from tests.support.runs import digest, train
+
+pytestmark = pytest.mark.slow
+
+DROPOUT = "optimize.dropout=[[0, 0.0], [6, 0.4]]"
+PIPELINE = """
+name: sparse
+stages:
+  - init: {source: auto, opacity: 0.3, count: 60}
+  - optimize:
+      steps: 12
+      losses: [l1]
+      log_every: 5
+      during:
+        - densify: {every: 4, start: 3, rules: [{type: clone, gradient_above: 1.0e-9, size_below: 1}]}
+        - decay_opacity: {every: 2, per_pass: 0.9}
+        - checkpoint: {every: 4, keep: 9}
+  - export: {file: point_cloud.ply}
+"""
+
+
+@pytest.fixture
+def pipeline(tmp_path):
+    (tmp_path / "sparse.yaml").write_text(PIPELINE)
+    return str(tmp_path / "sparse.yaml")
+
+
+def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, tmp_path, pipeline):
+    whole = digest(train(tiny_scene, tmp_path / "whole", DROPOUT, pipeline=pipeline).out)
+    again = train(tiny_scene, tmp_path / "again", DROPOUT, pipeline=pipeline).out
+    assert digest(again) == whole
+    (again / "checkpoints" / "step_000012.npz").unlink()
+    (again / "point_cloud.ply").unlink()
+    train(tiny_scene, again, DROPOUT, pipeline=pipeline, resume=True)
+    assert digest(again) == whole
+    without = [
+        digest(train(tiny_scene, tmp_path / n, *s, pipeline=pipeline).out)
+        for n, s in (
+            ("plain", ()),
+            ("zero", ("optimize.dropout=0",)),
+            ("never", ("optimize.dropout=[[0, 0], [9, 0]]",)),
+        )
+    ]
+    assert len(set(without)) == 1
+    assert without[0] != whole
+
+
+def test_opacities_decay_by_the_same_share_in_each_pass(tiny_scene, tmp_path, pipeline):
+    """Where nothing else changes them: eleven steps, of which five are followed by a decay, of eight photographs."""
+    still = "optimize.rates.logit_opacity=0", "densify.start=100"
+    found = {}
+    for factor in (1.0, 0.9):
+        out = train(
+            tiny_scene, tmp_path / str(factor), *still, f"decay_opacity.per_pass={factor}", pipeline=pipeline
+        ).out
+        logits = read_ply(out / "point_cloud.ply").parameters["logit_opacity"].astype(float)
+        found[factor] = 1 / (1 + np.exp(-logits))
+    np.testing.assert_allclose(found[1.0], 0.3, rtol=1e-5)
+    np.testing.assert_allclose(found[0.9], 0.3 * 0.9 ** (5 * 2 / 8), rtol=1e-5)
+
+
+def test_a_gaussian_that_is_left_out_counts_as_not_seen(rng):
+    device = Device(choose())
+    case = random_case(rng, 40)
+    model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device)
+    model.dropout = Dropout(0.5, 1, 2)
+    stats = SplatStats(model.gaussians, ("screen_grad",))
+    frame = rasterizer.forward(model, camera, device.zeros(3))
+    sums = device.upload(np.ones((rasterizer.pixel_sums(model, frame, frame.image)).shape, np.float32))
+    comparison = Comparison(rasterizer.workspace, camera, frame.image, frame.image, frame.image)
+    stats.add(ViewGradients(frame, comparison, [], sums), sums)
+    drawn = frame.radius.get()[:40] > 0
+    assert 5 < drawn.sum() < 35
+    for column in (SEEN, "stats/screen_grad"):
+        np.testing.assert_array_equal(model.gaussians.get(column)[:, 0] > 0, drawn)
+
+
+@pytest.mark.parametrize("wrong", ["1", "-0.1", "[[0, 0.2], [9, 2]]"])
+def test_a_probability_that_leaves_nothing_is_refused(pipeline, wrong):
+    with pytest.raises(ConfigError, match=r"expected values (of at most 0\.9|at least 0)"):
+        load(pipeline, [f"optimize.dropout={wrong}"])

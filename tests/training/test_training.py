@@ -1,0 +1,214 @@
+"""Whole runs on a tiny scene: the loss falls, the bits repeat, a run killed and resumed is the run that was not."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, DataError, Interrupted, NumericError
+from clsplat.formats.ply import write_ply
+from clsplat.formats.table import read as read_ply
+from clsplat.pipeline.loading import load
+from clsplat.progress import Progress
+from clsplat.runs import opening, runner
+from clsplat.runs.failures import failures_recorded
+from clsplat.training import checkpoint
+from clsplat.views.sampling import Sampler
+from tests.support.onnx_writer import distance_network
+from tests.support.runs import ONE_CORE, digest, train
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "finished"
+    train(tiny_scene, out)
+    return out
+
+
+def test_a_run_leaves_what_it_promises(finished, tiny_scene):
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert metrics["steps"] == 50
+    assert metrics["pipeline"] == "smoke"
+    assert metrics["test"]["1"]["views"] == 2
+    assert metrics["test"]["1"]["lpips"] is None
+    assert metrics["gaussians"] == len(read_ply(finished / "point_cloud.ply").parameters["means"])
+    assert json.loads((finished / "status.json").read_text())["state"] == "done"
+    assert len(list((finished / "renders").rglob("*.png"))) == 2
+    report = (finished / "report.html").read_text()
+    assert report.count("<img") == 6
+    assert "<polyline" in report
+    assert load(str(finished / "pipeline.yaml")).settings.name == "smoke"
+    assert len(list((finished / "checkpoints").iterdir())) == 2
+    assert not [path for path in finished.rglob(".*")], "temporary files are left"
+
+
+def test_the_loss_falls_and_density_changes(finished):
+    lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
+    loss = [line["loss"] for line in lines if line["kind"] == "train"]
+    assert loss[-1] < 0.6 * loss[0]
+    edits = [line for line in lines if line["kind"] == "densify"]
+    assert [line["step"] for line in edits] == [20, 30, 40]
+    assert any(line["after"] > line["before"] for line in edits)
+
+
+def test_the_same_bits_twice_and_with_one_core(finished, tiny_scene, tmp_path):
+    train(tiny_scene, tmp_path / "again")
+    assert digest(tmp_path / "again") == digest(finished)
+    command = [
+        sys.executable,
+        "-m",
+        "clsplat",
+        "run",
+        "smoke",
+        "--scene",
+        str(tiny_scene),
+        "--out",
+        str(tmp_path / "one"),
+    ]
+    subprocess.run(command, check=True, env={**os.environ, **ONE_CORE}, capture_output=True)
+    assert digest(tmp_path / "one") == digest(finished)
+
+
+def test_more_metrics_are_recorded(tiny_scene, tmp_path):
+    (tmp_path / "distance.onnx").write_bytes(distance_network())
+    metrics = "evaluate.metrics=[psnr, ssim, ms_ssim]"
+    run = train(tiny_scene, tmp_path / "run", "optimize.steps=3", metrics, f"evaluate.lpips='{tmp_path}/distance.onnx'")
+    averages = json.loads((tmp_path / "run" / "metrics.json").read_text())["test"]["1"]
+    views = run.records.read("view")
+    for name in ("psnr", "ssim", "ms_ssim", "lpips"):
+        assert averages[name] == pytest.approx(np.mean([view[name] for view in views]))
+    with pytest.raises(DataError, match="nowhere"):
+        train(tiny_scene, tmp_path / "early", "evaluate.lpips=nowhere.onnx")
+    assert not (tmp_path / "early" / "metrics.jsonl").exists(), "refused before training"
+
+
+def test_another_seed_gives_other_bits(finished, tiny_scene, tmp_path):
+    train(tiny_scene, tmp_path / "seed", "seed=1")
+    assert digest(tmp_path / "seed") != digest(finished)
+
+
+@pytest.mark.parametrize("sort", ["radix", "bitonic"])
+def test_the_sort_does_not_matter(finished, tiny_scene, tmp_path, sort):
+    train(tiny_scene, tmp_path / sort, f"rasterizer.sort={sort}")
+    assert digest(tmp_path / sort) == digest(finished)
+
+
+def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
+    out = tmp_path / "stopped"
+    checked = load("smoke", [f"scene.path='{tiny_scene}'"])
+    run = opening.open_run(checked, out, None)
+
+    def stop(progress: Progress) -> None:
+        run.interrupted = progress.step == 20
+
+    with pytest.raises(Interrupted, match="stopped at step 20"), failures_recorded(run.status):
+        runner.execute(checked, run, "new", stop)
+    assert json.loads((out / "status.json").read_text())["state"] == "interrupted"
+    train(tiny_scene, out, resume=True)
+    assert digest(out) == digest(finished)
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    steps = [line["step"] for line in lines if line["kind"] == "train"]
+    assert steps == sorted(set(steps))
+
+
+def test_killed_three_times_and_resumed(finished, tiny_scene, tmp_path):
+    """kill -9 at random moments; the resumed run ends with the bits of the undisturbed one."""
+    out, chance = tmp_path / "killed", random.Random(1)
+    command = [
+        sys.executable,
+        "-m",
+        "clsplat",
+        "run",
+        "smoke",
+        "--scene",
+        str(tiny_scene),
+        "--out",
+        str(out),
+        "--resume",
+    ]
+    killed = 0
+    while killed < 3:
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        wait_for = chance.choice(["step_000010.npz", "step_000020.npz", "step_000030.npz"])
+        deadline = time.time() + 60
+        while time.time() < deadline and process.poll() is None and not (out / "checkpoints" / wait_for).exists():
+            time.sleep(0.005)
+        time.sleep(chance.uniform(0, 0.05))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        killed += 1
+    subprocess.run(command, check=True, capture_output=True)
+    assert digest(out) == digest(finished)
+
+
+def test_a_damaged_checkpoint_is_passed_over(finished, tiny_scene, tmp_path):
+    out = tmp_path / "damaged"
+    train(tiny_scene, out)
+    (out / "checkpoints" / "step_000060.npz").write_bytes((out / "checkpoints" / "step_000050.npz").read_bytes()[:5000])
+    run = train(tiny_scene, out, resume=True)
+    assert run.step == 50
+    assert digest(out) == digest(finished)
+
+
+def test_a_checkpoint_of_another_format_is_refused(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "FORMAT", 1)
+    train(tiny_scene, tmp_path)
+    monkeypatch.undo()
+    before = (tmp_path / "metrics.jsonl").read_bytes()
+    with pytest.raises(ConfigError, match=r"has format 1, expected 4.*use another --out"):
+        train(tiny_scene, tmp_path, resume=True)
+    assert (tmp_path / "metrics.jsonl").read_bytes() == before
+
+
+def test_other_settings_are_refused_on_resume(tiny_scene, tmp_path):
+    train(tiny_scene, tmp_path)
+    with pytest.raises(ConfigError, match=r"stages\[0\].init.count was 2000, is 1000"):
+        train(tiny_scene, tmp_path, "init.count=1000", resume=True)
+    with pytest.raises(ConfigError, match="already holds a run"):
+        train(tiny_scene, tmp_path)
+
+
+def test_checkpoints_hold_everything(finished, tiny_scene):
+    path = sorted((finished / "checkpoints").glob("*.npz"))[-1]
+    with np.load(path, allow_pickle=False) as archive:
+        names = set(archive.files)
+        meta = json.loads(str(archive["meta"]))
+    for table in ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest"):
+        assert {f"gaussians/{table}", f"adam/{table}/moment1", f"adam/{table}/moment2"} <= names
+    assert {"gaussians/filter_variance", "stats/screen_grad", "stats/seen"} <= names
+    assert (meta["step"], meta["degree"]) == (50, 1)
+
+
+def test_values_that_are_not_finite_stop_the_run(tiny_scene, tmp_path):
+    with pytest.raises(NumericError, match=r"step 10, view '.*': the loss is .*not finite: .*sh_base") as error:
+        train(tiny_scene, tmp_path, "optimize.rates.sh_base=1e38")
+    assert error.value.exit_code == 6
+    assert json.loads((tmp_path / "status.json").read_text())["exit_code"] == 6
+
+
+def test_a_model_without_gaussians_is_nothing_to_start_from(tiny_scene, tmp_path):
+    path = tmp_path / "empty.ply"
+    widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 45}
+    write_ply(path, {name: np.zeros((0, width), np.float32) for name, width in widths.items()}, {})
+    with pytest.raises(DataError, match=r"empty\.ply: holds no Gaussians"):
+        train(tiny_scene, tmp_path / "run", "init.source=ply", f"init.file='{path}'")
+
+
+def test_views_come_in_random_order_without_repeats(tiny_scene, tmp_path):
+    checked = load("smoke", [f"scene.path='{tiny_scene}'"])
+    run = opening.open_run(checked, tmp_path, None)
+    sampler = Sampler(run.scene.split("train"), checked.settings.training.views, run.seed)
+    names = [sampler.at(step).view.name for step in range(1, 25)]
+    epochs = [names[i : i + 8] for i in (0, 8, 16)]
+    for epoch in epochs:
+        assert len(set(epoch)) == 8
+    assert epochs[0] != epochs[1] != epochs[2]

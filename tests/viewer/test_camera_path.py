@@ -1,0 +1,174 @@
+"""camera_path.json of nerfstudio: written, read, moved back; damaged files are refused."""
+
+import json
+import logging
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from clsplat.cameras import inria
+from clsplat.cameras.posed import Posed
+from clsplat.errors import DataError
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
+from clsplat.video import camera_path
+from clsplat.video.paths import PATHS
+from tests.support.camera_rings import SIZE, rig_of, ring
+
+
+@pytest.fixture
+def views(rng):
+    return PATHS["ellipse"](rig_of(ring(np.linspace(0, 6, 20)), rng), 12, SIZE)
+
+
+def poses(views):
+    return np.stack([view.world_to_camera for view in views])
+
+
+def test_a_path_comes_back(views, tmp_path, caplog):
+    camera_path.write(tmp_path / "p.json", views, 24)
+    with caplog.at_level(logging.WARNING, "clsplat"):
+        found = camera_path.read(tmp_path / "p.json")
+    assert not caplog.records, "it is known to be in the world of the scene"
+    assert (found.fps, found.size) == (24, SIZE)
+    np.testing.assert_allclose(poses(found.views), poses(views), atol=1e-12)
+    for old, new in zip(views, found.views, strict=True):
+        np.testing.assert_allclose(
+            [new.camera.fx, new.camera.fy, new.camera.cx], [old.camera.fy, old.camera.fy, 32], rtol=1e-12
+        )
+    data = json.loads((tmp_path / "p.json").read_text())
+    first = np.array(data["camera_path"][0]["camera_to_world"]).reshape(4, 4)
+    np.testing.assert_allclose(first[:3, 3], views[0].position)
+    np.testing.assert_allclose(first[:3, 2], -views[0].world_to_camera[2, :3], err_msg="OpenGL looks along -z")
+    assert data["seconds"] == 0.5
+
+
+def test_a_path_of_nerfstudio_is_moved_back(views, tmp_path, rng):
+    turn, shift, scale = Rotation.random(random_state=3).as_matrix(), rng.normal(size=3), 0.37
+    camera_path.write(tmp_path / "p.json", views, 24)
+    data = json.loads((tmp_path / "p.json").read_text())
+    del data["world"]
+    for frame in data["camera_path"]:
+        matrix = np.array(frame["camera_to_world"]).reshape(4, 4)
+        matrix[:3, :3], matrix[:3, 3] = turn @ matrix[:3, :3], scale * (turn @ matrix[:3, 3] + shift)
+        frame["camera_to_world"] = matrix.ravel().tolist()
+    (tmp_path / "p.json").write_text(json.dumps(data))
+    world = {"transform": np.column_stack([turn, shift]).tolist(), "scale": scale}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(world))
+    np.testing.assert_allclose(poses(camera_path.read(tmp_path / "p.json").views), poses(views), atol=1e-12)
+
+
+def test_nerfstudios_transform_of_poses_applies_to_the_path(views, tmp_path):
+    """nerfstudio tells the move from the world of COLMAP; poses of transforms.json have one of their own."""
+    camera_path.write(tmp_path / "p.json", views, 24)
+    applied = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 2]])
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps({"transform": np.eye(3, 4).tolist(), "scale": 1}))
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "transforms.json").write_text(json.dumps({"applied_transform": applied.tolist()}))
+    found = camera_path.read(tmp_path / "p.json", tmp_path / "scene").views
+    for old, new in zip(views, found, strict=True):
+        np.testing.assert_allclose(new.position, applied[:, :3] @ old.position + applied[:, 3], atol=1e-12)
+        np.testing.assert_allclose(new.world_to_camera[2, :3], applied[:, :3] @ old.world_to_camera[2, :3], atol=1e-12)
+
+
+def test_a_path_that_may_have_been_moved_is_said(views, tmp_path, caplog):
+    camera_path.write(tmp_path / "p.json", views, 24)
+    data = json.loads((tmp_path / "p.json").read_text())
+    del data["world"]
+    (tmp_path / "p.json").write_text(json.dumps(data))
+    with caplog.at_level(logging.WARNING, "clsplat"):
+        camera_path.read(tmp_path / "p.json")
+    assert "put dataparser_transforms.json beside the path" in caplog.text
+
+
+def test_a_path_is_spread_over_other_numbers_of_frames(views):
+    many = camera_path.spread(views, 23)
+    np.testing.assert_allclose(poses(many)[::2], poses(views), atol=1e-12)
+    between = (views[0].position + views[1].position) / 2
+    np.testing.assert_allclose(many[1].position, between, atol=1e-12)
+    assert len(camera_path.spread(views[:1], 4)) == 4
+    assert camera_path.spread(views, 12) == views
+    assert len(camera_path.spread(views, 1)) == 1
+
+
+def test_another_size_keeps_the_vertical_field_of_view(views, tmp_path):
+    camera_path.write(tmp_path / "p.json", views, 24)
+    wide = camera_path.read(tmp_path / "p.json").resized((200, 96))[0].camera
+    assert wide.fy == pytest.approx(2 * views[0].camera.fy)
+    assert (wide.width, wide.cx, wide.cy) == (200, 100, 48)
+
+
+@pytest.fixture
+def oblique(tmp_path):
+    """A cameras.json with two lenses off the middle, and its path."""
+    cameras = [Camera(640, 480, 500.0, 400.0, cx, 200.0) for cx in (300.0, 350.0)]
+    views = [View(f"{i}.png", camera, np.eye(3, 4)) for i, camera in enumerate(cameras)]
+    inria.write(tmp_path, [Posed(view.name, view, False) for view in views], None, None)
+    return camera_path.read(tmp_path / "cameras.json")
+
+
+def lenses(views):
+    return [(c.fx, c.fy, c.cx, c.cy) for c in (view.camera for view in views)]
+
+
+def test_another_size_keeps_the_lens(oblique):
+    assert (
+        lenses(oblique.resized(oblique.size)) == lenses(oblique.views) == [(500, 400, 300, 200), (500, 400, 350, 200)]
+    )
+    assert lenses(oblique.resized((640, 240))) == [(250, 200, 310, 100), (250, 200, 335, 100)]
+
+
+def test_between_two_views_the_lens_is_between_theirs(oblique):
+    assert lenses(camera_path.spread(oblique.views, 3)) == [(500, 400, cx, 200) for cx in (300, 325, 350)]
+
+
+def test_what_a_path_loses_of_a_lens_is_said(oblique, tmp_path, caplog):
+    caplog.clear()
+    camera_path.write(tmp_path / "p.json", oblique.views, 30)
+    centre, sides = caplog.messages
+    assert f"{tmp_path / 'p.json'}: " in centre
+    assert "the middle of the image for the principal point, which is up to 40.0 px away" in centre
+    assert "the vertical focal length for the horizontal one, which moves the sides by up to 64.0 px" in sides
+    caplog.clear()
+    camera_path.write(tmp_path / "p.json", camera_path.read(tmp_path / "p.json").views, 30)
+    assert not caplog.messages
+
+
+FAULTS = {
+    "not a path": (lambda d: d.pop("camera_path"), "a list `camera_path`"),
+    "no frames": (lambda d: d.update(camera_path=[]), "has 0 frames"),
+    "a fisheye": (lambda d: d.update(camera_type="fisheye"), "expected perspective"),
+    "no angle": (lambda d: d["camera_path"][1].pop("fov"), "camera_path\\[1\\]: fov is None"),
+    "a wide angle": (lambda d: d["camera_path"][0].update(fov=180), "fov is 180"),
+    "no width at all": (lambda d: d["camera_path"][0].update(fov=1e-322), "fov is 1e-322"),
+    "text": (lambda d: d["camera_path"][0].update(fov="50"), "fov is '50'"),
+    "few numbers": (lambda d: d["camera_path"][2]["camera_to_world"].pop(), "camera_path\\[2\\]"),
+    "no rotation": (lambda d: d["camera_path"][0].update(camera_to_world=[0.0] * 16), "rotation"),
+    "huge": (lambda d: d.update(render_width=10**9), "size"),
+    "no height": (lambda d: d.update(render_height=0), r"size \(64, 0\).*; export the path again"),
+    "a width alone": (lambda d: d.pop("render_height"), r"size \(64, 0\)"),
+    "no size": (lambda d: d.update(render_width=0, render_height=0), r"size \(0, 0\)"),
+    "a rate": (lambda d: d.update(fps=100000), "frames a second.*; export the path again"),
+    "no rate": (lambda d: d.update(fps=0), "fps 0.0"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_damaged_paths_are_refused_in_a_line(fault, views, tmp_path):
+    camera_path.write(tmp_path / "p.json", views, 24)
+    data = json.loads((tmp_path / "p.json").read_text())
+    change, message = FAULTS[fault]
+    change(data)
+    (tmp_path / "p.json").write_text(json.dumps(data))
+    with pytest.raises(DataError, match=message) as raised:
+        camera_path.read(tmp_path / "p.json")
+    assert str(raised.value).startswith(f"{tmp_path / 'p.json'}: ")
+
+
+@pytest.mark.parametrize("world", [{}, {"transform": [[1, 0, 0, 0]], "scale": 1}, {"scale": 0}, [], {"transform": "x"}])
+def test_a_damaged_move_is_refused(world, views, tmp_path):
+    camera_path.write(tmp_path / "p.json", views, 24)
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(world))
+    with pytest.raises(DataError, match="export the file again"):
+        camera_path.read(tmp_path / "p.json")

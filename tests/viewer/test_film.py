@@ -1,0 +1,227 @@
+"""Films of a model by command and by function: colours, depth, coverage, photographs and models beside."""
+
+import json
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.errors import ConfigError, DataError, NumericError
+from clsplat.scene.images import read_image
+from clsplat.video.pictures import Canvas, depth_picture, letterboxed
+from tests.support.commands import clsplat as command
+from tests.support.pictures import decoded
+
+pytestmark = pytest.mark.slow
+
+
+def pictures(folder):
+    return {path.relative_to(folder).as_posix(): read_image(path) for path in sorted(folder.rglob("*.png"))}
+
+
+def test_a_film_is_the_pictures_of_its_path(few_steps, tiny_scene, tmp_path):
+    options = {"path": "orbit", "frames": 6, "size": (64, 48), "fps": 5}
+    told = clsplat.render_path(few_steps, video=tmp_path / "a.webm", save_path=tmp_path / "p.json", **options)
+    assert (told["frames"], told["seconds"], told["size"]) == (6, 1.2, [64, 48])
+    assert clsplat.render_path(few_steps, video=None, out=tmp_path / "out", **options)["frames"] == 6
+    found, fps = decoded(tmp_path / "a.webm")
+    single = pictures(tmp_path / "out")
+    assert fps == 5
+    assert list(single) == [f"frame_{i:05d}.png" for i in range(1, 7)]
+    for frame, picture in zip(found, single.values(), strict=True):
+        assert clsplat.metrics.psnr(frame, picture) > 25
+    model = clsplat.load(few_steps)
+    views = clsplat.camera_path(clsplat.read_scene(tiny_scene), "orbit", 6, "64x48")
+    renderer = clsplat.Renderer(model)
+    images = [renderer.render(view).image for view in views]
+    assert np.mean([clsplat.metrics.psnr(a, b) for a, b in zip(images, single.values(), strict=True)]) > 30
+
+    again = clsplat.render_path(few_steps, video=tmp_path / "b.webm", path=str(tmp_path / "p.json"))
+    assert (again["frames"], again["fps"]) == (6, 5)
+    assert (tmp_path / "a.webm").read_bytes() == (tmp_path / "b.webm").read_bytes()
+
+
+def test_a_path_of_a_file_needs_no_scene(few_steps, tmp_path):
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "o", frames=2, save_path=tmp_path / "p.json")
+    model = shutil.copy(few_steps / "point_cloud.ply", tmp_path)
+    told = clsplat.render_path(model, video=tmp_path / "a.webm", path=str(tmp_path / "p.json"), frames=5, size="32x32")
+    assert (told["frames"], told["size"]) == (5, [32, 32])
+    with pytest.raises(ConfigError, match="does not name its scene"):
+        clsplat.render_path(model, video=tmp_path / "a.webm")
+
+
+def test_a_path_of_a_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_path, caplog):
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "o", frames=2, save_path=tmp_path / "p.json")
+    shutil.copytree(few_steps, tmp_path / "run")
+    pipeline = tmp_path / "run" / "pipeline.yaml"
+    pipeline.write_text(pipeline.read_text().replace(str(tiny_scene), str(tmp_path / "gone")))
+    told = clsplat.render_path(
+        tmp_path / "run", video=None, out=tmp_path / "a", path=str(tmp_path / "p.json"), size="32x32"
+    )
+    assert told["frames"] == 2
+    assert f"the folder of its photographs, {tmp_path / 'gone'}, is missing" in caplog.text
+    with pytest.raises(DataError, match="is missing; give the folder of a scene"):
+        clsplat.render_path(tmp_path / "run", video=None, out=tmp_path / "b")
+
+
+def test_the_pictures_of_a_film_stand_alone(few_steps, tiny_scene, tmp_path):
+    out, options = tmp_path / "out", {"video": None, "out": tmp_path / "out", "size": (16, 16)}
+    clsplat.render_path(few_steps, **options, frames=5, depth=True)
+    clsplat.render_views(few_steps, out=out)
+    clsplat.render_path(few_steps, **options, frames=1, kind="npy")
+    (out / "frame_00007.png").write_bytes(b"a drawing")
+    renders = [path.relative_to(tiny_scene).as_posix() for path in sorted((tiny_scene / "test").glob("*.png"))]
+    clsplat.render_path(few_steps, **options, frames=2)
+    found = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.*") if path.is_file())
+    frames = ["frame_00001.npy", "frame_00001.png", "frame_00002.png", "frame_00007.png"]
+    assert found == [".renders.json", *frames, *renders]
+    with pytest.raises(ConfigError, match=r"frame_00007\.png: exists, and is no render"):
+        clsplat.render_path(few_steps, **options, frames=7)
+    (out / "frame_00003.png").write_bytes(b"a drawing")
+    with pytest.raises(ConfigError, match=r"frame_00003\.png: exists, and is no render"):
+        clsplat.render_path(few_steps, **options, frames=3)
+
+
+def test_a_film_that_fails_leaves_the_earlier_one(few_steps, tmp_path, monkeypatch):
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=3, size=(16, 16))
+    before = pictures(tmp_path / "out")
+    monkeypatch.setattr(Canvas, "layers", lambda *_: (_ for _ in ()).throw(NumericError("no picture")))
+    with pytest.raises(NumericError, match="no picture"):
+        clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=1, size=(16, 16))
+    assert pictures(tmp_path / "out").keys() == before.keys()
+    monkeypatch.undo()
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=1, size=(16, 16))
+    assert list(pictures(tmp_path / "out")) == ["frame_00001.png"]
+
+
+@pytest.mark.parametrize(
+    "record", [["../a.png", "frame_00001.png"], {"../a.png": True, "sub/b.png": True, "\0.png": True}, "x", [[]]]
+)
+def test_a_record_that_is_not_ours_removes_nothing(record, few_steps, tmp_path):
+    (tmp_path / "out" / "sub").mkdir(parents=True)
+    for name in ("a.png", "out/sub/b.png"):
+        (tmp_path / name).write_bytes(b"a drawing")
+    (tmp_path / "out" / ".renders.json").write_text(json.dumps(record))
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=2, size=(16, 16))
+    assert (tmp_path / "a.png").is_file()
+    assert (tmp_path / "out" / "sub" / "b.png").is_file()
+
+
+def test_a_folder_of_sog_needs_no_scene_for_a_path_of_a_file(few_steps, tmp_path):
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "o", frames=2, save_path=tmp_path / "p.json")
+    clsplat.load(few_steps).save(tmp_path / "m.sog")
+    with zipfile.ZipFile(tmp_path / "m.sog") as archive:
+        archive.extractall(tmp_path / "m")
+    options = {"path": str(tmp_path / "p.json"), "size": "32x32"}
+    told = clsplat.render_path(tmp_path / "m", video=tmp_path / "a.webm", **options)
+    assert told["frames"] == 2
+    clsplat.render_path(tmp_path / "m" / "meta.json", video=tmp_path / "b.webm", **options)
+    assert (tmp_path / "a.webm").read_bytes() == (tmp_path / "b.webm").read_bytes()
+    with pytest.raises(ConfigError, match="does not name its scene"):
+        clsplat.render_path(tmp_path / "m", video=tmp_path / "a.webm")
+
+
+def test_command_and_function_write_the_same_bytes(few_steps, tmp_path):
+    shown = command(
+        *("render", few_steps, "--path", "views", "--frames", "3", "--video", tmp_path / "a.webm"),
+        *("--side", "photograph", "--depth", "--alpha", "--size", "40x40", "--fps", "2"),
+    ).stdout
+    assert "3 frames of 80 x 40 px" in shown
+    assert "a.webm, a_depth.webm, a_alpha.webm" in shown
+    clsplat.render_path(
+        few_steps, None, tmp_path / "b.webm", path="views", frames=3, fps=2, size="40x40", side="photograph", depth=True
+    )
+    assert (tmp_path / "a.webm").read_bytes() == (tmp_path / "b.webm").read_bytes()
+    assert (tmp_path / "a_depth.webm").read_bytes() == (tmp_path / "b_depth.webm").read_bytes()
+    assert not (tmp_path / "b_alpha.webm").exists()
+
+
+def test_the_photograph_of_the_nearest_camera_stands_beside(few_steps, tiny_scene, tmp_path):
+    clsplat.render_path(few_steps, video=tmp_path / "a.webm", path="views", frames=10, side="photograph")
+    found, _ = decoded(tmp_path / "a.webm")
+    scene = clsplat.read_scene(tiny_scene)
+    assert len(found) == len(scene.views)
+    for frame, view in zip(found, scene.views, strict=True):
+        assert frame.shape == (40, 80, 3)
+        assert clsplat.metrics.psnr(frame[:, 40:], view.photograph(1.0)) > 24
+
+
+def test_another_model_stands_beside(few_steps, tmp_path):
+    clsplat.render_path(few_steps, video=tmp_path / "a.webm", frames=2, side=few_steps / "point_cloud.ply")
+    for frame in decoded(tmp_path / "a.webm")[0]:
+        assert np.abs(frame[:, :40].astype(int) - frame[:, 40:]).mean() < 3
+
+
+def test_depth_and_coverage_are_pictures_and_arrays(few_steps, tmp_path):
+    count = clsplat.render_views(few_steps, out=tmp_path / "png", depth=True, alpha=True)
+    assert count == 6 == len(pictures(tmp_path / "png"))
+    clsplat.render_views(few_steps, out=tmp_path / "npy", kind="npy", depth=True, alpha=True)
+    depth, alpha = (np.load(tmp_path / "npy" / "test" / f"r_000_{name}.npy") for name in ("depth", "alpha"))
+    assert depth.shape == alpha.shape == (40, 40)
+    assert 0 <= alpha.min() < 0.1
+    assert 0.9 < alpha.max() <= 1
+    seen = depth[alpha > 0.5]
+    assert 1 < seen.min() < seen.max() < 8
+    grey = read_image(tmp_path / "png" / "test" / "r_000_alpha.png")
+    np.testing.assert_allclose(grey[:, :, 1] / 255, alpha, atol=0.5 / 255)
+
+
+def test_depths_go_from_red_to_blue():
+    depth = np.array([[1.0, 2.0, 4.0, 0.0]], np.float32)
+    ((near, middle, far, nothing),) = depth_picture(depth, np.ones((1, 4), np.float32), (1.0, 4.0)).astype(int)
+    assert near[0] > 80 + near[2]
+    assert far[2] > far[0]
+    assert middle[1] > max(middle[0], middle[2]) - 60
+    assert nothing.tolist() == [0, 0, 0]
+
+
+def test_a_picture_stands_in_the_middle_of_its_box():
+    box = letterboxed(np.full((10, 20, 3), 7, np.uint8), (40, 40))
+    assert box.shape == (40, 40, 3)
+    assert (box[10:30] == 7).all()
+    assert (box[:10] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    {
+        ("--frames", "5"): "--frames is for films; give --path or --video, too",
+        ("--path", "orbit", "--split", "all"): "--split is for pictures of views",
+        ("--video", "x.avi"): "ends in .webm or .mp4",
+    }.items(),
+)
+def test_a_command_that_makes_no_film_ends_in_a_line(options, message, few_steps, tmp_path):
+    given = [tmp_path / word if word.startswith("x.") else word for word in options]
+    shown = command("render", few_steps, "--out", tmp_path / "out", *given, expect=2).stderr
+    assert message in shown
+    assert shown.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"path": "elipse"}, "no path 'elipse'; there are ellipse"),
+        ({"frames": 0}, "expected a whole number from 1 to 100000"),
+        ({"size": "33x32"}, "expected WIDTHxHEIGHT in even numbers"),
+        ({"size": "8192x32", "side": "photograph"}, "size \\(16384, 32\\)"),
+        ({"fps": float("nan")}, "expected frames a second"),
+        ({"video": None, "side": "photograph"}, "--side needs --video"),
+        ({"save_path": "x.txt"}, "ends in .json"),
+        ({"kind": "gif", "video": None}, "no kind 'gif'"),
+        ({"kind": "npy"}, "--format npy is for pictures"),
+        ({"side": "no.ply"}, "no.ply"),
+    ],
+)
+def test_what_makes_no_film_is_refused_before_any_work(options, message, few_steps, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((ConfigError, DataError), match=message):
+        clsplat.render_path(few_steps, **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_of_a_run_are_not_replaced(few_steps):
+    with pytest.raises(ConfigError, match="is a file of a run"):
+        clsplat.render_path(few_steps, video=None, save_path=few_steps / "metrics.json")

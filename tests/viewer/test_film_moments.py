@@ -1,0 +1,96 @@
+"""The moments of films: at one moment, as time runs, and at a fixed camera."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.scene.camera import Camera
+from clsplat.scene.scene import make_scene
+from clsplat.scene.view import View
+from clsplat.video import camera_path
+from clsplat.video.film import Wish, plan
+from clsplat.video.moments import times_of
+from clsplat.video.paths import nearest
+from tests.support.refusals import refusal
+
+CAMERA = Camera(40, 30, 50.0, 50.0, 20.0, 15.0)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Eight cameras about the origin, of two moments each."""
+    angles = np.arange(8) * np.pi / 4
+    views = []
+    for i, angle in enumerate(angles):
+        view = View.looking_at([3 * np.cos(angle), 3 * np.sin(angle), 1], [0, 0, 0], [0, 0, 1], CAMERA)
+        views += [replace(view, name=f"c{i}/{j}", time=float(j)) for j in range(2)]
+    return make_scene(tmp_path, views, set(), None)
+
+
+def film(scene, path="ellipse", times=None, frames=5, moves=True):
+    return plan(Wish.of(path, frames, None, None, times), scene, np.empty((0, 3)), moves).views
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [(None, None), (0.5, (0.5, 0.5)), ("0.5", (0.5, 0.5)), ("0..1", (0, 1)), ((1, 0.5), (1, 0.5)), ("1..0", (1, 0))],
+)
+def test_times_are_one_moment_or_two(given, expected):
+    assert times_of(given) == expected
+
+
+@pytest.mark.parametrize("given", ["", "a", "0..2", "-1", "0..1..2", "nan", [], [0.1, 0.2, 0.3], "0.."])
+def test_other_times_are_refused(given):
+    with pytest.raises(ConfigError, match="expected a time from 0 to 1, or two such as 0"):
+        times_of(given)
+
+
+def test_time_runs_along_a_path_or_stands_still(scene):
+    assert [view.time for view in film(scene)] == [0, 0.25, 0.5, 0.75, 1]
+    assert [view.time for view in film(scene, times="1..0.5", frames=3)] == [1, 0.75, 0.5]
+    frozen = film(scene, times=0.25)
+    assert {view.time for view in frozen} == {0.25}
+    assert len({view.position.tobytes() for view in frozen}) == 5
+
+
+def test_a_fixed_camera_is_one_view_over_time(scene):
+    views = film(scene, "fixed")
+    assert len({view.world_to_camera.tobytes() for view in views}) == 1
+    assert [view.time for view in views] == [0, 0.25, 0.5, 0.75, 1]
+    named = film(scene, "fixed:c3/1")
+    assert (named[0].world_to_camera == scene.views[7].world_to_camera).all()
+    with pytest.raises(DataError, match="no photograph is called 'c9/0'"):
+        film(scene, "fixed:c9/0")
+    with pytest.raises(ConfigError, match="only `fixed:NAME` names a view"):
+        film(scene, "orbit:c3/1")
+
+
+def test_the_views_of_a_scene_keep_their_moments(scene):
+    assert [view.time for view in film(scene, "views", frames=4)] == [0, 1, 0, 1]
+    assert {view.time for view in film(scene, "views", times=0.5)} == {0.5}
+
+
+def test_a_model_that_does_not_move_has_no_times(scene):
+    still = replace(scene, views=tuple(replace(view, time=None) for view in scene.views))
+    assert {view.time for view in film(still, moves=False)} == {None}
+    with pytest.raises(ConfigError, match="the model does not move; leave the time out"):
+        film(still, times=0.5, moves=False)
+
+
+def test_the_nearest_photograph_is_that_of_the_nearest_moment(scene):
+    view = replace(scene.views[6], name="frame", time=0.9)
+    assert nearest(view, scene.views, scene.extent).name == "c3/1"
+    assert nearest(replace(view, time=0.1), scene.views, scene.extent).name == "c3/0"
+
+
+def test_a_path_in_a_file_keeps_its_moments(scene, tmp_path):
+    views = film(scene, times="0..0.5")
+    camera_path.write(tmp_path / "path.json", views, 30)
+    again = camera_path.read(tmp_path / "path.json").views
+    assert [view.time for view in again] == pytest.approx([view.time for view in views])
+    assert film(scene, str(tmp_path / "path.json"), frames=None)[2].time == pytest.approx(0.25)
+    text = (tmp_path / "path.json").read_text().replace('"render_time": 0.5', '"render_time": 5')
+    (tmp_path / "path.json").write_text(text)
+    assert "camera_path[4]: render_time is 5; expected 0 to 1" in refusal(camera_path.read, tmp_path / "path.json")

@@ -1,0 +1,227 @@
+"""Camera paths: where they go, which way is up, and what they refuse."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.errors import ConfigError, DataError
+from clsplat.scene.camera import Camera
+from clsplat.scene.scene import make_scene
+from clsplat.scene.view import View
+from clsplat.video.film import Wish, plan
+from clsplat.video.lenses import around, checked_frames, checked_rate, checked_size, even_size, like
+from clsplat.video.paths import PATHS, nearest
+from clsplat.video.rig import Rig
+from clsplat.video.walk import order
+from tests.support.camera_rings import CAMERA, SIZE, UP, rig_of, ring
+from tests.support.data_sets import data_set
+
+AHEAD = np.array([0.0, 5.0, 0.0])
+BAD_SIZES = ["641x480", "640", "x", "9x9", "10000x10", "99999999999x2", "-2x4", (640, 480.0), (4,)]
+
+
+def positions(views):
+    return np.stack([view.position for view in views])
+
+
+def turns(views):
+    """The angles of views about the z axis."""
+    place = positions(views)
+    return np.arctan2(place[:, 1], place[:, 0])
+
+
+def test_the_focus_and_the_upward_axis_are_those_of_the_cameras(rng):
+    rig = rig_of(ring(np.linspace(0, 2 * np.pi, 12, endpoint=False), target=(0.2, -0.1, 0.3)), rng)
+    np.testing.assert_allclose(rig.focus, (0.2, -0.1, 0.3), atol=0.01)
+    assert rig.up @ UP > 0.99
+
+
+@pytest.mark.parametrize("name", ["ellipse", "orbit"])
+def test_ring_of_cameras_is_circled_once_at_its_distance(name, rng):
+    found = PATHS[name](rig_of(ring(np.linspace(0, 2 * np.pi, 24, endpoint=False)), rng), 36, SIZE)
+    place = positions(found)
+    np.testing.assert_allclose(np.hypot(place[:, 0], place[:, 1]), 3, rtol=0.05)
+    np.testing.assert_allclose(place[:, 2], 1, atol=0.05)
+    steps = np.diff(np.unwrap(turns(found)))
+    assert (np.sign(steps) == np.sign(steps[0])).all()
+    assert abs(steps.sum()) == pytest.approx(2 * np.pi * 35 / 36, rel=0.02)
+    for view in found:
+        assert (view.camera.width, view.camera.height) == SIZE
+        assert view.world_to_camera[1, :3] @ UP < -0.9, "up is up in the image"
+        x, y, z = view.world_to_camera @ (0, 0, 0, 1)
+        assert z > 2
+        np.testing.assert_allclose((x, y), 0, atol=0.05)
+
+
+def test_an_ellipse_is_as_long_and_wide_as_the_cameras_stand(rng):
+    angles = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    places = [(4 * np.cos(a), 2 * np.sin(a), 1) for a in angles]
+    views = [View.looking_at(p, (0, 0, 0), UP, CAMERA, f"{i:03d}") for i, p in enumerate(places)]
+    place = positions(PATHS["ellipse"](rig_of(views, rng), 40, SIZE))
+    assert 3.5 < np.abs(place[:, 0]).max() < 4.05
+    assert 1.7 < np.abs(place[:, 1]).max() < 2.05
+
+
+def test_ellipse_facing_cameras_on_one_side_swings_there(rng):
+    views = ring(np.linspace(-0.8, 0.8, 15))
+    found = PATHS["ellipse"](rig_of(views, rng), 60, SIZE)
+    assert np.abs(turns(found)).max() < 0.9
+    assert np.ptp(turns(found)) > 0.8
+    moves = np.linalg.norm(np.diff(positions([*found, found[0]]), axis=0), axis=1)
+    assert moves.max() < 0.5, "the last frame leads to the first"
+
+
+def test_an_orbit_says_what_no_photograph_shows(rng, caplog):
+    with caplog.at_level(logging.WARNING, "clsplat"):
+        PATHS["orbit"](rig_of(ring(np.linspace(-0.8, 0.8, 15)), rng), 4, SIZE)
+    assert "degrees from where no photograph was taken" in caplog.text
+
+
+def test_cameras_that_look_outwards_have_nothing_to_circle(rng):
+    views = [
+        View.looking_at(view.position, 3 * view.position * (1, 1, 0.2), UP, CAMERA, view.name)
+        for view in ring(np.linspace(0, 2 * np.pi, 12, endpoint=False), radius=0.5)
+    ]
+    with pytest.raises(DataError, match="use the path through"):
+        PATHS["ellipse"](rig_of(views), 4, SIZE)
+    assert len(PATHS["through"](rig_of(views, rng), 7, SIZE)) == 7
+
+
+def facing(rng, count=20):
+    """Views on a plane that look along y."""
+    places = np.column_stack([rng.uniform(-0.5, 0.5, count), np.zeros(count), rng.uniform(-0.3, 0.3, count)])
+    return [View.looking_at(p, p + AHEAD, UP, CAMERA, f"{i:03d}") for i, p in enumerate(places)]
+
+
+def test_spiral_sways_no_farther_than_the_cameras(rng):
+    views = facing(rng)
+    rig = Rig.of(views, rng.normal(size=(500, 3)) * 0.3 + (0, 5, 0))
+    found = PATHS["spiral"](rig, 50, SIZE)
+    assert (np.abs(positions(found)).max(axis=0) <= np.abs(positions(views)).max(axis=0) + 0.05).all()
+    assert np.ptp(positions(found)[:, 0]) > 0.3
+    assert all(view.world_to_camera[2, 1] > 0.95 for view in found)
+    assert 4 < rig.depths[0] < rig.depths[1] < 6
+
+
+def test_axes_that_are_almost_parallel_meet_amid_what_they_show(rng):
+    """As from a drone that looks straight down: the axes alone would meet far below the ground."""
+    places = np.column_stack([rng.uniform(-2, 2, (30, 2)), np.full(30, 5.0)])
+    slopes = np.column_stack([0.02 * -places[:, :2], np.full(30, -1.0)])
+    views = [
+        View.looking_at(p, p + s, (0, 1, 0), CAMERA, f"{i:03d}")
+        for i, (p, s) in enumerate(zip(places, slopes, strict=True))
+    ]
+    ground = np.column_stack([rng.uniform(-4, 4, (800, 2)), rng.uniform(-0.2, 0.2, 800)])
+    rig = Rig.of(views, ground)
+    np.testing.assert_allclose(rig.focus, (0, 0, 0), atol=0.8)
+    for view in PATHS["ellipse"](rig, 40, SIZE):
+        assert view.position[2] > 2, "above the ground"
+        assert view.world_to_camera[2, 2] < -0.7, "looking down"
+
+
+def test_a_ring_has_no_front_for_a_spiral(rng):
+    with pytest.raises(DataError, match="use ellipse or through"):
+        PATHS["spiral"](rig_of(ring(np.linspace(0, 2 * np.pi, 12, endpoint=False)), rng), 4, SIZE)
+
+
+def test_walk_goes_between_neighbors_whatever_their_names(rng):
+    views = ring(np.linspace(0, 4, 25))
+    shuffled = [replace(views[i], name=f"{k:03d}") for k, i in enumerate(rng.permutation(25))]
+    way = order(rig_of(shuffled, rng))
+    steps = np.linalg.norm(np.diff(positions(shuffled)[way], axis=0), axis=1)
+    assert np.median(steps) == pytest.approx(0.5, rel=0.1)
+    assert steps.sum() < 1.7 * 12
+    by_name = order(rig_of(views, rng))
+    assert by_name.tolist() == list(range(25))
+
+
+def test_a_walk_passes_near_the_views_and_looks_as_they_do(rng):
+    views = ring(np.linspace(0, 2.5, 20))
+    found = PATHS["through"](rig_of(views, rng), 100, SIZE)
+    place = positions(found)
+    gaps = np.linalg.norm(positions(views)[:, None] - place[None], axis=2).min(axis=1)
+    assert gaps.max() < 0.15
+    assert np.linalg.norm(np.diff(place, axis=0), axis=1).max() < 0.3, "no leaps"
+    for view in found:
+        closest = nearest(view, views, 1.0)
+        assert view.world_to_camera[2, :3] @ closest.world_to_camera[2, :3] > 0.97
+        assert view.world_to_camera[1, :3] @ closest.world_to_camera[1, :3] > 0.97
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("name", ["through", "views", "orbit", "ellipse"])
+def test_few_views_are_enough(name, count, rng):
+    found = PATHS[name](rig_of(ring(np.linspace(0, 1, count)), rng), 5, SIZE)
+    assert len(found) == (min(count, 5) if name == "views" else 5)
+    assert np.isfinite(positions(found)).all()
+
+
+def test_views_keep_their_pose_and_see_all_of_their_photograph():
+    (view,) = PATHS["views"](rig_of(ring([0.3])), 3, (300, 120))
+    np.testing.assert_array_equal(view.world_to_camera, ring([0.3])[0].world_to_camera)
+    camera, scale = view.camera, 120 / 150
+    assert (camera.fx, camera.cy) == (180 * scale, 74 * scale)
+    assert camera.cx == pytest.approx(101 * scale + (300 - 200 * scale) / 2)
+
+
+def test_a_camera_that_strayed_changes_nothing(rng):
+    views = ring(np.linspace(0, 2 * np.pi, 24, endpoint=False))
+    stray = View.looking_at((500, 0, 0), (500, 9, 0), UP, CAMERA, "stray")
+    with_it, without = (PATHS["ellipse"](rig_of(v), 8, SIZE) for v in ([*views, stray], views))
+    np.testing.assert_array_equal(positions(with_it), positions(without))
+
+
+def test_sizes():
+    assert even_size(Camera(225, 401, 9.0, 9.0, 1.0, 1.0)) == (224, 400)
+    assert max(even_size(Camera(20001, 10000, 9.0, 9.0, 1.0, 1.0))) <= 8192
+    wide = like(CAMERA, (400, 300))
+    assert (wide.fx, wide.cx, wide.cy) == (360, 200, 150)
+    assert around(CAMERA, (200, 150)) == CAMERA
+    assert checked_size("640x480") == checked_size((640, 480)) == (640, 480)
+
+
+@pytest.mark.parametrize(
+    "size", ["641x480", "640", "x", "9x9", "10000x10", "99999999999x2", "-2x4", (640, 480.0), (4,)]
+)
+def test_bad_sizes_are_refused(size):
+    with pytest.raises(ConfigError, match="even numbers"):
+        checked_size(size)
+
+
+@pytest.mark.parametrize("frames", [0, -1, 100_001, True, 2.5])
+def test_bad_numbers_of_frames_are_refused(frames):
+    with pytest.raises(ConfigError, match="whole number from 1"):
+        checked_frames(frames)
+
+
+@pytest.mark.parametrize("fps", [0, -1, 241, float("nan"), float("inf"), True])
+def test_bad_rates_are_refused(fps):
+    with pytest.raises(ConfigError, match="frames a second"):
+        checked_rate(fps)
+
+
+def test_an_unknown_path_and_a_path_without_a_scene_are_refused():
+    with pytest.raises(ConfigError, match="no path 'elipse'; there are ellipse, spiral, orbit, through, views"):
+        Wish.of("elipse", None, None, None)
+    with pytest.raises(ConfigError, match="needs the cameras of a scene"):
+        plan(Wish(), None, np.zeros((1, 3)))
+
+
+def test_a_path_of_a_scene_in_python(rng):
+    scene = make_scene(Path("none"), ring(np.linspace(0, 6, 12)), set(), None)
+    found = clsplat.camera_path(scene, "orbit", 5, "64x32")
+    assert [view.name for view in found] == [f"frame_{i:05d}" for i in range(1, 6)]
+    assert clsplat.camera_path(scene)[0].camera.width == 200
+
+
+def test_the_ellipse_of_photographs_stays_before_what_they_show():
+    scene = clsplat.read_scene(data_set("fox"))
+    found = clsplat.camera_path(scene, frames=30)
+    middle = scene.points.positions.mean(axis=0)
+    mean = np.mean([view.world_to_camera[2, :3] for view in scene.views], axis=0)
+    assert all(view.world_to_camera[2, :3] @ mean > 0 for view in found), "not from behind the wall"
+    assert all((view.world_to_camera @ [*middle, 1])[2] > 0 for view in found)

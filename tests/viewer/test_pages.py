@@ -1,0 +1,187 @@
+"""Pages: every value is escaped, nothing outside of the page is needed, the same input gives the same bytes."""
+
+import ast
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jinja2 import UndefinedError
+
+import clsplat as package
+from clsplat.pages.page import TEMPLATES, charts, duration, embedded, render, require_end
+from clsplat.pages.svg import Line, curve
+from tests.support.commands import clsplat
+from tests.support.html_page import HOSTILE, Page
+from tests.support.refusals import refusal
+
+SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
+PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "store", "viewer", "live")
+FOLDER = Path(package.__file__).parent / "pages" / "templates"
+DRAWINGS = {"clsplat/pages/svg.py", "clsplat/pages/plan.py", "clsplat/bench/table.py"}  # SVG, escaped there
+STATES = ("good", "warn", "bad", "note")  # colours of text with papers of their own
+WITHOUT_TEXT = {  # a background, or text on one that another rule or the page's data fix
+    *("td.bar i", "button.grown", ".slider::after", ".space canvas", ".space button:hover", ".space output", ".chip"),
+}
+TAG = re.compile(r"</?(html|head|body|p|div|span|table|t[rdh]|h\d|ul|li|a|b|i|br|img|pre|figure|svg|style|script)[\s>]")
+
+
+def strings(path: Path) -> list[tuple[int, str]]:
+    """The string literals of a source file, and the parts of its f-strings, with their lines."""
+    constants = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Constant)]
+    return [(node.lineno, node.value) for node in constants if isinstance(node.value, str)]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(path.parents[1])))
+def test_html_stands_in_templates_only(path):
+    name = path.relative_to(Path(package.__file__).parents[1]).as_posix()
+    if name in DRAWINGS:
+        assert any(TAG.search(text) for _, text in strings(path)), "it draws no more; take it from the list"
+        return
+    for line, text in strings(path):
+        assert not TAG.search(text), f"{name}:{line}: HTML belongs into clsplat/pages/templates"
+    assert "html.escape" not in path.read_text(), f"{name}: templates escape what they show"
+
+
+def luminance(colour: str) -> float:
+    """Of #rgb or #rrggbb, as WCAG has it."""
+    digits = colour[1:] if len(colour) == 7 else "".join(2 * digit for digit in colour[1:])
+    parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+@pytest.mark.parametrize("mode", ["light", "dark"])
+def test_text_can_be_read_on_its_paper(mode):
+    light, dark = re.findall(r":root \{(.*?)\}", (FOLDER / "base.css").read_text(), re.DOTALL)
+    found = [dict(re.findall(r"--([\w-]+): (#\w+)", text)) for text in (light, dark)]
+    assert found[0].keys() == found[1].keys(), "a colour of one mode alone"
+    colours = found[mode == "dark"]
+    on_paper = [(text, "paper") for text in ("ink", "soft", "link", "good", "warn", "bad")]
+    for text, paper in [
+        *on_paper,
+        ("ink", "card"),
+        *((name, f"{name}-paper") for name in STATES),
+        ("ink", "note-paper"),
+    ]:
+        dark, light = sorted((luminance(colours[text]), luminance(colours[paper])))
+        assert (light + 0.05) / (dark + 0.05) >= 4.5, f"{text} on {paper}"
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in FOLDER.iterdir() if path.suffix in (".css", ".j2")], ids=lambda p: p.name
+)
+def test_colours_of_text_and_paper_follow_the_mode(path):
+    """Where one of both is fixed, so is the other: the page's own is dark or light."""
+    text = path.read_text()
+    style = text if path.suffix == ".css" else "".join(re.findall(r"block style %\}(.*?)\{% endblock", text, re.DOTALL))
+    for names, rule in re.findall(r"([^{}]+)\{([^{}]*)\}", style):
+        fixed = {key for key in ("color", "background") if re.search(rf"(?<![-\w]){key}:[^;]*#\w", rule)}
+        assert len(fixed) != 1 or names.strip() in WITHOUT_TEXT, f"{names.strip()}: one fixed colour"
+
+
+def test_one_place_marks_text_as_safe():
+    found = [path.name for path in SOURCES for line in path.read_text().splitlines() if "Markup(" in line]
+    assert found == ["page.py"]
+    for path in FOLDER.iterdir():
+        assert not re.search(r"\|\s*safe|autoescape|Markup", path.read_text()), f"{path.name} puts in text unescaped"
+
+
+def test_every_template_file_is_part_of_a_page():
+    pages = [path.read_text() for path in FOLDER.glob("*.j2")]
+    for path in FOLDER.iterdir():
+        page = path.name.removesuffix(".html.j2") in PAGES
+        assert page or any(f'"{path.name}"' in text for text in pages), path.name
+
+
+def test_values_are_escaped_and_charts_are_not():
+    values = {"state": "ready", "verdict": HOSTILE, "findings": [], "figures": {HOSTILE: HOSTILE}, "space": None}
+    chart = curve(HOSTILE, [Line([(0.0, 0.0), (1.0, 1.0)])])
+    seen = {"charts": charts([chart, ""]), "fewest": [(HOSTILE, 3)]}
+    page = Page(render("inspect.html.j2", title=HOSTILE, subtitle=HOSTILE, seen=seen, lists=[], **values))
+    assert page.elements["script"] == 1
+    assert page.elements["svg"] == 1
+    assert page.text.count(HOSTILE) == 8, "title twice, subtitle, verdict, a figure twice, a view, a chart"
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("plain", "plain"),
+        ("try `a --b`, or `c` twice", "try <code>a --b</code>, or <code>c</code> twice"),
+        ("`a` ends", "<code>a</code> ends"),
+        ("it is `a`", "it is <code>a</code>"),
+        ("a`b is <i>", "a`b is &lt;i&gt;"),
+        ("`a` and b`c", "<code>a</code> and b`c"),
+        ("`<script>`", "<code>&lt;script&gt;</code>"),
+    ],
+)
+def test_what_stands_between_backticks_is_code(text, found):
+    page = TEMPLATES.from_string("{% from 'macros.html.j2' import words %}{{ words(text) }}")
+    assert page.render(text=text).strip() == found
+
+
+def test_a_value_that_a_template_lacks_is_an_error():
+    with pytest.raises(UndefinedError, match="is undefined"):
+        render("inspect.html.j2", title="a", subtitle="b")
+
+
+def test_data_cannot_end_their_script():
+    text = TEMPLATES.from_string("{{ data | tojson }}").render(data={"b": "</script>", "a": [1]})
+    assert text == '{"b":"\\u003c/script\\u003e","a":[1]}'
+    assert json.loads(text)["b"] == "</script>"
+
+
+def test_name_that_is_not_unicode_shows_a_question_mark():
+    page = render("inspect.html.j2", title="\udcff.png", subtitle="", state="ready", verdict="", findings=[],
+                  figures={}, space=None, seen=None, lists=[])  # fmt: skip
+    assert "<title>?.png</title>" in page
+
+
+@pytest.mark.parametrize(("seconds", "words"), [
+    (0.4, "0 s"), (59.4, "59 s"), (60, "1 min 0 s"), (3599, "59 min 59 s"), (3600, "1 h 0 min"), (7322, "2 h 2 min"),
+])  # fmt: skip
+def test_durations(seconds, words):
+    assert duration(seconds) == words
+
+
+def test_embedded_images_name_their_format():
+    image = np.zeros((2, 3, 3), np.uint8)
+    assert embedded(image).startswith("data:image/jpeg;base64,/9j/")
+    assert embedded(image, ".png").startswith("data:image/png;base64,iVBOR")
+
+
+def hostile_scene(tiny_scene: Path, folder: Path) -> Path:
+    """The tiny scene with a name of markup, and another for each test photograph."""
+    scene = shutil.copytree(tiny_scene, folder / HOSTILE)
+    table = json.loads((scene / "transforms_test.json").read_text())
+    for i, frame in enumerate(table["frames"]):
+        file = next(scene.glob(frame["file_path"].removeprefix("./") + "*"))
+        frame["file_path"] = f"./test/{HOSTILE}{i}"
+        file.rename(scene / "test" / f"{HOSTILE}{i}{file.suffix}")
+    (scene / "transforms_test.json").write_text(json.dumps(table))
+    return scene
+
+
+def test_the_report_of_a_scene_with_markup_in_its_names(tiny_scene, tmp_path):
+    scene, out = hostile_scene(tiny_scene, tmp_path), tmp_path / "run"
+    clsplat("run", "smoke", "--scene", scene, "--out", out, "--set", "optimize.steps=30", "optimize.log_every=10")
+    page = Page((out / "report.html").read_text())
+    assert (page.elements["script"], page.elements["b"]) == (1, 6), "the page's own, and labels of six images"
+    first = page.text.partition("Walk through")[0]
+    assert re.search(r"test PSNR \d+\.\d\d dB, SSIM 0\.\d{4} · \d+,\d{3} Gaussians · trained for \d+ s", first)
+    assert page.text.count(HOSTILE) >= 2, "its title, twice"
+    assert all(f"test/{HOSTILE}{i} (test): " in page.text for i in (0, 1))
+    settings = page.text.partition("Settings")[2]
+    assert "stages:" in settings
+    assert "<script>" in settings, "the scene's path"
+
+
+@pytest.mark.parametrize("text", ["", "<html>", "<html></html", "<html></html><p>"])
+def test_a_page_that_has_lost_its_end_is_refused(text, tmp_path):
+    (tmp_path / "a.html").write_text(text)
+    assert refusal(require_end, tmp_path / "a.html") == f"{tmp_path / 'a.html'}: ends before its end"
+    (tmp_path / "a.html").write_text("<html></html>\n")
+    require_end(tmp_path / "a.html")

@@ -1,0 +1,108 @@
+"""Space cut into cells, the views of blocks, and models joined: what holds for any Gaussians."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.blocks.cells import cells, owners, quantile
+from clsplat.blocks.views import Membership
+from clsplat.density.box import Box
+from clsplat.errors import DataError
+from clsplat.formats import ply_joining
+from clsplat.formats.ply import read_ply, write_ply
+from clsplat.formats.ply_joining import join_plys
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 9])
+def test_every_gaussian_has_one_cell_and_each_cell_its_share(rng, count):
+    means = (rng.standard_normal((4000, 3)) * [20, 5, 1]).astype(np.float32)
+    weights = rng.random(4000) * np.exp(means[:, 0] / 20)
+    found = cells(means, weights, count)
+    held = np.stack([cell.box.holds(means) for cell in found])
+    assert (held.sum(axis=0) == 1).all()
+    np.testing.assert_array_equal(owners(means, found), held.argmax(axis=0))
+    np.testing.assert_allclose([weights[one].sum() for one in held], weights.sum() / count, rtol=0.03)
+    far = np.array([[-1e9, 0, 0], [1e9, 1e9, 1e9], [0, -1e9, 1e9]])
+    assert (np.stack([cell.box.holds(far) for cell in found]).sum(axis=0) == 1).all()
+
+
+def test_long_sides_are_cut_and_thin_ones_are_not(rng):
+    means = rng.standard_normal((2000, 3)) * [20, 5, 0.1]
+    for cell in cells(means, np.ones(2000), 4):
+        assert (cell.box.low[2], cell.box.high[2]) == (None, None)
+
+
+def test_cell_grows_by_half_the_share_on_each_bounded_side():
+    left, right = cells(np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [12, 0, 0]]), np.ones(4), 2)
+    assert 0 < left.box.high[0] == right.box.low[0] <= 10
+    assert left.grown(0.2).high[0] == pytest.approx(left.box.high[0] + 0.1 * left.size[0])
+    assert right.grown(0.2).low[0] == pytest.approx(right.box.low[0] - 0.1 * right.size[0])
+    assert right.grown(0.2).high == [None] * 3
+
+
+def test_nothing_is_not_cut():
+    with pytest.raises(DataError, match="holds no Gaussians"):
+        cells(np.zeros((0, 3)), np.zeros(0), 2)
+
+
+def test_equal_places_are_not_cut():
+    with pytest.raises(DataError, match="cannot be cut: 5 Gaussians for 2 blocks; give fewer --blocks"):
+        cells(np.ones((5, 3)), np.ones(5), 2)
+
+
+def test_a_gaussian_without_a_place_is_told():
+    means = np.array([[0.0, 0, 0], [np.nan, 0, 0]])
+    with pytest.raises(DataError, match="1 of 2 Gaussians of the coarse model have places that are not finite"):
+        owners(means, cells(means[:1], np.ones(1), 1))
+
+
+def test_a_quantile_follows_the_weights():
+    assert quantile(np.array([3.0, 1, 2]), np.array([1.0, 8, 1]), 0.5) == 1
+    assert quantile(np.array([3.0, 1, 2]), np.array([1.0, 1, 8]), 0.5) == 2
+
+
+def test_views_belong_by_place_by_sight_and_to_their_best_block():
+    share = np.array([[0.9, 0.2, 0.0], [0.04, 0.03, 0.0], [0.0, 0.0, 0.0]])
+    inside = np.array([[False, False, False], [False, True, False], [False, False, False]])
+    members = Membership(share, inside, sight=0.05)
+    chosen = [[True, True, True], [True, True, False], [True, False, False]]  # the last block has but a best view
+    assert members.chosen.tolist() == chosen
+    reasons = [members.why(view, block) for view, block in ((0, 0), (1, 0), (1, 1), (0, 2))]
+    assert reasons == ["sight", "best", "place", "best"]
+
+
+def written(path: Path, rng: np.random.Generator, count: int, near: float = 0.2) -> dict[str, np.ndarray]:
+    widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 9}
+    parameters = {name: rng.standard_normal((count, width)).astype(np.float32) for name, width in widths.items()}
+    write_ply(path, parameters, {"near": near})
+    return parameters
+
+
+def test_joined_models_are_their_rows_in_order(rng, tmp_path, monkeypatch):
+    monkeypatch.setattr(ply_joining, "ROWS", 7)  # several pieces
+    files = [tmp_path / f"{i}.ply" for i in range(3)]
+    parts = [written(file, rng, count) for file, count in zip(files, (20, 1, 14), strict=True)]
+    seen = []
+    assert join_plys(tmp_path / "all.ply", files, lambda part, means: seen.append((part, means))) == 35
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    write_ply(tmp_path / "at_once.ply", whole, {"near": 0.2})
+    assert (tmp_path / "all.ply").read_bytes() == (tmp_path / "at_once.ply").read_bytes()
+    np.testing.assert_array_equal(np.concatenate([means for _, means in seen]), whole["means"])
+    assert read_ply(tmp_path / "all.ply").rendering["near"] == 0.2
+
+
+def test_models_that_do_not_fit_together_are_not_joined(rng, tmp_path):
+    written(tmp_path / "a.ply", rng, 5)
+    written(tmp_path / "b.ply", rng, 5, near=0.1)
+    with pytest.raises(DataError, match=r"b\.ply: has other properties, or another comment, than .*a\.ply"):
+        join_plys(tmp_path / "all.ply", [tmp_path / "a.ply", tmp_path / "b.ply"], lambda *_: None)
+    (tmp_path / "b.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-3])
+    with pytest.raises(DataError, match=r"b\.ply: its end is missing; train that block again"):
+        join_plys(tmp_path / "all.ply", [tmp_path / "a.ply", tmp_path / "b.ply"], lambda *_: None)
+    assert not (tmp_path / "all.ply").exists()
+
+
+def test_a_box_of_all_space_is_the_cell_of_one_block():
+    (cell,) = cells(np.zeros((3, 3)), np.zeros(3), 1)
+    assert cell.box == cell.grown(0.2) == Box()

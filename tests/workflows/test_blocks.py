@@ -1,0 +1,340 @@
+"""`clsplat blocks`: a scene is cut, its blocks are trained alone, and together they are the whole."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import clsplat
+from clsplat.cli import app
+from clsplat.density.box import Box
+from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError
+from clsplat.pipeline.loading import load
+from clsplat.scene.detect import read_scene
+from clsplat.schedule import values_of
+from clsplat.tuning import tuning
+from data_tools.multiscale import write_multiscale
+
+pytestmark = pytest.mark.slow
+
+COUNT = 3
+SHORT = ("optimize.steps=12", "checkpoint.every=4", "optimize.log_every=6", "model.sh_degree=1")
+MIP = ("model.world_filter={type: smoothing, variance: 0.2}", "model.screen_filter={type: mip, variance: 0.1}")
+NEVER = 0.9  # share of a view's pixels: then views belong to the block where they stand, or to their best
+
+
+def train(scene: Path, coarse: Path, out: Path, *overrides: str, **options) -> dict:
+    return clsplat.train_in_blocks(scene, out, coarse=coarse, overrides=[*SHORT, *overrides], **options)
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_scene: Path, few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """A scene in three blocks; nothing is changed in it."""
+    out = tmp_path_factory.mktemp("blocks") / "out"
+    return out, train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+
+
+def boxes(found: dict) -> list:
+    return [Box(**block["cell"]) for block in found["blocks"]]
+
+
+def by_owner(model: clsplat.Model, found: dict) -> clsplat.Model:
+    """A model with its Gaussians in the order of the blocks that own them."""
+    held = np.stack([box.holds(model.means) for box in boxes(found)])
+    assert (held.sum(axis=0) == 1).all()
+    return model[np.argsort(held.argmax(axis=0), kind="stable")]
+
+
+@pytest.mark.parametrize("filters", [(), MIP], ids=["plain", "mip"])
+def test_merged_model_is_the_whole_with_all_cameras_everywhere(tiny_scene, few_steps, tmp_path, filters):
+    coarse = clsplat.load(few_steps)
+    coarse.logit_opacity[::50] = -9  # in no view
+    coarse.save(tmp_path / "coarse.ply")
+    whole = train(tiny_scene, tmp_path / "coarse.ply", tmp_path / "whole", *filters, blocks=1)
+    parts = train(tiny_scene, tmp_path / "coarse.ply", tmp_path / "parts", *filters, blocks=COUNT, sight=0)
+    assert [len(block["views"]) for block in parts["blocks"]] == [8] * COUNT
+    assert [block["start"] for block in parts["blocks"]] == [whole["gaussians"]] * COUNT
+    name = "point_cloud_raw.ply" if filters else "point_cloud.ply"
+    one, other = (clsplat.load(Path(found["run"]) / name) for found in (whole, parts))
+    for table, values in by_owner(one, parts).tables().items():
+        np.testing.assert_array_equal(other.tables()[table], values)
+    assert other.tables().keys() >= ({"filter_variance"} if filters else {"means"})
+    assert (by_owner(coarse, parts).means != other.means[: len(coarse)]).any()  # they were trained
+
+
+def test_crops_of_an_untrained_partition_are_the_coarse_model(trained, few_steps):
+    out, found = trained
+    starts = [clsplat.load(out / f"block_{i:02d}.ply") for i in range(COUNT)]
+    own = [start[box.holds(start.means)] for start, box in zip(starts, boxes(found), strict=True)]
+    assert [len(model) for model in own] == [block["gaussians"] for block in found["blocks"]]
+    whole = by_owner(clsplat.load(few_steps), found)
+    for table, values in whole.tables().items():
+        np.testing.assert_array_equal(np.concatenate([model.tables()[table] for model in own]), values)
+
+
+def test_every_camera_is_used_and_views_are_fewer_than_all(trained, tiny_scene):
+    _, found = trained
+    names = [[view["name"] for view in block["views"]] for block in found["blocks"]]
+    train_views = [view.name for view in read_scene(tiny_scene).split("train")]
+    assert set().union(*names) == set(train_views)
+    assert min(map(len, names)) < len(train_views)
+
+
+def test_block_trains_with_the_full_extent_and_grows_in_its_cell(trained, tiny_scene):
+    out, found = trained
+    for block in found["blocks"]:
+        settings = load(str(out / block["name"] / "pipeline.yaml")).settings
+        assert settings.scene.train.names == [view["name"] for view in block["views"]]
+        assert settings.scene.extent == read_scene(tiny_scene).extent
+        (densify,) = [stage for stage in settings.training.during if stage.stage == "densify"]
+        assert densify.inside.model_dump() == block["growth"]
+        model = clsplat.load(out / block["name"])
+        assert boxes(found)[int(block["name"][-2:])].holds(model.means).all()
+
+
+@pytest.mark.parametrize("most", [16_000, "[[0, 15000], [8, 16000]]"])
+def test_a_number_of_gaussians_is_shared_by_pairs(most, tiny_scene, few_steps, tmp_path):
+    """All blocks grow to their parts; many of the Gaussians outside are pruned meanwhile, and leave no room."""
+    rules = "[{type: clone, gradient_above: 1.0e-7, size_below: 0.05}, {type: prune_faint, opacity_below: 0.11}]"
+    grows = f"densify.rules={rules}", f"densify.max_gaussians={most}", "densify.every=4", "densify.start=3"
+    found = train(tiny_scene, few_steps, tmp_path / "out", *grows, blocks=COUNT)
+    assert 12_000 < found["metrics"]["gaussians"] <= 16_000
+    for block in found["blocks"]:
+        settings = load(str(tmp_path / "out" / block["name"] / "pipeline.yaml")).settings
+        (densify,) = [stage for stage in settings.training.during if stage.stage == "densify"]
+        assert max(values_of(densify.max_gaussians)) == pytest.approx(block["pairs"] * 16_000)
+
+
+def test_the_merged_run_is_measured_with_all_views(trained):
+    out, found = trained
+    assert Path(found["run"]) == out / "merged"
+    assert found["metrics"] == json.loads((out / "merged" / "metrics.json").read_text())
+    assert (found["metrics"]["test"]["1"]["views"], found["metrics"]["train"]["1"]["views"]) == (2, 8)
+    merged = clsplat.load(out / "merged.ply").means
+    parts = [clsplat.load(out / f"block_{i:02d}").means for i in range(COUNT)]
+    np.testing.assert_array_equal(merged, np.concatenate(parts))
+    np.testing.assert_array_equal(clsplat.load(out / "merged").means, merged)
+
+
+def test_killed_and_missing_blocks_go_on_with_equal_bits(trained, tiny_scene, few_steps, tmp_path):
+    out = tmp_path / "out"
+    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    for name in ("metrics.json", "checksums.json", "point_cloud.ply", "checkpoints/step_000012.npz"):
+        (out / "block_01" / name).unlink()
+    shutil.rmtree(out / "block_02")
+    shutil.rmtree(out / "merged")
+    (out / "merged.ply").unlink()
+    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    assert "resumed at step 8" in (out / "block_01" / "log.txt").read_text()
+    assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
+    assert (out / "partition.json").read_bytes() == (trained[0] / "partition.json").read_bytes()
+
+
+def test_a_folder_of_blocks_and_its_scene_can_move(trained, tiny_scene, few_steps, tmp_path):
+    scene, out = tmp_path / "scene", tmp_path / "moved"
+    shutil.copytree(tiny_scene, scene)
+    shutil.copytree(trained[0], out)
+    for name in ("metrics.json", "checksums.json", "point_cloud.ply", "checkpoints/step_000012.npz"):
+        (out / "block_01" / name).unlink()
+    train(scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    assert "resumed at step 8" in (out / "block_01" / "log.txt").read_text()
+    assert "resumed at step 12" in (out / "block_00" / "log.txt").read_text()
+    for name in ("merged.ply", "merged/point_cloud.ply", "partition.json"):
+        assert (out / name).read_bytes() == (trained[0] / name).read_bytes()
+
+
+def test_what_is_done_is_left_alone(trained, tiny_scene, few_steps, monkeypatch):
+    monkeypatch.setattr("clsplat.tuning.tuning.run_pipeline", lambda *_: pytest.fail("a run begins"))
+    again = train(tiny_scene, few_steps, trained[0], blocks=COUNT, sight=NEVER)
+    assert again == trained[1]
+
+
+def test_a_block_that_fails_is_named_and_the_others_are_trained(tiny_scene, few_steps, tmp_path):
+    (tmp_path / "out").mkdir()
+    train(tiny_scene, few_steps, tmp_path / "out", blocks=COUNT, sight=NEVER, only_plan=True)
+    (tmp_path / "out" / "block_01").write_text("in the way")
+    with pytest.raises(ClsplatError, match=r"1 of 3 blocks failed; the first, block_01: .*the same command") as caught:
+        train(tiny_scene, few_steps, tmp_path / "out", blocks=COUNT, sight=NEVER)
+    assert caught.value.exit_code == 7
+    assert [(tmp_path / "out" / f"block_{i:02d}" / "metrics.json").is_file() for i in (0, 2)] == [True] * 2
+    assert not (tmp_path / "out" / "merged.ply").exists()
+
+
+def test_a_block_whose_checkpoints_are_all_damaged_begins_anew(trained, tiny_scene, few_steps, tmp_path, caplog):
+    out = tmp_path / "out"
+    shutil.copytree(trained[0], out)
+    (out / "block_01" / "point_cloud.ply").unlink()
+    for path in (out / "block_01" / "checkpoints").iterdir():
+        path.write_bytes(b"damaged")
+    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    assert "block_01: no checkpoint is whole; it is trained again from the beginning" in caplog.text
+    assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
+
+
+def test_a_block_without_gaussians_at_its_end_is_left_out(
+    trained, tiny_scene, few_steps, tmp_path, monkeypatch, caplog
+):
+    def empty(pipeline, folder, *options):
+        if folder.name == "block_01":
+            raise NoneInsideError("crop: none lies inside")
+        return tuning.trained(pipeline, folder, *options)
+
+    out = tmp_path / "out"
+    shutil.copytree(trained[0], out)
+    monkeypatch.setattr("clsplat.blocks.blocks.trained", empty)
+    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    assert "block_01: no Gaussian is left in its cell; the model goes on without it" in caplog.text
+    parts = [clsplat.load(trained[0] / f"block_{i:02d}").means for i in (0, 2)]
+    np.testing.assert_array_equal(clsplat.load(out / "merged").means, np.concatenate(parts))
+
+
+def test_a_box_without_gaussians_is_told_apart(few_steps, tiny_scene, tmp_path):
+    file = tmp_path / "x.yaml"
+    stages = [{"init": {"source": "model", "file": str(few_steps)}}, {"crop": {"inside": {"low": [99, 99, 99]}}}]
+    file.write_text(json.dumps({"name": "x", "stages": stages}))
+    with pytest.raises(NoneInsideError):
+        clsplat.run(file, tiny_scene, tmp_path / "out")
+
+
+def test_blocks_trained_in_a_store_are_those_trained_here(trained, tiny_scene, few_steps, tmp_path, monkeypatch):
+    on, out, here = tmp_path / "lab.yaml", tmp_path / "out", []
+    run = tuning.run_pipeline
+    monkeypatch.setattr(tuning, "run_pipeline", lambda *words: here.append(words[1].name) or run(*words))
+    on.write_text(f"engine: inline\nstore: '{tmp_path / 'store'}'\n")
+    for _ in range(2):  # the second time all is done
+        train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER, on=on)
+        assert here == ["merged"]
+    assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
+    cells = clsplat.status(tmp_path / "store")["cells"]
+    assert [(cell["name"], cell["state"]) for cell in cells] == [(f"block_{i:02d}", "published") for i in range(COUNT)]
+    on.write_text("engine: inline\n")
+    with pytest.raises(ConfigError, match="--on: blocks are trained as cells of a store; expected the key store"):
+        train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER, on=on)
+
+
+def test_status_tells_of_each_run_of_a_scene_in_blocks(trained, tmp_path):
+    out = tmp_path / "out"
+    assert clsplat.status(trained[0])["state"] == "done"
+    shutil.copytree(trained[0], out)
+    shutil.rmtree(out / "merged")
+    (out / "block_02" / "status.json").write_text("{")
+    shown = CliRunner().invoke(app, ["status", str(out)])
+    assert shown.exit_code == 0, shown.output
+    first, *parts = shown.stdout.splitlines()
+    assert first.endswith("out: unfinished, 2 of 4 runs are done")
+    told = [Path(part.strip().split(" at ")[0].split(";")[0]).name for part in parts]
+    assert told == ["block_00: done", "block_01: done", "block_02: unknown", "merged: waiting"]
+    (out / "blocks.json").write_text("[]")
+    with pytest.raises(DataError, match=r"blocks.json: expected the number of blocks; remove .*"):
+        clsplat.status(out)
+
+
+@pytest.mark.parametrize("damaged", ["block_01/point_cloud.ply", "block_01.ply", "partition.json", "block_02", None])
+def test_check_finds_what_is_damaged_in_a_folder_of_blocks(trained, tmp_path, damaged):
+    out = tmp_path / "out"
+    shutil.copytree(trained[0], out)
+    if damaged == "block_02":
+        shutil.rmtree(out / damaged)
+    elif damaged:
+        (out / damaged).write_bytes((out / damaged).read_bytes()[:-9])
+    found = clsplat.check(out)
+    assert [one["file"] for one in found["objects"] if not one["whole"]] == ([damaged] if damaged else [])
+    assert len(found["objects"]) > 30
+    shown = CliRunner().invoke(app, ["check", str(out)])
+    assert f"clsplat blocks … --out {out}` again" in str(shown.exception) if damaged else shown.exit_code == 0
+
+
+def test_steps_are_shared_by_views_with_compensating_rates(tiny_scene, few_steps, tmp_path):
+    shared = {"blocks": 2, "sight": NEVER, "steps": "shared"}
+    found = train(tiny_scene, few_steps, tmp_path / "out", "optimize.steps=16", **shared)
+    for block in found["blocks"]:
+        folder, share = tmp_path / "out" / block["name"], len(block["views"]) / 8
+        assert json.loads((folder / "metrics.json").read_text())["steps"] == 16 * share
+        rates = load(str(folder / "pipeline.yaml")).settings.training.rates
+        assert rates.log_scales == pytest.approx(4.0e-3 / share**0.5)
+        assert rates.means.initial == pytest.approx(6.4e-5 / share**0.5)
+
+
+def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):
+    coarse = ("optimize.steps=6", "optimize.views.resolution=1")
+    found = clsplat.train_in_blocks(
+        tiny_scene, tmp_path / "out", blocks=2, coarse_overrides=coarse, overrides=SHORT, only_plan=True
+    )
+    assert found["run"] is None
+    assert json.loads((tmp_path / "out" / "coarse" / "metrics.json").read_text())["steps"] == 6
+    assert found["gaussians"] == len(clsplat.load(tmp_path / "out" / "coarse"))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("model.background={type: directions}", "model.background is not for blocks: each block would learn its own"),
+        ("model.time={degree: 1}", "model.time is not for blocks: a cell holds Gaussians at their own time"),
+        ("optimize.colours={type: gain}", "optimize.colours is not for blocks: those of blocks would differ"),
+        ("scene.validation=4", "scene.validation is not for blocks: a block has no views to choose by"),
+        ("densify.inside={low: [0, null, null]}", "densify.inside is not for blocks: blocks set it; leave it out"),
+        (
+            "densify.budget={type: parabola, gaussians: 900}",
+            "densify.budget is not for blocks: it counts the",
+        ),
+        ("densify.per_pixel=0.1", "densify.per_pixel is not for blocks: photographs of blocks differ"),
+        ("init.source=random", "expected `init: {source: model}` first, and a stage 'optimize'"),
+    ],
+)
+def test_what_blocks_cannot_share_is_refused(override, message, tiny_scene, few_steps, tmp_path):
+    with pytest.raises(ConfigError, match=message):
+        train(tiny_scene, few_steps, tmp_path / "out", override)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_without_a_coarse_model_is_refused(tiny_scene, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"empty: has no pipeline\.yaml; expected a model file or a run folder"):
+        train(tiny_scene, tmp_path / "empty", tmp_path / "out")
+
+
+def test_a_scene_of_several_sizes_is_refused(tiny_scene, few_steps, tmp_path):
+    write_multiscale(tiny_scene, tmp_path / "scene", 2)
+    with pytest.raises(DataError, match="has each photograph in several sizes; expected one for blocks"):
+        train(tmp_path / "scene", few_steps, tmp_path / "out")
+
+
+@pytest.mark.parametrize(("option", "value"), [("blocks", 0), ("sight", 1.0), ("steps", "some")])
+def test_options_out_of_bounds_are_refused(option, value, tiny_scene, few_steps, tmp_path):
+    with pytest.raises(ConfigError, match=f"--{option} "):
+        train(tiny_scene, few_steps, tmp_path / "out", **{option: value})
+
+
+def test_a_plan_by_points_needs_points(tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "scene")
+    (tmp_path / "scene" / "points3d.ply").unlink()
+    refused = CliRunner().invoke(app, ["inspect", str(tmp_path / "scene"), "--blocks", "2"])
+    assert isinstance(refused.exception, DataError)
+    assert "has no points to cut by; `clsplat blocks --plan` trains a coarse model first" in str(refused.exception)
+
+
+def test_inspect_shows_a_plan_by_the_points_before_training(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shown = CliRunner().invoke(app, ["inspect", str(tiny_scene), "--blocks", "2", "--json"])
+    assert shown.exit_code == 0, shown.output
+    found = json.loads(shown.stdout)
+    assert [block["name"] for block in found["blocks"]] == ["block_00", "block_01"]
+    assert found["gaussians"] == len(read_scene(tiny_scene).points)
+    assert all(0 < low <= high for low, high in (block["seconds"] for block in found["blocks"]))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
+    arguments = ["blocks", "--scene", str(tiny_scene), "--coarse", str(few_steps), "--out", str(tmp_path / "out")]
+    shown = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "2"])
+    assert shown.exit_code == 0, shown.output
+    names = [line.split()[0] for line in shown.stdout.splitlines() if "%" in line]
+    assert names == ["block_00", "block_01", "whole"]
+    assert "time, by growth" in shown.stdout
+    assert all(re.search(r"\d min", line) for line in shown.stdout.splitlines() if "%" in line)
+    refused = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "3"])
+    assert "holds a scene in blocks that differs in blocks" in str(refused.exception)

@@ -1,0 +1,333 @@
+"""`clsplat compress`: what a target is, how far the search goes, and what it leaves."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import clsplat
+from clsplat import lock
+from clsplat.cli import app
+from clsplat.compress import search
+from clsplat.compress.page import page, table
+from clsplat.compress.rungs import FITTING, Ladder, checked_keeps
+from clsplat.compress.target import Point, Target
+from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
+from clsplat.formats.table import detect, read
+from clsplat.gaussians.model import Rendering
+from clsplat.gaussians.sky import Sky
+from clsplat.names import LOCK
+from clsplat.pipeline.loading import Pipeline
+from clsplat.runs import loaded, runner
+from clsplat.runs.model_file import Source, evaluate
+from clsplat.training.run import Run
+from clsplat.tuning.tuning import Tuning
+from tests.support.html_page import Page
+from tests.support.runs import NO_PROCESS
+
+pytestmark = pytest.mark.slow
+
+KEEP, STEPS = (1.0, 0.5), 20
+
+
+def point(size: int, psnr: float, keep: float = 0.5) -> Point:
+    return Point("a<b>.sog", keep, 3, "small", 10, size, psnr, 0.9)
+
+
+@pytest.fixture(scope="module")
+def searched(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished search for a file of any size."""
+    out = tmp_path_factory.mktemp("search") / "small"
+    clsplat.compress_model(few_steps, target="1MB", out=out, keep=KEEP, steps=STEPS)
+    assert "nothing to resume" not in (out / "keep_50" / "log.txt").read_text()
+    return out
+
+
+@pytest.mark.parametrize(
+    ("text", "most", "change"),
+    [
+        ("5MB", 5_000_000, None),
+        ("1.5 mb", 1_500_000, None),
+        ("2MiB", 2_097_152, None),
+        ("900kB", 900_000, None),
+        ("-0.1dB", None, -0.1),
+        ("-.5 dB", None, -0.5),
+        ("0dB", None, 0),
+    ],
+)
+def test_targets(text, most, change):
+    found = Target.of(text)
+    assert (found.most, found.change) == (most, change)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "5", "MB", "-5MB", "0MB", "0.5B", "0.1dB", "1e3MB", "5 apples", "-0.1 dB\n5MB", "٥MB", "nandB"]
+)
+def test_what_is_no_target_is_refused(text):
+    with pytest.raises(ConfigError, match="expected a size such as 5MB"):
+        Target.of(text)
+
+
+def test_a_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
+    sky = Sky(rng.random((64, 3), np.float32))
+    replace(clsplat.load(few_steps), sky=sky).save(tmp_path / "rung.sog")
+    search._copy(tmp_path / "rung.sog", tmp_path / "compressed.sog")
+    np.testing.assert_array_equal(clsplat.load(tmp_path / "compressed.sog").sky.texels, sky.texels)
+
+
+def test_the_best_of_a_size_and_the_smallest_of_a_loss():
+    points = [point(900, 30.0), point(700, 29.95), point(500, 29.5)]
+    assert Target.of("800B").best(points, 30) is points[1]
+    assert Target.of("-0.1dB").best(points, 30) is points[1]
+    assert Target.of("-0.6dB").best(points, 30) is points[2]
+    assert Target.of("0dB").best(points, 31) is None
+    assert Target.of("400B").best(points, 30) is None
+    assert Target.of("400B").nearest(points) is points[2]
+    assert Target.of("0dB").nearest(points) is points[0]
+
+
+def test_the_search_goes_down_until_it_cannot_be_better():
+    rung = [point(900, 30.0), point(500, 29.5)]
+    assert not Target.of("600B").ends(rung, 30), "fewer Gaussians let more settings fit"
+    assert Target.of("1kB").ends(rung, 30), "all fit"
+    assert not Target.of("-0.1dB").ends(rung, 30)
+    assert Target.of("0dB").ends(rung, 31), "none is good enough"
+
+
+def test_unsearched_format_is_refused_before_anything_is_opened():
+    with pytest.raises(ConfigError, match="--format 'glb': expected one of sog, spz"):
+        clsplat.compress_model("model.ply", "scene", format="glb")
+
+
+@pytest.mark.parametrize("keeps", [[], [0.0], [1.2], [-0.5], [float("nan")], [0.501, 0.5]])
+def test_what_are_no_shares_is_refused(keeps):
+    with pytest.raises(ConfigError, match="--keep: expected shares"):
+        checked_keeps(keeps)
+    assert checked_keeps([0.5, 1, 0.7, 0.5]) == [1, 0.7, 0.5]
+
+
+def test_every_file_is_measured_as_it_is_read_back(searched, few_steps, tiny_scene):
+    found = json.loads((searched / "compress.json").read_text())
+    whole = len(read(few_steps / "point_cloud.ply"))
+    assert found["source"]["gaussians"] == whole
+    assert {(one["keep"], one["gaussians"]) for one in found["points"]} == {(1.0, whole), (0.5, round(whole / 2))}
+    for one in found["points"][::3]:
+        file = searched / one["file"]
+        assert file.stat().st_size == one["bytes"]
+        assert read(file).sh_degree == one["degree"]
+        assert evaluate(file, tiny_scene)["test"]["1"]["psnr"] == pytest.approx(one["psnr"], abs=1e-9)
+
+
+def test_the_chosen_file_is_the_best(searched):
+    found = json.loads((searched / "compress.json").read_text())
+    assert found["chosen"]["psnr"] == max(one["psnr"] for one in found["points"])
+    assert (searched / "compressed.sog").read_bytes() == (searched / found["chosen"]["file"]).read_bytes()
+
+
+def test_the_page_shows_every_file_and_the_curve(searched):
+    text = (searched / "compress.html").read_text()
+    found = json.loads((searched / "compress.json").read_text())
+    assert all(one["file"] in text for one in found["points"])
+    assert text.count("<polyline") == len(KEEP)
+    assert text.count('class="chosen"') == 1
+    Page(text)
+
+
+def test_the_page_names_the_scene_and_leads_to_the_file(searched, few_steps, tiny_scene):
+    text = (searched / "compress.html").read_text()
+    assert f"<title>{tiny_scene.name} · point_cloud.ply, compressed to " in text
+    assert str(few_steps / "point_cloud.ply") in text
+    assert '<a href="compressed.sog">compressed.sog</a>' in text
+    before = page(Target.of("-1dB"), point(2000, 31), [point(900, 30.5)], None, "test", "fox", "a.ply")
+    assert "<a" not in before, "as long as none is written"
+
+
+def test_names_of_files_are_escaped():
+    source = point(2000, 31)
+    text = page(Target.of("-1dB"), source, [point(900, 30.5)], None, "test", "a<b>", "a<b>.ply")
+    assert "a<b>" not in text
+    assert "a&lt;b&gt;" in text
+    assert "No file meets the target" in text
+    assert re.findall(r'<polyline[^>]* stroke="([^"]+)"[^>]*dasharray', text) == ["var(--target)"]
+
+
+def test_repeated_search_trains_nothing_and_gives_the_same_bytes(searched, few_steps):
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in searched.rglob("*.ply")}
+    files = {path.name: path.read_bytes() for path in (searched / "trials").iterdir()}
+    found = clsplat.compress_model(few_steps, target="-40dB", out=searched, keep=KEEP, steps=STEPS)
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
+    assert {path.name: path.read_bytes() for path in (searched / "trials").iterdir()} == files
+    assert found["chosen"]["bytes"] == min(one["bytes"] for one in found["points"])
+
+
+def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatch):
+    opened: list[Path] = []
+
+    def load(path):
+        opened.append(path)
+        return clsplat.load(path)
+
+    monkeypatch.setattr(loaded, "load", load)
+    monkeypatch.setattr(search, "load", load)
+    (tmp_path / "own.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="holds something else"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
+    assert opened == [few_steps / "point_cloud.ply"]
+
+
+def test_interrupted_search_resumes_when_asked_again(few_steps, tmp_path, monkeypatch):
+    def interrupted(pipeline: Pipeline, run: Run) -> None:
+        run.interrupted = True
+        run_stages(pipeline, run)
+
+    run_stages = runner.run_stages
+    monkeypatch.setattr(runner, "run_stages", interrupted)
+    search = {"target": "1MB", "out": tmp_path / "out", "keep": [0.5], "steps": STEPS}
+    with pytest.raises(Interrupted, match=r"^stopped in keep_50; the same command goes on$"):
+        clsplat.compress_model(few_steps, **search)
+    monkeypatch.setattr(runner, "run_stages", run_stages)
+    assert Path(clsplat.compress_model(few_steps, **search)["file"]).is_file()
+    assert "resumed at step 0" in (tmp_path / "out" / "keep_50" / "log.txt").read_text()
+
+
+def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
+    with pytest.raises(ConfigError, match="a search that differs in steps; remove it, or give another --out"):
+        clsplat.compress_model(few_steps, target="1MB", out=searched, keep=KEEP, steps=STEPS + 1)
+    (tmp_path / "own.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="holds something else than a search"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
+
+
+def test_a_search_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "scene")
+    ask = {"target": "1MB", "out": tmp_path / "out", "keep": [1.0], "steps": STEPS}
+    clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
+    first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
+    second.write_bytes(first.read_bytes())
+    with pytest.raises(ConfigError, match=r"a search that differs in photographs"):
+        clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
+
+
+def test_one_process_searches_in_a_folder_at_a_time(few_steps, tmp_path):
+    with lock.held(tmp_path), pytest.raises(OutputError, match="is in use by this process"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_search_killed_at_an_early_write_resumes_and_sweeps(few_steps, tmp_path):
+    out, names = tmp_path / "out", [LOCK, f".compress.json.{NO_PROCESS}-0.partial"]
+    out.mkdir()
+    for name in names:
+        (out / name).write_text("x")
+    search = {"target": "1MB", "out": out, "keep": [1.0]}
+    clsplat.compress_model(few_steps, **search)
+    before = sorted(out.rglob("*"))
+    assert not {path.name for path in before} & set(names)
+    for name in (
+        f".compress.html.{NO_PROCESS}-0.partial",
+        f"trials/.keep_100_degree_0_small.sog.{NO_PROCESS}-0.partial",
+    ):
+        (out / name).write_text("x")
+    clsplat.compress_model(few_steps, **search)
+    assert sorted(out.rglob("*")) == before
+
+
+@pytest.mark.parametrize("text", ["", "[]"])
+def test_a_damaged_record_of_a_search_is_told_with_its_remedy(text, few_steps, tmp_path):
+    (tmp_path / "compress.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"compress\.json: is not the record of a search; remove .*, or give another"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
+
+
+def test_unreachable_target_leaves_page_and_nearest_file(few_steps, tmp_path):
+    with pytest.raises(ConfigError, match=r"no file meets it; the nearest, .*_degree_0_balanced\.spz") as error:
+        clsplat.compress_model(few_steps, target="1B", out=tmp_path / "out", format="spz", keep=[1.0])
+    assert "give a larger size" in str(error.value)
+    assert not (tmp_path / "out" / "compressed.spz").exists()
+    assert "No file meets" in (tmp_path / "out" / "compress.html").read_text()
+    assert detect(tmp_path / "out" / "trials" / "keep_100_degree_0_balanced.spz").name == "SPZ"
+
+
+def test_earlier_file_stays_where_none_meets_the_new_target(few_steps, tmp_path):
+    ask = {"out": tmp_path / "out", "format": "spz", "keep": [1.0]}
+    clsplat.compress_model(few_steps, target="1MB", **ask)
+    assert (tmp_path / "out" / "compressed.spz").is_file()
+    with pytest.raises(ConfigError, match=r"no file meets it; .*; compressed\.spz there is of another target"):
+        clsplat.compress_model(few_steps, target="2B", **ask)
+    assert (tmp_path / "out" / "compressed.spz").is_file()
+
+
+def test_what_spz_loses_is_said_once_for_a_search(few_steps, tiny_scene, tmp_path, caplog):
+    caplog.set_level("INFO")
+    model = clsplat.load(few_steps / "point_cloud.ply")
+    model = replace(model, rendering=replace(model.rendering, near=0.05))
+    model.save(tmp_path / "a.ply")
+    ask = {"out": tmp_path / "out", "format": "spz", "keep": KEEP, "steps": STEPS}
+    clsplat.compress_model(tmp_path / "a.ply", tiny_scene, target="-90dB", **ask)
+    assert len(list((tmp_path / "out" / "trials").iterdir())) > 1
+    (told,) = [text for text in caplog.messages if "does not keep" in text]
+    assert told.startswith(f"{tmp_path / 'out' / 'compressed.spz'}: SPZ does not keep near = 0.05")
+    assert "axes as the format says" not in caplog.text
+
+
+def test_the_command_prints_a_table(searched, few_steps):
+    arguments = ["--target", "-40dB", "--out", str(searched), "--keep", "1,0.5", "--steps", str(STEPS)]
+    found = CliRunner().invoke(app, ["compress", str(few_steps), *arguments])
+    assert found.exit_code == 0, found.output
+    assert table(json.loads((searched / "compress.json").read_text())) in found.output
+    assert "compressed.sog: " in found.output
+
+
+def test_a_loss_of_nothing_has_no_sign(monkeypatch):
+    same = {"psnr": 30.0, "bytes": 10}
+    found = {"chosen": {**same, "psnr": 29.999}, "source": same, "file": "a.sog", "page": "a.html"}
+    monkeypatch.setattr("clsplat.api.compression.compress_model", lambda *_, **__: found)
+    monkeypatch.setattr("clsplat.compress.page.table", lambda _: "")
+    told = CliRunner().invoke(app, ["compress", "a.ply"]).output
+    assert "0.00 dB" in told
+    assert "-0.00" not in told
+
+
+def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
+    """A mip model keeps its filter, and photographs are read as the model's run read them."""
+    model = clsplat.load(few_steps / "point_cloud.ply")
+    mip = replace(model, rendering=Rendering(near=0.05, screen_variance=0.1, compensate=1.0, background="white"))
+    ladder = Ladder(tmp_path, Tuning("compress", Source.of(few_steps, None), mip, 20, None))
+    settings = ladder.pipeline(few_steps / "point_cloud.ply", 0.7).settings
+    screen = settings.model.screen_filter
+    assert (settings.model.near, screen.variance, screen.compensate) == (0.05, 0.1, 1)
+    assert (settings.scene.background, settings.model.sh_degree) == ("white", model.sh_degree)
+    assert (settings.stages[1].keep, settings.training.steps, settings.training.rates.means.over) == (0.7, 20, 20)
+    assert [stage.stage for stage in settings.stages] == ["init", "prune_least", "optimize", "take_average", "export"]
+
+
+@pytest.mark.parametrize(("steps", "lengths", "starts"), [(None, (400, 200), (200, 500)), (100, (40, 20), (20, 50))])
+def test_averages_of_a_palette_begin_amid_its_trainings(steps, lengths, starts, few_steps, tmp_path):
+    """Their steps count from the first stage that is run, not from that of the recipe."""
+    model = clsplat.load(few_steps / "point_cloud.ply")
+    tuning = Tuning("compress", Source.of(few_steps, None), model, steps, None)
+    settings = tuning.pipeline(FITTING, {"init.file": str(few_steps / "point_cloud.ply")}).settings
+    trainings = [stage for stage in settings.stages if stage.stage == "optimize"]
+    assert tuple(training.steps for training in trainings) == lengths
+    assert tuple(training.during[-1].start for training in trainings) == starts
+
+
+@pytest.mark.parametrize("steps", [19, 1, 0, -5])
+def test_fewer_steps_than_leave_an_average_are_refused(steps, few_steps, tmp_path):
+    with pytest.raises(ConfigError, match=f"--steps {steps}: expected a number of at least 20"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, steps=steps)
+
+
+def test_a_model_whose_size_cannot_be_told_leaves_no_folder(few_steps, tmp_path, monkeypatch):
+    def damaged(path):
+        raise DataError("a level is missing")
+
+    monkeypatch.setattr(search, "bytes_of", damaged)
+    with pytest.raises(DataError, match="a level is missing"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,205 @@
+"""Decimation by merging pairs: against a straight float64 reference, and what it keeps."""
+
+import numpy as np
+import pytest
+
+from clsplat.density import mixture
+from clsplat.density.mixture import covariance_of, mass_of, merged, surface, volume
+from clsplat.errors import ConfigError, DataError
+from clsplat.formats.splats import PARAMETERS
+from clsplat.gaussians.model import Model, Rendering
+from clsplat.lod import decimation
+from clsplat.lod.decimation import decimated, matched, pair_cost
+from tests.support.models import splats
+
+
+def model(rng: np.random.Generator, count: int, degree: int = 2, mode: str = "default") -> Model:
+    """Faint Gaussians of like sizes."""
+    tables = splats(rng, count, degree, mode).parameters
+    tables["log_scales"] = rng.uniform(-2, -1, (count, 3)).astype(np.float32)
+    tables["logit_opacity"] = rng.uniform(-4, -2, (count, 1)).astype(np.float32)
+    return Model(**tables, rendering=Rendering(screen_variance=0.1, compensate=float(mode == "mip")))
+
+
+def wide(source: Model) -> dict[str, np.ndarray]:
+    return {name: table.astype(np.float64) for name, table in source.tables().items()}
+
+
+def area(scales: np.ndarray) -> float:
+    """Thomsen's surface of an ellipsoid, over 4 pi."""
+    a, b, c = scales
+    p = 1.6075
+    return float((((a * b) ** p + (a * c) ** p + (b * c) ** p) / 3) ** (1 / p))
+
+
+def moments(tables: dict[str, np.ndarray], row: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, mean and covariance of one Gaussian, written out."""
+    w, x, y, z = tables["quats"][row] / np.linalg.norm(tables["quats"][row])
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    scales = np.exp(tables["log_scales"][row])
+    mass = area(scales) / (1 + np.exp(-tables["logit_opacity"][row, 0]))
+    return mass, tables["means"][row], turn @ np.diag(scales**2) @ turn.T
+
+
+def test_a_pair_becomes_the_moments_of_its_mixture(rng):
+    tables = wide(model(rng, 40))
+    first, second = np.arange(0, 40, 2), np.arange(1, 40, 2)
+    found = merged(tables, first, second, surface)
+    for pair, (i, j) in enumerate(zip(first, second, strict=True)):
+        (a, mean_a, cov_a), (b, mean_b, cov_b) = moments(tables, i), moments(tables, j)
+        mean = (a * mean_a + b * mean_b) / (a + b)
+        apart_a, apart_b = mean_a - mean, mean_b - mean
+        covariance = (a * (cov_a + np.outer(apart_a, apart_a)) + b * (cov_b + np.outer(apart_b, apart_b))) / (a + b)
+        mass, mean_found, covariance_found = moments(found, pair)
+        np.testing.assert_allclose(mean_found, mean, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(covariance_found, covariance, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(mass, a + b, rtol=1e-9)
+        for name in ("sh_base", "sh_rest"):
+            colour = (a * tables[name][i] + b * tables[name][j]) / (a + b)
+            np.testing.assert_allclose(found[name][pair], colour, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [surface, volume])
+def test_a_mixture_is_symmetric_in_its_pair(rng, size):
+    tables = wide(model(rng, 20))
+    one, two = np.arange(10), np.arange(10, 20)
+    there, back = merged(tables, one, two, size), merged(tables, two, one, size)
+    for found in (there, back):
+        found["covariance"] = covariance_of(found.pop("quats"), found["log_scales"])
+    for name in there:
+        np.testing.assert_allclose(there[name], back[name], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(pair_cost(tables, one, two), pair_cost(tables, two, one), rtol=1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 3, 64, 257])
+def test_mass_and_mean_are_kept(rng, count):
+    source = model(rng, count)
+    found = decimated(source)
+    assert len(found) == (count + 1) // 2
+    before, after = wide(source), wide(found)
+    mass = [mass_of(tables, surface) for tables in (before, after)]
+    np.testing.assert_allclose(mass[1].sum(), mass[0].sum(), rtol=1e-5)
+    mean = [(one[:, None] * tables["means"]).sum(axis=0) for one, tables in zip(mass, (before, after), strict=True)]
+    np.testing.assert_allclose(mean[1], mean[0], rtol=1e-4, atol=1e-4 * mass[0].sum())
+    for name in PARAMETERS:
+        assert getattr(found, name).dtype == np.float32
+
+
+def test_a_share_is_met_in_several_rounds(rng):
+    assert [len(decimated(model(rng, 100), keep)) for keep in (1, 0.7, 0.25, 0.001)] == [100, 70, 25, 1]
+
+
+def test_none_and_one_stay(rng):
+    for count in (0, 1):
+        source = model(rng, count)
+        found = decimated(source)
+        for name, table in source.tables().items():
+            np.testing.assert_array_equal(getattr(found, name), table)
+
+
+def test_same_model_gives_same_bytes_in_any_row_order(rng):
+    source = model(rng, 300)
+    found, again = decimated(source), decimated(source[:])
+    for name, table in found.tables().items():
+        assert table.tobytes() == getattr(again, name).tobytes()
+    mixed = decimated(source[rng.permutation(300)])
+    for name in ("means", "sh_base"):
+        tables = (np.sort(getattr(one, name), axis=0) for one in (found, mixed))
+        np.testing.assert_allclose(*tables, rtol=1e-4, atol=1e-5)
+
+
+def test_duplicates_in_one_place_become_one(rng):
+    """More of them than there are neighbours."""
+    one = model(rng, 1)
+    found = decimated(one[np.zeros(51, int)])
+    assert len(found) == 26
+    np.testing.assert_allclose(found.means, np.repeat(one.means, 26, axis=0), rtol=1e-6)
+    np.testing.assert_allclose(np.sort(found.log_scales), np.repeat(np.sort(one.log_scales), 26, axis=0), rtol=1e-5)
+    alone = np.isclose(found.logit_opacity, one.logit_opacity, rtol=1e-5)
+    assert alone.sum() == 1, "25 pairs, and the odd one"
+
+
+def test_thousands_in_one_place_are_no_more_work_than_others(rng):
+    """A round pairs them all: a tree of places alone, or of rows, takes quadratic time here."""
+    one = model(rng, 1, degree=0)
+    rows = [len(pairs) for pairs in matched(wide(one[np.zeros(30_000, int)]))]
+    assert rows == [15_000, 15_000]
+
+
+def test_work_grows_with_rows_and_pairs_not_with_their_product(rng, monkeypatch):
+    """Masses are those of all rows once, and not again for each block of pairs."""
+    rows: list[int] = []
+    monkeypatch.setattr(
+        mixture, "mass_of", lambda tables, size: rows.append(len(tables["means"])) or mass_of(tables, size)
+    )
+    monkeypatch.setattr(decimation, "mass_of", mixture.mass_of, raising=False)
+    source = wide(model(rng, 300))
+    whole = matched(source)
+    monkeypatch.setattr(decimation, "BLOCK", 50)
+    for one, two in zip(matched(source), whole, strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert rows == [300, 300]
+
+
+def test_the_cheapest_pair_goes_first_and_none_is_in_two():
+    """Three in a row, and two far from them that are equal."""
+    x = np.array([0, 0.1, 0.35, 9, 9], np.float32)
+    tables = {
+        "means": np.stack([x, 0 * x, 0 * x], axis=1),
+        "quats": np.tile([1.0, 0, 0, 0], (5, 1)),
+        "log_scales": np.full((5, 3), -1.0),
+        "logit_opacity": np.full((5, 1), -3.0),
+        "sh_base": np.zeros((5, 3)),
+        "sh_rest": np.zeros((5, 0)),
+    }
+    first, second = matched({name: table.astype(np.float64) for name, table in tables.items()})
+    assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(3, 4), (0, 1)]
+
+
+def test_colour_keeps_neighbours_apart():
+    tables = {
+        "means": np.array([[0.0, 0, 0], [0.1, 0, 0], [0.25, 0, 0]]),
+        "quats": np.tile([1.0, 0, 0, 0], (3, 1)),
+        "log_scales": np.full((3, 3), -1.0),
+        "logit_opacity": np.full((3, 1), -3.0),
+        "sh_base": np.array([[1.0] * 3, [-1.0] * 3, [-1.0] * 3]),
+        "sh_rest": np.zeros((3, 0)),
+    }
+    assert [rows.tolist() for rows in matched(tables)] == [[1], [2]]
+
+
+def test_extreme_values_and_zero_quaternions_merge_to_finite(rng):
+    source = model(rng, 24)
+    source.log_scales[:6] = (-80, -80, 3)
+    source.log_scales[6:9] = 60
+    source.quats[3:9] = 0
+    source.logit_opacity[8:16] = (np.arange(8)[:, None] - 4) * 30
+    source.means[20] = 1e30
+    found = decimated(source, 0.25)
+    assert len(found) == 6
+    assert all(np.isfinite(table).all() for table in found.tables().values())
+
+
+def test_mip_model_keeps_its_numbers_and_bakes_a_world_filter(rng):
+    source = model(rng, 10, mode="mip")
+    filtered = Model(**source.tables(), filter_variance=np.full((10, 1), 0.1), rendering=source.rendering)
+    found = decimated(filtered)
+    assert found.filter_variance is None
+    assert found.rendering == source.rendering
+    np.testing.assert_array_equal(found.means, decimated(filtered.baked()).means)
+
+
+def test_what_cannot_be_merged_is_refused(rng):
+    source = model(rng, 5)
+    for keep in (0, -1, 1.5, float("nan")):
+        with pytest.raises(ConfigError, match="expected a share"):
+            decimated(source, keep)
+    source.means[2, 1] = np.nan
+    with pytest.raises(DataError, match="1 Gaussians hold values that are not finite"):
+        decimated(source)

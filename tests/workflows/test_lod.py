@@ -1,0 +1,279 @@
+"""`clsplat lod`: levels are merged, trained, measured and written, and what cannot be is refused."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import clsplat
+from clsplat.cli import app
+from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
+from clsplat.formats.model_files import bytes_of
+from clsplat.formats.table import read
+from clsplat.gaussians.sky import Sky
+from clsplat.lod import levels
+from clsplat.lod.decimation import decimated
+from clsplat.lod.table import table
+from clsplat.lod.training import Plan
+from clsplat.runs import runner
+from clsplat.runs.model_file import evaluate
+from tests.support.runs import NO_PROCESS
+
+pytestmark = pytest.mark.slow
+
+STEPS = 20
+
+
+@pytest.fixture(scope="module")
+def trained(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """Three levels of a run's model, the coarser two trained."""
+    folder = tmp_path_factory.mktemp("lod") / "site"
+    return folder, clsplat.write_levels(few_steps, folder, levels=3, steps=STEPS)
+
+
+def tree(folder: Path) -> dict[Path, bytes]:
+    return {file.relative_to(folder): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
+def test_levels_are_trained_and_measured(trained, few_steps, tiny_scene):
+    folder, found = trained
+    whole = len(read(few_steps / "point_cloud.ply"))
+    counts = [level["gaussians"] for level in found["levels"]]
+    assert counts == [whole, (whole + 1) // 2, ((whole + 1) // 2 + 1) // 2]
+    assert json.loads((folder / "lod-meta.json").read_text())["counts"] == counts
+    training = folder.with_name("site.training")
+    for number in (1, 2):
+        for file, key in ((f"level_{number}.ply", "merged_psnr"), (f"level_{number}/point_cloud.ply", "psnr")):
+            measured = evaluate(training / file, tiny_scene)["test"]["1"]["psnr"]
+            assert found["levels"][number][key] == pytest.approx(measured, abs=1e-9)
+        assert json.loads((training / f"level_{number}" / "metrics.json").read_text())["steps"] == STEPS
+        assert "\nname: lod\n" in (training / f"level_{number}" / "pipeline.yaml").read_text()
+    first = found["levels"][0]
+    assert first["psnr"] == first["merged_psnr"] == evaluate(few_steps)["test"]["1"]["psnr"]
+
+
+def test_numbers_are_told_as_elsewhere(monkeypatch, caplog):
+    caplog.set_level("INFO")
+    monkeypatch.setattr(levels, "decimated", lambda model, keep: range(1200))
+    levels._levels(range(2400), Plan(levels=2), None)
+    assert "level 1: 1,200 Gaussians" in caplog.text
+
+
+def test_each_level_is_merged_from_the_trained_one_before(trained):
+    training = trained[0].with_name("site.training")
+    expected = decimated(clsplat.load(training / "level_1" / "point_cloud.ply"))
+    np.testing.assert_array_equal(clsplat.load(training / "level_2.ply").means, expected.means)
+
+
+def test_sizes_are_those_of_the_files(trained):
+    folder, found = trained
+    assert found["bytes"] == bytes_of(folder) == sum(map(len, tree(folder).values()))
+    meta = (folder / "lod-meta.json").stat().st_size
+    assert sum(level["bytes"] for level in found["levels"]) == found["bytes"] - meta
+
+
+def test_a_sky_goes_with_the_levels(few_steps, tmp_path, rng, caplog):
+    sky = Sky(rng.random((64, 3), np.float32))
+    replace(clsplat.load(few_steps), sky=sky).save(tmp_path / "model.ply")
+    caplog.set_level("INFO")
+    clsplat.write_levels(tmp_path / "model.ply", tmp_path / "site", levels=2)
+    np.testing.assert_array_equal(clsplat.load(tmp_path / "site").sky.texels, sky.texels)
+    assert "the sky of the finest level is in lod-meta_sky.json" in caplog.text
+
+
+def test_the_written_level_0_is_a_model(trained, few_steps, tiny_scene):
+    folder, found = trained
+    psnr = evaluate(folder, tiny_scene)["test"]["1"]["psnr"]
+    assert psnr == pytest.approx(found["levels"][0]["psnr"], abs=1)
+
+
+def test_the_same_model_again_gives_the_same_bytes(trained, few_steps, tmp_path):
+    clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
+    assert tree(tmp_path / "site") == tree(trained[0])
+
+
+def test_a_file_alone_is_merged_without_a_device(few_steps, tmp_path, monkeypatch):
+    def opens(device):
+        raise AssertionError("a device is opened")
+
+    monkeypatch.setattr("clsplat.runs.model_file.open_correct", opens)
+    file = tmp_path / "model.ply"
+    file.write_bytes((few_steps / "point_cloud.ply").read_bytes())
+    found = clsplat.write_levels(file, tmp_path / "site", levels=2, keep=0.3)
+    whole = len(read(file))
+    assert [level["gaussians"] for level in found["levels"]] == [whole, int(0.3 * whole + 0.5)]
+    assert found["split"] is None
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["model.ply", "site"]
+    assert table(found).splitlines()[0].split() == ["level", "Gaussians", "MB"]
+
+
+@pytest.fixture
+def alone(few_steps: Path, tmp_path: Path) -> Path:
+    """The file of a model whose photographs are not known."""
+    file = tmp_path / "model.ply"
+    file.write_bytes((few_steps / "point_cloud.ply").read_bytes())
+    return file
+
+
+def test_that_a_file_is_merged_alone_is_said(alone, tmp_path):
+    found = CliRunner().invoke(app, ["lod", str(alone), str(tmp_path / "site"), "--steps", "0"])
+    assert found.exit_code == 0, found.output
+    assert "model.ply: no photographs: merged alone" in found.output
+
+
+@pytest.mark.parametrize("option", ["steps", "downscale", "device"])
+def test_options_that_need_photographs_are_refused_without_them(option, alone, tmp_path):
+    message = rf"model\.ply: no photographs are known, needed for --{option}; give --scene, or leave that out$"
+    with pytest.raises(ConfigError, match=message):
+        clsplat.write_levels(alone, tmp_path / "site", **{option: STEPS})
+    assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
+
+
+@pytest.fixture
+def moved(few_steps: Path, tiny_scene: Path, tmp_path: Path) -> Path:
+    """A run whose photographs have moved."""
+    run = tmp_path / "run"
+    shutil.copytree(few_steps, run)
+    settings = (run / "pipeline.yaml").read_text()
+    (run / "pipeline.yaml").write_text(settings.replace(str(tiny_scene), str(tmp_path / "gone")))
+    return run
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_without_steps_a_run_needs_no_photographs(there, moved, tmp_path, caplog):
+    if there:
+        (tmp_path / "gone").mkdir()
+    found = clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0)
+    assert (len(found["levels"]), found["split"]) == (2, None)
+    assert "levels are merged alone, and not measured" in caplog.text
+
+
+def test_a_device_is_refused_where_the_photographs_have_moved(moved, tmp_path):
+    message = r"run: its photographs cannot be read, needed for --device; give --scene, or leave that out$"
+    with pytest.raises(ConfigError, match=message):
+        clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0, device="nosuch")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_training_without_its_photographs_names_the_way_out(moved, tmp_path):
+    with pytest.raises(DataError, match=r"gone, is missing; .* \(--scene DIR names another; --steps 0 needs none\)$"):
+        clsplat.write_levels(moved, tmp_path / "site")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_damaged_model_is_told_as_such(few_steps, tmp_path):
+    shutil.copytree(few_steps, tmp_path / "run")
+    (tmp_path / "run" / "point_cloud.ply").write_bytes(b"")
+    with pytest.raises(DataError, match=r"point_cloud\.ply: .*[^)]$"):
+        clsplat.write_levels(tmp_path / "run", tmp_path / "site")
+
+
+def test_one_level_is_not_trained(few_steps, tmp_path):
+    clsplat.write_levels(few_steps, tmp_path / "site", levels=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
+
+
+@pytest.mark.parametrize(("name", "steps"), [("file/site", 0), ("n" * 245, STEPS)])
+def test_unwritable_path_is_refused_before_the_work(name, steps, few_steps, tmp_path, monkeypatch):
+    def works(*_):
+        raise AssertionError("the work begins")
+
+    monkeypatch.setattr("clsplat.lod.levels.decimated", works)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="cannot be written"):
+        clsplat.write_levels(few_steps, tmp_path / name, steps=steps)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_what_a_killed_process_left_is_removed(alone, tmp_path):
+    for name in (f".site.{NO_PROCESS}-0.partial", f".other.{NO_PROCESS}-0.partial"):
+        (tmp_path / name / "0_0").mkdir(parents=True)
+    clsplat.write_levels(alone, tmp_path / "site", levels=2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f".other.{NO_PROCESS}-0.partial", "model.ply", "site"]
+
+
+def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch, trained):
+    def interrupted(pipeline, run):
+        run.interrupted = True
+        run_stages(pipeline, run)
+
+    run_stages = runner.run_stages
+    monkeypatch.setattr(runner, "run_stages", interrupted)
+    with pytest.raises(Interrupted, match=r"^stopped in level_1; the same command goes on$"):
+        clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
+    assert not (tmp_path / "site").exists()
+    monkeypatch.setattr(runner, "run_stages", run_stages)
+    with pytest.raises(ConfigError, match=r"site\.training: holds the training of levels that differs in steps"):
+        clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS + 1)
+    clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
+    assert tree(tmp_path / "site") == tree(trained[0])
+
+
+def test_a_training_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "scene")
+    ask = {"folder": tmp_path / "site", "scene": tmp_path / "scene", "levels": 2, "steps": STEPS}
+    clsplat.write_levels(few_steps, **ask)
+    shutil.rmtree(tmp_path / "site")
+    first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
+    second.write_bytes(first.read_bytes())
+    with pytest.raises(ConfigError, match=r"the training of levels that differs in photographs"):
+        clsplat.write_levels(few_steps, **ask)
+
+
+def test_a_folder_of_levels_is_a_model_too(trained, tiny_scene, tmp_path):
+    """With a scene of its own, as any model file."""
+    found = clsplat.write_levels(trained[0], tmp_path / "site", tiny_scene, levels=2, steps=STEPS)
+    assert found["levels"][0]["gaussians"] == trained[1]["levels"][0]["gaussians"]
+
+
+def test_photographs_are_as_small_as_is_asked(few_steps, tmp_path):
+    clsplat.write_levels(few_steps, tmp_path / "site", levels=2, steps=STEPS, downscale=2)
+    assert "20 x 20 px" in (tmp_path / "site.training" / "level_1" / "log.txt").read_text()
+
+
+def test_without_steps_levels_are_measured_alone(few_steps, tmp_path):
+    found = clsplat.write_levels(few_steps, tmp_path / "site", levels=2, steps=0)
+    assert found["levels"][1]["psnr"] == found["levels"][1]["merged_psnr"]
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        ({"levels": 0}, r"--levels 0: expected 1 to 12$"),
+        ({"levels": 13}, r"--levels 13: expected 1 to 12$"),
+        ({"keep": 0.0}, "--keep 0: expected a share"),
+        ({"keep": 1.0}, "--keep 1: expected a share"),
+        ({"keep": float("nan")}, "--keep nan: expected a share"),
+        ({"steps": -1}, "--steps -1: expected a number of at least 20"),
+        ({"downscale": 0.5}, "--downscale 0.5: expected a divisor"),
+        ({"downscale": 2.0, "steps": 0}, "--downscale 2: belongs to a training; expected --steps above 0"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(plan, message):
+    with pytest.raises(ConfigError, match=message):
+        Plan(**plan)
+
+
+def test_an_empty_model_and_a_folder_in_use_are_refused(few_steps, tmp_path):
+    model = clsplat.load(few_steps)
+    model[:0].save(tmp_path / "empty.ply")
+    with pytest.raises(DataError, match=r"empty\.ply: the model holds no Gaussians; expected some to merge"):
+        clsplat.write_levels(tmp_path / "empty.ply", tmp_path / "site")
+    with pytest.raises(ConfigError, match="is in use; give the name of a new folder"):
+        clsplat.write_levels(few_steps, tmp_path)
+
+
+def test_the_command_prints_a_table_and_advises_one_file_for_few(few_steps, tmp_path):
+    arguments = ["lod", str(few_steps), str(tmp_path / "site"), "--levels", "2", "--steps", str(STEPS)]
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == 0, found.output
+    text = " ".join(found.output.split())
+    assert "below a million one SOG is better" in text
+    assert "level Gaussians MB PSNR, dB before training" in text
+    assert "site/lod-meta.json: " in text.replace(" /", "/")
+    assert "PSNR of test views, not yet quantised" in text
