@@ -2,11 +2,11 @@
 
     python -m tests.support.bits [NAME ...] [--out FILE] [--jobs N] [--list]
 
-prints a line `NAME SHA256` for each case, in the order of the names.  The hash is that of a PLY file's data, without its
-header, which holds the version, or of the tables of a field.  Cases are all recipes in `pipelines/`, in STEPS steps with
-growth, and trainings with settings that no recipe has.  Only the command line is used, so that this file serves before
-and after modules move.  Counts and skipped cases go to standard error.  Real scenes are read from $CLSPLAT_DATA, or from
-`shared/data` beside the checkout.
+prints a line `NAME SHA256` for each case, in the order of the names.  The hash is that of a PLY file's data, without
+its header, which holds the version, or of the tables of a field.  Cases are all recipes in `pipelines/`, in STEPS steps
+with growth, and trainings with settings that no recipe has.  Only the command line is used, so that this file serves
+before and after modules move.  Counts and skipped cases go to standard error.  Real scenes are read from $CLSPLAT_DATA,
+or from `shared/data` beside the checkout.
 """
 
 import argparse
@@ -22,9 +22,9 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -368,7 +368,7 @@ def hash_model(out: Path) -> str:
 
 def hash_ply(file: Path) -> str:
     """Return the hash of what follows the header."""
-    header, end, data = file.read_bytes().partition(b"end_header\n")
+    header, _, data = file.read_bytes().partition(b"end_header\n")
     count = next(line.split()[-1].decode() for line in header.splitlines() if line.startswith(b"element vertex"))
     print(f"  {file.parent.name}/{file.name}: {count} Gaussians", file=sys.stderr)
     return hashlib.sha256(data).hexdigest()
