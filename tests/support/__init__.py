@@ -1,0 +1,1 @@
+"""What tests and their authors share."""
