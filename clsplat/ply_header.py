@@ -1,6 +1,7 @@
-"""Read the header of a PLY file: comments, and place and properties of its vertices."""
+"""The header of a PLY file: comments, and place and properties of its vertices."""
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,17 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
     if not form:
         raise DataError(f"{path}: the PLY header has no 'format ascii 1.0' or 'format binary_…'; export it again")
     return _vertices(path, form, tuple(comments), elements, end.end())
+
+
+def format_ply_header(comments: Iterable[str], **elements: tuple[int, Iterable[str]]) -> bytes:
+    """Return the header of a binary little-endian file.
+
+    elements: by name the number of rows and the properties of each element, such as `float x`, in their order.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    for name, (count, properties) in elements.items():
+        lines += [f"element {name} {count}", *(f"property {text}" for text in properties)]
+    return "\n".join([*lines, "end_header", ""]).encode()
 
 
 def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_Element], start: int) -> PlyHeader:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.files import atomic
+from clsplat.quaternions import unit_quaternions
 from clsplat.scene.colmap_binary import POINT2D
-from clsplat.scene.quaternion import unit_quaternions
 from clsplat.scene.scene import Camera, PointCloud, View
 from clsplat.scene.tracks import Tracks
 

@@ -20,7 +20,7 @@ from clsplat.caches import cache_folder
 from clsplat.errors import ConfigError, DataError, DeviceError, MemoryLimitError, OutputError
 from clsplat.files import write_text
 from clsplat.opencl.discovery import DeviceInfo
-from clsplat.pages.columns import columns
+from clsplat.pages.columns import text_table
 from clsplat.reading import read_json
 
 MODULE = "clsplat.bench.packed"
@@ -64,7 +64,7 @@ class Packings:
         for one in self.tried:
             memory = "" if one.memory is None else f"{one.memory / 2**20:,.0f}"
             rows.append((str(one.processes), str(one.cores), f"{one.rate:.1f}", memory))
-        lines = [f"device: {self.device}", f"scene {self.scene}, {self.pipeline}", columns(rows)]
+        lines = [f"device: {self.device}", f"scene {self.scene}, {self.pipeline}", text_table(rows)]
         lines += [f"{number} processes: {why}" for number, why in self.refused.items()]
         lines.append(f"best: {told(self.best)}; sweeps with engine local take it (packing: auto)")
         return "\n".join(lines)

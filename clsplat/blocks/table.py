@@ -3,7 +3,7 @@
 from typing import Any
 
 from clsplat.errors import one_line
-from clsplat.pages.columns import columns
+from clsplat.pages.columns import text_table
 from clsplat.runs.expected import minutes_text
 from clsplat.runs.status import status_text
 
@@ -20,11 +20,11 @@ def table(found: dict[str, Any]) -> str:
     whole = ["whole", *[f"{found['gaussians']:,}"] * 2, str(found["views"]), "", "100 %", _mib(found["memory"])]
     times = [one["seconds"] for one in found["blocks"] if "seconds" in one]
     if not times:
-        return columns([HEADINGS, *map(_cells, found["blocks"]), whole])
+        return text_table([HEADINGS, *map(_cells, found["blocks"]), whole])
     rows = [[*_cells(block), minutes_text(seconds)] for block, seconds in zip(found["blocks"], times, strict=True)]
     low, high = (sum(ends) for ends in zip(*times, strict=True))
     total = [*whole, f"{minutes_text((low, high))}, one after the other"]
-    return f"{columns([[*HEADINGS, TIME], *rows, total])}\n{GUESS}"
+    return f"{text_table([[*HEADINGS, TIME], *rows, total])}\n{GUESS}"
 
 
 def status_table(found: dict[str, Any]) -> str:

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from clsplat.cameras.posed import Posed
 from clsplat.errors import DataError, quoted
 from clsplat.files import write_text
+from clsplat.quaternions import unit_quaternions
 from clsplat.scene.lens import Lens
-from clsplat.scene.quaternion import unit_quaternions
 from clsplat.scene.reprojection import projected
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.tracks import Tracks

@@ -8,7 +8,7 @@ import typer
 from clsplat import terminal
 from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, JsonOption, LiveOption, PipelineArgument, SetOption, command, recipe_names
-from clsplat.errors import ConfigError, DataError, OutputError, in_shell
+from clsplat.errors import ClsplatError, ConfigError, DataError, OutputError, in_shell
 
 OnOption = Annotated[
     Path | None,
@@ -168,9 +168,13 @@ def check(
         raise ConfigError("check: expected a pipeline, a run folder, a model, or --schema")
     found = commands.check(pipeline)
     if "objects" in found:
-        _show_verified(found, as_json)
+        from clsplat.runs.verdict import lines, verdict
+
+        _show_findings(found, as_json, lines(found), verdict(found), None if found["whole"] else OutputError)
     elif "model" in found:
-        _show_examined(found, as_json)
+        from clsplat.gaussians.checkup import lines, verdict
+
+        _show_findings(found, as_json, lines(found), verdict(found), None if found["valid"] else DataError)
     elif as_json:
         terminal.show_json({**found, "valid": True})
     elif "parameters" in found:
@@ -181,32 +185,18 @@ def check(
         terminal.show(f"{found['path']}: valid; {', '.join(found['stages'])}")
 
 
-def _show_verified(found: dict[str, Any], as_json: bool) -> None:
-    """Show what was found of a run folder.  Raises OutputError where a file is damaged."""
-    from clsplat.runs.verdict import lines, verdict
-
+def _show_findings(
+    found: dict[str, Any], as_json: bool, text: str, verdict: str, error: type[ClsplatError] | None
+) -> None:
+    """Show what `check` found, and the verdict on it, which is raised as an error where there is one."""
     if as_json:
         terminal.show_json(found)
     else:
-        terminal.show(lines(found))
-    if not found["whole"]:
-        raise OutputError(verdict(found))
+        terminal.show(text)
+    if error:
+        raise error(verdict)
     if not as_json:
-        terminal.show(verdict(found))
-
-
-def _show_examined(found: dict[str, Any], as_json: bool) -> None:
-    """Show what a model file holds.  Raises DataError where something is wrong with it."""
-    from clsplat.gaussians.checkup import lines, verdict
-
-    if as_json:
-        terminal.show_json(found)
-    else:
-        terminal.show(lines(found))
-    if not found["valid"]:
-        raise DataError(verdict(found))
-    if not as_json:
-        terminal.show(verdict(found))
+        terminal.show(verdict)
 
 
 @command(

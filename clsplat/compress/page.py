@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from clsplat.compress.target import Point, Target
-from clsplat.pages.columns import columns
+from clsplat.pages.columns import text_table
 from clsplat.pages.page import charts, render
 from clsplat.pages.svg import Line, curve
 
@@ -30,9 +30,9 @@ def table(found: dict[str, Any]) -> str:
     """Return the record of a search as lines of text; a star marks the file that was chosen."""
     source, points = Point(**found["source"]), [Point(**point) for point in found["points"]]
     chosen = found["chosen"] and Point(**found["chosen"])
-    marks = [" ", " ", *("*" if point == chosen else " " for point in points)]
+    marks = ["", "", *("*" if point == chosen else "" for point in points)]
     rows = [HEADINGS, *(cells(point, source) for point in (source, *points))]
-    return columns([[mark, *row] for mark, row in zip(marks, rows, strict=True)])
+    return text_table([[mark, *row] for mark, row in zip(marks, rows, strict=True)])
 
 
 def page(

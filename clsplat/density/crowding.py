@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.density.edit import Edit, Rule
-from clsplat.scene.quaternion import rotation_matrix
+from clsplat.quaternions import rotation_matrix
 from clsplat.schedule import NonNegative, Positive
 
 Floats = NDArray[np.float64]

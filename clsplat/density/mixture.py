@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.formats.splats import inverse_opacities
-from clsplat.scene.quaternion import rotation_matrix, unit_quaternions
+from clsplat.quaternions import rotation_matrix, unit_quaternions
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -30,7 +30,7 @@ from clsplat.formats.splats import (
     swapped,
     unit,
 )
-from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
+from clsplat.ply_header import MAX_HEADER, PlyHeader, format_ply_header, parse_ply_header
 from clsplat.reading import opened
 
 CHUNK = 256  # splats
@@ -88,13 +88,14 @@ def write_compressed_ply(path: Path, splats: SplatFile, options: Writing) -> str
     vertices = np.stack([position, _packed_rotation(p["quats"]), scale, colours], axis=1)
     rest = swapped(p["sh_rest"], p["sh_rest"].shape[1] // 3, 3).astype(np.float64)
     sh = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype(np.uint8)
-    header = ["ply", "format binary_little_endian 1.0", *comments(splats.rendering), f"element chunk {len(chunks)}"]
-    header += [*(f"property float {name}" for name in _ENDS), f"element vertex {count}"]
-    header += [f"property uint {name}" for name in PACKED]
+    elements = {
+        "chunk": (len(chunks), [f"float {name}" for name in _ENDS]),
+        "vertex": (count, [f"uint {name}" for name in PACKED]),
+    }
     if sh.shape[1]:
-        header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(sh.shape[1]))]
+        elements["sh"] = count, [f"uchar f_rest_{i}" for i in range(sh.shape[1])]
     with written(path) as file:
-        file.write(("\n".join([*header, "end_header"]) + "\n").encode())
+        file.write(format_ply_header(comments(splats.rendering), **elements))
         for table, kind in ((chunks, "<f4"), (vertices, "<u4"), (sh, "u1")):
             file.write(np.ascontiguousarray(table, kind).tobytes())
     return file.sha256

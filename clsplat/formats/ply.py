@@ -31,7 +31,7 @@ from clsplat.formats.splats import (
     sh_coefficients,
     swapped,
 )
-from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
+from clsplat.ply_header import MAX_HEADER, PlyHeader, format_ply_header, parse_ply_header
 from clsplat.reading import opened
 
 RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
@@ -76,10 +76,8 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     names += [FILTER] if "filter_variance" in parameters else []
     names += columns_of(parameters[MOTION].shape[1]) if MOTION in parameters else ()
-    header = ["ply", "format binary_little_endian 1.0", *comments(rendering)]
-    header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
     with written(path) as file:
-        file.write(("\n".join(header) + "\n").encode())
+        file.write(format_ply_header(comments(rendering), vertex=(count, (f"float {name}" for name in names))))
         for first in range(0, count, ROWS):
             file.write(_body({name: table[first : first + ROWS] for name, table in parameters.items()}))
     return file.sha256
@@ -103,9 +101,9 @@ def _body(parameters: Parameters) -> bytes:
 
 
 def comments(rendering: dict[str, Any]) -> list[str]:
-    """Return the lines of a header that say how a model is rendered."""
+    """Return the comments of a header that say how a model is rendered."""
     mode = "mip" if rendering.get("compensate") else "default"
-    return [f"comment {RENDERING}{json.dumps(rendering, sort_keys=True, allow_nan=False)}", f"comment {MODE}{mode}"]
+    return [f"{RENDERING}{json.dumps(rendering, sort_keys=True, allow_nan=False)}", f"{MODE}{mode}"]
 
 
 def mode_of(header: PlyHeader) -> str:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.formats.output import written
-from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
+from clsplat.ply_header import MAX_HEADER, PlyHeader, format_ply_header, parse_ply_header
 from clsplat.reading import opened
 
 ROWS = 1 << 16  # of a piece
@@ -26,8 +26,9 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
     for part, header in zip(parts, headers, strict=True):
         if (header.dtype, header.comments) != (first.dtype, first.comments):
             raise DataError(f"{part}: has other properties, or another comment, than {parts[0]}; train both alike")
+    properties = [f"float {name}" for name in first.dtype.names or ()]
     with written(path) as output:
-        output.write(_text(first, count))
+        output.write(format_ply_header(first.comments, vertex=(count, properties)))
         for number, (part, header) in enumerate(zip(parts, headers, strict=True)):
             with opened(part, "a PLY file") as file:
                 file.seek(header.start)
@@ -49,10 +50,3 @@ def _header(part: Path) -> PlyHeader:
     if header.format != "binary_little_endian" or list(header.sections) != ["vertex"] or kinds != {np.dtype("<f4")}:
         raise DataError(f"{part}: expected a model as `export` writes it")
     return header
-
-
-def _text(header: PlyHeader, count: int) -> bytes:
-    """The header of a file with so many vertices, whose values are floats."""
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in header.comments)]
-    lines += [f"element vertex {count}", *(f"property float {name}" for name in header.dtype.names or ())]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.formats.packing import from_smallest_three, smallest_three
 from clsplat.formats.splats import MAX_LOG, logits, opacities, unit
+from clsplat.quaternions import multiply
 
 Floats = NDArray[np.floating]
 SMALL = 25  # percentile of the sizes that steps of positions are compared with
@@ -85,7 +86,7 @@ def rounded_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray
     for number, (w, x, y, z) in enumerate(_TURNS):
         size = np.abs(q[:, 0] * w - q[:, 1] * x - q[:, 2] * y - q[:, 3] * z)
         taken, along = np.where(size > along, number, taken), np.maximum(size, along)
-    largest, others = smallest_three(_product(q, _TURNS[taken]))
+    largest, others = smallest_three(multiply(q, _TURNS[taken]))
     levels = np.clip(np.rint(255 * (others * 0.5**0.5 + 0.5) / step) * step, 0, 255)
     turned = from_smallest_three(largest, (levels / 255 - 0.5) * 2**0.5)
     return turned, log_scales[rows[:, None], _axes(_TURNS)[taken]].astype(np.float32)
@@ -97,20 +98,8 @@ def rounded_opacities(logit: Floats, step: int) -> NDArray[np.float32]:
     return logits(np.clip(levels, 1, 255) / 255)
 
 
-def _product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Products of quaternions, [N, 4]."""
-    (a, b, c, d), (w, x, y, z) = p.T, q.T
-    parts = (
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    )
-    return np.stack(parts, axis=1)
-
-
 def _axes(turns: NDArray[np.float64]) -> NDArray[np.intp]:
     """The axis that each axis comes from, [24, 3], by rotations of axes onto axes."""
     inverse = turns * [1, -1, -1, -1]
-    axes = [_product(_product(turns, np.tile(np.eye(4)[1 + axis], (len(turns), 1))), inverse) for axis in range(3)]
+    axes = [multiply(multiply(turns, np.eye(4)[1 + axis]), inverse) for axis in range(3)]
     return np.stack([np.abs(image[:, 1:]).argmax(axis=1) for image in axes], axis=1)

@@ -28,13 +28,13 @@ from clsplat.formats.splats import (
 )
 from clsplat.formats.table import for_writing, read, write
 from clsplat.gaussians.motion import at_time, transformed_motion
-from clsplat.gaussians.quaternions import product, quaternion_of
 from clsplat.gaussians.rendering import Rendering as Rendering
 from clsplat.gaussians.run_model import model_at
 from clsplat.gaussians.sky import Sky, keep_sky, sky_beside
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.harmonics import rotated_sh
 from clsplat.opencl.device import Device
+from clsplat.quaternions import multiply, unit_quaternions
 
 Floats = NDArray[np.float32]
 WIDTHS = {  # of the tables
@@ -153,7 +153,7 @@ class Model:
         with np.errstate(over="ignore", invalid="ignore"):
             changed: dict[str, Any] = {
                 "means": scale * self.means.astype(np.float64) @ turn.T + np.asarray(translation, np.float64),
-                "quats": product(quaternion_of(turn), self.quats.astype(np.float64)),
+                "quats": multiply(unit_quaternions(turn), self.quats.astype(np.float64)),
                 "log_scales": self.log_scales + np.log(scale),
                 "sh_rest": rotated_sh(self.sh_rest, turn),
             }

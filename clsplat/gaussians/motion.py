@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError
 from clsplat.formats.motion import MOTION, STILL, fields_of
 from clsplat.formats.splats import Parameters
-from clsplat.gaussians.quaternions import product, quaternion_of
+from clsplat.quaternions import multiply, unit_quaternions
 
 FAINTEST = 1 / 255  # of a presence: what is fainter is nowhere to be seen
 LOGIT = 80.0  # of an opacity, at most where it fades
@@ -62,7 +62,7 @@ def transformed_motion(motion: NDArray[np.floating], scale: float, turn: NDArray
     for name in fields.keys() & {"velocity", "acceleration", "jerk"}:
         moved[:, fields[name]] = scale * moved[:, fields[name]] @ turn.T
     if "turn" in fields:
-        moved[:, fields["turn"]] = product(quaternion_of(turn.astype(np.float64)), moved[:, fields["turn"]])
+        moved[:, fields["turn"]] = multiply(unit_quaternions(turn.astype(np.float64)), moved[:, fields["turn"]])
     return moved
 
 

@@ -14,8 +14,8 @@ from clsplat.live.orders import Order, Pace
 from clsplat.live.page import page
 from clsplat.live.pictures import Kind
 from clsplat.live.requests import Answer, Refused, Request
+from clsplat.quaternions import rotation_matrix
 from clsplat.scene.camera import Camera
-from clsplat.scene.quaternion import rotation_matrix
 from clsplat.scene.view import View
 
 WAIT = 4.0  # s until a page that waits for a picture asks again

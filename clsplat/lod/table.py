@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from clsplat.pages.columns import columns
+from clsplat.pages.columns import text_table
 
 HEADINGS = ("level", "Gaussians", "MB", "PSNR, dB", "before training")
 
@@ -10,7 +10,7 @@ HEADINGS = ("level", "Gaussians", "MB", "PSNR, dB", "before training")
 def table(found: dict[str, Any]) -> str:
     """Return what `levels_of_detail` returns as lines of text."""
     used = len(HEADINGS) if found["split"] else 3
-    return columns([HEADINGS[:used], *(_cells(level)[:used] for level in found["levels"])])
+    return text_table([HEADINGS[:used], *(_cells(level)[:used] for level in found["levels"])])
 
 
 def _cells(level: dict[str, Any]) -> list[str]:

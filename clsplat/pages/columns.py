@@ -1,9 +1,20 @@
-"""A table as lines of text."""
+"""A table as lines of plain text, for the terminal and for log files."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+WIDE = 1 << 20  # columns: nothing is wrapped or cut, whatever the width of the terminal
 
 
-def columns(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows of equal length as lines, each column as wide as its widest cell, to the right."""
-    widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+def text_table(rows: Iterable[Sequence[str]], left: int = 0) -> str:
+    """Return rows as lines, the first `left` columns aligned to the left and the others to the right."""
+    table = Table.grid(padding=(0, 2))
+    for row in rows:
+        table.add_row(*map(Text, row))  # `Text`: brackets are no markup
+    for column in table.columns[left:]:
+        column.justify = "right"
+    lines = Console(width=WIDE, color_system=None).render_lines(table, pad=False)
+    return "\n".join("".join(segment.text for segment in line).rstrip() for line in lines)

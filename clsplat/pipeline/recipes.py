@@ -7,6 +7,7 @@ from typing import Any
 
 from clsplat.errors import ConfigError
 from clsplat.files import is_there, write_text
+from clsplat.pages.columns import text_table
 from clsplat.pipeline.files import find, shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.settable import Key, settable
@@ -32,8 +33,7 @@ def summaries() -> list[dict[str, str]]:
 
 def summaries_text(found: list[dict[str, str]]) -> str:
     """Return a line for each of `summaries`."""
-    width = max(len(one["name"]) for one in found)
-    return "\n".join(f"{one['name']:<{width}}  {one['summary']}" for one in found)
+    return text_table(((one["name"], one["summary"]) for one in found), left=2)
 
 
 def manual(name: str) -> dict[str, Any]:

@@ -3,11 +3,11 @@
 from clsplat.reading import read_file as read_file
 from clsplat.scene.camera import Camera as Camera
 from clsplat.scene.choice import Choice as Choice
+from clsplat.scene.colmap import pose_matrix as pose_matrix
 from clsplat.scene.detect import read_scene as read_scene
 from clsplat.scene.images import inside as inside
 from clsplat.scene.images import require_files as require_files
 from clsplat.scene.parts import Parts as Parts
-from clsplat.scene.quaternion import pose_matrix as pose_matrix
 from clsplat.scene.readers import Reader as Reader
 from clsplat.scene.scene import PointCloud as PointCloud
 from clsplat.scene.scene import Scene as Scene

@@ -1,13 +1,16 @@
 """Read COLMAP folders: choose the model, find the photographs, make pinhole cameras."""
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.errors import DataError, quoted
+from clsplat.quaternions import rotation_matrix
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL
 from clsplat.scene.colmap_files import find_file, read_cameras, read_images, read_point_table
 from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord
@@ -16,7 +19,6 @@ from clsplat.scene.lens import MODELS, Lens, shared
 from clsplat.scene.masks import mask_file
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE, PointTable
-from clsplat.scene.quaternion import pose_matrix
 from clsplat.scene.readers import Reader
 from clsplat.scene.reprojection import misses
 from clsplat.scene.scene import PointCloud, Scene, View, every_nth, make_scene
@@ -151,3 +153,18 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
             f"{MIN_FOCAL:g} on and finite numbers: {REMEDY}"
         )
     return Lens(camera.width, camera.height, camera.model, camera.params)
+
+
+def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> NDArray[np.float64]:
+    """Return the pose [3, 4] of a quaternion of any length but zero and a translation in scene units.
+
+    Raises ValueError when numbers are missing or not finite, or the quaternion is zero.
+    """
+    length = math.hypot(*quaternion)
+    sizes = len(quaternion), len(translation)
+    if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(part) < MAX_VALUE for part in translation):
+        raise ValueError(
+            f"quaternion {quoted(tuple(quaternion))}, translation {quoted(tuple(translation))}; "
+            "expected finite numbers and a rotation"
+        )
+    return np.column_stack([rotation_matrix(*(part / length for part in quaternion)), translation])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError, quoted, shortened
 from clsplat.files import atomic
-from clsplat.ply_header import PlyHeader, parse_ply_header
+from clsplat.ply_header import PlyHeader, format_ply_header, parse_ply_header
 from clsplat.reading import read_file
 from clsplat.scene.scene import Floats, PointCloud
 from clsplat.scene.times import Clock
@@ -90,10 +90,9 @@ def write_points_ply(path: Path, points: PointCloud) -> None:
         table[name] = points.positions[:, i]
     for i, name in enumerate(RGB):
         table[name] = np.rint(points.colours[:, i] * 255)
-    properties = [f"property {'uchar' if kind[name] == np.uint8 else 'float'} {name}" for name in kind.names or ()]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
+    properties = [f"{'uchar' if kind[name] == np.uint8 else 'float'} {name}" for name in kind.names or ()]
     with atomic(path) as file:
-        file.write("\n".join(lines).encode() + table.tobytes())
+        file.write(format_ply_header((), vertex=(len(points), properties)) + table.tobytes())
 
 
 def _require(path: Path, count: int, stride: int, size: int) -> None:

@@ -6,13 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.bench.cases import Case, run_bench
+from clsplat.bench.cases import Case, Result, run_bench
 from clsplat.bench.comparison import beside, read_measurement
+from clsplat.bench.floors import Work
 from clsplat.bench.peaks import Peaks
 from clsplat.bench.scenes import case, synthetic
+from clsplat.bench.table import table
 from clsplat.errors import ConfigError
 from clsplat.formats.motion import MOTION
 from clsplat.gaussians.tables import INTERVAL2, PARAMETERS
+from clsplat.pages.columns import text_table
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
 from clsplat.views.photographs import Photograph
@@ -115,3 +118,37 @@ def test_a_machine_that_gives_less_is_told():
 
 def test_a_scene_that_was_not_measured_is_told():
     assert "  has not measured: B; there are A" in beside(measurement(scenes={"A": TIMES, "B": TIMES}), measurement())
+
+
+def test_a_table_in_text_is_plain_and_never_cut(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "20")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    long = "a long name [bold]of[/bold] a scene" * 20
+    assert text_table([("scene", "MiB"), (long, "7"), ("b", "")], left=1).splitlines() == [
+        "scene".ljust(len(long)) + "  MiB",
+        long + "    7",
+        "b",
+    ]
+    assert text_table([]) == ""
+
+
+def test_the_table_of_a_scene_has_a_row_for_each_stage():
+    result = Result(
+        work=Work(gaussians=1000, pairs=2000, rows=3, pixels=4),
+        stages={"project": 1.2, "blend": 30.0},
+        floors={"project": 0.5},
+        host=1.0,
+        step=22.0,
+        densify=3.0,
+        memory=2**24,
+        planned=2**25,
+    )
+    earlier = {"stages": {"project": 2.4, "blend": 0.0}, "host": 1.0, "step": 44.0, "densify": 1.0}
+    lines = [line.split() for line in table("A", result, earlier).splitlines()]
+    assert lines[1:4] == [
+        ["stage", "ms", "floor", "ratio", "was", "now/was"],
+        ["project", "1.20", "0.50", "2.40", "2.40", "0.50"],
+        ["blend", "30.00"],
+    ]
+    assert [line[0] for line in lines[4:]] == ["host", "step", "densify", "memory"]
+    assert table("A", result, None).splitlines()[1].split() == ["stage", "ms", "floor", "ratio"]

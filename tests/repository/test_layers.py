@@ -44,6 +44,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
         "plugins",
         "processes",
         "progress",
+        "quaternions",
         "reading",
         "results",
     }
@@ -169,7 +170,7 @@ def test_commands_call_the_api_alone_and_print(path):
 
 def test_data_tools_use_the_scene_layer_only():
     for path in sorted((PACKAGE.parent / "data_tools").glob("*.py")):
-        allowed = {"scene", "errors", "files", "progress", "reading", "signals"} | (
+        allowed = {"scene", "errors", "files", "progress", "quaternions", "reading", "signals"} | (
             {"api", "cli", "prepare"} if path.stem == "__main__" else set()
         )
         for line, module in imports(path):

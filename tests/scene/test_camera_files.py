@@ -15,10 +15,10 @@ from clsplat import cli
 from clsplat.cameras import inria
 from clsplat.cameras.nerfstudio import DISTORTION
 from clsplat.errors import ConfigError, DataError
+from clsplat.quaternions import rotation_matrix
 from clsplat.scene.exif import CameraExposure, write_exposures
 from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.lens import MODELS, Lens
-from clsplat.scene.quaternion import rotation_matrix
 from clsplat.scene.reprojection import with_cameras
 from clsplat.scene.scene import PointCloud, make_scene
 from clsplat.scene.tracks import Tracks

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clsplat.scene.quaternion import pose_matrix, rotation_matrix, unit_quaternions
+from clsplat.quaternions import multiply, rotation_matrix, unit_quaternions
+from clsplat.scene.colmap import pose_matrix
 
 
 def test_rotations_are_those_of_scipy(rng):
@@ -50,3 +51,12 @@ def test_a_pose_takes_a_quaternion_of_any_length():
 def test_a_pose_that_is_none_is_refused(quaternion, translation):
     with pytest.raises(ValueError, match="expected finite numbers and a rotation"):
         pose_matrix(quaternion, translation)
+
+
+def test_products_turn_one_after_the_other(rng):
+    left, right = rng.normal(size=(2, 50, 4))
+    matrices = [Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix() for quats in (left, right)]
+    left, right = (quats / np.linalg.norm(quats, axis=1, keepdims=True) for quats in (left, right))
+    np.testing.assert_allclose(rotation_matrix(*multiply(left, right).T), matrices[0] @ matrices[1], atol=1e-12)
+    np.testing.assert_array_equal(multiply(left[0], right), multiply(np.tile(left[0], (50, 1)), right))
+    np.testing.assert_array_equal(multiply(left, right[0]), multiply(left, np.tile(right[0], (50, 1))))

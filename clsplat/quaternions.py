@@ -1,14 +1,8 @@
-"""Quaternions (w, x, y, z), rotation matrices and poses."""
-
-import math
-from collections.abc import Sequence
+"""Quaternions (w, x, y, z) and rotation matrices on the host."""
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
-
-from clsplat.errors import quoted
-from clsplat.scene.points import MAX_VALUE
 
 Floats = NDArray[np.float64]
 
@@ -30,16 +24,13 @@ def unit_quaternions(rotations: NDArray[np.floating]) -> Floats:
     return quaternions
 
 
-def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> Floats:
-    """Return the pose [3, 4] of a quaternion of any length but zero and a translation in scene units.
-
-    Raises ValueError when numbers are missing or not finite, or the quaternion is zero.
-    """
-    length = math.hypot(*quaternion)
-    sizes = len(quaternion), len(translation)
-    if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(part) < MAX_VALUE for part in translation):
-        raise ValueError(
-            f"quaternion {quoted(tuple(quaternion))}, translation {quoted(tuple(translation))}; "
-            "expected finite numbers and a rotation"
-        )
-    return np.column_stack([rotation_matrix(*(part / length for part in quaternion)), translation])
+def multiply(left: Floats, right: Floats) -> Floats:
+    """Return the products of quaternions, [N, 4]; one of both may be [4]."""
+    (w, x, y, z), (a, b, c, d) = left.T, right.T
+    parts = [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+    return np.stack(parts, axis=1)
