@@ -48,9 +48,9 @@ def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[
     return parameters, View("bench", camera, np.eye(4)[:3], Path("bench"))
 
 
-def case(device: Device, width: int, height: int, count: int, settings: PipelineFile) -> Case:
+def case(device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE) -> Case:
     """Return a synthetic scene with a noise image as its photograph."""
-    parameters, view = synthetic(width, height, count)
+    parameters, view = synthetic(width, height, count, size)
     camera = upload_camera(device, view)
     shape = (3, height, width)
     pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
