@@ -166,14 +166,6 @@ def _gather_one(source: Path, target: Path) -> None:
             file.write(copied(data, encoded.tobytes()))
 
 
-def is_readable(photograph: Path) -> bool:
-    """Return whether `gather` would take a photograph."""
-    try:
-        return bool(read_grey(photograph, CHECKED_SIDE)[0].size)
-    except DataError:
-        return False
-
-
 def link(source: Path, target: Path) -> None:
     """Link a file or folder, or copy it where links are not supported; what is there already stays.
 

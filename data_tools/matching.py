@@ -39,9 +39,8 @@ class Pairing:
 
     @classmethod
     def beside(cls, folder: Path) -> "Pairing":
-        """Return the one by which match_features made a folder; the usual one of a folder of an earlier version."""
-        path = folder / MATCHING
-        return cls(**read_json(path, "how photographs were matched")) if path.is_file() else cls()
+        """Return the one by which match_features made a folder.  Raises DataError where it is missing."""
+        return cls(**read_json(folder / MATCHING, "how photographs were matched"))
 
 
 def match_features(

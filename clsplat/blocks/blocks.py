@@ -113,10 +113,11 @@ class Blocks:
         return found
 
     def plan_of(self, partition: Partition) -> dict[str, Any]:
-        """Return the manifest with the time that the training of each block takes, from some steps of it."""
+        """Return the manifest with the time that the training of each block takes, roughly."""
         pipelines = {block.name: self.of_block(block, partition) for block in partition.blocks}
         sizes = sorted((view.camera.width, view.camera.height) for view in self.scene.scene.split("train"))
-        found, times = partition.data(), block_seconds(partition.blocks, pipelines, sizes[len(sizes) // 2], self.device)
+        units, size = self.device.info.units, sizes[len(sizes) // 2]
+        found, times = partition.data(), block_seconds(partition.blocks, pipelines, size, units)
         return {**found, "blocks": [{**block, "seconds": times[block["name"]]} for block in found["blocks"]]}
 
     def of_block(self, block: Block, partition: Partition) -> Pipeline:

@@ -16,7 +16,7 @@ from clsplat.pipeline.yaml_file import Document
 from clsplat.schedule import divided, values_of
 from clsplat.stages.base import Stage
 from clsplat.stages.densify import Densify
-from clsplat.stages.init import MODEL_SOURCES, Init
+from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 
 
@@ -48,7 +48,7 @@ def require_divisible(pipeline: Pipeline) -> None:
     for key, (is_set, remedy) in faults.items():
         if is_set:
             raise ConfigError(f"{pipeline.path}: {key} is not for blocks: {remedy}")
-    if not (isinstance(first, Init) and first.source in MODEL_SOURCES and trainings):
+    if not (isinstance(first, Init) and first.source == "model" and trainings):
         raise ConfigError(f"{pipeline.path}: expected `init: {{source: model}}` first, and a stage 'optimize'")
 
 

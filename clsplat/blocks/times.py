@@ -1,27 +1,26 @@
-"""How long the training of each block takes, by what steps take on this machine now."""
+"""How long the training of each block takes, roughly."""
 
 from collections.abc import Mapping, Sequence
 
 from clsplat.blocks.partition import Block
-from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.expected import DENSEST, most_of, step_seconds
 from clsplat.stages.optimize import Optimize
 
 
 def block_seconds(
-    blocks: Sequence[Block], pipelines: Mapping[str, Pipeline], size: tuple[int, int], device: Device
+    blocks: Sequence[Block], pipelines: Mapping[str, Pipeline], size: tuple[int, int], units: int
 ) -> dict[str, list[float]]:
-    """Return the time of the training of each block, s: with the Gaussians of its start, and with the most of them.
+    """Return the time of the training of each block, s: at least, with the Gaussians of its start, and at most.
 
-    pipelines: by the names of blocks; size: of a photograph, px.  The device is used for some seconds.
+    pipelines: by the names of blocks; size: of a photograph, px; units: compute units of the device.
     """
-    counts = {block.name: _counts(block, pipelines[block.name], size) for block in blocks}
-    numbers = sorted({number for ends in counts.values() for number in ends})
-    settings = pipelines[blocks[0].name].settings
-    each = dict(zip(numbers, step_seconds(device, size, numbers, settings), strict=True))
-    steps = {name: sum(training.steps for training in _trainings(pipelines[name])) for name in counts}
-    return {name: [steps[name] * each[end] for end in ends] for name, ends in counts.items()}
+    found = {}
+    for block in blocks:
+        ends = (step_seconds(units, size, count) for count in _counts(block, pipelines[block.name], size))
+        steps = sum(training.steps for training in _trainings(pipelines[block.name]))
+        found[block.name] = [steps * each[end] for end, each in enumerate(ends)]
+    return found
 
 
 def _counts(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:

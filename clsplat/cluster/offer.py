@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Sequence
-from typing import Any
 
 from clsplat.cluster.connection import require_certificates
 from clsplat.cluster.probe import places
@@ -12,11 +11,11 @@ from clsplat.processes import Owner
 LOG = logging.getLogger("clsplat")
 
 
-def offer(execution: Execution, devices: Sequence[str] | None = None, **options: Any) -> None:
+def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
     """Prove each device by a short run, and work for a scheduler until it ends or a signal comes.
 
-    execution: its engine is the scheduler; devices: names, default every device that works; options: as for `serve`.
-    Raises DeviceError where there is none or no scheduler answers.
+    execution: its engine is the scheduler; devices: names, default every device that works.  Raises DeviceError where
+    there is none or no scheduler answers.
     """
     from clsplat.cluster import serving  # where Dask is installed
 
@@ -25,4 +24,4 @@ def offer(execution: Execution, devices: Sequence[str] | None = None, **options:
     found = places(Owner.this().host, list(devices) if devices is not None else None)
     for place in found:
         LOG.info("offers %s, bits:%s", place.text, place.bits)
-    serving.serve(execution, found, **options)
+    serving.serve(execution, found)

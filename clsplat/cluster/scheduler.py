@@ -1,4 +1,4 @@
-"""Engines on Dask: a cluster of this machine, jobs of a queue, or a scheduler elsewhere.
+"""Engines on Dask: a cluster of this machine, or a scheduler elsewhere.
 
 Dask gives membership, liveness and a queue.  What it does not give is in the store: going on inside of a cell, once in
 effect, stopping.  At most one cell a device is in flight, for a worker that dies takes all cells on its list with it.
@@ -8,10 +8,9 @@ import json
 import logging
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,12 +61,6 @@ def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "C
         )
         return Cluster(distributed.Client(cluster, set_as_default=False), store, cluster, found)
     warn_of_open_port(execution)
-    if execution.slurm:
-        from clsplat.cluster import slurm  # where dask-jobqueue is installed
-
-        queue = slurm.cluster(execution, execution.slurm, store.root / "slurm")
-        client = distributed.Client(queue, set_as_default=False)
-        return Cluster(client, store, queue, jobs=(execution.slurm.jobs, partial(slurm.are_waiting, queue)))
     try:
         client = distributed.Client(
             execution.address, security=security(execution.tls), set_as_default=False, timeout=ANSWER
@@ -103,22 +96,13 @@ class _Future:
 class Cluster:
     """The devices of a Dask cluster."""
 
-    def __init__(
-        self,
-        client: Any,
-        store: Store,
-        cluster: Any = None,
-        found: list[Place] | None = None,
-        jobs: tuple[int, Callable[[], bool]] = (0, lambda: False),
-    ) -> None:
-        """cluster: what starts workers, and starts them again; found: the devices of this machine, on any of which its
-        workers run cells, else each has its own; jobs: their number, and what tells whether some wait in a queue.
+    def __init__(self, client: Any, store: Store, cluster: Any = None, found: list[Place] | None = None) -> None:
+        """cluster: what starts workers of this machine, and starts them again; found: its devices, on any of which they
+        run cells.  Of a scheduler elsewhere both are None, and each worker has its own device.
         """
         self._client, self._store, self._cluster, self._found = client, store, cluster, found
-        self._count, self._are_waiting = len(found or ()) or jobs[0], jobs[1]
         self._sweep = uuid.uuid4().hex
         self._looked, self._seen = -LOOK, time.monotonic()
-        self._asked = self._seen  # when the queue was asked
         self._places: list[Place] = []
         self._tickets: list[_Future] = []
         self.addresses: set[str] = set()
@@ -137,29 +121,24 @@ class Cluster:
         return self._places
 
     def may_join(self, waited: float) -> bool:
-        """Whether workers may still join: elsewhere for a minute, of jobs as long as some wait in the queue."""
-        return self._found is None and (waited <= ALONE or self._are_waiting())
+        """Whether workers may still join: those of a scheduler elsewhere, for a minute."""
+        return self._found is None and waited <= ALONE
 
     def _look(self, now: float) -> None:
         with self._needs_scheduler():
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
         self.addresses = set(workers)
-        if self._cluster and len(workers) < self._count:
-            if self._places and now - self._asked > ALONE:
-                self._asked = now
-                self._are_waiting()
-            self._cluster.scale(self._count)  # a worker that dies while it starts is not started again by itself
+        if self._cluster and len(workers) < (count := len(self._found or ())):
+            self._cluster.scale(count)  # a worker that dies while it starts is not started again by itself
         known = [one for address, worker in workers.items() if (one := place_of(address, worker))]
         self._places = known if self._found is None else self._found if workers else []
-        if self._places or (now - self._seen > ALONE and self._are_waiting()):
+        if self._places:
             self._seen = now
         elif now - self._seen > ALONE:
             others = f" ({len(workers)} of another version get no cells)" if workers else ""
-            start = "start some with `clsplat worker --scheduler ADDRESS`"
-            if self._cluster and self._found is None:
-                start = f"no job waits; {self._store.root / 'slurm'} has what they printed"
             raise DeviceError(
-                f"no worker of this version for {ALONE:.0f} s{others}; {start}; what was done is in the store"
+                f"no worker of this version for {ALONE:.0f} s{others}; start some with `clsplat worker --scheduler "
+                "ADDRESS`; what was done is in the store"
             )
 
     @contextmanager

@@ -6,7 +6,6 @@ import logging
 import threading
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 from clsplat.cluster.connection import unanswered, warn_of_open_port
 from clsplat.cluster.fingerprint import code_digest
@@ -19,15 +18,12 @@ from clsplat.signals import stopping_on_signals
 ANSWER = 20.0  # seconds that a scheduler may take to answer
 
 
-def serve(execution: Execution, found: Sequence[Place], **options: Any) -> None:
-    """Let a process a device work for a scheduler, until that ends or a signal comes.  Raises DeviceError.
-
-    options: of each worker, as Dask has them, such as the name that a queue knows it by.
-    """
+def serve(execution: Execution, found: Sequence[Place]) -> None:
+    """Let a process a device work for a scheduler, until that ends or a signal comes.  Raises DeviceError."""
     warn_of_open_port(execution)
     stop = threading.Event()
     with dask.config.set(SETTINGS), stopping_on_signals(stop.set):
-        asyncio.run(_serve(execution, found, stop, options))
+        asyncio.run(_serve(execution, found, stop))
     if stop.is_set():
         raise Interrupted("stopped; cells that ran here go on elsewhere")
 
@@ -37,10 +33,7 @@ def _told(text: str, worker: object) -> str:
     return text
 
 
-async def _serve(execution: Execution, found: Sequence[Place], stop: threading.Event, options: dict[str, Any]) -> None:
-    options = {"nthreads": 1, "memory_limit": 0, "security": security(execution.tls), **options}
-    if execution.is_local and "interface" not in options:
-        options["host"] = LOOPBACK
+async def _serve(execution: Execution, found: Sequence[Place], stop: threading.Event) -> None:
     told = [
         {
             "host": place.worker,
@@ -55,10 +48,13 @@ async def _serve(execution: Execution, found: Sequence[Place], stop: threading.E
     nannies = [
         distributed.Nanny(
             execution.address,
+            nthreads=1,
+            memory_limit=0,
+            security=security(execution.tls),
+            host=LOOPBACK if execution.is_local else None,
             metrics={TOLD: partial(_told, json.dumps(one))},
             dashboard_address=f"{LOOPBACK}:0",
             silence_logs=logging.CRITICAL,
-            **options,
         )
         for one in told
     ]

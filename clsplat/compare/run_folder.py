@@ -13,7 +13,6 @@ from clsplat.errors import ConfigError, DataError, shortened
 from clsplat.names import METRICS, PIPELINE, STATUS
 from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.file import SceneSettings
-from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.prepare.cache import noted
 from clsplat.reading import read_file, read_json
@@ -58,7 +57,7 @@ class RunMetrics(BaseModel):
     parameters: int | None = None  # of a field
     steps: int
     train_seconds: float
-    cpu_seconds: float | None = None  # of all threads, in the training; older runs have none
+    cpu_seconds: float | None = None  # of all threads, in the training
     device_memory: int | None = None  # bytes, the peak
     seed: int
     device: str
@@ -115,7 +114,7 @@ class RunFolder:
         return [(line["step"], line[figure]) for line in chosen if isinstance(line.get(figure), int | float)]
 
     def by_cpu_seconds(self, points: Points) -> Points:
-        """Return points (step, figure) by the CPU seconds of training at their step; none for an older run."""
+        """Return points (step, figure) by the CPU seconds of training at their step; none where no record has them."""
         spent = [(0.0, 0.0), *self.points("train", "cpu_seconds")]
         if len(spent) == 1:
             return []
@@ -139,7 +138,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
     try:
-        return SceneSettings.model_validate(with_new_names(settings).get("scene", {}))
+        return SceneSettings.model_validate(settings.get("scene", {}))
     except ValidationError as error:
         file = path / PIPELINE
         raise ConfigError(explain(error, SceneSettings, file, read_yaml(file))) from error

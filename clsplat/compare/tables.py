@@ -74,7 +74,7 @@ def main_table(rows: Sequence[Row]) -> Table:
 
 
 def _cost(rows: Sequence[Row], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
-    """A column of what older runs have not noted; none where no run has."""
+    """A column of what not all runs note; none where no run does."""
     found = [[cost(run.metrics) for run in row.runs] for row in rows]
     values = [[value for value in row if value is not None] for row in found]
     return [Column(heading, _cells(values, 0))] if any(values) else []

@@ -25,7 +25,7 @@ def file_of_run(folder: Path, stage: str, default: str) -> Path:
     """Return the file of the last stage of a name, as metrics.json of a run folder has it, else the default one."""
     try:
         name = read_json(folder / METRICS)["files"][stage]
-    except (DataError, KeyError, TypeError):  # not finished, or of an earlier version
+    except (DataError, KeyError, TypeError):  # not finished
         name = default
     return folder / (name if isinstance(name, str) and is_inside(name) else default)
 

@@ -12,7 +12,7 @@ from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.settings import ReadPath, Settings
 
 STORE = "runs/store"
-ENGINE = r"^(inline|local|slurm|(dask|tls)://[^/:\s]+:(\d{1,5}))$"
+ENGINE = r"^(inline|local|(dask|tls)://[^/:\s]+:(\d{1,5}))$"
 LAST_PORT = 65_535
 LOOPBACK = ("127.0.0.1", "localhost")
 OF_A_STORE = ("devices", "placement", "retries")  # keys that only cells of a store obey
@@ -36,32 +36,11 @@ class Tls(Settings):
     """Its private key."""
 
 
-class Slurm(Settings):
-    """Jobs of a SLURM cluster, each of which is a worker with one device: that which a run would choose there."""
-
-    jobs: Annotated[int, Field(ge=1)]
-    """Jobs at a time."""
-    cores: Annotated[int, Field(ge=1)]
-    """CPU cores of a job."""
-    memory: Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?[KMGT]i?B$")]
-    """Memory of a job, such as 16GB."""
-    walltime: Annotated[str, Field(pattern=r"^[\d:-]+$")]
-    """Time of a job, HH:MM:SS.  Two minutes before its end its cell saves its state, and the next job goes on."""
-    partition: str | None = None
-    """Where jobs are submitted; without it, that which the cluster has as its default."""
-    account: str | None = None
-    """Who pays for it."""
-    options: list[str] = Field([])
-    """Other options of sbatch, such as --gres=gpu:1."""
-    interface: str | None = None
-    """Network interface by which nodes reach this machine, such as ib0; without it, that of its name."""
-
-
 def _engine(value: Any) -> Any:
     found = re.fullmatch(ENGINE, value) if isinstance(value, str) else None
     if isinstance(value, str) and (found is None or int(found[3] or 0) > LAST_PORT):
         scheduler = "dask://HOST:PORT (where Dask says tcp://) or tls://HOST:PORT"
-        raise ValueError(f"expected inline, local, slurm, or the address of a scheduler, {scheduler}")
+        raise ValueError(f"expected inline, local, or the address of a scheduler, {scheduler}")
     return value
 
 
@@ -69,8 +48,8 @@ class Execution(Settings):
     """Where the cells of a matrix run, and where they are kept."""
 
     engine: Annotated[str, BeforeValidator(_engine), Field(pattern=ENGINE)] = "inline"
-    """inline: one after the other in this process; local: one process a device of this machine; slurm: jobs that this
-    process submits; dask://HOST:PORT or tls://HOST:PORT: the devices that `clsplat worker` offers to that scheduler."""
+    """inline: one after the other in this process; local: one process a device of this machine; dask://HOST:PORT or
+    tls://HOST:PORT: the devices that `clsplat worker` offers to that scheduler."""
     store: ReadPath | None = None
     """Folder of cells and results, shared by all machines; without it runs/store, and inline runs without a store."""
     devices: Literal["auto"] | Annotated[list[str], Field(min_length=1)] = "auto"
@@ -85,9 +64,7 @@ class Execution(Settings):
     insecure: bool = False
     """Whether a scheduler on another machine may be reached without TLS: whoever reaches its port can run code."""
     tls: Tls | None = None
-    """Certificates for tls:// and slurm."""
-    slurm: Slurm | None = None
-    """The jobs of engine slurm."""
+    """Certificates for tls://."""
 
     @field_validator("store")
     @classmethod
@@ -104,25 +81,17 @@ class Execution(Settings):
         unused = unused if self.keeps is None else {}
         if self.has_workers:
             unused["devices"] = "a scheduler has the devices that its workers offer"
-        if scheme not in ("tls", "slurm"):
-            unused["tls"] = "certificates are for an engine tls://HOST:PORT, and slurm"
+        if scheme != "tls":
+            unused["tls"] = "certificates are for an engine tls://HOST:PORT"
         if scheme != "local":
             unused["packing"] = "it is for engine local"
-        if scheme not in ("dask", "slurm"):
-            unused["insecure"] = "it is for an engine dask://HOST:PORT, and slurm"
-        if scheme != "slurm":
-            unused["slurm"] = "it is for engine slurm"
+        if scheme != "dask":
+            unused["insecure"] = "it is for an engine dask://HOST:PORT"
         for key, reason in unused.items():
             if getattr(self, key) != type(self).model_fields[key].default:
                 raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; or leave it out")
         if scheme == "dask" and not self.is_local and not self.insecure:
             raise ValueError(f"{self.engine}: expected tls:// for another machine, or insecure: true (--insecure)")
-        if scheme == "slurm" and self.slurm is None:
-            raise ValueError("slurm: expected slurm: {jobs: …, cores: …, memory: …, walltime: …}")
-        if scheme == "slurm" and self.tls is None and not self.insecure:
-            raise ValueError(
-                "slurm: expected tls: {ca: …, cert: …, key: …}, or insecure: true, for jobs on other machines"
-            )
         if scheme == "tls" and self.tls is None:
             raise ValueError(
                 f"{self.engine}: expected tls: {{ca: …, cert: …, key: …}} (--tls-ca, --tls-cert and --tls-key)"
@@ -132,7 +101,7 @@ class Execution(Settings):
     @property
     def has_workers(self) -> bool:
         """Whether cells run on the devices that workers offer to a scheduler."""
-        return self.engine.startswith(("dask://", "tls://", "slurm"))
+        return self.engine.startswith(("dask://", "tls://"))
 
     @property
     def is_local(self) -> bool:

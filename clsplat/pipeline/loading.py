@@ -23,7 +23,6 @@ from clsplat.pipeline.moving import check_moving
 from clsplat.pipeline.on_host import check_on_host
 from clsplat.pipeline.overridden import held, overridden
 from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
-from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.screen_filter import check_screen_filter
 from clsplat.pipeline.settable import CADENCE, settable
 from clsplat.pipeline.sky import check_sky
@@ -94,7 +93,7 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
     """Check a document with overrides; the document stays unchanged.  Raises ConfigError as `load` does."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
-    tagged = with_new_names(_tagged_file(document, path), warn_about=str(path))
+    tagged = _tagged_file(document, path)
     try:
         return _as_needed(Pipeline(path, _validated(overridden(tagged, overrides), path, document)))
     except ConfigError:
@@ -142,7 +141,6 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
         if held(data, [place]):  # whose values need not go together with those of the file
             data = before
             continue
-        data = with_new_names(data, old_wins=True)
         try:
             _check_order(path, PipelineFile.model_validate(data))
             without = None

@@ -3,13 +3,12 @@
 import copy
 from collections.abc import Collection, Sequence
 from itertools import compress
-from typing import Any, Literal
+from typing import Any
 
 from clsplat.pipeline.choice_places import choices_in, place_in, set_at, touch
 from clsplat.pipeline.choices import without_choices
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.overrides import apply, split, value_at
-from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.yaml_file import Place
 
 
@@ -20,7 +19,7 @@ def overridden(tagged: dict[str, Any], overrides: Sequence[str]) -> dict[str, An
     """
     if any(_is_of_photographs(override) for override in overrides):
         tagged = forgotten(tagged)
-    data, places = _applied(tagged, overrides, warn="yes")
+    data, places = _applied(tagged, overrides)
     chosen = held(data, places)
     if not chosen:
         return without_overridden(data, places)
@@ -82,15 +81,10 @@ def _is_of_photographs(override: str) -> bool:
     return names[0] == "scene" and names[1:2] != ["validation"]
 
 
-def _applied(
-    tagged: dict[str, Any], overrides: Sequence[str], warn: Literal["yes", "no"] = "no"
-) -> tuple[dict[str, Any], list[Place]]:
+def _applied(tagged: dict[str, Any], overrides: Sequence[str]) -> tuple[dict[str, Any], list[Place]]:
     """A file's data with overrides at their places, and these."""
-    data, places = copy.deepcopy(tagged), list[Place]()
-    for override in overrides:
-        places.append(apply(data, override, PipelineFile))
-        data = with_new_names(data, warn_about=f"--set {override}" if warn == "yes" else "", old_wins=True)
-    return data, places
+    data = copy.deepcopy(tagged)
+    return data, [apply(data, override, PipelineFile) for override in overrides]
 
 
 def _columns(choice: dict[str, Any], kept: list[bool]) -> dict[str, Any] | None:

@@ -170,7 +170,7 @@ def record_of(folder: Path) -> dict[str, Any]:
     except DataError:
         return {}
     is_one = isinstance(record, dict) and isinstance(record.get("settings"), dict)
-    return record if is_one and isinstance(record.get("files", []), dict | list) else {}
+    return record if is_one and isinstance(record.get("files", {}), dict) else {}
 
 
 def _sizes(folder: Path) -> dict[str, int]:
@@ -193,7 +193,7 @@ def _fault(folder: Path) -> str:
         path = folder / str(name)
         if not os.path.isfile(path):
             return f"{name} is missing"
-        if isinstance(files, dict) and path.stat().st_size != files[name]:  # a list is of an earlier version
+        if path.stat().st_size != files[name]:
             return f"{name} was changed"
     return ""
 

@@ -27,7 +27,7 @@ class Step(Settings):
 
     version: ClassVar[int] = 1  # increase it when the result changes
     resumes: ClassVar[bool] = False  # whether `make` goes on with what an interrupted call left in `out`
-    of_first: ClassVar[tuple[float, float] | None] = None  # its time, least and most, by the first step's; a guess
+    seconds: ClassVar[tuple[float, float] | None] = None  # of a piece of its work, at least and at most: a guess
 
     stage: str
     """Name of the step."""
@@ -42,12 +42,9 @@ class Step(Settings):
         """Return whether `source` needs neither this step nor those after it: such as a scene that holds cameras."""
         return False
 
-    def pieces(self, photographs: int) -> tuple[int, str] | None:
-        """Return the number of pieces of its work on so many photographs, each of about the same time, and their name.
-
-        None: few photographs do not tell its time.
-        """
-        return None
+    def pieces(self, photographs: int) -> tuple[int, str]:
+        """Return the number of pieces of its work on so many photographs, and their name."""
+        return photographs, "photographs"
 
     @abstractmethod
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
@@ -70,6 +67,7 @@ class FindFeatures(Step):
 
     version: ClassVar[int] = 2  # by OpenCV; photographs without EXIF data share a camera
     resumes: ClassVar[bool] = True
+    seconds: ClassVar[tuple[float, float]] = 0.2, 3.0
 
     stage: Literal["find_features"] = "find_features"
 
@@ -91,9 +89,6 @@ class FindFeatures(Step):
         require_photographs(source, without.resolve())
         require_pycolmap()
 
-    def pieces(self, photographs: int) -> tuple[int, str] | None:
-        return photographs, "photographs"
-
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         self.check(source, without)
         sought = Sought(self.long_side, self.features)
@@ -110,6 +105,7 @@ class MatchFeatures(Step):
     """Match features between pairs of photographs."""
 
     resumes: ClassVar[bool] = True
+    seconds: ClassVar[tuple[float, float]] = 0.05, 1.0  # of a pair
 
     stage: Literal["match_features"] = "match_features"
 
@@ -120,7 +116,7 @@ class MatchFeatures(Step):
     threads: Positive = 1
     """Number of threads; more than one are faster, and the result does not always repeat to the bit."""
 
-    def pieces(self, photographs: int) -> tuple[int, str] | None:
+    def pieces(self, photographs: int) -> tuple[int, str]:
         return most_pairs(photographs, self.matching, self.neighbours), "pairs"
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
@@ -133,7 +129,7 @@ class MapCameras(Step):
 
     version: ClassVar[int] = 2  # more pairs of photographs that are left out
     resumes: ClassVar[bool] = True
-    of_first: ClassVar[tuple[float, float]] = 0.3, 3.0  # 0.4 to 0.7 in three captures; further attempts take more
+    seconds: ClassVar[tuple[float, float]] = 0.1, 4.0  # further attempts take more
 
     stage: Literal["map_cameras"] = "map_cameras"
 
@@ -164,7 +160,7 @@ class Undistort(Step):
 
     version: ClassVar[int] = 3  # the tracks of points, how far these are from their places, and the exposures
     resumes: ClassVar[bool] = True
-    of_first: ClassVar[tuple[float, float]] = 0.1, 1.0
+    seconds: ClassVar[tuple[float, float]] = 0.05, 1.0
 
     stage: Literal["undistort"] = "undistort"
 

@@ -1,7 +1,7 @@
 """What a run would do, before it does it."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from clsplat import lock
@@ -9,9 +9,9 @@ from clsplat.errors import DataError, amount
 from clsplat.opencl.device import Device
 from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.loading import Pipeline
-from clsplat.prepare.cache import Planned
 from clsplat.runs.choices import settle
 from clsplat.runs.default_folder import start_of
+from clsplat.runs.expected import expected
 from clsplat.runs.folders import Start, check_run_folder
 from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
@@ -30,20 +30,17 @@ from clsplat.training.run import Run
 LOG = logging.getLogger("clsplat")
 
 
-Expect = Callable[[Pipeline, Sequence[Planned], Sequence[str], Measures, Device, Run | None], list[str]]
-
-
 def describe(
     pipeline: Pipeline,
     out: Path,
     device: str | Device | None,
     start: Start,
     read: ReadScene = read_run_scene,
-    expect: Expect | None = None,
+    with_time: bool = False,
 ) -> str:
     """Return a line for each stage of a run in `out`, which is left as it is.
 
-    read: reads the scene; expect: returns lines that tell how long a new run takes, None: nothing tells it.
+    read: reads the scene; with_time: whether lines follow that say how long a new run takes.
     Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
     """
     planned = pipeline.preparation(out)
@@ -72,8 +69,8 @@ def describe(
     lines += [*(head if choices or not measures else []), *choices]
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages if _does(stage, run)]
     lines += _on_host(pipeline, run) if run else []
-    if expect and start != "resume":
-        lines += expect(pipeline, planned, names, measures, opened, run)
+    if with_time and start != "resume":
+        lines += expected(pipeline, planned, names, measures, opened, run)
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 
 

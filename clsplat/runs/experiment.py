@@ -21,7 +21,6 @@ from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import description, folders, outputs
 from clsplat.runs.course import is_finished
 from clsplat.runs.default_folder import free_folder, start_of
-from clsplat.runs.expected import expected
 from clsplat.runs.failures import Failures, failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.runs.found import has_begun, has_ended
@@ -89,13 +88,13 @@ class Job:
         return cls.open(str(file), scene, out, overrides, "resume", execution)
 
     def describe(self, device: str | Device | None = None) -> str:
-        """What would run, as lines of text, of a single run with the time that it takes.
+        """What would run, as lines of text, of a single run with a rough range of the time that it takes.
 
         Raises what `run` raises before it begins.
         """
         if isinstance(self.work, Experiment):
             return describe_matrix(self.work, self.out, device, self.start)
-        return description.describe(self.work, self.out, device, self.start, expect=expected)
+        return description.describe(self.work, self.out, device, self.start, with_time=True)
 
     def run(self, device: str | Device | None = None, live: int | None = None, minutes: float | None = None) -> None:
         """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why.

@@ -97,16 +97,11 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
 
 
 def _rendered(out: Path) -> dict[str, bool]:
-    """The files that earlier calls have rendered into a folder, and whether each is a frame of a film.
-
-    A list is of an earlier version, and knows of no films.
-    """
+    """The files that earlier calls have rendered into a folder, and whether each is a frame of a film."""
     try:
         found = read_json(out / RECORD)
     except DataError:
         return {}
-    if isinstance(found, list):
-        return {name: False for name in found if isinstance(name, str)}
     table = found if isinstance(found, dict) else {}
     return {name: film is True and FRAME.fullmatch(name) is not None for name, film in table.items()}
 

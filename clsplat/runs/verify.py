@@ -31,7 +31,7 @@ from clsplat.runs.status import state_of
 from clsplat.training import checkpoint
 from clsplat.training.status import read_status
 
-NO_SUMS = "is missing, as in runs of earlier versions and of a Trainer; without it the outputs are not verified"
+NO_SUMS = "is missing, as in runs of a Trainer; without it the outputs are not verified"
 
 
 def verify(out: Path) -> dict[str, Any]:

@@ -81,7 +81,7 @@ class Identity:
         """Return what `data` returned.  Raises ValueError where it is damaged."""
         try:
             train, test, points = dict(data["train"]), dict(data["test"]), str(data["points"])
-            found = cls(train, test, points, dict(data.get("validation", {})))
+            found = cls(train, test, points, dict(data["validation"]))
             if found.digest == data["digest"]:
                 return found
         except (KeyError, TypeError, ValueError):

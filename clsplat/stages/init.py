@@ -30,7 +30,6 @@ from clsplat.training.skies import begin_sky
 
 LOG = logging.getLogger("clsplat")
 MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
-MODEL_SOURCES = ("model", "ply")
 CHANCES = {"uniform": None, "laplacian": laplacian_chance}  # of a pixel to become a point of a sweep
 
 
@@ -49,8 +48,8 @@ class Init(Stage):
     takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette", "field", "metrics"})
     edits: ClassVar[bool] = True
 
-    source: Literal["auto", "points", "points+sweep", "sweep", "hull", "random", "model", "ply"] = "auto"
-    """Source of the first Gaussians; `ply` is an older name of `model`."""
+    source: Literal["auto", "points", "points+sweep", "sweep", "hull", "random", "model"] = "auto"
+    """Source of the first Gaussians."""
     transparent: Literal["random", "hull"] = "random"
     """Source of `auto` for a scene without points whose photographs are transparent."""
     fewest: Annotated[int, Field(ge=0)] = 0
@@ -79,13 +78,13 @@ class Init(Stage):
     """Model file of any format, or a run folder, for `source: model`."""
 
     def check(self) -> None:
-        if self.source in MODEL_SOURCES and self.file is None:
+        if self.source == "model" and self.file is None:
             raise ConfigError(f"init.file: source '{self.source}' needs a model file, or the folder of a run; give one")
 
     def check_in(self, run: Run) -> None:
         require_times(run.scene, run.model_settings.time)
         source = self._source(run.scene)
-        if source in MODEL_SOURCES:
+        if source == "model":
             self._read()
         elif source in ("random", "hull"):
             self._require_memory(run, self.count)
@@ -98,9 +97,9 @@ class Init(Stage):
         parameters, source = self._parameters(run, degree)
         gaussians = Gaussians(run.device, parameters)
         run.adam, run.stats, run.metrics = None, None, {}  # which were of an earlier model
-        run.model = run.model_settings.model(gaussians, degree if self.source in MODEL_SOURCES else 0)
+        run.model = run.model_settings.model(gaussians, degree if self.source == "model" else 0)
         run.refresh_filter()
-        begin_sky(run, load(Path(self.file)).sky if source in MODEL_SOURCES and self.file else None)
+        begin_sky(run, load(Path(self.file)).sky if source == "model" and self.file else None)
         LOG.info("%s Gaussians from %s", f"{run.model.gaussians.count:,}", self._origin(source, run.scene))
 
     def expected_count(self, scene: Scene) -> int:
@@ -109,7 +108,7 @@ class Init(Stage):
         Raises DataError where its model cannot be read.
         """
         source = self._source(scene)
-        if source in MODEL_SOURCES:
+        if source == "model":
             return len(self._read()["means"])
         if source in ("points", "points+sweep"):
             return (0 if scene.points is None else len(scene.points)) + self.swept * self._is_joined(scene)
@@ -128,7 +127,7 @@ class Init(Stage):
             "hull": "the hull of the silhouettes",
             "points+sweep": "the scene's points and a sweep over the photographs",
         }
-        has_own = scene.points is not None or source in MODEL_SOURCES
+        has_own = scene.points is not None or source == "model"
         return names.get(source, source) + ("" if has_own else ": the scene has no points")
 
     def _source(self, scene: Scene) -> str:
@@ -141,7 +140,7 @@ class Init(Stage):
     def _parameters(self, run: Run, degree: int) -> tuple[Parameters, str]:
         """The parameters and their source: random points too where photographs agree on too few."""
         source = self._source(run.scene)
-        if source in MODEL_SOURCES:
+        if source == "model":
             return with_motion(with_degree(self._read(), degree), run.model_settings.time, str(self.file)), source
         chance = CHANCES[self.detail]
         found: dict[str, Callable[[], PointCloud | None]] = {

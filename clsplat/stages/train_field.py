@@ -3,7 +3,6 @@
 import logging
 import math
 from collections.abc import Iterator
-from statistics import median
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
@@ -25,7 +24,6 @@ from clsplat.training.run import Run
 from clsplat.views.order import Order, Uniform, ViewPool
 
 LOG = logging.getLogger("clsplat")
-TRIED, STEPS = 256, 5  # rays of a step that is timed at most, and how many steps are
 
 
 class TrainField(Training):
@@ -101,19 +99,6 @@ class TrainField(Training):
                 report(run, forecast, values, seconds)
                 seconds.clear()
             self.end_step(run)
-
-    def time_of_step(self, run: Run) -> float:
-        """Return the time of a step on the photographs of a run, s, by some with fewer rays; the run stays as it is."""
-        small = self.model_copy(update={"rays": min(self.rays, TRIED), "photographs": 1})
-        field = LearnedField.first(self.field, run.seed, run.photographs.background)
-        pool, seconds = ViewPool(run.scene.split("train"), run.seed), list[float]()
-        for step in range(1, 1 + STEPS):
-            shown = list(small._shown(run, pool, step))
-            start, _ = clocks()
-            field.step(shown, self.coarse_weight, AdamStep(0.0), run.seed, step)
-            run.device.finish()
-            seconds.append(clocks()[0] - start)
-        return median(seconds) * self.rays / small.rays
 
     def rate_at(self, step: int) -> float:
         """Return the learning rate of a global step (Barron et al. 2021, released code: delayed warm-up)."""

@@ -39,15 +39,12 @@ def write(file: BinaryIO, notes: Notes, arrays: Iterable[tuple[str, NDArray[np.f
 def read(path: Path) -> tuple[Notes, Arrays]:
     """Return notes and arrays, all as they were written.  Raises DataError, with the reason alone, when damaged.
 
-    An archive without any checksum, of an earlier program, is returned with its notes alone.
     Raises OutputError and MemoryError where the system cannot read it, which says nothing about the file.
     """
     try:
         with regular(path) as file, zipfile.ZipFile(file) as archive:
             _require_sizes(archive, path.stat().st_size)
             notes = _notes(archive)
-            if DIGESTS not in notes:
-                return notes, {}
             digests = notes.pop(DIGESTS)
             expected = sorted(f"{name}.npy" for name in (*digests, META, META_DIGEST))
             if sorted(archive.namelist()) != expected:
@@ -95,13 +92,12 @@ def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
 
 
 def _notes(archive: zipfile.ZipFile) -> Notes:
-    """The notes, checked where they have a checksum; without one they may be of an earlier format."""
+    """The notes, checked."""
     data = archive.read(f"{META}.npy")
-    digest = f"{META_DIGEST}.npy" in archive.namelist()
-    if digest and hashlib.sha256(data).hexdigest() != str(_array(archive.read(f"{META_DIGEST}.npy"))):
+    if hashlib.sha256(data).hexdigest() != str(_array(archive.read(f"{META_DIGEST}.npy"))):
         raise DataError("its notes differ from their checksum")
     notes = json.loads(str(_array(data)))
-    if not isinstance(notes, dict) or (DIGESTS in notes) != digest:
+    if not isinstance(notes, dict) or DIGESTS not in notes:
         raise DataError("its checksums are missing")
     return notes
 

@@ -36,8 +36,8 @@ class Difference(NamedTuple):
 def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind: Kind = None) -> Iterator[Difference]:
     """Yield the settings in which two resolved pipelines differ, in their order.
 
-    settings: what `new` was resolved from; its classes tell the kinds.  A key that `old` does not have, of an earlier
-    version, had its default.
+    settings: what `new` was resolved from; its classes tell the kinds.  A key that `old` does not have had its
+    default.
     """
     if isinstance(old, dict) and isinstance(new, dict):
         for key in [*old, *(key for key in new if key not in old and not _is_default(settings, key))]:

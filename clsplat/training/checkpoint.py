@@ -80,8 +80,8 @@ def load(path: Path) -> tuple[State, Arrays]:
     notes, tables = archive.read(path)
     if type(notes.get("format")) is int and notes["format"] != FORMAT:
         raise ConfigError(
-            f"{path} has format {notes['format']}, expected {FORMAT}: clsplat {notes.get('version')} made it before "
-            "the format changed; go on with the program that made it, or use another --out"
+            f"{path}: has format {notes['format']}, expected {FORMAT}; resume it with the version that wrote it, "
+            "or give another --out"
         )
     try:
         state = State.model_validate(notes)

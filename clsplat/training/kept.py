@@ -55,7 +55,7 @@ class Best(BaseModel):
     metrics: dict[str, dict[str, Any]]
     """Its averages, by split and downscale."""
     numbers: dict[str, float] = {}
-    """What parts of the run kept at its step, such as the colours of photographs; older files have none."""
+    """What parts of the run kept at its step, such as the colours of photographs."""
     evaluations: Count
     """Number of measurements so far."""
     since: Count

@@ -112,6 +112,4 @@ class Records:
                 raise DataError(
                     f"{path}:{number}: damaged; expected keys and values with 'step' and 'kind'; remove this line"
                 )
-            if "scale" in line:  # its name in older runs
-                line["downscale"] = line.pop("scale")
             yield line

@@ -27,21 +27,21 @@ class State(BaseModel):
     stage_step: Count
     acted: Count
     edited: bool
-    field: dict[str, Any] | None = None  # kind, shape and parameters of the field that is trained instead of Gaussians
+    field: dict[str, Any] | None  # kind, shape and parameters of the field that is trained instead of Gaussians
     degree: Annotated[int, Field(ge=0, le=3)]
     zero_fresh: list[str]
     updates: dict[str, Count]
-    numbers: dict[str, float] = {}  # that parts of the run keep; older files have none
-    best: Best | None = None  # what validation has found; older files have none
+    numbers: dict[str, float]  # that parts of the run keep
+    best: Best | None  # what validation has found
     train_seconds: float
-    cpu_seconds: float = 0.0  # in the same time; older files have none
+    cpu_seconds: float  # in the same time
     metrics: dict[str, dict[str, Any]]
     records: Count  # lines of metrics.jsonl
-    written: dict[str, str] = {}  # models, by path in the run folder, with their SHA-256; older files have none
+    written: dict[str, str]  # models, by path in the run folder, with their SHA-256
     changes: list[str]
     device: str
     inputs: str  # identity of the scene
-    read: dict[str, str] = {}  # hashes of the files that settings name, by their text; older files have none
+    read: dict[str, str]  # hashes of the files that settings name, by their text
     pipeline: dict[str, Any]
 
     def is_trained(self, pipeline: dict[str, Any]) -> bool:

@@ -148,16 +148,6 @@ def test_a_damaged_result_is_made_again(photos, tmp_path, fault, caplog):
     assert do(steps, photos, root) == ("pab", [])
 
 
-def test_earlier_result_whose_record_has_no_sizes_is_kept(photos, tmp_path):
-    root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a")]
-    do(steps, photos, root)
-    record = plan(steps, photos, root)[0].folder / "record.json"
-    record.write_text(json.dumps({**json.loads(record.read_text()), "files": ["x.txt"]}))
-    assert do(steps, photos, root) == ("pa", [])
-    (record.parent / "x.txt").unlink()
-    assert do(steps, photos, root) == ("pa", ["a"])
-
-
 class Linked(Copy):
     """Leaves the images of the step before where they are, as the matches and the cameras do."""
 

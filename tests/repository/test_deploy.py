@@ -1,4 +1,4 @@
-"""What deployers start from: the container file, the service, the job, and the page that explains them."""
+"""What deployers start from: the container file, the service, the jobs, and the page that explains them."""
 
 import fnmatch
 import re

@@ -24,7 +24,6 @@ READ = {  # text that is read, or compared, and never the name of something that
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",
     "Video.path", "Video.size", "Choice.names", "Choice.file", "Execution.engine",
     "Execution.devices", "Tls.ca", "Tls.cert", "Tls.key",
-    "Slurm.memory", "Slurm.walltime", "Slurm.partition", "Slurm.account", "Slurm.options", "Slurm.interface",
 }  # fmt: skip
 NAMES = {"PipelineFile.name", "MatrixFile.name", "Execution.store"}  # of folders
 OUTSIDE = [

@@ -21,8 +21,8 @@ def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
         "c": ["smoke", "--scene", tiny_scene, "--device", "no such device"],
         "d": ["smoke", "--scene", tiny_scene, "--set", "evaluate.lpips=nowhere.onnx"],
         "e": ["smoke", "--scene", tiny_scene, "--set", "init.source=random", "init.count=50000000"],
-        "f": ["smoke", "--scene", tiny_scene, "--set", "init.source=ply", f"init.file={damaged}"],
-        "g": ["smoke", "--scene", tiny_scene, "--set", "init.source=ply"],
+        "f": ["smoke", "--scene", tiny_scene, "--set", "init.source=model", f"init.file={damaged}"],
+        "g": ["smoke", "--scene", tiny_scene, "--set", "init.source=model"],
     }.items():
         out = tmp_path / name
         words = ["run", *arguments, "--out", out]

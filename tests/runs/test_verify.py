@@ -216,7 +216,7 @@ def test_every_file_that_is_gone_is_named(finished, copy):
 def test_a_run_without_checksums_is_not_called_whole(copy):
     (copy / "checksums.json").unlink()
     done = command("check", copy, expect=7)
-    assert "checksums.json is missing, as in runs of earlier versions" in done.stderr
+    assert "checksums.json is missing, as in runs of a Trainer" in done.stderr
     assert "whole" not in done.stderr
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import subprocess
 from contextlib import suppress
@@ -24,6 +25,7 @@ from clsplat.pipeline.execution import Execution, Tls, options, values_of
 from clsplat.pipeline.schema import json_schema
 from clsplat.runs.experiment import Job
 from tests.support.cells import SPEC, WRITES, command
+from tests.support.commands import clsplat
 from tests.support.pipelines import STAGES
 
 psutil = pytest.importorskip("psutil", exc_type=ImportError)  # of Dask
@@ -78,6 +80,24 @@ def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_
     for cell in ("tiny-seed=0", "tiny-seed=1"):
         assert (out / cell / "metrics.json").is_file()
     assert [event["event"] for event in store.events()].count("start") == 2
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_the_tasks_of_a_job_array_run_the_cells_of_a_matrix(file, runs, tmp_path):
+    """With a stand-in for sbatch, which runs the tasks in turn, and one for the command, which notes its arguments."""
+    programs, calls, store = tmp_path / "bin", tmp_path / "calls", tmp_path / "store"
+    programs.mkdir()
+    tasks = """range=${1#--array=}; shift
+        for task in $(seq "${range%-*}" "${range#*-}"); do SLURM_ARRAY_TASK_ID=$task bash "$@" || exit; done"""
+    for name, text in {"sbatch": tasks, "clsplat": f'echo "$@" >> {shlex.quote(str(calls))}'}.items():
+        (programs / name).write_text(f"#!/bin/sh\n{text}\n")
+        (programs / name).chmod(0o755)
+    script = Path(__file__).parents[1] / "examples" / "deploy" / "array.sh"
+    path = {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"}
+    subprocess.run([programs / "sbatch", "--array=0-1", script, file, store], env=path, timeout=60, check=True)
+    for line in calls.read_text().splitlines():
+        clsplat(*line.split())
+    assert [cell["state"] for cell in store_status(store)["cells"]] == ["published"] * 2
 
 
 def test_run_continued_in_a_matrix_folder_is_not_shown_as_cell(file, runs, few_steps, tmp_path):
@@ -163,12 +183,6 @@ def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
         ("placement: {bits: any}", "placement has no effect with engine inline: expected a store too"),
         ("devices: [pocl]", "devices has no effect with engine inline: expected a store too"),
         ("engine: local, tls: {ca: a, cert: b, key: c}", "tls has no effect with engine local: certificates are for"),
-        ("engine: slurm, insecure: true", "slurm: expected slurm: {jobs: …, cores: …, memory: …, walltime: …}"),
-        (
-            "engine: slurm, slurm: {jobs: 2, cores: 4, memory: 8GB, walltime: '1:00:00'}",
-            "slurm: expected tls: ",
-        ),
-        ("engine: local, slurm: {jobs: 2, cores: 4, memory: 8GB, walltime: '1:00:00'}", "slurm has no effect with"),
         ("engine: local, insecure: true", "insecure has no effect with engine local: it is for an engine dask://"),
         (
             "engine: dask://127.0.0.1:1, devices: [a]",
@@ -176,10 +190,10 @@ def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
         ),
         ("engine: dask://far:1", "expected tls:// for another machine, or insecure: true"),
         ("engine: tls://far:1", "tls://far:1: expected tls: "),
-        ("engine: ray", "x.yaml:3: execution.engine: expected inline, local, slurm, or the address of a scheduler"),
+        ("engine: ray", "x.yaml:3: execution.engine: expected inline, local, or the address of a scheduler"),
         (
             "engine: dask://h:99999",
-            "x.yaml:3: execution.engine: expected inline, local, slurm, or the address of a scheduler",
+            "x.yaml:3: execution.engine: expected inline, local, or the address of a scheduler",
         ),
     ],
 )
@@ -291,16 +305,9 @@ def test_workers_of_another_version_alone_end_a_sweep(tmp_path, monkeypatch):
     monkeypatch.setattr(scheduler, "ALONE", -1.0)
     with pytest.raises(DeviceError, match=r"no worker of this version for .* \(1 of another version get no cells\)"):
         scheduler.Cluster(FakeClient(old="another"), Store(tmp_path)).places()
-    jobs = type("Jobs", (), {"scale": lambda *count: None})()
-    waits = [True, False]
-    queue = scheduler.Cluster(FakeClient(), Store(tmp_path), jobs, jobs=(2, lambda: waits.pop(0)))
-    assert queue.places() == [], "its jobs wait"
-    queue._looked = -scheduler.LOOK
-    with pytest.raises(DeviceError, match=r"no worker .*; no job waits; .*slurm has what they printed"):
-        queue.places()
 
 
-@pytest.mark.parametrize("starter", ["nobody", "this machine", "a queue"])
+@pytest.mark.parametrize("starter", ["nobody", "this machine"])
 def test_a_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, starter):
     scheduler = pytest.importorskip("clsplat.cluster.scheduler")
     client, sent = FakeClient(), []

@@ -164,7 +164,7 @@ def test_a_checkpoint_of_another_format_is_refused(tiny_scene, tmp_path, monkeyp
     train(tiny_scene, tmp_path)
     monkeypatch.undo()
     before = (tmp_path / "metrics.jsonl").read_bytes()
-    with pytest.raises(ConfigError, match=r"has format 1, expected 4.*use another --out"):
+    with pytest.raises(ConfigError, match=r"has format 1, expected 4.*give another --out"):
         train(tiny_scene, tmp_path, resume=True)
     assert (tmp_path / "metrics.jsonl").read_bytes() == before
 
@@ -200,7 +200,7 @@ def test_a_model_without_gaussians_is_nothing_to_start_from(tiny_scene, tmp_path
     widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 45}
     write_ply(path, {name: np.zeros((0, width), np.float32) for name, width in widths.items()}, {})
     with pytest.raises(DataError, match=r"empty\.ply: holds no Gaussians"):
-        train(tiny_scene, tmp_path / "run", "init.source=ply", f"init.file='{path}'")
+        train(tiny_scene, tmp_path / "run", "init.source=model", f"init.file='{path}'")
 
 
 def test_views_come_in_random_order_without_repeats(tiny_scene, tmp_path):
