@@ -20,6 +20,7 @@ from clsplat import plugins
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Terms
 from clsplat.conformance import quick
+from clsplat.data_tools.synthetic import Options, write_dataset
 from clsplat.opencl import device as opencl_device
 from clsplat.opencl import program
 from clsplat.opencl.device import Array, Device
@@ -27,7 +28,6 @@ from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.opencl.program import Program
 from clsplat.scene.readers import Reader
 from clsplat.settings import Settings, rebuild
-from data_tools.synthetic import Options, write_dataset
 from tests.few_steps import FEW, killed
 
 hypothesis.settings.register_profile("suite", deadline=None)  # a busy machine is no fault

@@ -16,6 +16,7 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Cell
 from clsplat.prepare.cache import plan
+from clsplat.prepare.matching import MAX_EXHAUSTIVE, most_pairs
 from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step, Undistort
 from clsplat.runs import expected as module
 from clsplat.runs.description import describe
@@ -24,7 +25,6 @@ from clsplat.runs.single import run_pipeline
 from clsplat.runs.unprepared import check_preparation, known, listed
 from clsplat.settings import Settings
 from clsplat.stages.optimize import Optimize
-from data_tools.matching import MAX_EXHAUSTIVE, most_pairs
 from tests.refusals import refusal
 
 COUNT = 23

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clsplat.prepare.colmap_writer import write_model
+from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.camera import Camera
 from clsplat.scene.colmap import tracks_of
 from clsplat.scene.colmap_files import read_images, read_point_table
@@ -18,8 +20,6 @@ from clsplat.scene.tracks import Tracks
 from clsplat.scene.view import load_image
 from clsplat.training.colours import exposures_of
 from clsplat.views.exposures import UNKNOWN, Exposures, _fitted, measured, samples, with_noted
-from data_tools.colmap_writer import write_model
-from data_tools.undistort import undistort_scene
 
 SIZE, POINTS = 64, 400
 

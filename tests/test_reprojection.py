@@ -12,6 +12,8 @@ from clsplat.inspect.findings import POSES, POSES_ERROR
 from clsplat.inspect.inspection import Inspection
 from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.loading import load
+from clsplat.prepare.colmap_writer import write_model
+from clsplat.prepare.undistort import undistort_scene
 from clsplat.runs.description import describe
 from clsplat.runs.single import run_pipeline
 from clsplat.scene.capture import measured
@@ -22,8 +24,6 @@ from clsplat.scene.tracks import Tracks
 from clsplat.scene.view import View
 from clsplat.views.colours import Auto
 from clsplat.views.poses import Poses
-from data_tools.colmap_writer import write_model
-from data_tools.undistort import undistort_scene
 from tests.few_steps import FEW
 from tests.test_lens import STRONG
 from tests.yards import Yard

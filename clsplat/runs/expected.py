@@ -23,6 +23,7 @@ from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import Planned
+from clsplat.prepare.gather import is_readable, link
 from clsplat.progress import only
 from clsplat.scene.capture import Measures
 from clsplat.scene.images import image_size
@@ -32,7 +33,6 @@ from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
 from clsplat.training.run import Run
-from data_tools.gather import is_readable, link
 
 LOG = logging.getLogger("clsplat")
 TRIED = 3  # photographs, the fewest of which features are found
