@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "clsplat"
 ROWS = (  # from the top down; a module imports only from lower rows, or from its own folder
     {"__main__"},
     {"cli"},
-    {"torch"},
+    {"plugin", "torch"},
     {"api"},
     {"blocks", "compress", "lod"},
     {"tuning"},
