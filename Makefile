@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test torture docs bench wheel clean
 
 demo: $(VENV)/installed
-	$(BIN)/python -m data_tools synthetic demo/scene
+	$(BIN)/clsplat data synthetic demo/scene
 	$(BIN)/clsplat run quickstart --scene demo/scene --out demo/run --resume
 
 test: $(VENV)/tested-with

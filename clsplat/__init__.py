@@ -73,6 +73,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
+if not (_HERE / "data_tools").is_dir():  # a checkout has clsplat.data_tools next to the package
+    __path__.append(str(_HERE.parent))
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.converting": "convert",
     "clsplat.api.commands": "check copy_pipeline describe_run evaluate pipeline_schema"

@@ -26,7 +26,6 @@ from clsplat.scene.readers import Reader
 from clsplat.settings import Settings, fault_of, rebuild
 
 GROUP = "clsplat.plugins"
-OWN_PACKAGES = ("clsplat", "data_tools")
 _KERNEL_FILE = re.compile(r"[\w-]+\.(?:cl|h)\b")
 _loaded: dict[str, "Plugin"] = {}  # by name
 
@@ -200,7 +199,7 @@ def _helpers(module: ModuleType, folder: Path) -> list[Path]:
         for helper in _imports(waiting.pop()):
             file = Path(helper.__file__ or "").resolve()
             own = file.suffix == ".py" and file.is_relative_to(folder) and "site-packages" not in file.parts
-            if own and file not in found and helper.__name__.partition(".")[0] not in OWN_PACKAGES:
+            if own and file not in found and helper.__name__.partition(".")[0] != "clsplat":
                 found[file] = None
                 waiting.append(helper)
     return sorted(found)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from data_tools.shapes import Array, Shape, align, disc, dot, rotate, unit
+from .shapes import Array, Shape, align, disc, dot, rotate, unit
 
 BLOCK = 65536  # rays at a time, by measurement: smaller blocks cost calls, larger ones memory
 SKIN = 1e-6  # secondary rays start this far above the surface

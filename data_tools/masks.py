@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
+from clsplat.manifest import Made, hash_of
 from clsplat.progress import Count
 from clsplat.scene.colmap import ColmapReader, image_folder
 from clsplat.scene.detect import read_scene, reader_of
@@ -14,7 +15,6 @@ from clsplat.scene.images import read_image, write_image
 from clsplat.scene.masks import mask_file
 from clsplat.scene.scene import View
 from clsplat.scene.view import load_mask
-from data_tools.made import Made, hash_of
 
 MIN_ALPHA = 0.5  # of the largest value
 

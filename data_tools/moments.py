@@ -13,7 +13,8 @@ from clsplat.files import told_as
 from clsplat.progress import Count
 from clsplat.scene.images import is_image, write_image
 from clsplat.scene.multicamera import VIDEO_SUFFIXES, VIDEOS
-from data_tools.video import decoded, limited
+
+from .video import decoded, limited
 
 LOG = logging.getLogger("clsplat")
 

@@ -20,9 +20,10 @@ from rich.progress import track
 from clsplat.scene.images import write_image
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
-from data_tools.casting import World, camera_pose
-from data_tools.shapes import Array, Box, Cylinder, Shape, Sphere, Vector
-from data_tools.still_life import (
+
+from .casting import World, camera_pose
+from .shapes import Array, Box, Cylinder, Shape, Sphere, Vector
+from .still_life import (
     SCENE_RADIUS,
     bound,
     candy,
@@ -36,7 +37,7 @@ from data_tools.still_life import (
     planks,
     tin,
 )
-from data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, Options, surface_points, write_png
+from .synthetic import CAMERA_DISTANCE, LOOK_AT, Options, surface_points, write_png
 
 MOVING_VERSION = 1  # increase it when the images change
 HELD_OUT, FIRST_HELD_OUT = 5, 2  # of the moments: every fifth, from the third on

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.files import atomic
+from clsplat.manifest import Made, hash_of
 from clsplat.progress import Count
 from clsplat.scene.images import is_image, read_image
-from data_tools.made import Made, hash_of
 
 QUALITY = 98  # of JPEG
 

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from data_tools.shapes import Array, Box, Cylinder, Shape, Sphere, Vector, dot, spiral, unit
+from .shapes import Array, Box, Cylinder, Shape, Sphere, Vector, dot, spiral, unit
 
 SCENE_RADIUS = 1.25  # of the table
 SCENE_VERSION = 1  # increase it when the images change: folders of other versions count as incomplete

@@ -20,9 +20,10 @@ from clsplat.files import is_there
 from clsplat.reading import read_file
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
-from data_tools.casting import World, camera_pose
-from data_tools.shapes import Array, spiral
-from data_tools.still_life import SCENE, SCENE_RADIUS, SCENE_VERSION
+
+from .casting import World, camera_pose
+from .shapes import Array, spiral
+from .still_life import SCENE, SCENE_RADIUS, SCENE_VERSION
 
 LOOK_AT = np.array([0.0, 0.0, 0.08])  # scene units: the point in the middle of every image
 CAMERA_DISTANCE = 3.75

@@ -15,10 +15,10 @@ from reference_pages import key_table, manual
 import clsplat
 from clsplat import errors
 from clsplat.cli import app
+from clsplat.cli.data import app as tools
 from clsplat.scene import Reader
 from clsplat.schedule import Curve
 from clsplat.settings import Settings
-from data_tools.__main__ import app as tools
 
 OTHER_CODES = {0: "Done.", 1: "Internal error, a defect of clsplat: `--debug` shows it; please report it."}
 

@@ -4,8 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from clsplat.schedule import NonNegative, at_step
-from clsplat.views.transforms import PhotographTransform, Planes
+from clsplat.plugin import NonNegative, PhotographTransform, Planes, at_step
 
 
 class BoxBlur(PhotographTransform):

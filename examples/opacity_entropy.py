@@ -5,8 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from clsplat.losses.base import LossValue, Penalty, PenaltyInputs
-from clsplat.schedule import at_step
+from clsplat.plugin import LossValue, Penalty, PenaltyInputs, at_step
 
 
 class OpacityEntropy(Penalty):

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.gaussians.tables import Gaussians, Gradients
-from clsplat.losses.base import Penalty, PenaltyInputs
-from clsplat.render.workspace import Workspace
-from clsplat.settings import variants
+from clsplat.plugin import Gaussians, Gradients, Penalty, PenaltyInputs, Workspace, variants
 
 clsplat.load_plugin(Path(__file__).with_name("opacity_entropy.py"))
 

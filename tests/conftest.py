@@ -21,6 +21,7 @@ from clsplat import plugins
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Terms
 from clsplat.conformance import quick
+from clsplat.data_tools.synthetic import Options, write_dataset
 from clsplat.opencl import device as opencl_device
 from clsplat.opencl import program
 from clsplat.opencl.device import Array, Device
@@ -28,7 +29,6 @@ from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.opencl.program import Kernel, Program
 from clsplat.scene.readers import Reader
 from clsplat.settings import Settings, rebuild
-from data_tools.synthetic import Options, write_dataset
 from tests.support.devices import NAMES, TUNINGS
 from tests.support.runs import FEW, killed, train
 

@@ -55,7 +55,7 @@ class Commands(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name == "data" and cmd_name not in self.commands:
-            from data_tools.__main__ import app as tools
+            from clsplat.cli.data import app as tools
 
             self.commands[cmd_name] = data = typer.main.get_command(tools)
             data.name = cmd_name

@@ -11,7 +11,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import data_tools
 from clsplat import __version__, resource_dir
 from clsplat.errors import ClsplatError, DataError
 from clsplat.files import write_text
@@ -50,7 +49,7 @@ def code_digest() -> str:
 @cache
 def tools_digest() -> str:
     """Return a hash of what else decides over the bits of scenes that `prepare` makes."""
-    return _digest([*_sources(Path(data_tools.__file__).resolve().parent, "*.py"), *_versions("pycolmap")])
+    return _digest(_versions("pycolmap"))
 
 
 def _sources(root: Path, *patterns: str) -> list[str]:

@@ -5,13 +5,12 @@ processor.  Devices of one class may go on with each other's cells.
 """
 
 import hashlib
-import io
 import json
 import logging
 import subprocess
 import sys
 import tempfile
-from contextlib import redirect_stdout, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,12 +24,12 @@ from clsplat.files import write_text
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
 from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json, sha256
-from data_tools.synthetic import Options, write_dataset
 
 LOG = logging.getLogger("clsplat")
 TOLD = "clsplat"  # name of what a worker tells of its device, among the figures that Dask keeps of it
 CLASS = 8  # hexadecimal digits of a bits class
 SECONDS = 600.0  # that the fixed run may take: a runtime may build its kernels for minutes
+SCENE_OPTIONS = ("--size", "48", "--train", "8", "--test", "2", "--seed", "0")
 PIPELINE = """\
 # What a training may use: spherical harmonics, growth, a reset, both filters.
 name: probe
@@ -140,23 +139,27 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 def _run(device: str) -> str:
     with tempfile.TemporaryDirectory(prefix="clsplat-") as name:
         folder = Path(name)
-        with redirect_stdout(io.StringIO()):  # its bar
-            write_dataset(folder / "scene", Options(size=48, train=8, test=2, seed=0), workers=1)
         write_text(folder / "probe.yaml", PIPELINE)
+        scene = str(folder / "scene")
+        _call(device, [sys.executable, "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder)
         words = filled(run_command(device), folder / "probe.yaml", folder / "run")
-        with (folder / "errors.txt").open("wb") as errors:
-            command = [*words, "--scene", str(folder / "scene")]
-            process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)
-            try:
-                process.wait(SECONDS)
-            except subprocess.TimeoutExpired:
-                raise DeviceError(f"{device}: the run of its test did not end in {SECONDS:.0f} s") from None
-            finally:
-                process.kill()
-                process.wait()
-                assert process.stdin
-                process.stdin.close()
-        if process.returncode:
-            lines = read_file(folder / "errors.txt").decode(errors="replace").strip().splitlines()
-            raise DeviceError(f"{device}: the run of its test failed: {lines[-1] if lines else process.returncode}")
+        _call(device, [*words, "--scene", scene], folder)
         return sha256(folder / "run" / "point_cloud.ply")[:CLASS]
+
+
+def _call(device: str, command: list[str], folder: Path) -> None:
+    """Run a command of the test, whose input stays open.  Raises DeviceError where it fails."""
+    with (folder / "errors.txt").open("wb") as errors:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)
+        try:
+            process.wait(SECONDS)
+        except subprocess.TimeoutExpired:
+            raise DeviceError(f"{device}: the run of its test did not end in {SECONDS:.0f} s") from None
+        finally:
+            process.kill()
+            process.wait()
+            assert process.stdin
+            process.stdin.close()
+    if process.returncode:
+        lines = read_file(folder / "errors.txt").decode(errors="replace").strip().splitlines()
+        raise DeviceError(f"{device}: the run of its test failed: {lines[-1] if lines else process.returncode}")

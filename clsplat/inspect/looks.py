@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.inspect.padding import padding
+from clsplat.prepare.gather import why_unreadable
 from clsplat.progress import counted
 from clsplat.scene.exif import CameraExposure, exposure_of
 from clsplat.scene.exposures import camera_exposures
@@ -21,7 +22,6 @@ from clsplat.scene.images import read_grey
 from clsplat.scene.parts import Parts
 from clsplat.scene.sharpness import SIDE, both_sharpnesses, is_blurred
 from clsplat.scene.view import NO_FILE
-from data_tools.gather import why_unreadable
 
 THUMBNAIL = 32  # px, of each side
 SAME = 1.0  # grey levels between thumbnails: frames of a video are 9 apart, two codings of one photograph 0.3

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from clsplat.errors import DataError
+from clsplat.prepare.gather import list_photographs
 from clsplat.progress import kept, only
 from clsplat.scene.detect import read_scene, reader_of
 from clsplat.scene.images import is_image
 from clsplat.scene.parts import Parts
 from clsplat.scene.reprojection import require_ahead
-from data_tools.gather import list_photographs
 
 LOG = logging.getLogger("clsplat")
 

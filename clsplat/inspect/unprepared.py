@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from clsplat.errors import amount, in_shell
 from clsplat.inspect.finding import Finding
 from clsplat.inspect.survey import Facts
-from data_tools.gather import MIN_PHOTOGRAPHS
-from data_tools.gather import remedy as remedy_of
-from data_tools.told import left_out
+from clsplat.prepare.gather import MIN_PHOTOGRAPHS
+from clsplat.prepare.gather import remedy as remedy_of
+from clsplat.prepare.messages import left_out
 
 
 def unprepared(facts: Facts) -> Iterator[Finding]:

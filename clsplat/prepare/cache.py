@@ -16,11 +16,11 @@ from clsplat import lock
 from clsplat.errors import DataError
 from clsplat.files import make_folder, sweep, sync_below, sync_folder, told_as, unwritable, write_text
 from clsplat.names import NOTE
+from clsplat.prepare.database import IMAGES
+from clsplat.prepare.gather import require_folder
 from clsplat.prepare.steps import Step
 from clsplat.progress import Count
 from clsplat.reading import read_json, sha256
-from data_tools.gather import require_folder
-from data_tools.names import IMAGES
 
 LOG = logging.getLogger("clsplat")
 RECORD = "record.json"

@@ -8,13 +8,13 @@ from clsplat.errors import DataError
 from clsplat.files import make_folder, sync_below, sync_folder, told_as
 from clsplat.names import LOCK
 from clsplat.prepare.cache import RECORD, plan, prepare
+from clsplat.prepare.database import IMAGES, MODEL
+from clsplat.prepare.features import CameraModel
+from clsplat.prepare.gather import link
+from clsplat.prepare.mapping import Mapper
+from clsplat.prepare.matching import Matching
 from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step
 from clsplat.reading import read_json
-from data_tools.features import CameraModel
-from data_tools.gather import link
-from data_tools.mapping import Mapper
-from data_tools.matching import Matching
-from data_tools.names import IMAGES, MODEL
 
 STEPS = ".steps"  # in the folder of the scene: results from which an interrupted call continues
 

@@ -7,17 +7,17 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from clsplat.errors import DataError
+from clsplat.prepare.database import require_pycolmap
+from clsplat.prepare.features import CameraModel, Sought, find_features
+from clsplat.prepare.gather import require_photographs
+from clsplat.prepare.mapping import MOST, Mapper, map_cameras
+from clsplat.prepare.matching import Matching, match_features, most_pairs
+from clsplat.prepare.messages import left_out
+from clsplat.prepare.shared_intrinsics import Cameras
+from clsplat.prepare.undistort import Blank, undistort_scene
 from clsplat.scene.detect import holds_scene
 from clsplat.settings import Settings
 from clsplat.training.found import photographs_text
-from data_tools.features import CameraModel, Sought, find_features
-from data_tools.gather import require_photographs
-from data_tools.mapping import MOST, Mapper, map_cameras
-from data_tools.matching import Matching, match_features, most_pairs
-from data_tools.pycolmap_import import require_pycolmap
-from data_tools.sharing import Cameras
-from data_tools.told import left_out
-from data_tools.undistort import Blank, undistort_scene
 
 Positive = Annotated[int, Field(gt=0)]
 

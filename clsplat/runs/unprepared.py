@@ -11,13 +11,13 @@ import numpy as np
 from clsplat.errors import DataError
 from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.prepare.cache import Planned
+from clsplat.prepare.gather import list_photographs
 from clsplat.progress import only
 from clsplat.scene.camera import Camera
 from clsplat.scene.capture import Measures
 from clsplat.scene.choice import OfPlaced
 from clsplat.scene.scene import Scene, every_nth, make_scene
 from clsplat.scene.view import View
-from data_tools.gather import list_photographs
 
 
 def listed(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[str]:

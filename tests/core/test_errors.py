@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import clsplat
-import data_tools
+import clsplat.data_tools
 from clsplat import cli
 from clsplat.errors import (
     MESSAGE_LIMIT,
@@ -146,7 +146,7 @@ def test_a_path_in_a_command_is_one_word_of_a_shell():
 
 
 def test_every_command_in_a_message_has_its_paths_quoted():
-    packages = [Path(package.__file__).parent for package in (clsplat, data_tools)]
+    packages = [Path(package.__file__).parent for package in (clsplat, clsplat.data_tools)]
     sources = "".join(path.read_text() for folder in packages for path in folder.rglob("*.py"))
     commands = re.findall(r"`clsplat [^`\n]*`", sources)
     places = {place for command in commands for place in re.findall(r"\{([^{}]*)\}", command)}

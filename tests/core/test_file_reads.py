@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 import clsplat
+from clsplat.data_tools.video import write_frames
 from clsplat.errors import ClsplatError, ConfigError, DataError
+from clsplat.manifest import Made, hash_of
 from clsplat.pipeline import recipes
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.plugins import digest_of
 from clsplat.runs.summary import summary
 from clsplat.scene import decoding
 from clsplat.training import archive
-from data_tools.made import Made, hash_of
-from data_tools.video import write_frames
 from tests.support.timeouts import failing
 
 ROOT = Path(__file__).parents[2]

@@ -14,14 +14,14 @@ import clsplat
 from clsplat import files
 from clsplat.errors import OutputError
 from clsplat.files import append, atomic, write_text
+from clsplat.manifest import RECORD as RECORD_OF_A_TOOL
+from clsplat.manifest import Made
 from clsplat.prepare.cache import RECORD, Planned, prepare
 from clsplat.prepare.place import STEPS, _show
 from clsplat.prepare.steps import Step
 from clsplat.runs import folders
 from clsplat.settings import Settings
 from clsplat.training import checkpoint
-from data_tools.made import RECORD as RECORD_OF_A_TOOL
-from data_tools.made import Made
 from tests.support.commands import clsplat as command
 from tests.support.runs import NO_PROCESS
 

@@ -1,12 +1,15 @@
 """Variants from outside the package: loading, recording, refusing, and the same bits as inside."""
 
+import ast
 import json
+import re
 import shutil
 import subprocess
 import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -18,7 +21,8 @@ from clsplat.scene.detect import readers
 from clsplat.settings import Settings, variants
 from tests.support.runs import train
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
 RULE = """
 from typing import Literal
 from clsplat.density.edit import Edit
@@ -329,6 +333,15 @@ def test_pipeline_with_a_missing_or_changed_plugin_is_refused(tmp_path):
         load(str(saved))
 
 
+def with_imports_of_the_package(text: str) -> str:
+    """Replace imports from clsplat.plugin by those from the modules that define the names."""
+    plugin = ast.parse((ROOT / "clsplat" / "plugin.py").read_text("utf-8"))
+    places = {name.name: node.module for node in plugin.body if isinstance(node, ast.ImportFrom) for name in node.names}
+    found = re.search(r"^from clsplat.plugin import (.+)\n", text, re.M)
+    lines = [f"from {places[name]} import {name}\n" for name in found[1].split(", ")]
+    return text.replace(found[0], "".join(lines))
+
+
 @pytest.mark.parametrize("name", TRIALS)
 def test_the_bits_are_those_of_the_same_code_inside_the_package(name, tiny_scene, tmp_path):
     """A copy of the package with the example among its modules, run in a process of its own, beside the plug-in."""
@@ -337,7 +350,8 @@ def test_the_bits_are_those_of_the_same_code_inside_the_package(name, tiny_scene
     for folder in ("cl_kernels", "pipelines", "data_tools"):
         shutil.copytree(EXAMPLES.parent / folder, inside / folder, ignore=shutil.ignore_patterns("__pycache__"))
     room = {"opacity_entropy": "losses", "box_blur": "views"}[name]
-    shutil.copy(EXAMPLES / f"{name}.py", inside / "clsplat" / room)
+    text = (EXAMPLES / f"{name}.py").read_text("utf-8")
+    (inside / "clsplat" / room / f"{name}.py").write_text(with_imports_of_the_package(text), "utf-8")
     shutil.copy(EXAMPLES / f"{name}.cl", inside / "clsplat" / room)
     code = f"import sys; sys.path.insert(0, {str(inside)!r}); from clsplat.cli import main; main()"
     hashes = []
@@ -395,3 +409,53 @@ def test_commands_on_a_run_say_that_its_plugin_is_missing(command, tiny_scene, t
     done = subprocess.run(arguments, capture_output=True, text=True, cwd=EXAMPLES.parent, check=False)
     assert done.returncode == 2
     assert "needs the plug-in 'opacity_entropy', which is not loaded; use --plugin" in done.stderr
+
+
+# ---- the public module
+
+
+def imported(text: str) -> set[str]:
+    """The modules of clsplat that a text of Python imports."""
+    nodes = list(ast.walk(ast.parse(text)))
+    found = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom) and node.module == "clsplat":
+            found |= {f"clsplat.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(node.module or "")
+    return {name for name in found if name.partition(".")[0] == "clsplat"}
+
+
+def test_examples_and_docs_import_only_the_public_module():
+    allowed = {"clsplat", "clsplat.plugin"}
+    texts = {path.name: path.read_text("utf-8") for path in EXAMPLES.rglob("*.py")}
+    for path in EXAMPLES.rglob("*.ipynb"):
+        cells = json.loads(path.read_text("utf-8"))["cells"]
+        texts[path.name] = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    faults = {name: found for name, text in texts.items() if (found := imported(text) - allowed)}
+    page = (ROOT / "docs" / "extending.md").read_text("utf-8")
+    assert '--8<-- "clsplat/' not in page, "the package's own files import other modules"
+    dotted = set(re.findall(r"clsplat\.(\w+)\.\w+", page)) - {"plugin", "schema"}
+    assert (faults, dotted) == ({}, set())
+
+
+def test_the_public_module_lists_all_that_it_imports():
+    from clsplat import plugin
+
+    node = ast.parse(Path(plugin.__file__).read_text("utf-8"))
+    names = {alias.name for part in node.body if isinstance(part, ast.ImportFrom) for alias in part.names}
+    assert sorted(names) == plugin.__all__ == sorted(plugin.__all__)
+    inside = [
+        path for path in (ROOT / "clsplat").rglob("*.py") if "clsplat.plugin" in imported(path.read_text("utf-8"))
+    ]
+    assert inside == [], "nothing in the package imports it"
+
+
+def test_the_rule_and_the_stage_of_the_examples_act(tiny_scene, tmp_path):
+    plugins.load_file(EXAMPLES / "random_pruning.py")
+    rules = "[{type: prune_at_random, share: 0.9, opacity_below: 0.9}]"
+    stages = f"{{densify: {{every: 10, start: 15, rules: {rules}}}}}, {{cap_size: {{every: 10, to: 0.001}}}}"
+    plain = train(tiny_scene, tmp_path / "plain")
+    run = train(tiny_scene, tmp_path / "run", f"optimize.during=[{stages}]")
+    assert 0 < run.model.gaussians.count < plain.model.gaussians.count
+    assert run.model.gaussians.get("log_scales").max() < np.log(0.0015 * run.scene.extent), "and some steps since"

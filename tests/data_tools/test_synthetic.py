@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from clsplat import cli
+from clsplat.data_tools import synthetic
+from clsplat.data_tools.shapes import Box, Cylinder, Shape, Sphere
+from clsplat.data_tools.still_life import SCENE
+from clsplat.data_tools.synthetic import STILL_LIFE, Options, write_dataset
 from clsplat.errors import DataError, OutputError
 from clsplat.scene.points import read_points_ply
-from data_tools import __main__ as command
-from data_tools import synthetic
-from data_tools.shapes import Box, Cylinder, Shape, Sphere
-from data_tools.still_life import SCENE
-from data_tools.synthetic import STILL_LIFE, Options, write_dataset
 
 Array = NDArray[Any]
 
@@ -166,9 +166,9 @@ def test_other_folders_are_refused_and_not_touched(
 ) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "note.txt").write_text("keep")
-    monkeypatch.setattr(sys, "argv", ["data_tools", "synthetic", str(tmp_path / "mine")])
+    monkeypatch.setattr(sys, "argv", ["clsplat", "data", "synthetic", str(tmp_path / "mine")])
     with pytest.raises(SystemExit) as stop:
-        command.main()
+        cli.main()
     assert stop.value.code == 3
     assert capsys.readouterr().err.startswith("error: ")
     assert [p.name for p in tmp_path.rglob("*")] == ["mine", "note.txt"]

@@ -13,6 +13,8 @@ import pytest
 
 import clsplat
 from clsplat.api.renderer import Renderer
+from clsplat.data_tools.moving import Moving
+from clsplat.data_tools.synthetic import write_dataset
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.motion import MOTION
 from clsplat.gaussians.model import load
@@ -20,8 +22,6 @@ from clsplat.gaussians.tables import moment_tables
 from clsplat.stages.first_motion import drift, moving
 from clsplat.training import checkpoint
 from clsplat.training.memory import first_tables, plan
-from data_tools.moving import Moving
-from data_tools.synthetic import write_dataset
 from tests.support.recipes import ONE_THREAD, STEPS, digest, short, train
 from tests.support.runs import train as train_overridden
 

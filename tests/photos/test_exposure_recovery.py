@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import clsplat
+from clsplat.data_tools.synthetic import Options, write_dataset
 from clsplat.metrics.colours import colour_figures
 from clsplat.views.colours import Gain
-from data_tools.synthetic import Options, write_dataset
 from tests.support.runs import train
 
 pytestmark = pytest.mark.slow

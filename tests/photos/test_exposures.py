@@ -6,6 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clsplat.prepare.colmap_writer import write_model
+from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.colmap import tracks_of
 from clsplat.scene.colmap_files import read_images, read_point_table
 from clsplat.scene.detect import read_scene
@@ -14,8 +16,6 @@ from clsplat.scene.scene import PointCloud, View
 from clsplat.scene.view import load_image
 from clsplat.training.colours import exposures_of
 from clsplat.views.exposures import UNKNOWN, Exposures, _fitted, measured, samples, with_noted
-from data_tools.colmap_writer import write_model
-from data_tools.undistort import undistort_scene
 from tests.support.exposed_wall import POINTS, SIZE, Wall
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from data_tools.synthetic import Options, write_dataset
+from clsplat.data_tools.synthetic import Options, write_dataset
 from tests.support.runs import train
 
 PHOTOGRAPHS, SHARE, AREA = 14, 0.4, 0.1  # of them with a rectangle, of which a rectangle covers

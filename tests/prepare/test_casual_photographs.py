@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from clsplat.errors import DataError, in_shell
+from clsplat.prepare import diagnosis as reasons_tool
+from clsplat.prepare import mapping
 from clsplat.prepare.cache import fingerprint
+from clsplat.prepare.database import image_names, opened
+from clsplat.prepare.diagnosis import Matched, diagnosis, reasons
+from clsplat.prepare.features import Sought, find_features, sift
+from clsplat.prepare.gather import gather, list_photographs
+from clsplat.prepare.mapping import map_cameras
+from clsplat.prepare.matching import match_features
+from clsplat.prepare.messages import left_out
+from clsplat.prepare.rotation_only import without_depth
 from clsplat.scene.exif import copied, exposure_of, optics_of
 from clsplat.scene.images import read_grey, read_header, read_image
-from data_tools import mapping
-from data_tools import reasons as reasons_tool
-from data_tools.database import image_names, opened
-from data_tools.features import Sought, find_features, sift
-from data_tools.gather import gather, list_photographs
-from data_tools.mapping import map_cameras
-from data_tools.matching import match_features
-from data_tools.reasons import Matched, diagnosis, reasons
-from data_tools.told import left_out
-from data_tools.turning import without_depth
 from tests.support.pictures import blocks
 from tests.support.refusals import refusal
 

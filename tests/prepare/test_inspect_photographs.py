@@ -10,8 +10,8 @@ import pytest
 from clsplat.errors import DataError
 from clsplat.inspect.inspection import Inspection
 from clsplat.inspect.looks import looks
+from clsplat.prepare.gather import list_photographs
 from clsplat.scene.exif import CameraExposure
-from data_tools.gather import list_photographs
 from tests.support.orbit_scene import photograph, said
 
 

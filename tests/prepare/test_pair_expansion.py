@@ -10,11 +10,11 @@ import cv2
 import pytest
 
 from clsplat.errors import DataError
+from clsplat.prepare import mapping
+from clsplat.prepare.features import Sought, find_features
+from clsplat.prepare.mapping import map_cameras
+from clsplat.prepare.matching import match_features, match_pairs, more_pairs
 from clsplat.scene.detect import read_scene
-from data_tools import mapping
-from data_tools.features import Sought, find_features
-from data_tools.mapping import map_cameras
-from data_tools.matching import match_features, match_pairs, more_pairs
 from tests.support.data_sets import data_set
 from tests.support.pictures import blocks
 
@@ -102,7 +102,8 @@ def test_left_out_photograph_is_placed_also_after_a_kill(matches, tmp_path, capl
     killed = f"""
 import os, signal, threading, time
 from pathlib import Path
-from data_tools import mapping, matching
+from clsplat.prepare import mapping
+from clsplat.prepare import matching
 out = Path({str(tmp_path / "half")!r})
 def kill():
     while not (out / mapping.WIDER).exists() or matching.pairs_done(out / mapping.WIDER) < 20:

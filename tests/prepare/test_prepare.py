@@ -13,11 +13,11 @@ from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.pipeline.loading import load
 from clsplat.prepare import steps as prepare_steps
 from clsplat.prepare.cache import fingerprint, plan, prepare
+from clsplat.prepare.gather import link
 from clsplat.prepare.place import place_photographs
 from clsplat.prepare.steps import Step
 from clsplat.runs import opening, runner
 from clsplat.settings import Settings
-from data_tools.gather import link
 from tests.support.refusals import refusal
 
 

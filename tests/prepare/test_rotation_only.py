@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from data_tools.database import opened
-from data_tools.turning import without_depth
+from clsplat.prepare.database import opened
+from clsplat.prepare.rotation_only import without_depth
 
 WIDTH, HEIGHT, FOCAL = 1000, 750, 800.0
 

@@ -14,22 +14,20 @@ import pytest
 
 from clsplat import progress
 from clsplat.errors import DataError
+from clsplat.prepare import features as features_tool
+from clsplat.prepare import mapping as mapping_tool
+from clsplat.prepare import undistort as undistort_tool
+from clsplat.prepare.colmap_writer import write_model
+from clsplat.prepare.features import Sought, find_features
+from clsplat.prepare.gather import list_photographs
+from clsplat.prepare.mapping import map_cameras, with_pairs
+from clsplat.prepare.matching import Pairing, alike, match_features
+from clsplat.prepare.undistort import undistort_scene
 from clsplat.progress import heard_by
 from clsplat.scene.detect import read_scene
 from clsplat.scene.lens import Lens
 from clsplat.scene.scene import Camera, View
 from clsplat.scene.view import load_image, load_mask
-from data_tools import features as features_tool
-from data_tools import mapping as mapping_tool
-from data_tools import undistort as undistort_tool
-from data_tools.colmap_writer import write_model
-from data_tools.features import Sought, find_features
-from data_tools.gather import list_photographs
-from data_tools.mapping import map_cameras
-from data_tools.matching import Pairing, match_features
-from data_tools.triangulation import with_pairs
-from data_tools.undistort import undistort_scene
-from data_tools.vocabulary import alike
 from tests.support.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry
 from tests.support.colmap_writer import write_model as write_test_model
 from tests.support.data_sets import data_set
@@ -198,7 +196,7 @@ def test_features_are_found_once_each_also_after_a_kill(few, tmp_path, monkeypat
     killed = f"""
 import os, signal
 from pathlib import Path
-from data_tools import features
+from clsplat.prepare import features
 find, calls = features.sift, []
 def counted(*a):
     calls.append(a)
@@ -273,7 +271,7 @@ def test_pairs_are_matched_once_also_after_a_kill(placed, tmp_path):
     killed = f"""
 import os, signal, threading, time
 from pathlib import Path
-from data_tools import matching
+from clsplat.prepare import matching
 def kill():
     while matching.pairs_done(Path({str(database)!r})) < 5:
         time.sleep(0.01)

@@ -14,12 +14,12 @@ from ruamel.yaml import YAML
 
 import clsplat
 from clsplat.cli import app
+from clsplat.cli.data import app as tools
 from clsplat.losses.base import Loss
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import readers
 from clsplat.training.adam import Rates
 from clsplat.views.sampling import ViewSettings
-from data_tools.__main__ import app as tools
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs"))

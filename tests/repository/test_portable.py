@@ -86,7 +86,7 @@ def test_every_test_is_found(tmp_path):
 
 def test_a_scene_is_made_trained_and_resumed(system, tmp_path):
     scene, out = tmp_path / "scene", tmp_path / "run"
-    command(system, "data_tools", "synthetic", scene, "--size", "32", "--train", "4", "--test", "1")
+    command(system, "clsplat", "data", "synthetic", scene, "--size", "32", "--train", "4", "--test", "1")
     small = ["--set", "optimize.steps=8", "optimize.log_every=2"]
     command(system, "clsplat", "run", "smoke", "--scene", scene, "--out", out, *small)
     assert ": done at step 8" in command(system, "clsplat", "status", out).stdout

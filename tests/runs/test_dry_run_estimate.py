@@ -13,13 +13,13 @@ from clsplat.cluster.store import Store
 from clsplat.errors import ConfigError, DataError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Cell
+from clsplat.prepare.matching import MAX_EXHAUSTIVE, most_pairs
 from clsplat.runs import expected as module
 from clsplat.runs.description import describe
 from clsplat.runs.experiment import Job
 from clsplat.runs.single import run_pipeline
 from clsplat.runs.unprepared import check_preparation, known, listed
 from clsplat.stages.optimize import Optimize
-from data_tools.matching import MAX_EXHAUSTIVE, most_pairs
 
 COUNT = 23
 SKY = "of the training photographs show a sky"

@@ -114,7 +114,7 @@ def test_first_signal_stops_at_once_where_there_is_no_model(pipeline, tiny_scene
 
 AFTER = """
 import os, signal
-from data_tools.pycolmap_import import require_pycolmap
+from clsplat.prepare.database import require_pycolmap
 
 def handler(number, frame):
     raise SystemExit("handled")
@@ -125,7 +125,7 @@ os.kill(os.getpid(), signal.SIGTERM)
 """
 WITHIN = """
 import signal, sys
-from data_tools.pycolmap_import import require_pycolmap
+from clsplat.prepare.database import require_pycolmap
 
 class Finder:
     def find_spec(name, path, target=None):

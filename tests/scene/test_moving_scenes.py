@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from clsplat.cameras.table import write_cameras
+from clsplat.data_tools.moments import write_moments
+from clsplat.data_tools.moving import STANDING, Moving, shapes_at
+from clsplat.data_tools.synthetic import write_dataset
 from clsplat.errors import DataError
 from clsplat.inspect.figures import figures
 from clsplat.inspect.inspection import Inspection
+from clsplat.prepare.colmap_writer import write_model
+from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.decoding import decode_all, require_whole
 from clsplat.scene.detect import read_scene
 from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.times import Clock, by_camera, moments_of
 from clsplat.scene.times_file import write_times
-from data_tools.colmap_writer import write_model
-from data_tools.moments import write_moments
-from data_tools.moving import STANDING, Moving, shapes_at
-from data_tools.synthetic import write_dataset
-from data_tools.undistort import undistort_scene
 from tests.support.refusals import refusal
 from tests.support.transforms_scene import LENS, frames, several_cameras, write
 

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
+from clsplat.data_tools.multiscale import pyramid, write_multiscale
 from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Camera, View, make_scene
 from clsplat.scene.view import load_image
 from clsplat.settings import variants
 from clsplat.views.order import Order, ViewPool
-from data_tools.multiscale import pyramid, write_multiscale
 from tests.support.refusals import refusal
 
 

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from clsplat.data_tools.casting import camera_pose
+from clsplat.data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, STILL_LIFE, write_png
 from clsplat.errors import DataError
 from clsplat.scene.detail import MAX_SPACING, laplacian_chance, spacing
 from clsplat.scene.detect import read_scene
@@ -20,8 +22,6 @@ from clsplat.scene.scene import Camera, PointCloud, View
 from clsplat.scene.transparency import opaque_pixels
 from clsplat.scene.view import load_image
 from clsplat.stages.init import Init, from_points
-from data_tools.casting import camera_pose
-from data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, STILL_LIFE, write_png
 from tests.support.data_sets import data_set
 from tests.support.runs import train
 

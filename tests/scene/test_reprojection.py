@@ -11,6 +11,7 @@ from clsplat.inspect.findings import POSES, POSES_ERROR
 from clsplat.inspect.inspection import Inspection
 from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.loading import load
+from clsplat.prepare.undistort import undistort_scene
 from clsplat.runs.description import describe
 from clsplat.runs.single import run_pipeline
 from clsplat.scene.capture import measured
@@ -21,7 +22,6 @@ from clsplat.scene.tracks import Tracks
 from clsplat.scene.view import View
 from clsplat.views.colours import Auto
 from clsplat.views.poses import Poses
-from data_tools.undistort import undistort_scene
 from tests.support.camera_rings import STRONG
 from tests.support.outdoor_scene import Yard, missing
 from tests.support.runs import FEW

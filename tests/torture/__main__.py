@@ -17,7 +17,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from clsplat import __version__
-from data_tools.synthetic import Options, write_dataset
+from clsplat.data_tools.synthetic import Options, write_dataset
 from tests.torture.kills import kills
 
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.conformance import uses
-from data_tools.synthetic import Options, write_dataset
+from clsplat.data_tools.synthetic import Options, write_dataset
 from tests.torture import __main__ as torture
 from tests.torture import each_file, kills
 

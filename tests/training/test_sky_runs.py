@@ -17,6 +17,7 @@ from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.metrics.images import psnr
 from clsplat.pipeline.choices import without_choices
 from clsplat.pipeline.loading import load
+from clsplat.prepare.colmap_writer import write_model
 from clsplat.reading import sha256
 from clsplat.render.backdrops import Auto
 from clsplat.runs.found import has_ended
@@ -29,7 +30,6 @@ from clsplat.training import checkpoint
 from clsplat.training.archive import split
 from clsplat.training.sky import FOLDER, check_tables
 from clsplat.views.sky_share import Seen, looked_at, panorama
-from data_tools.colmap_writer import write_model
 from tests.support.outdoor_scene import Yard, painted
 from tests.support.runs import FEW, digest, train
 

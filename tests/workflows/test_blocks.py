@@ -11,13 +11,13 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat.cli import app
+from clsplat.data_tools.multiscale import write_multiscale
 from clsplat.density.box import Box
 from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
 from clsplat.schedule import values_of
 from clsplat.tuning import tuning
-from data_tools.multiscale import write_multiscale
 
 pytestmark = pytest.mark.slow
 

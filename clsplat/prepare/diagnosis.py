@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import amount, first_few
+from clsplat.prepare.database import feature_counts, verified
+from clsplat.prepare.gather import MIN_PHOTOGRAPHS
 from clsplat.scene.sharpness import is_blurred, sharpness_of
-from data_tools.database import feature_counts, verified
-from data_tools.gather import MIN_PHOTOGRAPHS
 
 FEW_FEATURES = 300  # of a photograph: a wall of one colour has tens, a garden thousands
 TEXTURED = 1000  # features: photographs with as many are not weakly textured; three times FEW_FEATURES

@@ -11,22 +11,34 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError, amount
 from clsplat.files import write_text
+from clsplat.prepare.database import (
+    DATABASE,
+    IMAGES,
+    MATCHING,
+    PAIRS,
+    explained,
+    image_names,
+    opened,
+    pairs_done,
+    require_pycolmap,
+    verified,
+)
+from clsplat.prepare.gather import link
 from clsplat.progress import Count, watched
 from clsplat.reading import read_json
-from data_tools.database import explained, image_names, opened, pairs_done, verified
-from data_tools.gather import link
-from data_tools.names import DATABASE, IMAGES, MATCHING, PAIRS
-from data_tools.pycolmap_import import require_pycolmap
-from data_tools.vocabulary import alike, likeness
 
 LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
 MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
+WORDS = 1024  # of a vocabulary learned from the photographs (Sivic and Zisserman 2003)
+SAMPLES = 40  # descriptors for each word, from which the words are learnt
+ROUNDS = 10  # of k-means
 
 
 @dataclass(frozen=True)
@@ -194,3 +206,44 @@ def _counted(database: Path, pairs: int) -> Iterator[None]:
     with watched(count, lambda: pairs_done(database)):
         yield
     count.reach(pairs)
+
+
+def alike(tables: Sequence[NDArray[np.float32]], neighbours: int) -> list[tuple[int, int]]:
+    """Return pairs (i, j), i < j, of each photograph with the `neighbours` most similar ones, by `likeness`."""
+    close = likeness(tables)
+    np.fill_diagonal(close, -1)
+    nearest = np.argsort(-close, axis=1, kind="stable")[:, : min(neighbours, len(tables) - 1)]
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row})
+
+
+def likeness(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+    """Return how alike photographs are, 0 to 1, [N, N].
+
+    tables: descriptors [M, 128] of each photograph.  A word is a cell of k-means over a sample of the descriptors;
+    photographs are compared by the cosine of their TF-IDF vectors.  Photographs without descriptors are like none.
+    """
+    rng = np.random.default_rng(0)
+    sample = np.concatenate(
+        [table[rng.permutation(len(table))[: SAMPLES * WORDS // len(tables) + 1]] for table in tables]
+    )
+    if not len(sample):
+        return np.zeros((len(tables), len(tables)))
+    counts = np.zeros((len(tables), WORDS))
+    words = _words(sample)
+    for row, table in enumerate(tables):
+        if len(table):
+            distance = (words**2).sum(axis=1) - 2 * table @ words.T
+            counts[row] += np.bincount(distance.argmin(axis=1), minlength=WORDS)
+    rarity = np.log(len(tables) / np.maximum((counts > 0).sum(axis=0), 1))
+    vectors = counts * rarity
+    vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+    return np.asarray(vectors @ vectors.T)
+
+
+def _words(sample: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Centres of k-means, [at most WORDS, 128]."""
+    cv2.setRNGSeed(0)
+    criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0)
+    count, labels = min(WORDS, len(sample)), np.empty(0, np.int32)
+    _, _, words = cv2.kmeans(sample, count, labels, criteria, 1, cv2.KMEANS_PP_CENTERS)
+    return np.asarray(words, np.float32)

@@ -6,6 +6,7 @@ first of those that have as many.
 
 import logging
 import shutil
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,17 +15,23 @@ from typing import Any, Literal
 import cv2
 
 from clsplat.errors import DataError
+from clsplat.prepare.database import (
+    DATABASE,
+    IMAGES,
+    MODEL,
+    clear_features,
+    explained,
+    image_names,
+    require_pycolmap,
+    verified,
+)
+from clsplat.prepare.diagnosis import Matched, diagnosis, reasons
+from clsplat.prepare.features import Sought, add_features
+from clsplat.prepare.gather import MIN_PHOTOGRAPHS, link
+from clsplat.prepare.matching import Pairing, match_pairs, match_within, more_pairs
+from clsplat.prepare.messages import warn_of
+from clsplat.prepare.rotation_only import without_depth
 from clsplat.progress import Count
-from data_tools.database import clear_features, explained, image_names, verified
-from data_tools.features import Sought, add_features
-from data_tools.gather import MIN_PHOTOGRAPHS, link
-from data_tools.matching import Pairing, match_pairs, match_within, more_pairs
-from data_tools.names import DATABASE, IMAGES, MODEL
-from data_tools.pycolmap_import import require_pycolmap
-from data_tools.reasons import Matched, diagnosis, reasons
-from data_tools.told import warn_of
-from data_tools.triangulation import PAIR, with_pairs
-from data_tools.turning import without_depth
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
@@ -33,6 +40,9 @@ DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
 DENSER = Sought(long_side=2400, count=16384, contrast=0.01)
 NOT_DENSER = "denser features would not help: there are enough, and most photographs have nothing in common"
 FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap's are of the middle two
+PAIR = 2  # photographs of a point; COLMAP leaves such points out of its models
+PAIR_ERROR = 1.0  # px at the size of the features, mean of both: any two places that match are near rays of a point
+PAIR_ANGLE = 1.5  # degrees between two rays; as COLMAP asks of all points
 LOOSE = {  # COLMAP's own values: 100 matches, 16 and 1.5 degrees, 30 matches, a quarter of them
     "init_min_num_inliers": 50,
     "init_min_tri_angle": 5.0,
@@ -205,3 +215,28 @@ def _written(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[str
 
 def _names(*models: Any) -> set[str]:
     return {model.images[number].name for model in models for number in model.reg_image_ids()}
+
+
+def with_pairs(model: Any, database: Path, out: Path, threads: int = 1) -> Any:
+    """Triangulate the points of a model again, of pairs too; its cameras stay.
+
+    database: the features and matches that it was made of; out: the folder with the images.
+    """
+    pycolmap = require_pycolmap()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = threads
+    options.random_seed = options.mapper.random_seed = 0
+    options.triangulation.ignore_two_view_tracks = False
+    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = PAIR_ANGLE
+    pycolmap.set_random_seed(0)
+    with tempfile.TemporaryDirectory(dir=out) as work, explained(out / IMAGES, "triangulate the points"):
+        found = pycolmap.triangulate_points(
+            model, str(database), str(out / IMAGES), work, clear_points=True, options=options
+        )
+    for number in [number for number, point in found.points3D.items() if _is_loose(point)]:
+        found.delete_point3D(number)
+    return found
+
+
+def _is_loose(point: Any) -> bool:
+    return bool(point.track.length() == PAIR and point.error > PAIR_ERROR)

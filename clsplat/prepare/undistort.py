@@ -8,6 +8,8 @@ from typing import Literal
 import numpy as np
 
 from clsplat.errors import DataError
+from clsplat.manifest import Made, hash_of
+from clsplat.prepare.colmap_writer import write_model
 from clsplat.progress import Count
 from clsplat.scene.detect import read_scene
 from clsplat.scene.exif import write_exposures
@@ -17,8 +19,6 @@ from clsplat.scene.lens import shared
 from clsplat.scene.scene import View
 from clsplat.scene.times_file import write_times
 from clsplat.scene.view import load_image, load_mask
-from data_tools.colmap_writer import write_model
-from data_tools.made import Made, hash_of
 
 Blank = Literal["crop", "mask"]
 

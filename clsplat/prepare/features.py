@@ -15,14 +15,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.prepare.database import (
+    DATABASE,
+    IMAGES,
+    explained,
+    image_names,
+    opened,
+    remove,
+    require_pycolmap,
+    without_features,
+)
+from clsplat.prepare.gather import gather, list_photographs
+from clsplat.prepare.messages import warn_of
+from clsplat.prepare.shared_intrinsics import Cameras, sharing, sharing_text
 from clsplat.progress import counted
 from clsplat.scene.images import read_grey
-from data_tools.database import explained, image_names, opened, remove, without_features
-from data_tools.gather import gather, list_photographs
-from data_tools.names import DATABASE, IMAGES
-from data_tools.pycolmap_import import require_pycolmap
-from data_tools.sharing import Cameras, sharing, sharing_text
-from data_tools.told import warn_of
 
 LOG = logging.getLogger("clsplat")
 CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from data_tools.database import opened
-from data_tools.reasons import FEW_MATCHES, joined
+from clsplat.prepare.database import opened
+from clsplat.prepare.diagnosis import FEW_MATCHES, joined
 
 PAIRS = 120  # that are looked at, evenly spaced from those with the most matches to those with the fewest
 NEAR = 3.0  # px: of a match that a homography explains, and of a point that has not moved

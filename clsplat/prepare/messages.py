@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from clsplat.errors import amount, first_few
-from data_tools.gather import remedy
+from clsplat.prepare.gather import remedy
 
 LOG = logging.getLogger("clsplat")
 

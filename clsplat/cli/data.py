@@ -1,18 +1,18 @@
-"""Dataset preparation: `clsplat data COMMAND …`, or `python -m data_tools COMMAND …`."""
+"""Commands that make, prepare and download datasets: `clsplat data COMMAND …`."""
 
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from clsplat.data_tools.multiscale import write_multiscale
+from clsplat.data_tools.synthetic import Options, write_dataset
 from clsplat.errors import ConfigError
+from clsplat.prepare.features import CameraModel
+from clsplat.prepare.mapping import Mapper
+from clsplat.prepare.matching import Matching
+from clsplat.prepare.undistort import Blank
 from clsplat.scene.detect import format_names
-from data_tools.features import CameraModel
-from data_tools.mapping import Mapper
-from data_tools.matching import Matching
-from data_tools.multiscale import write_multiscale
-from data_tools.synthetic import Options, write_dataset
-from data_tools.undistort import Blank
 
 DATASET = f"The folder of a dataset: {format_names()}."
 
@@ -26,7 +26,7 @@ Seed = Annotated[int, typer.Option(min=0, help="Seed of the surface points and t
 
 
 @app.callback()
-def data_tools() -> None:
+def data() -> None:
     """Prepare datasets for clsplat."""
 
 
@@ -51,7 +51,7 @@ def synthetic(
     ] = None,
 ) -> None:
     """Ray-cast the demo scene: a still life with exact cameras, in the Blender (NeRF-synthetic) layout."""
-    from data_tools.moving import Moving
+    from clsplat.data_tools.moving import Moving
 
     given = {"size": size, "train": train, "test": test, "times": times}
     found = {name: value for name, value in given.items() if value is not None}
@@ -70,7 +70,7 @@ def city(
     seed: Seed = 0,
 ) -> None:
     """Ray-cast a city from the air: streets, houses, roofs; with exact cameras, in the Blender layout."""
-    from data_tools.city import City
+    from clsplat.data_tools.city import City
 
     print(write_dataset(out, City(size=size, train=train, test=test, seed=seed, lots=lots)))
 
@@ -114,7 +114,7 @@ def video(
     ] = False,
 ) -> None:
     """Take sharp frames of a video, with the same motion between them."""
-    from data_tools.video import write_frames
+    from clsplat.data_tools.video import write_frames
 
     print(f"{write_frames(file, out, frames, long_side, times)} frames in {out}")
 
@@ -126,7 +126,7 @@ def moments(
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
 ) -> None:
     """Take frames of the videos of several cameras, at the same moments of each."""
-    from data_tools.moments import write_moments
+    from clsplat.data_tools.moments import write_moments
 
     print(f"{moments_} frames of each of {write_moments(scene, moments_, long_side)} cameras in {scene / 'videos'}")
 
@@ -139,7 +139,7 @@ def undistort(
     blank: Annotated[Blank, typer.Option(help="Cut blank pixels off, or keep and mask them.")] = "crop",
 ) -> None:
     """Undistort the photographs of a scene, of fisheye lenses too."""
-    from data_tools.undistort import undistort_scene
+    from clsplat.prepare.undistort import undistort_scene
 
     print(f"{undistort_scene(scene, out, long_side, blank)} images in {out}")
 
@@ -150,7 +150,7 @@ def resize(
     levels: Annotated[int, typer.Option(min=1, max=6, help="images_2, images_4, …")] = 3,
 ) -> None:
     """Make image pyramids beside a scene's images."""
-    from data_tools.resize import write_pyramid
+    from clsplat.data_tools.resize import write_pyramid
 
     print(f"{write_pyramid(scene, levels)} images written beside {scene / 'images'}")
 
@@ -165,7 +165,7 @@ def masks(
     threshold: Annotated[float, typer.Option(min=0, max=1, help="Smallest alpha of a pixel that counts.")] = 0.5,
 ) -> None:
     """Write masks, white in pixels that count, from alpha or from a folder."""
-    from data_tools.masks import write_masks
+    from clsplat.data_tools.masks import write_masks
 
     print(f"{write_masks(scene, folder, out, threshold)} masks written")
 
@@ -195,18 +195,7 @@ def fetch(
     sha256: Annotated[str, typer.Option(help="The checksum of an archive given by its address.")] = "",
 ) -> None:
     """Download a public data set; a second call continues an interrupted download."""
-    from data_tools.fetch import Source, named
-    from data_tools.fetch import fetch as download
+    from clsplat.data_tools.fetch import Source, named
+    from clsplat.data_tools.fetch import fetch as download
 
     download(Source(name, "", sha256 or None) if "://" in name else named(name), out)
-
-
-def main() -> None:
-    """Run the command line as `clsplat data` does."""
-    from clsplat.cli import main as clsplat
-
-    clsplat("data")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""What COLMAP's database holds so far."""
+"""pycolmap and its database: what is in it so far."""
 
 import subprocess
 import sys
@@ -8,13 +8,34 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from clsplat.errors import DataError
+from clsplat.errors import ConfigError, DataError
+from clsplat.signals import stopping_on_signals
 
+DATABASE, IMAGES, PAIRS, MODEL = "database.db", "images", "pairs.txt", "sparse"
+MATCHING = "matching.json"  # how photographs were matched, for further attempts
 COUNT_ROWS = """
 import sqlite3, sys
 with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as opened:
     print(opened.execute(f"SELECT COUNT(*) FROM {sys.argv[2]}").fetchone()[0])
 """
+
+
+def require_pycolmap() -> ModuleType:
+    """Return pycolmap.  Raises ConfigError where it is not installed.
+
+    Its import takes SIGTERM, to end the process with a dump, and for any exception says that pycolmap is broken: so
+    signals wait for its end, where they get their handlers back.
+    """
+    signals: list[None] = []
+    try:
+        with stopping_on_signals(lambda: signals.append(None)):
+            import pycolmap
+    except ImportError as error:
+        raise ConfigError("placing photographs needs pycolmap: pip install 'pycolmap>=4,<5'") from error
+    if signals:
+        raise KeyboardInterrupt
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # what ends a step is raised too
+    return pycolmap
 
 
 @contextmanager

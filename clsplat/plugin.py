@@ -1,0 +1,95 @@
+"""What plug-ins may import: the bases of their classes, and the names that these need.
+
+Modules below other packages of clsplat may move between versions; the names in this module stay. Nothing in clsplat
+imports it.
+"""
+
+from clsplat.density.edit import Edit, Rule
+from clsplat.density.statistics import Statistic
+from clsplat.errors import (
+    ClsplatError,
+    ConfigError,
+    DataError,
+    DeviceError,
+    MemoryLimitError,
+    NumericError,
+    OutputError,
+)
+from clsplat.filters import FilterViews, ScreenFilter, WorldFilter
+from clsplat.gaussians.tables import Gaussians, Gradients
+from clsplat.losses.base import Comparison, ImageLoss, LossValue, Penalty, PenaltyInputs, ViewGradients
+from clsplat.opencl.device import Array, Device
+from clsplat.prepare.steps import Step
+from clsplat.reading import read_file
+from clsplat.render.camera import DeviceCamera
+from clsplat.render.workspace import Workspace
+from clsplat.scene.camera import Camera
+from clsplat.scene.colmap import pose_matrix
+from clsplat.scene.images import inside, require_files
+from clsplat.scene.readers import Reader
+from clsplat.scene.scene import PointCloud, Scene, View, every_nth, make_scene
+from clsplat.schedule import AtLeastOne, Curve, NonNegative, Positive, Schedule, at_step
+from clsplat.settings import OneOf, Settings, variants
+from clsplat.stages.base import Scheduled, Stage, path_in_run
+from clsplat.training.run import Run
+from clsplat.views.learned import LearnedTransform
+from clsplat.views.order import Order, ViewPool
+from clsplat.views.transforms import PhotographTransform, Planes
+
+__all__ = [
+    "Array",
+    "AtLeastOne",
+    "Camera",
+    "ClsplatError",
+    "Comparison",
+    "ConfigError",
+    "Curve",
+    "DataError",
+    "Device",
+    "DeviceCamera",
+    "DeviceError",
+    "Edit",
+    "FilterViews",
+    "Gaussians",
+    "Gradients",
+    "ImageLoss",
+    "LearnedTransform",
+    "LossValue",
+    "MemoryLimitError",
+    "NonNegative",
+    "NumericError",
+    "OneOf",
+    "Order",
+    "OutputError",
+    "Penalty",
+    "PenaltyInputs",
+    "PhotographTransform",
+    "Planes",
+    "PointCloud",
+    "Positive",
+    "Reader",
+    "Rule",
+    "Run",
+    "Scene",
+    "Schedule",
+    "Scheduled",
+    "ScreenFilter",
+    "Settings",
+    "Stage",
+    "Statistic",
+    "Step",
+    "View",
+    "ViewGradients",
+    "ViewPool",
+    "Workspace",
+    "WorldFilter",
+    "at_step",
+    "every_nth",
+    "inside",
+    "make_scene",
+    "path_in_run",
+    "pose_matrix",
+    "read_file",
+    "require_files",
+    "variants",
+]

@@ -1,0 +1,38 @@
+"""A density rule and a stage: `rules: [..., prune_at_random]` and `during: [..., {cap_size: {every: 100}}]`."""
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from clsplat.plugin import Edit, Positive, Rule, Run, Scheduled, at_step
+
+
+class PruneAtRandom(Rule):
+    """Remove a random share of the faint Gaussians."""
+
+    type: Literal["prune_at_random"] = "prune_at_random"
+    share: Positive = 0.5
+    """Share of the faint Gaussians that is removed; by step."""
+    opacity_below: Positive = 0.1
+    """Opacity of faint Gaussians; by step."""
+
+    def mark(self, edit: Edit) -> None:
+        opacity = 1 / (1 + np.exp(-edit.gaussians.get("logit_opacity")[:, 0]))
+        faint = opacity < edit.at(self.opacity_below)
+        edit.choose(faint & (edit.random().random(len(faint)) < edit.at(self.share)), copies=0, kept=0)
+
+
+class CapSize(Scheduled):
+    """Shrink Gaussians that are larger than a share of the scene's extent."""
+
+    stage: Literal["cap_size"] = "cap_size"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
+
+    to: Positive = 0.1
+    """Largest standard deviation along an axis, as a share of the extent; by step."""
+
+    def run(self, run: Run) -> None:
+        log_scales = run.model.gaussians.get("log_scales")
+        largest = np.log(at_step(self.to, run.step) * run.scene.extent)
+        run.model.gaussians.set("log_scales", np.minimum(log_scales, largest).astype(np.float32))
