@@ -31,6 +31,7 @@ from clsplat.views.photographs import Photograph
 
 SPLAT_Y_MIN, SPLAT_Y_MAX = (int(constants("splat.h")[name]) for name in ("SPLAT_Y_MIN", "SPLAT_Y_MAX"))
 WARM_UP_STEPS = 3  # compile kernels and grow buffers
+LEAST_RATE = 1e-30  # changes nothing, so that every step does the same work; at a rate of 0 harmonics have no update
 
 
 @dataclass
@@ -64,9 +65,8 @@ class Case:
         colour = device.zeros(3)
         colour.fill(1.0 if background == "white" else 0.0)
         model = settings.model.model(gaussians, gaussians.sh_degree)
-        none: dict[str, Any] = dict.fromkeys(PARAMETERS, 0.0)
-        still = MotionRates(**dict.fromkeys(MotionRates.model_fields, 0.0))
-        zero_rates = Rates(**none, motion=still)  # every step does the same work
+        least: dict[str, Any] = dict.fromkeys(PARAMETERS, LEAST_RATE)
+        motion = MotionRates(**dict.fromkeys(MotionRates.model_fields, LEAST_RATE))
         self.trainer = Trainer(
             Rasterizer(device, "radix"),
             model,
@@ -74,7 +74,7 @@ class Case:
             SplatStats(gaussians, optimize.statistics),
             colour,
             optimize.losses,
-            zero_rates,
+            Rates(**least, motion=motion),
             rows=optimize.update,
         )
         self.clock: list[float] = []

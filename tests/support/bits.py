@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+import yaml  # type: ignore[import-untyped]
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
@@ -40,12 +40,12 @@ OPAQUE = 0.3  # so few steps do not recover from faint Gaussians
 SIZES = {"rays": 64, "coarse_samples": 16, "fine_samples": 16, "width": 64, "colour_width": 32, "entries": 4096}
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
 TWO_THREADS = dict.fromkeys(ONE_THREAD, "2")
-LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.001, "p2": -0.002}
-FISHEYE = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.0}
+LENS: dict[str, Any] = {"k1": -0.12, "k2": 0.03, "p1": 0.001, "p2": -0.002}
+FISHEYE: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.0}
 DEPTHS = "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: inverse_depth, weight: 0.5}]"
 MANY = (
     "optimize.colours=affine", "optimize.poses={start: 4}", "optimize.distractors={count: 30, start: 4}",
-    "optimize.dropout=0.1", "model.background=directions", "rasterizer.harmonics=host",
+    "optimize.dropout=0.1", "rasterizer.harmonics=host",
 )  # fmt: skip
 
 
@@ -184,7 +184,7 @@ def adjust(name: str, settings: dict[str, Any]) -> None:
         settings["every"] = 10**6
     elif name == "checkpoint":
         settings["every"] = STEPS // 3
-    elif name != "raise_sh" and settings["every"] != 1:
+    elif name not in ("raise_sh", "add_to_average") and settings["every"] != 1:
         settings["every"] = max(EDITS_EVERY, settings["every"])
         if "stop" in settings and settings["stop"] <= settings["every"]:
             settings["stop"] = settings["every"] + 1
@@ -219,9 +219,11 @@ def is_point(item: Any) -> bool:
 
 
 def at(steps: int, factor: float, key: str) -> int:
-    """Return a scaled number of steps; a stop stays behind the last act before it."""
+    """Return a scaled number of steps; a stop stays behind the last act before it, and 1 is each step."""
     if key == "stop":
         return math.floor((steps - 1) * factor) + 1
+    if key == "every":
+        return min(steps, max(2, math.floor(steps * factor)))
     return max(int(key != "start"), math.floor(steps * factor))
 
 
@@ -332,8 +334,8 @@ class Place:
         """Run the command up to its first checkpoint."""
         for _ in range(5):
             shutil.rmtree(out, ignore_errors=True)
-            silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
-            process = subprocess.Popen(**self._process(tuple(words), {}), **silent)
+            silent: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            process = subprocess.Popen(**self._process(tuple(words), {}), **silent, start_new_session=True)
             while process.poll() is None and not list((out / "checkpoints").glob("step_*")):
                 time.sleep(0.002)
             if process.poll() is None:
