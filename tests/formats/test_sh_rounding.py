@@ -214,7 +214,8 @@ def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
     assert (tmp_path / "a.spz").stat().st_size < 0.8 * (tmp_path / "high.spz").stat().st_size
     exact = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
     given = there_and_back(tmp_path / "b.spz", source, Writing(sh_bits=(8, 8))).parameters["sh_rest"]
-    assert np.abs(given - exact).max() <= 1 / 256
+    within = np.abs(exact) < 127 / 128  # others are cut
+    assert np.abs(given - exact)[within].max() <= 1 / 256
 
 
 def test_each_gaussian_of_an_spz_has_the_steps_of_its_own_weight(tmp_path, rng):

@@ -2,14 +2,12 @@
 
 import ast
 import tomllib
-from pathlib import Path
 
 import pytest
 
 from clsplat import resource_dir
+from tests.support.sources import FILES, ROOT
 
-ROOT = Path(__file__).parents[2]
-FILES = sorted(path for folder in ("clsplat", "data_tools") for path in (ROOT / folder).rglob("*.py"))
 MAX_LINES = 250
 MAX_FUNCTION_LINES = 60
 MAPPED = {"clsplat.cl_kernels", "clsplat.pipelines"}  # folders beside the package that go into it

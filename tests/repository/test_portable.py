@@ -12,7 +12,7 @@ import pytest
 from clsplat import files
 from clsplat.errors import OutputError
 from clsplat.opencl import runtimes
-from tests.repository.test_limits import FILES, ROOT
+from tests.support.sources import FILES, ROOT
 
 pytestmark = pytest.mark.slow
 
