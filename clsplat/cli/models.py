@@ -23,12 +23,7 @@ def evaluate(
     scene: SceneOption = None,
     downscales: Annotated[
         str | None,
-        typer.Option(
-            "--downscales",
-            "--scales",
-            metavar="N,…",
-            help="Divide image sizes by these; default: as the run did, 1 for a file.",
-        ),
+        typer.Option(metavar="N,…", help="Divide image sizes by these; default: as the run did, 1 for a file."),
     ] = None,
     metrics: Annotated[
         str, typer.Option(metavar="NAME,…", help="Of psnr, ssim, ms_ssim and flip, separated by commas.")

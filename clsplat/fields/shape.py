@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from clsplat.fields.grid import FARTHEST, FEATURES, FIRST_MOST, GridShape
 from clsplat.opencl.program import constants
@@ -83,11 +83,6 @@ class FieldShape(Settings):
         if not self.degrees and self.grid is None:
             raise ValueError("expected 'degrees' above 0, or a 'grid': else the network reads no position")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_null(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without a grid, the keys are those of files that knew none."""
-        return {key: value for key, value in handler(self).items() if key != "grid" or value is not None}
 
     @property
     def position_parts(self) -> list[int]:
@@ -173,10 +168,10 @@ class FieldShape(Settings):
 
 def _with_all_keys(value: Any) -> Any:
     """A shape as a file has it.  Raises ValueError where a key is missing: defaults may be others than when it was
-    written.  One without a grid has no such key."""
+    written."""
     written = value if isinstance(value, dict) else {}
     grid = written.get("grid")
-    missing = [name for name in FieldShape.model_fields if written and name not in {*written, "grid"}]
+    missing = [name for name in FieldShape.model_fields if written and name not in written]
     if isinstance(grid, dict):
         missing += [f"grid.{name}" for name in GridShape.model_fields if name not in grid]
     if missing:

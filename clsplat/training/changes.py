@@ -36,11 +36,10 @@ class Difference(NamedTuple):
 def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind: Kind = None) -> Iterator[Difference]:
     """Yield the settings in which two resolved pipelines differ, in their order.
 
-    settings: what `new` was resolved from; its classes tell the kinds.  A key that `old` does not have had its
-    default.
+    settings: what `new` was resolved from; its classes tell the kinds.
     """
     if isinstance(old, dict) and isinstance(new, dict):
-        for key in [*old, *(key for key in new if key not in old and not _is_default(settings, key))]:
+        for key in dict.fromkeys([*old, *new]):
             inner, of = _inside(settings, key)
             where = f"{place}.{key}" if place else str(key)
             yield from differences(old.get(key), new.get(key), inner, where, kind or of)
@@ -55,14 +54,6 @@ def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind:
 def first_difference(old: Any, new: Any) -> Difference | None:
     """Return the first setting in which two resolved pipelines differ, or None."""
     return next(differences(old, new), None)
-
-
-def _is_default(settings: Any, key: str) -> bool:
-    """Whether a key has the value that it has where it is not written."""
-    field = type(settings).model_fields.get(key) if isinstance(settings, Settings) else None
-    if field is None or field.is_required():
-        return False
-    return bool(getattr(settings, key) == field.get_default(call_default_factory=True))
 
 
 def _inside(settings: Any, key: str) -> tuple[Any, Kind]:

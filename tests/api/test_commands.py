@@ -104,7 +104,7 @@ def test_rendered_files_are_pictures_of_the_renderer(runs, tiny_scene, tmp_path)
 
 def test_json(runs, tiny_scene):
     pairs = {
-        f"evaluate {runs[0]} --scales 1,2": lambda: clsplat.evaluate(runs[0], downscales=[1, 2]),
+        f"evaluate {runs[0]} --downscales 1,2": lambda: clsplat.evaluate(runs[0], downscales=[1, 2]),
         f"evaluate {runs[0]}/point_cloud.ply --scene {tiny_scene}": lambda: clsplat.evaluate(
             runs[0] / "point_cloud.ply", tiny_scene
         ),

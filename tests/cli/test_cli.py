@@ -93,7 +93,7 @@ def test_render_writes_one_file_for_each_view(model, tiny_scene, tmp_path):
 
 
 def test_evaluate_agrees_with_the_run(model, tiny_scene, tmp_path):
-    clsplat("evaluate", model, "--scene", tiny_scene, "--scales", "1,2", "--out", tmp_path / "m.json")
+    clsplat("evaluate", model, "--scene", tiny_scene, "--downscales", "1,2", "--out", tmp_path / "m.json")
     metrics = json.loads((tmp_path / "m.json").read_text())
     run = json.loads((model.parent / "metrics.json").read_text())
     assert metrics["test"]["1"] == run["test"]["1"]
@@ -151,7 +151,7 @@ def test_bad_settings(tiny_scene, tmp_path):
     clsplat("run", "smoke", "--out", out, expect=2)
     clsplat("run", expect=2)
     clsplat("run", "smoke", "--nonsense", expect=2)
-    clsplat("evaluate", tiny_scene / "points3d.ply", "--scene", tiny_scene, "--scales", "a", expect=2)
+    clsplat("evaluate", tiny_scene / "points3d.ply", "--scene", tiny_scene, "--downscales", "a", expect=2)
 
 
 def test_unknown_device_names_what_exists(tiny_scene, tmp_path):

@@ -12,7 +12,7 @@ from clsplat.errors import ConfigError, DataError, MemoryLimitError
 from clsplat.fields.shape import FieldShape
 from clsplat.pipeline.loading import load
 from clsplat.stages.train_field import TrainField
-from clsplat.training import archive, checkpoint
+from clsplat.training import archive
 from clsplat.training.field_memory import field_plan
 from tests.support.fields import PIPELINE, SHAPE, alone, bits, resumed
 from tests.support.runs import train
@@ -78,16 +78,6 @@ def test_a_file_without_a_key_of_its_shape_is_refused(finished, tmp_path, missin
         archive.write(file, notes, arrays.items())
     with pytest.raises(DataError, match=rf"it lacks {missing}; expected a file of the stage export_field"):
         clsplat.load_field(tmp_path / "field.npz")
-
-
-def test_fields_without_a_grid_write_the_keys_that_they_had(tiny_scene, tmp_path):
-    plain = tmp_path / "plain.yaml"
-    plain.write_text(PIPELINE.partition("  - evaluate: {split: test, downscales")[0] + "  - export_field\n")
-    train(tiny_scene, tmp_path / "run", "train_field.steps=1", pipeline=str(plain))
-    assert "grid" not in archive.read(tmp_path / "run/field.npz")[0]["shape"]
-    state, _ = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])
-    assert state.field is not None
-    assert "grid" not in state.field["shape"]
 
 
 def test_the_recipe_reads_a_grid_in_the_place_of_sines():

@@ -116,21 +116,3 @@ def test_first_difference():
     assert first_difference(old, old) is None
     assert str(first_difference(old, {"a": 1, "b": {"c": [1, {"d": 3}]}})) == "b.c[1].d was 2, is 3"
     assert first_difference(old, {"a": 1}) is not None
-
-
-@pytest.mark.parametrize(
-    ("place", "other"),
-    [("stages.0.init.scale", 0.5), ("stages.1.optimize.during.0.densify.rules.0.opacity", "shared")],
-)
-def test_a_key_that_an_earlier_version_had_not_had_its_default(place, other, pipeline):
-    now = pipeline(TRAINING)
-    before, *keys = now.resolved(), *place.split(".")
-    at = before
-    for key in keys[:-1]:
-        at = at[int(key) if isinstance(at, list) else key]
-    del at[keys[-1]]
-    assert not list(differences(before, now.resolved(), now.settings))
-    changed = pipeline(
-        TRAINING, f"{place.replace('stages.0.', '').replace('stages.1.', '').replace('during.0.', '')}={other}"
-    )
-    assert [d.place.rpartition(".")[2] for d in differences(before, changed.resolved(), changed.settings)] == [keys[-1]]
