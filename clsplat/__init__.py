@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from clsplat.training.field_file import FieldModel as FieldModel
     from clsplat.training.field_file import load_field as load_field
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 _HERE = Path(__file__).resolve().parent
 if not (_HERE / "data_tools").is_dir():  # a checkout has clsplat.data_tools next to the package
     __path__.append(str(_HERE.parent))
