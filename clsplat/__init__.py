@@ -70,8 +70,8 @@ if TYPE_CHECKING:
     from clsplat.scene.view import View as View
     from clsplat.training.field_file import FieldModel as FieldModel
     from clsplat.training.field_file import load_field as load_field
+    from clsplat.version import __version__ as __version__
 
-__version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
 if not (_HERE / "data_tools").is_dir():  # a checkout has clsplat.data_tools next to the package
     __path__.append(str(_HERE.parent))
@@ -99,15 +99,16 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.scene.split": "Split",
     "clsplat.scene.view": "View",
     "clsplat.training.field_file": "FieldModel load_field",
+    "clsplat.version": "__version__",
 }
 _PLACES = {name: room for room, names in _ROOMS.items() for name in names.split()}
-_MODULES = ("errors", "metrics")
+_MODULES = {"errors": "clsplat.errors", "metrics": "clsplat.metrics"}
 __all__ = sorted([*_PLACES, *_MODULES])
 
 
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
-        return importlib.import_module(f"clsplat.{name}")
+        return importlib.import_module(_MODULES[name])
     if name not in _PLACES:
         raise AttributeError(f"module 'clsplat' has no attribute '{name}'")
     value = getattr(importlib.import_module(_PLACES[name]), name)
@@ -116,12 +117,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
-
-
-def resource_dir(name: str) -> Path:
-    """Return the folder `cl_kernels` or `pipelines`: a wheel carries it inside the package, a checkout beside it."""
-    for base in (_HERE, _HERE.parent):
-        if (base / name).is_dir():
-            return base / name
-    raise FileNotFoundError(f"{name}/ is missing beside {_HERE}")
+    return __all__

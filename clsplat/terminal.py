@@ -14,11 +14,12 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
-from clsplat import __version__, streams
+from clsplat import streams
 from clsplat.errors import OutputError
 from clsplat.files import told_as
 from clsplat.progress import Progress as TrainingProgress
 from clsplat.progress import clock, counts_shown, heard_by
+from clsplat.version import __version__
 
 LOG = logging.getLogger("clsplat")
 CONSOLE = Console(file=streams.STDOUT, highlight=False, soft_wrap=True)  # type: ignore[arg-type]

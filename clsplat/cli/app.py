@@ -9,11 +9,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from clsplat import __version__, terminal
+from clsplat import terminal
 from clsplat.api import arguments, tools
 from clsplat.errors import ConfigError
 from clsplat.pipeline.files import shipped
 from clsplat.signals import stop_with_input
+from clsplat.version import full_version
 
 SYNONYMS = {
     **dict.fromkeys(("train", "fit", "optimize", "start"), "run"),
@@ -111,7 +112,7 @@ class Common:
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        terminal.show(f"clsplat {__version__}")
+        terminal.show(f"clsplat {full_version()}")
         raise typer.Exit
 
 

@@ -11,7 +11,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from clsplat import __version__, resource_dir
 from clsplat.errors import ClsplatError, DataError
 from clsplat.files import write_text
 from clsplat.names import PREPARED
@@ -23,11 +22,11 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE
+from clsplat.version import __version__, list_sources
 
 KEPT = 16  # hexadecimal digits of a hash
 # decode photographs, place Gaussians, and compress models: OpenCV has libwebp
 LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "zstandard", "deflate")
-PACKAGE = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
@@ -42,19 +41,14 @@ class Known:
 @cache
 def code_digest() -> str:
     """Return a hash of the program: the package, its kernels, and the libraries that decide over bits."""
-    own = [*_sources(PACKAGE, "*.py"), *_sources(resource_dir("cl_kernels"), "*.cl", "*.h")]
-    return _digest([__version__, *own, *_versions(*LIBRARIES), f"zlib {zlib.ZLIB_RUNTIME_VERSION}", _builtin_zstd()])
+    libraries = [*_versions(*LIBRARIES), f"zlib {zlib.ZLIB_RUNTIME_VERSION}", _builtin_zstd()]
+    return _digest([__version__, *list_sources(), *libraries])
 
 
 @cache
 def tools_digest() -> str:
     """Return a hash of what else decides over the bits of scenes that `prepare` makes."""
     return _digest(_versions("pycolmap"))
-
-
-def _sources(root: Path, *patterns: str) -> list[str]:
-    paths = sorted(path for pattern in patterns for path in root.rglob(pattern))
-    return [f"{path.relative_to(root).as_posix()} {sha256(path)}" for path in paths]
 
 
 def _versions(*names: str) -> Iterator[str]:

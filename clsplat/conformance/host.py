@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from clsplat import __version__, cores
+from clsplat import cores
+from clsplat.version import full_version
 
 CODE = ("PYOPENCL_BUILD", "POCL_", "CL_", "RUSTICL_", "LP_", "IGC_", "AMD_", "GPU_", "CUDA_")  # may change what runs
 CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not
@@ -35,7 +36,7 @@ def available_memory() -> int | None:
 def system() -> dict[str, Any]:
     """Return what a bug report needs of the host; of the environment only what concerns OpenCL."""
     return {
-        "clsplat": __version__,
+        "clsplat": full_version(),
         "system": platform.platform(),
         "machine": platform.machine(),
         "processors": os.cpu_count(),

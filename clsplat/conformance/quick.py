@@ -9,7 +9,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
-from clsplat import __version__, resource_dir
 from clsplat.caches import cache_folder
 from clsplat.conformance import uses
 from clsplat.conformance.host import code_variables
@@ -21,6 +20,7 @@ from clsplat.opencl.discovery import DeviceInfo, Schedule, tuning_of
 from clsplat.opencl.kernel_caches import damaged_kernels
 from clsplat.opencl.program import BUILD_OPTIONS
 from clsplat.render.tiles import Sort, known_sort
+from clsplat.version import __version__, resource_dir
 
 LOG = logging.getLogger("clsplat")
 QUICK_SECONDS = 300  # without a word from a check, in front of a run

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 import numpy as np
 import pyopencl as cl
 
-from clsplat import resource_dir
 from clsplat.errors import KernelError
 from clsplat.opencl.device import Array
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.opencl.kernel_caches import kernel_caches
+from clsplat.version import resource_dir
 
 if TYPE_CHECKING:
     from clsplat.opencl.device import Device

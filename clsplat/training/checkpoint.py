@@ -14,7 +14,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from clsplat import __version__
 from clsplat.errors import ClsplatError, ConfigError, DataError, NotFiniteError, OutputError, in_shell
 from clsplat.files import atomic
 from clsplat.names import CHECKPOINTS, PIPELINE
@@ -24,6 +23,7 @@ from clsplat.training.archive import Arrays
 from clsplat.training.changes import differences
 from clsplat.training.run import Run
 from clsplat.training.state import State
+from clsplat.version import full_version
 
 FORMAT = 4
 LOG = logging.getLogger("clsplat")
@@ -154,7 +154,7 @@ def _write(run: Run, kind: str) -> Path:
     run.records.write()  # the state counts them
     state = State(
         format=FORMAT,
-        version=__version__,
+        version=full_version(),
         step=run.step,
         cursor=run.cursor,
         stage_step=run.stage_step,

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from clsplat import __version__
 from clsplat.errors import DataError, one_line, quoted, shortened
 from clsplat.fields.field import Field
 from clsplat.fields.shape import FieldShape, WrittenShape
@@ -24,6 +23,7 @@ from clsplat.gaussians.run_model import file_of_run
 from clsplat.opencl.device import Device
 from clsplat.reading import sha256
 from clsplat.training import archive
+from clsplat.version import __version__
 from clsplat.views.photographs import BACKGROUNDS
 
 FORMAT: Final = 1

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from clsplat import __version__
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.training.run import Run
+from clsplat.version import __version__
 
 
 def host_model(run: Run) -> Model:

@@ -12,13 +12,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from clsplat import __version__
 from clsplat.errors import DataError, OutputError
 from clsplat.files import write_text
 from clsplat.names import STATUS
 from clsplat.processes import Owner
 from clsplat.reading import read_json
 from clsplat.training.status_schema import FORMAT, Amount, Status
+from clsplat.version import full_version
 
 LOG = logging.getLogger("clsplat")
 BEAT = 5.0  # seconds between two writes of a run that goes on
@@ -46,7 +46,7 @@ class StatusFile:
         self.now = Status(
             format=FORMAT,
             state="starting",
-            version=__version__,
+            version=full_version(),
             **asdict(Owner.this()),
             started=now,
             changed=now,

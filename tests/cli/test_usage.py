@@ -11,7 +11,6 @@ from unittest.mock import ANY
 
 import pytest
 
-from clsplat import __version__
 from clsplat.cli.app import ORDER, SYNONYMS
 from clsplat.errors import DataError
 from clsplat.pipeline.files import shipped
@@ -20,6 +19,7 @@ from clsplat.pipeline.recipes import copy, manual, summaries, summary
 from clsplat.pipeline.settable import settable
 from clsplat.runs.status import run_status, status_text
 from clsplat.training.records import Records
+from clsplat.version import full_version
 from tests.support.commands import clsplat, process
 from tests.support.runs import train, write_status
 
@@ -34,7 +34,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def test_version():
-    assert clsplat("--version").stdout == f"clsplat {__version__}\n"
+    assert clsplat("--version").stdout == f"clsplat {full_version()}\n"
 
 
 def test_no_command_shows_the_help_and_says_what_is_missing():

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from clsplat import resource_dir
 from clsplat.conformance import supervision, worker
 from clsplat.conformance.check import Note
 from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS
 from clsplat.opencl.program import parse_kernels
+from clsplat.version import resource_dir
 from tests.support.figures import hold
 
 

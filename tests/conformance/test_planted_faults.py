@@ -4,13 +4,13 @@ import re
 
 import pytest
 
-from clsplat import resource_dir
 from clsplat.conformance.check import Check, Note
 from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS, SPEED
 from clsplat.opencl import program
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import choose
 from clsplat.opencl.program import parse_kernels
+from clsplat.version import resource_dir
 from tests.support.devices import NAMES
 
 pytestmark = pytest.mark.slow  # most programs are built anew

@@ -8,7 +8,6 @@ import pytest
 from jsonschema import Draft202012Validator
 from ruamel.yaml import YAML
 
-from clsplat import resource_dir
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
@@ -16,6 +15,7 @@ from clsplat.pipeline.schema import json_schema
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.plugins import load_file
 from clsplat.stages.optimize import Optimize
+from clsplat.version import resource_dir
 from tests.support.pipelines import flat
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

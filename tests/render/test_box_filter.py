@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat import resource_dir
 from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.table import read, write
@@ -18,6 +17,7 @@ from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.scene.stand import Stand
 from clsplat.settings import variants
+from clsplat.version import resource_dir
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
 from tests.support.models import splats

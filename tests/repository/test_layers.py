@@ -49,7 +49,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
         "reading",
         "results",
     }
-    | {"schedule", "settings", "signals", "streams", ""},
+    | {"schedule", "settings", "signals", "streams", "version", ""},
 )
 ROW = {name: i for i, row in enumerate(ROWS) for name in row}
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -75,7 +75,7 @@ TEXTS = {  # what turns results into lines of text
     "clsplat.runs.verdict": {"lines", "verdict"},
     "clsplat.pipeline.files": {"shipped"},  # for completion, which must be fast
 }
-BELOW_COMMANDS = {"api", "cli", "terminal", "errors", "files", "results", "signals", "streams", ""}
+BELOW_COMMANDS = {"api", "cli", "terminal", "errors", "files", "results", "signals", "streams", "version", ""}
 
 
 def imports(path: Path) -> list[tuple[int, str]]:

@@ -15,6 +15,7 @@ from clsplat.files import write_text
 from clsplat.runs.experiment import Job
 from clsplat.training import status as writing
 from clsplat.training.status import StatusFile
+from clsplat.version import full_version
 from tests.support.runs import digest, train
 
 pytestmark = pytest.mark.slow
@@ -75,7 +76,7 @@ def test_every_status_of_a_run_fits_the_schema(written, tiny_scene, tmp_path):
     last = written[-1]
     assert (last["exit_code"], last["step"], last["steps"], last["stage"]) == (0, 50, 50, "report")
     assert last["device"]
-    assert last["version"] == clsplat.__version__
+    assert last["version"] == full_version()
     assert "seconds_left" not in last
 
 
