@@ -44,7 +44,7 @@ def test_models_and_scenes_open_no_device():
 
 def test_names_for_readers_and_for_type_checkers_agree():
     tree = ast.parse(Path(clsplat.__file__).read_text())
-    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    (block,) = [node for node in tree.body if isinstance(node, ast.If) and isinstance(node.test, ast.Name)]
     typed = {}
     for node in block.body:
         assert isinstance(node, ast.ImportFrom)

@@ -13,11 +13,12 @@ import pytest
 import clsplat
 from clsplat.version import _commit, full_version
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SOURCES = "git ls-files --cached --others --exclude-standard"
 PROBE = """
 import importlib.util, clsplat
-print(clsplat.__version__, clsplat.resource_dir("cl_kernels").is_dir(), clsplat.resource_dir("pipelines").is_dir())
+from clsplat.version import resource_dir
+print(clsplat.__version__, resource_dir("cl_kernels").is_dir(), resource_dir("pipelines").is_dir())
 print([name for name in ("cl_kernels", "data_tools", "pipelines", "tests") if importlib.util.find_spec(name)])
 print(importlib.util.find_spec("clsplat.data_tools.synthetic") is not None)
 """
