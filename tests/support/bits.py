@@ -36,6 +36,7 @@ DATA = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
 STEPS = 60
 EDITS_EVERY = 10  # at least: growth doubles with each
 STEP_KEYS = {"steps", "start", "stop", "until", "over", "every", "warm_up", "grow_until"}
+FEW_GAUSSIANS = 3000  # of a budget: trainings reach it
 OPAQUE = 0.3  # so few steps do not recover from faint Gaussians
 SIZES = {"rays": 64, "coarse_samples": 16, "fine_samples": 16, "width": 64, "colour_width": 32, "entries": 4096}
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
@@ -43,6 +44,7 @@ TWO_THREADS = dict.fromkeys(ONE_THREAD, "2")
 LENS: dict[str, Any] = {"k1": -0.12, "k2": 0.03, "p1": 0.001, "p2": -0.002}
 FISHEYE: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.0}
 DEPTHS = "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: inverse_depth, weight: 0.5}]"
+BEST = "optimize.keep=best", "scene.validation=2", "optimize.rates.means=[[40, 1.6e-4], [41, 0.3]]"  # not the last one
 MANY = (
     "optimize.colours=affine", "optimize.poses={start: 4}", "optimize.distractors={count: 30, start: 4}",
     "optimize.dropout=0.1", "rasterizer.harmonics=host",
@@ -81,7 +83,7 @@ NAMED = {
     "alpha_as_mask": sets("scene.alpha=mask"),
     "affine": sets("optimize.colours=affine"),
     "background_random": sets("optimize.background=random"),
-    "background_transparent": sets("optimize.background=transparent"),
+    "background_transparent": sets("optimize.background=transparent", same_as="background_random"),
     "blocks_command": Case(
         command=("blocks", "{blocks}", "--scene", "{still}", "--coarse", "{model}", "--blocks", "3", "--out", "{out}")
     ),
@@ -94,7 +96,7 @@ NAMED = {
     "convert_sog": Case(command=("convert", "{model}", "{out}.sog")),
     "convert_splat": Case(command=("convert", "{model}", "{out}.splat")),
     "convert_spz": Case(command=("convert", "{model}", "{out}.spz")),
-    "deferred": sets("optimize.update=deferred"),
+    "deferred": sets("optimize.update=deferred", same_as="splat_7k"),
     "distractors": sets("optimize.distractors={count: 30, start: 4}"),
     "downscale": sets("scene.downscale=2"),
     "dropout": sets("optimize.dropout=0.3"),
@@ -106,13 +108,16 @@ NAMED = {
     "gain": sets("optimize.colours=gain"),
     "grid": sets("optimize.colours={type: grid, cells: [3, 2, 4]}"),
     "haar": sets("optimize.views.transforms=[{type: haar, learn: filter}]"),
-    "harmonics_on_host": sets("rasterizer.harmonics=host"),
+    "harmonics_on_host": sets("rasterizer.harmonics=host", same_as="splat_7k"),
     "inside": sets("stages.1.during.1.inside={low: [0, null, null]}"),
     "inverse_depth": sets(DEPTHS, "scene.downscale=8", scene="fox"),
-    "keep_best": sets("optimize.keep=best", "scene.validation=2"),
-    "keep_best_refit": sets("optimize.keep=best", "scene.validation=2", "optimize.refit=true"),
+    "keep_best": sets(*BEST),
+    "keep_best_refit": sets(*BEST, "optimize.refit=true"),
     "killed_and_resumed": Case(is_killed=True, same_as="splat_7k"),
+    "killed_field": Case("mip_grid", is_killed=True, same_as="mip_grid"),
+    "killed_in_motion": Case("dynamic_7k", "moving", is_killed=True, same_as="dynamic_7k"),
     "killed_with_many": sets(*MANY, is_killed=True, same_as="many"),
+    "killed_with_sky": sets("model.background=directions", is_killed=True, same_as="sky"),
     "launch_tiles": sets("rasterizer.launch_tiles=2", same_as="splat_7k"),
     "lens": sets(scene="lens"),
     "levels": sets("scene.levels=3"),
@@ -124,9 +129,9 @@ NAMED = {
         recipe="dynamic_7k",
         scene="moving",
     ),
-    "multiscale": sets(scene="multiscale"),
+    "multiscale": sets("scene.levels=2", scene="multiscale"),
     "order_of_paper": sets("optimize.views.order=paper"),
-    "pair_budget": sets("rasterizer.pair_budget=1"),
+    "pair_budget": sets("rasterizer.pair_budget=1", same_as="splat_7k"),
     "plugin_blur": sets(
         "optimize.views={transforms: [{type: box_blur, reach: [[0, 3], [40, 0]]}]}", plugin="box_blur.py"
     ),
@@ -173,6 +178,10 @@ def shorten(recipe: dict[str, Any]) -> dict[str, Any]:
         for name, settings in stage.items() if isinstance(stage, dict) else ():
             if name == "init" and "opacity" in settings:
                 settings["opacity"] = max(settings["opacity"], OPAQUE)
+            for transform in settings.get("views", {}).get("transforms", ()):
+                if transform["type"] == "mean_filter":  # shares of the width, of wider photographs
+                    points = transform["width"]["points"]
+                    transform["width"]["points"] = [[step, 15 * width] for step, width in points]
             for inner in settings.get("during", ()):
                 adjust(*next(iter(inner.items())))
     return short
@@ -193,6 +202,14 @@ def adjust(name: str, settings: dict[str, Any]) -> None:
     for rule in settings.get("rules", ()):
         if rule.get("statistic") == "gain":
             rule["gradient_above"] = 0.5  # so few steps promise little
+        if "start" in rule:
+            rule["start"] = min(rule["start"], EDITS_EVERY)
+        if "ratio_above" in rule:
+            rule["ratio_above"] = min(rule["ratio_above"], 2)
+    if "gaussians" in (budget := settings.get("budget", ())):
+        budget["gaussians"] = FEW_GAUSSIANS
+    if "remove" in settings:
+        settings["remove"] = min(settings["remove"], 0.3)
 
 
 def scaled(node: Any, factor: float) -> Any:
