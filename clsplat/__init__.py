@@ -14,38 +14,37 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from clsplat import errors as errors
     from clsplat import metrics as metrics
-    from clsplat.api.blocks import plan_in_blocks as plan_in_blocks
-    from clsplat.api.blocks import train_in_blocks as train_in_blocks
+    from clsplat.api.commands import cancel as cancel
     from clsplat.api.commands import check as check
+    from clsplat.api.commands import compare_runs as compare_runs
+    from clsplat.api.commands import compress_model as compress_model
+    from clsplat.api.commands import convert as convert
     from clsplat.api.commands import copy_pipeline as copy_pipeline
     from clsplat.api.commands import describe_run as describe_run
     from clsplat.api.commands import evaluate as evaluate
     from clsplat.api.commands import pipeline_schema as pipeline_schema
     from clsplat.api.commands import pipelines as pipelines
+    from clsplat.api.commands import plan_in_blocks as plan_in_blocks
     from clsplat.api.commands import resume as resume
     from clsplat.api.commands import run as run
+    from clsplat.api.commands import run_cell as run_cell
     from clsplat.api.commands import status as status
     from clsplat.api.commands import status_schema as status_schema
-    from clsplat.api.compression import compress_model as compress_model
-    from clsplat.api.compression import write_levels as write_levels
-    from clsplat.api.converting import convert as convert
+    from clsplat.api.commands import train_in_blocks as train_in_blocks
+    from clsplat.api.commands import view as view
+    from clsplat.api.commands import work_for as work_for
+    from clsplat.api.commands import write_levels as write_levels
     from clsplat.api.device import Device as Device
-    from clsplat.api.field_renderer import FieldRenderer as FieldRenderer
-    from clsplat.api.pages import compare_runs as compare_runs
-    from clsplat.api.pages import view as view
     from clsplat.api.pictures import camera_path as camera_path
     from clsplat.api.pictures import render_path as render_path
     from clsplat.api.pictures import render_views as render_views
     from clsplat.api.pictures import write_cameras as write_cameras
     from clsplat.api.pictures import write_video as write_video
+    from clsplat.api.renderer import FieldRenderer as FieldRenderer
     from clsplat.api.renderer import Gradients as Gradients
     from clsplat.api.renderer import Picture as Picture
     from clsplat.api.renderer import Renderer as Renderer
-    from clsplat.api.sweeps import cancel as cancel
-    from clsplat.api.sweeps import run_cell as run_cell
-    from clsplat.api.sweeps import work_for as work_for
     from clsplat.api.tools import devices as devices
     from clsplat.api.tools import doctor as doctor
     from clsplat.api.tools import inspect_scene as inspect_scene
@@ -56,53 +55,48 @@ if TYPE_CHECKING:
     from clsplat.api.tools import read_measurement as read_measurement
     from clsplat.api.trainer import Report as Report
     from clsplat.api.trainer import Trainer as Trainer
+    from clsplat.core import errors as errors
+    from clsplat.core.resources import __version__ as __version__
     from clsplat.formats.splats import Reading as Reading
     from clsplat.formats.splats import Writing as Writing
     from clsplat.gaussians.model import Model as Model
     from clsplat.gaussians.model import Rendering as Rendering
     from clsplat.gaussians.model import load as load
+    from clsplat.nerf.files import FieldModel as FieldModel
+    from clsplat.nerf.files import load_field as load_field
     from clsplat.scene.camera import Camera as Camera
-    from clsplat.scene.choice import Choice as Choice
     from clsplat.scene.detect import read_scene as read_scene
     from clsplat.scene.scene import PointCloud as PointCloud
     from clsplat.scene.scene import Scene as Scene
-    from clsplat.scene.split import Split as Split
     from clsplat.scene.view import View as View
-    from clsplat.training.field_file import FieldModel as FieldModel
-    from clsplat.training.field_file import load_field as load_field
-    from clsplat.version import __version__ as __version__
+    from clsplat.scene.view_selection import Choice as Choice
+    from clsplat.scene.view_selection import Split as Split
 
 _HERE = Path(__file__).resolve().parent
 if not (_HERE / "data_tools").is_dir():  # a checkout has clsplat.data_tools next to the package
     __path__.append(str(_HERE.parent))
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
-    "clsplat.api.converting": "convert",
-    "clsplat.api.commands": "check copy_pipeline describe_run evaluate pipeline_schema"
-    " pipelines resume run status status_schema",
-    "clsplat.api.blocks": "plan_in_blocks train_in_blocks",
-    "clsplat.api.compression": "compress_model write_levels",
+    "clsplat.api.commands": "cancel check compare_runs compress_model convert copy_pipeline describe_run evaluate"
+    " pipeline_schema pipelines plan_in_blocks resume run run_cell status status_schema"
+    " train_in_blocks view work_for write_levels",
     "clsplat.api.device": "Device",
-    "clsplat.api.pages": "compare_runs view",
-    "clsplat.api.field_renderer": "FieldRenderer",
-    "clsplat.api.renderer": "Gradients Picture Renderer",
-    "clsplat.api.sweeps": "cancel run_cell work_for",
+    "clsplat.api.pictures": "camera_path render_path render_views write_cameras write_video",
+    "clsplat.api.renderer": "FieldRenderer Gradients Picture Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_packing measure_speed"
     " read_measurement",
     "clsplat.api.trainer": "Report Trainer",
-    "clsplat.api.pictures": "camera_path render_path render_views write_cameras write_video",
+    "clsplat.core.resources": "__version__",
     "clsplat.formats.splats": "Reading Writing",
-    "clsplat.gaussians.model": "Model Rendering load",
+    "clsplat.gaussians.model": "load Model Rendering",
+    "clsplat.nerf.files": "FieldModel load_field",
     "clsplat.scene.camera": "Camera",
-    "clsplat.scene.choice": "Choice",
     "clsplat.scene.detect": "read_scene",
     "clsplat.scene.scene": "PointCloud Scene",
-    "clsplat.scene.split": "Split",
     "clsplat.scene.view": "View",
-    "clsplat.training.field_file": "FieldModel load_field",
-    "clsplat.version": "__version__",
+    "clsplat.scene.view_selection": "Choice Split",
 }
 _PLACES = {name: room for room, names in _ROOMS.items() for name in names.split()}
-_MODULES = {"errors": "clsplat.errors", "metrics": "clsplat.metrics"}
+_MODULES = {"errors": "clsplat.core.errors", "metrics": "clsplat.metrics"}
 __all__ = sorted([*_PLACES, *_MODULES])
 
 

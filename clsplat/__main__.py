@@ -1,6 +1,6 @@
 """The command `clsplat`, also as `python -m clsplat`."""
 
-from clsplat.signals import end_at_once_on_signals
+from clsplat.core.signals import end_at_once_on_signals
 
 
 def main() -> None:

@@ -4,9 +4,7 @@ Modules below other packages of clsplat may move between versions; the names in 
 imports it.
 """
 
-from clsplat.density.edit import Edit, Rule
-from clsplat.density.statistics import Statistic
-from clsplat.errors import (
+from clsplat.core.errors import (
     ClsplatError,
     ConfigError,
     DataError,
@@ -15,26 +13,29 @@ from clsplat.errors import (
     NumericError,
     OutputError,
 )
-from clsplat.filters import FilterViews, ScreenFilter, WorldFilter
-from clsplat.gaussians.tables import Gaussians, Gradients
+from clsplat.core.reading import read_file
+from clsplat.core.schedule import AtLeastOne, Curve, NonNegative, Positive, Schedule, at_step
+from clsplat.core.settings import OneOf, Settings, variants
+from clsplat.density.edit import Edit, Rule
+from clsplat.density.statistics import Statistic
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.structs import Gradients
 from clsplat.losses.base import Comparison, ImageLoss, LossValue, Penalty, PenaltyInputs, ViewGradients
 from clsplat.opencl.device import Array, Device
+from clsplat.photos.sampling import Order, ViewPool
+from clsplat.photos.transforms import LearnedTransform, PhotographTransform, Planes
 from clsplat.prepare.steps import Step
-from clsplat.reading import read_file
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.filters import FilterViews, ScreenFilter, WorldFilter
 from clsplat.render.workspace import Workspace
 from clsplat.scene.camera import Camera
 from clsplat.scene.colmap import pose_matrix
 from clsplat.scene.images import inside, require_files
-from clsplat.scene.readers import Reader
-from clsplat.scene.scene import PointCloud, Scene, View, every_nth, make_scene
-from clsplat.schedule import AtLeastOne, Curve, NonNegative, Positive, Schedule, at_step
-from clsplat.settings import OneOf, Settings, variants
-from clsplat.stages.base import Scheduled, Stage, path_in_run
+from clsplat.scene.reader import Reader
+from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
+from clsplat.scene.view import View
 from clsplat.training.run import Run
-from clsplat.views.learned import LearnedTransform
-from clsplat.views.order import Order, ViewPool
-from clsplat.views.transforms import PhotographTransform, Planes
+from clsplat.training.stage import Scheduled, Stage, path_in_run
 
 __all__ = [
     "Array",

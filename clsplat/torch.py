@@ -14,7 +14,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from clsplat.api.renderer import Colour, Renderer
-from clsplat.gaussians.tables import PARAMETERS
+from clsplat.formats.splats import PARAMETERS
 from clsplat.scene.view import View
 
 

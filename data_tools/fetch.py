@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
-from clsplat.errors import ConfigError, DataError, OutputError
-from clsplat.files import is_there, unwritable
-from clsplat.reading import sha256
+from clsplat.core.errors import ConfigError, DataError, OutputError
+from clsplat.core.files import is_there, unwritable
+from clsplat.core.reading import sha256
 
 CHUNK = 1 << 20  # bytes
 MAX_TRIES = 5  # of one download

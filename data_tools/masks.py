@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.manifest import Made, hash_of
-from clsplat.progress import Count
+from clsplat.core.errors import DataError
+from clsplat.core.manifest import Made, hash_of
+from clsplat.core.progress import Count
 from clsplat.scene.colmap import ColmapReader, image_folder
 from clsplat.scene.detect import read_scene, reader_of
 from clsplat.scene.images import read_image, write_image
-from clsplat.scene.masks import mask_file
-from clsplat.scene.scene import View
-from clsplat.scene.view import load_mask
+from clsplat.scene.photographs import mask_file
+from clsplat.scene.view import View, load_mask
 
 MIN_ALPHA = 0.5  # of the largest value
 

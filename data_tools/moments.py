@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from clsplat.errors import DataError, first_few
-from clsplat.files import told_as
-from clsplat.progress import Count
+from clsplat.core.errors import DataError, first_few
+from clsplat.core.files import told_as
+from clsplat.core.progress import Count
 from clsplat.scene.images import is_image, write_image
 from clsplat.scene.multicamera import VIDEO_SUFFIXES, VIDEOS
 

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.files import atomic, write_text
+from clsplat.core.errors import DataError
+from clsplat.core.files import atomic, write_text
 from clsplat.scene.images import read_image
-from clsplat.scene.transforms import Transforms, view_name
+from clsplat.scene.transforms_json import Transforms, view_name
 
 MIN_DEPTH, MAX_DEPTH = 2.0, 6.0  # scene units; mip-NeRF's values for these scenes
 

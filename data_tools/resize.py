@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.files import atomic
-from clsplat.manifest import Made, hash_of
-from clsplat.progress import Count
+from clsplat.core.errors import DataError
+from clsplat.core.files import atomic
+from clsplat.core.manifest import Made, hash_of
+from clsplat.core.progress import Count
 from clsplat.scene.images import is_image, read_image
 
 QUALITY = 98  # of JPEG

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from clsplat.errors import DataError, OutputError
-from clsplat.files import is_there
-from clsplat.reading import read_file
+from clsplat.core.errors import DataError, OutputError
+from clsplat.core.files import is_there
+from clsplat.core.reading import read_file
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
 

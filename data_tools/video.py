@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.files import write_text
-from clsplat.progress import Count
-from clsplat.reading import read_json, sha256
+from clsplat.core.errors import DataError
+from clsplat.core.files import write_text
+from clsplat.core.progress import Count
+from clsplat.core.reading import read_json, sha256
 from clsplat.scene.images import image_size, is_image, write_image
-from clsplat.scene.sharpness import SIDE, sharpness
+from clsplat.scene.quality import SIDE, sharpness
 from clsplat.scene.times_file import write_times
 
 LOG = logging.getLogger("clsplat")

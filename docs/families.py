@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 
-import clsplat.pipeline.schema  # noqa: F401  (it imports all that a pipeline can name)
+import clsplat.pipeline.recipes  # noqa: F401  (it imports all that a pipeline can name)
+from clsplat.core.schedule import Curve, Decay, Every, Points
+from clsplat.core.settings import Settings, descriptions
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.matrix import Matrix
-from clsplat.schedule import Curve, Decay, Every, Points
-from clsplat.settings import Settings, descriptions
 
 ROOT = Path(__file__).resolve().parents[1]
 Kind = type[Settings]

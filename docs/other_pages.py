@@ -13,12 +13,12 @@ from families import ROOT, families, groups
 from reference_pages import key_table, manual
 
 import clsplat
-from clsplat import errors
 from clsplat.cli import app
 from clsplat.cli.data import app as tools
+from clsplat.core import errors
+from clsplat.core.schedule import Curve
+from clsplat.core.settings import Settings
 from clsplat.scene import Reader
-from clsplat.schedule import Curve
-from clsplat.settings import Settings
 
 OTHER_CODES = {0: "Done.", 1: "Internal error, a defect of clsplat: `--debug` shows it; please report it."}
 

@@ -7,9 +7,9 @@ from families import NOTATIONS, Kind, families, family, groups, parts, tag, unna
 from schedule_page import schedule_page
 from yaml_examples import example
 
+from clsplat.core.schedule import Bounded
+from clsplat.core.settings import descriptions, variants
 from clsplat.scene.detect import readers
-from clsplat.schedule import Bounded
-from clsplat.settings import descriptions, variants
 
 Node = dict[str, Any]
 HEADINGS = {

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from families import NOTATIONS, Kind, families, family, models, tag, unnamed
 
-from clsplat.schedule import Curve, Decay, Every, Points
+from clsplat.core.schedule import Curve, Decay, Every, Points
 
 EXAMPLES = {  # notation: what it means, and how a file writes it
     "A constant": ("The same at every step.", "weight: 0.8"),

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.bench.table import STYLE
-from clsplat.compare.run_folder import read_settings
-from clsplat.pages.svg import HEIGHT, WIDTH, Line, curve
+from clsplat.conformance.bench.measurement import STYLE
+from clsplat.runs.results import read_settings
 from clsplat.training.records import Records
+from clsplat.viewer.charts import HEIGHT, WIDTH, Line, curve
 
 LONGEST = 130  # CPU seconds that are shown
 

@@ -17,18 +17,17 @@ import hypothesis
 import numpy as np
 import pytest
 
-from clsplat import plugins
-from clsplat.cluster.store import Store
-from clsplat.cluster.task import Terms
 from clsplat.conformance import quick
+from clsplat.core.settings import Settings, rebuild
 from clsplat.data_tools.synthetic import Options, write_dataset
 from clsplat.opencl import device as opencl_device
-from clsplat.opencl import program
-from clsplat.opencl.device import Array, Device
+from clsplat.opencl import device as program
+from clsplat.opencl.device import Array, Device, Kernel, Program
 from clsplat.opencl.discovery import DeviceInfo, choose
-from clsplat.opencl.program import Kernel, Program
-from clsplat.scene.readers import Reader
-from clsplat.settings import Settings, rebuild
+from clsplat.pipeline import plugins
+from clsplat.scene.reader import Reader
+from clsplat.sweeps.store import Store
+from clsplat.sweeps.task import Terms
 from tests.support.devices import NAMES, TUNINGS
 from tests.support.runs import FEW, killed, train
 

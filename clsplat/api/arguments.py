@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 
 PathLike = str | Path
 Overrides = Mapping[str, Any] | Sequence[str]  # values by place, or 'place=value' as --set takes it
@@ -39,7 +39,7 @@ def _plain(value: Any) -> Any:
 
 def load_plugins() -> None:
     """Import the plug-ins of installed packages, once."""
-    from clsplat import plugins
+    from clsplat.pipeline import plugins
 
     plugins.load_installed()
 

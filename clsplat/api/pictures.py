@@ -89,13 +89,13 @@ def render_path(
     replaced; DataError for files that cannot be read, and where the scene's cameras give no such path; NumericError for
     pictures that are not finite; OutputError where files cannot be written; the errors of the device.
     """
-    from clsplat.runs import filming
-    from clsplat.video.film import Wish
+    from clsplat.runs import film
+    from clsplat.viewer.video.film import Wish
 
     load_plugins()
-    wish, place = Wish.of(str(path), frames, fps, size, times), filming.Place(path_of(video), Path(out), kind)
-    extras = filming.Extras(None if side is None else str(side), layer_names(depth, alpha), path_of(save_path))
-    return filming.film(Path(model), path_of(scene), place, wish, extras, downscale=downscale, device=device)
+    wish, place = Wish.of(str(path), frames, fps, size, times), film.Place(path_of(video), Path(out), kind)
+    extras = film.Extras(None if side is None else str(side), layer_names(depth, alpha), path_of(save_path))
+    return film.film(Path(model), path_of(scene), place, wish, extras, downscale=downscale, device=device)
 
 
 def camera_path(
@@ -107,7 +107,7 @@ def camera_path(
     """
     import numpy as np
 
-    from clsplat.video.film import Wish, plan
+    from clsplat.viewer.video.film import Wish, plan
 
     points = np.empty((0, 3), np.float32) if scene.points is None else scene.points.positions
     return plan(Wish.of(str(path), frames, None, size), scene, points).views
@@ -118,7 +118,7 @@ def write_video(file: PathLike, images: "Iterable[NDArray[np.generic]]", fps: fl
 
     Raises ConfigError for another suffix and for sizes that are odd, ValueError for pictures of different sizes.
     """
-    from clsplat.video.encoding import write_all
+    from clsplat.viewer.video.encoding import write_all
 
     return write_all(Path(file), images, fps)
 
@@ -135,8 +135,8 @@ def write_cameras(
     images: copy the photographs to out/images, too.  Returns the files of cameras.  Raises DataError for a lens that
     the format cannot hold, ConfigError where a file is there.
     """
-    from clsplat.runs import cameras
+    from clsplat.runs import film
     from clsplat.scene.scene import Scene
 
     load_plugins()
-    return cameras.write(scene if isinstance(scene, Scene) else Path(scene), Path(out), format, images)
+    return film.write(scene if isinstance(scene, Scene) else Path(scene), Path(out), format, images)

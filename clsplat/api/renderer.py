@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.api.device import proved
+from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.gaussians.model import Model
-from clsplat.gaussians.tables import DeviceModel
 from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.views import require_finite
+from clsplat.nerf.files import FieldModel
 from clsplat.opencl.device import Array, Device
+from clsplat.photos.photographs import BACKGROUNDS
 from clsplat.render.camera import DeviceCamera, upload_camera
-from clsplat.render.pictures import layers
+from clsplat.render.painter import Layers, layers
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.scene.view import View, colour_of
-from clsplat.views.photographs import BACKGROUNDS
 
 Floats = NDArray[np.float32]
 Colour = float | Sequence[float]
@@ -155,3 +156,30 @@ def _checked(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:
     if array.shape != shape:
         raise ValueError(f"the derivative by {name} has shape {array.shape}; expected {shape}, as the picture")
     return array
+
+
+# Rendering of a field with NumPy out.
+
+
+class FieldRenderer:
+    """A field on a device, which serves one thread."""
+
+    def __init__(self, model: FieldModel, device: str | Device | None = None) -> None:
+        """Copy a field to a device, or to one by its name; by default `default_device()`.
+
+        Raises DeviceError when there is none, or when it computes wrongly.
+        """
+        self.model, self.device = model, proved(device)
+        self._field = model.upload(self.device)
+
+    def render(self, view: View, depth: bool = False) -> Layers:
+        """Return `image` [height, width, 3] before the field's background, `alpha` and `depth` [height, width].
+
+        depth: mean depth of what covers a pixel, scene units; None where it is not asked for.
+        Raises ValueError for a camera that cannot be, NumericError where a value of the picture is not finite.
+        """
+        view.camera.check()
+        found = self._field.layers(upload_camera(self.device, view), depth)
+        for values in found.arrays:
+            require_finite(values, view)
+        return found

@@ -8,11 +8,11 @@ from clsplat.api.arguments import PathLike, load_plugins, path_of
 from clsplat.opencl.runtimes import INSTALL as INSTALL
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
-    from clsplat.bench.measurement import Measurement
-    from clsplat.bench.packing import Packings
-    from clsplat.conformance.report import DeviceReport
-    from clsplat.inspect.inspection import Inspection
+    from clsplat.conformance.bench.measurement import Measurement
+    from clsplat.conformance.bench.packing import Packings
+    from clsplat.conformance.doctor import DeviceReport
     from clsplat.opencl.device import Device
+    from clsplat.prepare.inspect.findings import Inspection
 
 ScheduleName = Literal["auto", "wide", "simt"]  # wide for CPUs, simt for GPUs
 
@@ -36,8 +36,7 @@ def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -
 
     It takes a minute or two on a CPU.  page: a file to write, to be attached to a report.
     """
-    from clsplat.conformance.doctor import examine
-    from clsplat.conformance.page import check_place, write_page
+    from clsplat.conformance.doctor import check_place, examine, write_page
 
     load_plugins()
     if page is not None:
@@ -54,10 +53,10 @@ def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection"
     scene: a folder, or that of a run, which stands for the one it was trained on; page: a file to write, with the
     cameras and points in 3D.  Raises DataError only where there is no such folder.
     """
-    from clsplat.inspect.inspection import Inspection
-    from clsplat.inspect.page import write_page
-    from clsplat.results import check_result
-    from clsplat.runs.source import photographs_of
+    from clsplat.core.files import check_result
+    from clsplat.prepare.inspect.findings import Inspection
+    from clsplat.prepare.inspect.page import write_page
+    from clsplat.runs.model_file import photographs_of
 
     load_plugins()
     if page is not None:
@@ -83,7 +82,7 @@ def measure_speed(
     scenes: fixed ones, of A, B and C; model, scene: a splat or point cloud and its scene, timed too; pipeline: whose
     losses, statistics and filter a step has; repeats: steps of each scene.
     """
-    from clsplat.bench.measurement import measure
+    from clsplat.conformance.bench.measurement import measure
 
     load_plugins()
     return measure(
@@ -106,7 +105,7 @@ def measure_growth(
     device: "str | Device | None" = None,
 ) -> str:
     """Time a step with 50 000 to a million Gaussians; write the chart, an SVG, and return a table."""
-    from clsplat.bench import measurement
+    from clsplat.conformance.bench import measurement
 
     load_plugins()
     return measurement.measure_growth(
@@ -126,7 +125,7 @@ def measure_packing(
 
     Return steps per second and memory of each number, as `data()` and `text()`; sweeps on this machine take the `best`.
     """
-    from clsplat.bench import measurement
+    from clsplat.conformance.bench import measurement
 
     load_plugins()
     return measurement.measure_packing(
@@ -136,14 +135,14 @@ def measure_packing(
 
 def read_measurement(file: PathLike, pipeline: PathLike = "splat") -> dict[str, Any]:
     """Read the `data()` of an earlier measurement from JSON, to be shown beside another of the same pipeline."""
-    from clsplat.bench import comparison
+    from clsplat.conformance.bench import measurement
 
     load_plugins()
-    return comparison.read_measurement(Path(file), str(pipeline))
+    return measurement.read_measurement(Path(file), str(pipeline))
 
 
 def load_plugin(file: PathLike) -> None:
     """Import a plug-in, as `--plugin` does.  Raises ConfigError, with file and line, when that fails."""
-    from clsplat import plugins
+    from clsplat.pipeline import plugins
 
     plugins.load_file(Path(file))

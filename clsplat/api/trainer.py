@@ -9,33 +9,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from clsplat import lock
 from clsplat.api.arguments import PathLike, load_plugins, overrides
 from clsplat.api.device import proved
-from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
+from clsplat.core import lock
+from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
+from clsplat.core.files import CHECKSUMS, END_STATES
+from clsplat.core.schedule import Schedule
+from clsplat.core.signals import stopping_on_signals
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import ViewLosses
 from clsplat.losses.host import HostFunction, HostLoss
 from clsplat.metrics.views import mean, measure
-from clsplat.names import CHECKSUMS, END_STATES
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.runs import folders, opening, outputs, runner
-from clsplat.runs.choices import settle
+from clsplat.runs import opening, outputs, run_folder, runner
 from clsplat.runs.failures import failures_recorded
-from clsplat.runs.folders import Start
-from clsplat.runs.scenes import RunScene
-from clsplat.runs.source import as_setting
+from clsplat.runs.model_file import as_setting
+from clsplat.runs.opening import RunScene, settle
+from clsplat.runs.run_folder import Start
 from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE
-from clsplat.schedule import Schedule
-from clsplat.signals import stopping_on_signals
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
-from clsplat.training.host_model import host_model
-from clsplat.training.rescue import saved_on_failure
+from clsplat.training.checkpoint import saved_on_failure
+from clsplat.training.run import host_model
 from clsplat.training.status import StatusFile
 
 
@@ -101,7 +100,7 @@ class Trainer:
         rasterizer = self.pipeline.settings.rasterizer
         opened = proved(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:
-            status = holding.enter_context(folders.opened(self.out, start, step=0))
+            status = holding.enter_context(run_folder.opened(self.out, start, step=0))
             with failures_recorded(status, as_raised=True):
                 scene_of_run = RunScene.of(self.pipeline.settings.scene, self.scene)
                 self._run = opening.make_run(self.pipeline, scene_of_run, opened, self.out, status)

@@ -8,11 +8,11 @@ from typing import Any
 
 import typer
 
-from clsplat import streams, terminal
-from clsplat.cli import blocks, models, pictures, runs, sweeps, tools  # noqa: F401  register their commands
+from clsplat.cli import models, runs, tools  # noqa: F401  register their commands
 from clsplat.cli.app import Passed, app
-from clsplat.errors import Interrupted, as_clsplat_error, one_line
-from clsplat.signals import stop_at_once, stopping_on_signals
+from clsplat.core import signals, terminal
+from clsplat.core.errors import Interrupted, as_clsplat_error, one_line
+from clsplat.core.signals import stop_at_once, stopping_on_signals
 
 COMPLETION = "_CLSPLAT_COMPLETE"  # set where a shell asks for completions
 DEBUG, PLUGIN = "--debug", "--plugin"  # options that stand before the command or after it
@@ -24,7 +24,7 @@ def main(*before: str) -> None:
 
     before: arguments that stand before those of the process.
     """
-    streams.install()
+    signals.install()
     arguments = _options_first(_with_port(_one_set_each([*before, *sys.argv[1:]])))
     try:
         with stopping_on_signals(stop_at_once):
@@ -32,7 +32,7 @@ def main(*before: str) -> None:
             if shown:  # typer makes the code 130 of a KeyboardInterrupt before the command begins
                 raise KeyboardInterrupt
             if shown is not None:  # the code of --help and --version; commands return nothing
-                streams.check_output()
+                signals.check_output()
             code = 0
     except BaseException as error:
         if isinstance(error, SystemExit) and COMPLETION in os.environ:

@@ -9,12 +9,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from clsplat import terminal
 from clsplat.api import arguments, tools
-from clsplat.errors import ConfigError
+from clsplat.core import terminal
+from clsplat.core.errors import ConfigError
+from clsplat.core.resources import full_version
+from clsplat.core.signals import stop_with_input
 from clsplat.pipeline.files import shipped
-from clsplat.signals import stop_with_input
-from clsplat.version import full_version
 
 SYNONYMS = {
     **dict.fromkeys(("train", "fit", "optimize", "start"), "run"),

@@ -5,9 +5,9 @@ from typing import Annotated, Literal
 
 import typer
 
+from clsplat.core.errors import ConfigError
 from clsplat.data_tools.multiscale import write_multiscale
 from clsplat.data_tools.synthetic import Options, write_dataset
-from clsplat.errors import ConfigError
 from clsplat.prepare.features import CameraModel
 from clsplat.prepare.mapping import Mapper
 from clsplat.prepare.matching import Matching
@@ -95,7 +95,7 @@ def photos(
     mapper: Annotated[Mapper, typer.Option(help="Method that places the cameras.")] = "incremental",
 ) -> None:
     """Find the cameras of photographs: features, matches, structure from motion; a COLMAP folder."""
-    from clsplat.prepare.place import place_photographs
+    from clsplat.prepare.cache import place_photographs
 
     count = place_photographs(source, out, long_side, camera_model, matching, mapper)
     print(f"{count} photographs placed, a COLMAP folder in {out}")

@@ -5,10 +5,11 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from clsplat import terminal
 from clsplat.api import commands
+from clsplat.api import commands as api
 from clsplat.cli.app import DeviceOption, JsonOption, LiveOption, PipelineArgument, SetOption, command, recipe_names
-from clsplat.errors import ClsplatError, ConfigError, DataError, OutputError, in_shell
+from clsplat.core import terminal
+from clsplat.core.errors import ClsplatError, ConfigError, DataError, OutputError, in_shell
 
 OnOption = Annotated[
     Path | None,
@@ -96,7 +97,7 @@ def resume(
 
 
 def _show_summary(folder: Path) -> None:
-    from clsplat.runs.summary import summary
+    from clsplat.runs.status import summary
 
     for line in summary(folder):
         terminal.remark(line)
@@ -121,9 +122,9 @@ def status(
     as_json: JsonOption = False,
 ) -> None:
     """Show the state of a run, its step and its metrics, or of all cells of a store, from the files alone."""
-    from clsplat.blocks.table import status_table
-    from clsplat.cluster.overview import overview_text
     from clsplat.runs.status import status_text
+    from clsplat.sweeps.status import overview_text
+    from clsplat.workflows.blocks import status_table
 
     if schema:
         terminal.show_json(commands.status_schema())
@@ -168,11 +169,11 @@ def check(
         raise ConfigError("check: expected a pipeline, a run folder, a model, or --schema")
     found = commands.check(pipeline)
     if "objects" in found:
-        from clsplat.runs.verdict import lines, verdict
+        from clsplat.runs.verify import lines, verdict
 
         _show_findings(found, as_json, lines(found), verdict(found), None if found["whole"] else OutputError)
     elif "model" in found:
-        from clsplat.gaussians.checkup import lines, verdict
+        from clsplat.gaussians.validate import lines, verdict
 
         _show_findings(found, as_json, lines(found), verdict(found), None if found["valid"] else DataError)
     elif as_json:
@@ -226,3 +227,129 @@ def pipelines(
 
         found = commands.pipelines(name or None)
         terminal.show(manual_text(found) if name else summaries_text(found))
+
+
+# The command that trains a scene in blocks.
+
+
+@command(
+    "blocks",
+    "clsplat blocks --scene my_city --plan",
+    "clsplat blocks --scene my_city --blocks 9 --out runs/my_city",
+    "clsplat blocks my_blocks.yaml --scene my_city --coarse runs/splat_7k",
+)
+def blocks(
+    pipeline: PipelineArgument = "blocks",
+    scene: Annotated[
+        Path,
+        typer.Option(metavar="DIR", help="A COLMAP, Blender or nerfstudio folder, or a run's.", show_default=False),
+    ] = ...,  # type: ignore[assignment]
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the runs of all blocks and the model.")] = Path(
+        "runs/blocks"
+    ),
+    count: Annotated[int, typer.Option("--blocks", metavar="N", help="Number of blocks.")] = 4,
+    coarse: Annotated[
+        str, typer.Option(metavar="PIPELINE|MODEL|RUN", help="What makes the coarse model that is cut, or that model.")
+    ] = "blocks_coarse",
+    sight: Annotated[
+        float, typer.Option(metavar="SHARE", help="Of a view's pixels, above which it belongs to a block.")
+    ] = 0.05,
+    steps: Annotated[
+        Literal["each", "shared"],
+        typer.Option(help="Each block has the pipeline's steps, or its share of them by its views."),
+    ] = "each",
+    plan: Annotated[bool, typer.Option("--plan", help="Train the coarse model, show the plan, and stop.")] = False,
+    set_: SetOption = None,
+    set_coarse: Annotated[
+        list[str] | None,
+        typer.Option("--set-coarse", metavar="KEY=VALUE", help="As --set, of the coarse model; may be repeated."),
+    ] = None,
+    on: Annotated[
+        Path | None,
+        typer.Option("--on", metavar="FILE", help="Where blocks are trained, as cells of a store: engine, store."),
+    ] = None,
+    as_json: JsonOption = False,
+    device: DeviceOption = None,
+) -> None:
+    """Train a large scene in blocks that fit the device, one after the other or on several, and merge them."""
+    from clsplat.workflows.blocks import table
+
+    if as_json:
+        terminal.keep_stdout_for_json()
+    found = api.train_in_blocks(
+        scene,
+        out,
+        pipeline,
+        blocks=count,
+        coarse=coarse,
+        sight=sight,
+        steps=steps,
+        overrides=set_ or (),
+        coarse_overrides=set_coarse or (),
+        only_plan=plan,
+        on=on,
+        device=device,
+    )
+    if as_json:
+        terminal.show_json(found)
+        return
+    terminal.show(table(found))
+    if plan:
+        terminal.remark(f"{out}/partition.json: the plan; the same command without --plan trains the blocks")
+    else:
+        terminal.remark(f"`clsplat view {in_shell(found['run'])}` shows {found['metrics']['gaussians']:,} Gaussians")
+
+
+# Commands about the cells of a sweep.
+
+StoreOption = Annotated[Path, typer.Option("--store", metavar="DIR", help="The store of cells, a shared folder.")]
+
+
+@command(
+    "cell",
+    "clsplat cell sweep.yaml --index 3 --store /shared/store",
+    "clsplat cell splat_7k --scene my_scene --store runs/store",
+)
+def cell(
+    pipeline: PipelineArgument,
+    store: StoreOption,
+    scene: Annotated[Path | None, typer.Option(metavar="DIR", help="The photographs, as for run.")] = None,
+    index: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="The cell of a matrix, counted from 0, such as $SLURM_ARRAY_TASK_ID."),
+    ] = None,
+    device: DeviceOption = None,
+    set_: SetOption = None,
+) -> None:
+    """Run one cell of a matrix, unless its result is in the store; what every queue can call."""
+    commands.run_cell(pipeline, store, scene, index=index, set=set_ or (), device=device)
+
+
+@command("cancel", "clsplat cancel runs/store", "clsplat cancel runs/store seed=1")
+def cancel(
+    store: Annotated[Path, typer.Argument(metavar="STORE", help="The store of cells.")],
+    cell: Annotated[str | None, typer.Argument(metavar="[CELL]", help="A cell's name or key; default: all.")] = None,
+) -> None:
+    """Let cells that run, on whatever machine, save their state and stop."""
+    terminal.remark(f"{store}: {commands.cancel(store, cell)} asked to stop")
+
+
+@command(
+    "worker",
+    "clsplat worker --scheduler dask://127.0.0.1:8786",
+    "clsplat worker --scheduler dask://head:8786 --insecure",
+)
+def worker(
+    scheduler: Annotated[str, typer.Option(metavar="ADDRESS", help="dask://HOST:PORT, or tls://HOST:PORT.")],
+    device: Annotated[
+        list[str] | None, typer.Option("--device", metavar="NAME", help="A device; may be repeated; default: all.")
+    ] = None,
+    tls_ca: Annotated[str | None, typer.Option(metavar="FILE", help="Certificate of the authority, PEM.")] = None,
+    tls_cert: Annotated[str | None, typer.Option(metavar="FILE", help="Certificate of this machine, PEM.")] = None,
+    tls_key: Annotated[str | None, typer.Option(metavar="FILE", help="Its private key, PEM.")] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Without TLS: whoever reaches the scheduler's port can run code.")
+    ] = False,
+) -> None:
+    """Offer the devices of this machine to a Dask scheduler, one process a device, until it ends."""
+    commands.work_for(scheduler, device, tls=(tls_ca, tls_cert, tls_key), insecure=insecure)

@@ -5,11 +5,11 @@ from typing import Annotated, Literal
 
 import typer
 
-from clsplat import streams, terminal
 from clsplat.api import tools
-from clsplat.api.blocks import plan_in_blocks
+from clsplat.api.commands import plan_in_blocks
 from clsplat.cli.app import DeviceOption, JsonOption, command
-from clsplat.errors import ConfigError, DataError, DeviceError
+from clsplat.core import signals, terminal
+from clsplat.core.errors import ConfigError, DataError, DeviceError
 
 
 @command("devices", "clsplat devices", "clsplat devices --json")
@@ -34,7 +34,7 @@ def doctor(
     ] = None,
 ) -> None:
     """Prove that a device computes what the reference says; exit 4 when it does not."""
-    from clsplat.conformance.page import check_place, write_page
+    from clsplat.conformance.doctor import check_place, write_page
 
     if as_json:
         terminal.keep_stdout_for_json()
@@ -76,8 +76,8 @@ def inspect(
     device: DeviceOption = None,
 ) -> None:
     """Tell whether a dataset will train, and what is wrong with it; exit 3 when it cannot train."""
-    from clsplat.blocks.table import table
-    from clsplat.inspect.table import show
+    from clsplat.prepare.inspect.findings import show
+    from clsplat.workflows.blocks import table
 
     if count is None and device is not None:
         raise ConfigError("inspect: --device is for --blocks, which times some steps; leave it out")
@@ -98,7 +98,7 @@ def inspect(
         terminal.show_json(inspection.data())
     else:
         show(inspection, terminal.CONSOLE)
-        streams.check_output()
+        signals.check_output()
     if not inspection.trainable:
         raise DataError(inspection.verdict)
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from clsplat import cores
-from clsplat.version import full_version
+from clsplat.core import machine
+from clsplat.core.resources import full_version
 
 CODE = ("PYOPENCL_BUILD", "POCL_", "CL_", "RUSTICL_", "LP_", "IGC_", "AMD_", "GPU_", "CUDA_")  # may change what runs
 CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not
@@ -50,7 +50,7 @@ def system() -> dict[str, Any]:
 def code_variables() -> dict[str, str]:
     """Return the variables with which compilers and runtimes may make other code of the same kernels."""
     found = _variables(CODE)
-    return {name: value for name, value in found.items() if not name.startswith(CACHES) and name not in cores.LIMITS}
+    return {name: value for name, value in found.items() if not name.startswith(CACHES) and name not in machine.LIMITS}
 
 
 def _variables(prefixes: tuple[str, ...]) -> dict[str, str]:

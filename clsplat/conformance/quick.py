@@ -1,26 +1,70 @@
 """The two-second form: the kernels of a training step on one small scene, once for a device, driver and kernels."""
 
+import atexit
 import hashlib
+import json
 import logging
+import os
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
-from clsplat.caches import cache_folder
-from clsplat.conformance import uses
 from clsplat.conformance.host import code_variables
 from clsplat.conformance.supervision import supervised
-from clsplat.errors import DeviceError, MemoryLimitError, OutputError
-from clsplat.files import write_text
-from clsplat.opencl.device import Device, open_device
+from clsplat.core.errors import DataError, DeviceError, MemoryLimitError, OutputError
+from clsplat.core.files import write_text
+from clsplat.core.machine import Owner, cache_folder
+from clsplat.core.reading import read_json
+from clsplat.core.resources import __version__, resource_dir
+from clsplat.opencl.device import BUILD_OPTIONS, Device, open_device
 from clsplat.opencl.discovery import DeviceInfo, Schedule, tuning_of
 from clsplat.opencl.kernel_caches import damaged_kernels
-from clsplat.opencl.program import BUILD_OPTIONS
 from clsplat.render.tiles import Sort, known_sort
-from clsplat.version import __version__, resource_dir
+
+# Uses of a device in progress: after one that ended without a word, as with a signal, the device is checked again.
+
+FOLDER = "in_use"
+_own: set[Path] = set()  # marks of this process
+
+
+def begin(records: Sequence[Path]) -> None:
+    """Mark the records of a device as in use by this process, until it ends in an orderly way."""
+    folder, owner = records[0].parent.parent / FOLDER, Owner.this()
+    place = hashlib.sha256(repr(owner).encode()).hexdigest()[:8]  # containers with one cache have equal numbers
+    mark = folder / f"{owner.process}-{place}-{records[0].name}.json"
+    if mark not in _own:
+        with suppress(OutputError):
+            write_text(mark, json.dumps({**asdict(owner), "records": [record.name for record in records]}))
+            _own.add(mark)
+            atexit.register(_end, mark)
+
+
+def forget_after_sudden_ends(cache: Path) -> None:
+    """Remove the records in a folder of caches that a process used which has ended and left its mark."""
+    for mark in {*(cache / FOLDER).glob("*.json")} - _own:
+        try:
+            values = read_json(mark)
+        except DataError:
+            continue
+        owner = Owner.named_by(values) if isinstance(values, dict) else None
+        # the first process of every container has the same number
+        if owner is not None and (owner.process == os.getpid() or owner.has_ended):
+            with suppress(OSError):
+                names = values.get("records")
+                for name in names if isinstance(names, list) else ():
+                    with suppress(ValueError):  # no name of a file
+                        (cache / "conformance" / Path(str(name)).name).unlink(missing_ok=True)
+                mark.unlink(missing_ok=True)
+
+
+def _end(mark: Path) -> None:
+    with suppress(OSError):
+        mark.unlink(missing_ok=True)
+
 
 LOG = logging.getLogger("clsplat")
 QUICK_SECONDS = 300  # without a word from a check, in front of a run
@@ -50,9 +94,9 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     bitonic = known_sort(device, sort) != "radix"
     sorts = SORTS if bitonic else SORTS[:1]
     records = [_record(info, schedule, one) for one in sorts]
-    uses.forget_after_sudden_ends(cache_folder())
+    forget_after_sudden_ends(cache_folder())
     if all(record.exists() for record in records):
-        uses.begin(records)
+        begin(records)
         return
     from clsplat.conformance.checks import BITONIC, ESSENTIAL  # a run on a device that is known needs no reference
 
@@ -66,7 +110,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
             how = "cannot be trusted" if result.fault else "computes wrongly"
             raise DeviceError(f"{device.text} {how}: {result.failures[0]}; `clsplat doctor` tells more")
     remember(info, schedule, sorts)
-    uses.begin(records)
+    begin(records)
 
 
 def remember(info: DeviceInfo, schedule: Resolved, sorts: Sequence[str] = SORTS) -> None:

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.gaussians.tables import DeviceModel, Dropout, Gaussians
+from clsplat.conformance.reference import Splats
+from clsplat.gaussians.gaussians import DeviceModel, Dropout, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.camera import DeviceCamera, upload_camera
-from clsplat.scene.scene import Camera, View
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
 
 SHARP = ref.Thresholds()
 EYE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.09, 0.977, 0.3]])
@@ -125,3 +127,35 @@ def safe_case(
         if min(gaps.alpha, gaps.transmittance, gaps.cap) > margin and gaps.depth > min(margin, 2e-6):
             return case
     raise AssertionError("no scene with margins was found")
+
+
+# What the kernels' sums over pixels are as gradients of splats (cl_kernels/splat.h, pixel_box.h).
+
+Floats = NDArray[Any]
+
+
+def gradients_of_sums(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
+    """dL/d(mean2d), [N, 2], and dL/d(conic), [N, 3], of sums [N, PIXEL_SUMS]; culled splats have sums of 0."""
+    if splats.pixel_box:
+        return m[:, 1:3], _covariance_gradient(splats, m[:, 3:6])
+    a, b, c = splats.conic.T
+    mean2d = -np.stack([a * m[:, 1] + b * m[:, 2], b * m[:, 1] + c * m[:, 2]], axis=1)
+    return mean2d, np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)
+
+
+def _covariance_gradient(splats: Splats, m: Floats) -> Floats:
+    """From the derivatives by k = xy / yy, ln s, s² = yy, and ln t, t² = xx - xy² / yy; turned: x for y."""
+    found = np.zeros((len(m), 3))
+    for n in np.flatnonzero(splats.visible):
+        xx, xy, yy = splats.conic[n]
+        turned = xx > yy
+        if turned:
+            xx, yy = yy, xx
+        k, t2 = xy / yy, xx - xy * xy / yy
+        by_k, by_s, by_t = m[n]
+        by_t2 = by_t / (2 * t2)
+        by_yy = -by_k * k / yy + by_s / (2 * yy) + by_t2 * k * k
+        found[n] = by_t2, by_k / yy - 2 * k * by_t2, by_yy
+        if turned:
+            found[n] = found[n, ::-1]
+    return found

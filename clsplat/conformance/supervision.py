@@ -12,9 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from clsplat.conformance.check import Check, Note
-from clsplat.conformance.comparison import Figure
-from clsplat.errors import shortened
+from clsplat.conformance.check import Check, Figure, Note
+from clsplat.core.errors import shortened
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.opencl.kernel_caches import empty_kernel_caches
 

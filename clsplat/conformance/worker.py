@@ -16,10 +16,10 @@ from typing import Any, TextIO
 
 from clsplat.conformance.check import Check, Note
 from clsplat.conformance.checks import BY_NAME
-from clsplat.errors import ClsplatError, KernelError, MemoryLimitError, as_clsplat_error, one_line, shortened
+from clsplat.core.errors import ClsplatError, KernelError, MemoryLimitError, as_clsplat_error, one_line, shortened
+from clsplat.core.signals import only_reader_of_stdin, only_writer_of_stdout
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import Schedule, list_devices
-from clsplat.streams import only_reader_of_stdin, only_writer_of_stdout
 
 LOG_LIMIT = 4000  # characters of a build log
 

@@ -1,5 +1,5 @@
-"""Density control: statistics of Gaussians, and rules that add and remove them.  Each module defines variants."""
+"""Density control: statistics of Gaussians, edits, budgets, and what rules share.  Each module defines variants."""
 
-from clsplat.settings import import_modules
+from clsplat.core.settings import import_modules
 
 import_modules(__name__, __path__)

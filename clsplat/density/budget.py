@@ -6,9 +6,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from clsplat.core.schedule import Positive
+from clsplat.core.settings import Settings
 from clsplat.density.edit import Edit
-from clsplat.schedule import Positive
-from clsplat.settings import Settings
 
 
 @dataclass(frozen=True)

@@ -15,15 +15,43 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.density.outcomes import outcomes_of, require_rows
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import Schedule, at_step
+from clsplat.core.settings import Settings
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale, Threshold
-from clsplat.errors import ConfigError
-from clsplat.gaussians.rows import checked_rows
-from clsplat.gaussians.tables import Gaussians, moment_tables
-from clsplat.schedule import Schedule, at_step
-from clsplat.settings import Settings
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.structs import checked_rows, moment_tables
+
+# What a rule may ask an edit for: numbers of rows that can be, for the Gaussians of a mask.
+
+MAX_ROWS = 2**32 - 2  # sums of 32 bits stay at one more, whatever more there is (cl_kernels/scan.cl)
+
+
+def require_rows(copies: int, kept: int) -> None:
+    """Raise ValueError for numbers of rows that cannot be."""
+    for name, number in (("copies", copies), ("kept", kept)):
+        if not 0 <= number <= MAX_ROWS:
+            bound = "0 or more" if number < 0 else f"at most {MAX_ROWS}"
+            raise ValueError(f"{name}: expected a number of rows, {bound}, got {number}")
+
+
+def outcomes_of(
+    chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], kept: int, count: int
+) -> NDArray[np.uint32]:
+    """Return copies + 1 for the Gaussians that are chosen, 0 for the others, [N]; ValueError as `Edit.choose`."""
+    numbers = np.asarray(copies)
+    if chosen.dtype != np.bool_ or chosen.shape != (count,):
+        raise ValueError(f"chosen: expected a mask, bool [{count}], got {chosen.dtype} {list(chosen.shape)}")
+    if not np.issubdtype(numbers.dtype, np.integer) or numbers.shape not in ((), (count,)):
+        raise ValueError(
+            f"copies: expected an integer or integers [{count}], got {numbers.dtype} {list(numbers.shape)}"
+        )
+    require_rows(int(numbers.min(initial=0)), kept)
+    require_rows(int(numbers.max(initial=0)), kept)
+    return np.where(chosen, numbers.astype(np.int64) + 1, 0).astype(np.uint32)
+
 
 MAX_BOUND = 3.0e38  # a bound above all values
 MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that all values but zero reach

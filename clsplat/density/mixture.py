@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.quaternions import rotation_matrix, unit_quaternions
 from clsplat.formats.splats import inverse_opacities
-from clsplat.quaternions import rotation_matrix, unit_quaternions
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -12,13 +12,12 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.tables import Gaussians
+from clsplat.core.settings import Settings, VariantName, variants
+from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import ViewGradients
-from clsplat.opencl.device import Array
-from clsplat.opencl.program import constants
+from clsplat.opencl.device import Array, constants
+from clsplat.photos.photographs import known_gradient
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame
-from clsplat.settings import Settings, VariantName, variants
-from clsplat.views.texture import known_gradient
 
 FOLDER = "stats/"
 SEEN = "stats/seen"

@@ -10,15 +10,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.tables import DeviceModel
+from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, Dssim
-from clsplat.opencl.device import Array
-from clsplat.opencl.program import constants
-from clsplat.render.pictures import inside
+from clsplat.opencl.device import Array, constants
+from clsplat.photos.photographs import Photograph, Photographs, apply_mask
+from clsplat.render.painter import inside
 from clsplat.render.rasterizer import Frame, Rasterizer
-from clsplat.scene.scene import View
-from clsplat.views.photographs import Photograph, Photographs, apply_mask
+from clsplat.scene.view import View
 
 WEIGHT, BLENDED, SQUARE = (int(constants("splat.h")[f"SUM_{name}"]) for name in ("WEIGHT", "BLENDED", "SQUARE"))
 LOSSES = L1(weight=0.8), Dssim(weight=0.2)  # of a view in published scores

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from clsplat.errors import ConfigError
-from clsplat.schedule import NonNegative, explained
-from clsplat.settings import Settings
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import NonNegative, explained
+from clsplat.core.settings import Settings
 
 Share = Annotated[float, Field(ge=0, le=1)]
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.harmonics import basis
 from clsplat.density.survey import WEIGHT, Look
-from clsplat.gaussians.tables import SH_C0
-from clsplat.harmonics import basis
+from clsplat.formats.splats import SH_C0
 
 Floats = NDArray[np.float64]
 Nearest = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]

@@ -1,0 +1,1 @@
+"""Splat files: a module for each format, and one table of them."""

@@ -14,10 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.formats.output import written
-from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three
-from clsplat.formats.ply import comment_of, comments, mode_of
+from clsplat.core.errors import DataError
+from clsplat.core.reading import opened
+from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, written
+from clsplat.formats.ply import (
+    MAX_HEADER,
+    PlyHeader,
+    comment_of,
+    comments,
+    format_ply_header,
+    mode_of,
+    parse_ply_header,
+)
 from clsplat.formats.splats import (
     MAX_DEGREE,
     SH_C0,
@@ -30,8 +38,6 @@ from clsplat.formats.splats import (
     swapped,
     unit,
 )
-from clsplat.ply_header import MAX_HEADER, PlyHeader, format_ply_header, parse_ply_header
-from clsplat.reading import opened
 
 CHUNK = 256  # splats
 BITS = (11, 10, 11)  # of x, y and z

@@ -4,7 +4,7 @@
 
 f_rest is channel-major (all red, all green, all blue); opacity is a logit, scales are logarithms, rot is (w, x, y, z).
 Normals are written as zeros.  Where a world filter is not yet part of scales and opacity, `filter_3D` follows, its
-standard deviation (Mip-Splatting); where Gaussians move, the columns of their motion (clsplat/formats/motion.py).
+standard deviation (Mip-Splatting); where Gaussians move, the columns of their motion (clsplat/formats/splats.py).
 Comments hold the numbers that a rasterizer needs, and the mode for viewers: `SplatRenderMode: mip` when a screen filter
 reduces opacities to keep their energy, else `default`.
 """
@@ -12,27 +12,166 @@ reduces opacities to keep their energy, else `default`.
 import json
 import os
 import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, quoted
-from clsplat.formats.motion import MOTION, columns_among, columns_of
-from clsplat.formats.output import written
+from clsplat.core.errors import DataError, quoted, shortened
+from clsplat.core.reading import opened
+from clsplat.formats.packing import written
 from clsplat.formats.splats import (
     FLAT_LOG_SCALE,
     MAX_DEGREE,
+    MOTION,
     PARAMETERS,
     Parameters,
     SplatFile,
+    columns_among,
+    columns_of,
     require_held,
     sh_coefficients,
     swapped,
 )
-from clsplat.ply_header import MAX_HEADER, PlyHeader, format_ply_header, parse_ply_header
-from clsplat.reading import opened
+
+# The header of a PLY file: comments, and place and properties of its vertices.
+
+ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}  # of bytes, as NumPy writes them
+MAX_HEADER = 1 << 16  # bytes; real headers have about 1.5 KB
+END = re.compile(rb"\nend_header[ \t]*\r?\n")
+COUNT = re.compile("[0-9]{1,18}")
+TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+
+
+@dataclass(frozen=True)
+class Section:
+    """One element of a binary PLY file."""
+
+    count: int
+    dtype: np.dtype[Any]  # of one row, in the byte order of the file
+    start: int  # bytes before its rows
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """The vertices of a PLY file."""
+
+    format: str  # one of ORDERS
+    comments: tuple[str, ...]
+    count: int
+    dtype: np.dtype[Any]  # of one vertex, in the byte order of the file
+    start: int  # bytes before the vertices; of an ascii file those of the header
+    lines_before: int  # of an ascii file: lines between header and vertices
+    sections: dict[str, Section] = field(default_factory=dict)  # of a binary file: all elements before one with a list
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: list[tuple[str, str]]  # name and NumPy type
+    has_list: bool = False
+
+
+def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
+    """Return the header of a PLY file from its first MAX_HEADER bytes, or more; `path` is for messages.
+
+    Elements before the vertices must have no lists; elements after them may.
+    Raises DataError when it is not a PLY file, has no vertices, or has vertices with lists.
+    """
+    end = END.search(data, 0, MAX_HEADER)
+    if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
+        raise DataError(
+            f"{path}: not a PLY file; expected a header from 'ply' to 'end_header' in its first {MAX_HEADER} bytes: "
+            "copy or export it again"
+        )
+    form = ""
+    elements: list[_Element] = []
+    comments = []
+    for number, line in enumerate(data[: end.start()].decode("utf-8", "replace").split("\n"), start=1):
+        match line.split():
+            case ["format", name, _] if name in ORDERS and not form:
+                form = name
+            case ["element", name, count] if COUNT.fullmatch(count):
+                elements.append(_Element(name, int(count), []))
+            case ["property", kind, name] if kind in TYPES and elements:
+                elements[-1].properties.append((name, TYPES[kind]))
+            case ["property", "list", _, _, _] if elements and elements[-1].name != "vertex":
+                elements[-1].has_list = True
+            case ["comment", *_]:
+                comments.append(line.strip().removeprefix("comment").lstrip())
+            case [] | ["ply"] | ["obj_info", *_]:
+                pass
+            case _:
+                raise DataError(
+                    f"{path}: line {number}: cannot read {quoted(line.strip())}; expected a PLY header whose vertices "
+                    "have single numbers as properties: export it again"
+                )
+    if not form:
+        raise DataError(f"{path}: the PLY header has no 'format ascii 1.0' or 'format binary_…'; export it again")
+    return _vertices(path, form, tuple(comments), elements, end.end())
+
+
+def format_ply_header(comments: Iterable[str], **elements: tuple[int, Iterable[str]]) -> bytes:
+    """Return the header of a binary little-endian file.
+
+    elements: by name the number of rows and the properties of each element, such as `float x`, in their order.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    for name, (count, properties) in elements.items():
+        lines += [f"element {name} {count}", *(f"property {text}" for text in properties)]
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_Element], start: int) -> PlyHeader:
+    names = [element.name for element in elements]
+    if "vertex" not in names:
+        raise DataError(
+            f"{path}: has no vertices, only {shortened(', '.join(names)) or 'a header'}; expected 'element vertex N'"
+        )
+    *before, vertex = elements[: names.index("vertex") + 1]
+    if lists := [element.name for element in before if element.has_list]:
+        raise DataError(
+            f"{path}: {quoted(lists[0])}, with a list, stands before the vertices; export it with vertices first"
+        )
+    properties = [name for name, _ in vertex.properties]
+    if not properties or len(set(properties)) < len(properties):
+        fault = "a property of the vertices is declared twice" if properties else "its vertices have no properties"
+        raise DataError(f"{path}: {fault}; export it again")
+    dtype = np.dtype([(name, ORDERS[form] + kind) for name, kind in vertex.properties])
+    if form == "ascii":
+        return PlyHeader(form, comments, vertex.count, dtype, start, sum(element.count for element in before))
+    sections = _sections(elements, ORDERS[form], start)
+    return PlyHeader(form, comments, vertex.count, dtype, sections["vertex"].start, 0, sections)
+
+
+def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Section]:
+    """Where the elements of a binary file lie, up to one whose size nobody knows; of two with one name the first."""
+    sections: dict[str, Section] = {}
+    for element in elements:
+        if element.has_list:
+            break
+        names = [f"{i} {name}" for i, (name, _) in enumerate(element.properties)]
+        if len({name for name, _ in element.properties}) == len(element.properties):
+            names = [name for name, _ in element.properties]
+        kinds = [order + kind for _, kind in element.properties]
+        dtype = np.dtype(list(zip(names, kinds, strict=True)))
+        sections.setdefault(element.name, Section(element.count, dtype, start))
+        start += element.count * dtype.itemsize
+    return sections
+
 
 RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
 MIP = re.compile(r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE)  # of all programs
@@ -194,3 +333,46 @@ def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.flo
         return np.zeros((len(vertices), 0), np.float32)
     with np.errstate(over="ignore"):  # of doubles: infinity is refused
         return np.stack([vertices[c].astype(np.float32) for c in columns], axis=1)
+
+
+# Several splat PLY files as one, a piece at a time: the memory is that of a piece, whatever the files hold.
+
+PIECE_ROWS = 1 << 16  # of a piece
+Check = Callable[[int, NDArray[np.float32]], None]
+
+
+def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
+    """Write the vertices of all parts, in their order, with the header of the first; return their number.
+
+    check: is given the number of a part and the means of some of its rows, [n, 3], and raises what is wrong.
+    Raises DataError where a part is damaged or has other properties or another comment than the first, OutputError.
+    """
+    headers = [_header(part) for part in parts]
+    first, count = headers[0], sum(header.count for header in headers)
+    for part, header in zip(parts, headers, strict=True):
+        if (header.dtype, header.comments) != (first.dtype, first.comments):
+            raise DataError(f"{part}: has other properties, or another comment, than {parts[0]}; train both alike")
+    properties = [f"float {name}" for name in first.dtype.names or ()]
+    with written(path) as output:
+        output.write(format_ply_header(first.comments, vertex=(count, properties)))
+        for number, (part, header) in enumerate(zip(parts, headers, strict=True)):
+            with opened(part, "a PLY file") as file:
+                file.seek(header.start)
+                for start in range(0, header.count, PIECE_ROWS):
+                    size = min(PIECE_ROWS, header.count - start) * header.dtype.itemsize
+                    piece = file.read(size)
+                    if len(piece) < size:
+                        raise DataError(f"{part}: its end is missing; train that block again")
+                    rows = np.frombuffer(piece, header.dtype)
+                    check(number, np.stack([rows[axis].astype(np.float32) for axis in "xyz"], axis=1))
+                    output.write(piece)
+    return count
+
+
+def _header(part: Path) -> PlyHeader:
+    with opened(part, "a PLY file") as file:
+        header = parse_ply_header(part, file.read(MAX_HEADER))
+    kinds = {header.dtype[name] for name in header.dtype.names or ()}
+    if header.format != "binary_little_endian" or list(header.sections) != ["vertex"] or kinds != {np.dtype("<f4")}:
+        raise DataError(f"{part}: expected a model as `export` writes it")
+    return header

@@ -8,20 +8,133 @@
 In version 1 scales, sh0, the logit of opacity, and shN lie between a least and a largest value, in 8 bits.
 """
 
+import io
 import json
 import math
+import os
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, quoted
-from clsplat.formats import webp
-from clsplat.formats.packing import from_smallest_three
+from clsplat.core.errors import DataError, quoted
+from clsplat.core.reading import read_file, read_json
+from clsplat.formats import packing
+from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, written
+from clsplat.formats.palette import Clustering, HostClusters, codebook, different, nearest, palette
 from clsplat.formats.ply import checked_numbers
-from clsplat.formats.sog_files import META, PARTS, SLACK, Files, is_beside, sog_files
-from clsplat.formats.splats import MAX_DEGREE, SplatFile, logits, sh_coefficients
+from clsplat.formats.sog_quantize import (
+    base_for,
+    log_weights,
+    rounded,
+    rounded_opacities,
+    rounded_quats,
+    tree_palette,
+    visible_form,
+    weighed_means,
+)
+from clsplat.formats.splats import (
+    MAX_DEGREE,
+    MAX_FILE,
+    Parameters,
+    Quality,
+    SplatFile,
+    Writing,
+    logits,
+    opacities,
+    require_moderate,
+    require_some,
+    sh_coefficients,
+    unit,
+)
+
+# The files of a SOG: in a ZIP, or beside a meta.json.
+
+META = "meta.json"
+PARTS = ("means", "scales", "quats", "sh0")  # of a meta.json, and shN
+MAX_META = 1 << 24  # bytes
+MAX_IMAGE = 1 << 30
+KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+RATIO = 2  # most bytes of images that one byte of a ZIP may stand for: they are compressed already
+SLACK = 1 << 16  # bytes, or px, beyond what the numbers need
+
+
+def with_images(path: Path) -> list[Path]:
+    """Return a meta.json and the images beside it that it names and that are there; of a damaged one it alone."""
+    try:
+        meta = read_json(path, limit=MAX_META)
+    except DataError:
+        return [path]
+    parts = [meta.get(name) for name in (*PARTS, "shN")] if isinstance(meta, dict) else []
+    lists = [part.get("files") for part in parts if isinstance(part, dict)]
+    names = {name: None for one in lists if isinstance(one, list) for name in one if isinstance(name, str)}
+    images = [path.with_name(name) for name in names if is_beside(name) and name != META]
+    return [path, *filter(os.path.isfile, images)]
+
+
+def is_beside(name: str) -> bool:
+    """Whether a name does not leave its folder."""
+    return name == Path(name).name and "\\" not in name and bool(name.strip("."))
+
+
+class Files:
+    """The files of a SOG, each read once: members of a ZIP, wherever they lie in it, or files beside a meta.json."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile | None = None, size: int = MAX_FILE) -> None:
+        self.path, self.archive, self.most = path, archive, size
+        self.held: dict[str, bytes] = {}
+
+    @property
+    def size(self) -> int:
+        """Bytes of those that were read, as they lie on the disk."""
+        return min(self.most, sum(map(len, self.held.values())))
+
+    def read(self, name: str) -> bytes:
+        """The bytes of a file.  Raises DataError."""
+        if name not in self.held:
+            self.held[name] = self._member(self.archive, name) if self.archive else self._beside(name)
+        return self.held[name]
+
+    def _beside(self, name: str) -> bytes:
+        return read_file(self.path.with_name(name), "a file of a SOG", limit=MAX_META if name == META else MAX_IMAGE)
+
+    def _member(self, archive: zipfile.ZipFile, name: str) -> bytes:
+        found = next((one for one in archive.infolist() if one.filename.rpartition("/")[2] == name), None)
+        if found is None or found.compress_type not in KINDS:
+            fault = f"has no {quoted(name)}" if found is None else f"{quoted(name)} is compressed in another way"
+            raise DataError(
+                f"{self.path}: {fault}; expected the files that {META} names, stored or deflated: export it again"
+            )
+        images = sum(len(data) for one, data in self.held.items() if one != META)
+        most = MAX_META if name == META else min(MAX_IMAGE, SLACK + RATIO * self.most - images)
+        with archive.open(found) as member:
+            data = member.read(most + 1)
+        if len(data) > most:
+            raise DataError(f"{self.path}: {quoted(name)} has more than {most} bytes; export it again")
+        return data
+
+
+@contextmanager
+def sog_files(path: Path) -> Iterator[Files]:
+    """The files of a folder or of a ZIP."""
+    if path.name == META:
+        yield Files(path)
+        return
+    data = read_file(path, "a .sog file", limit=MAX_FILE)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            yield Files(path, archive, len(data))
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError, KeyError) as error:
+        raise DataError(f"{path}: a damaged ZIP ({quoted(error)}); copy or export the file again") from error
+
 
 PIXELS_PER_BYTE = 16  # of all images; real ones have less than one
 PER_ROW = 64  # centroids
@@ -106,7 +219,7 @@ class _Sog:
         files = self._data("shN")
         if len(files) != 2:
             raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels: export it again")
-        labels = webp.decode(self.path, "labels of shN", files[1], self.count, self._most(self.count))
+        labels = packing.decode(self.path, "labels of shN", files[1], self.count, self._most(self.count))
         chosen = labels[: self.count, 0].astype(np.intp) | labels[: self.count, 1].astype(np.intp) << 8
         used = entries = 1 + int(chosen.max(initial=0))
         if self.old:
@@ -120,13 +233,13 @@ class _Sog:
                 f"{self.path}: labels of shN name {used} centroids; shN.count is {entries}: export it again"
             )
         most = self._most(size * MAX_PALETTE)
-        centroids = webp.decode(self.path, "centroids of shN", files[0], entries * size, most)
+        centroids = packing.decode(self.path, "centroids of shN", files[0], entries * size, most)
         table = centroids[: entries * size, :3].reshape(entries, 3 * size)
         return np.asarray(self._looked_up("shN", table)[chosen])
 
     def _degree_of_width(self, data: bytes) -> int:
         """The degree of a version 1, which no number tells: its centroids are 64 a row."""
-        width, _ = webp.size(self.path, "centroids of shN", data)
+        width, _ = packing.size(self.path, "centroids of shN", data)
         if width // PER_ROW not in WIDTHS:
             raise DataError(
                 f"{self.path}: centroids of shN are {width} px wide; expected 192, 512 or 960: export it again"
@@ -152,7 +265,9 @@ class _Sog:
             raise DataError(
                 f"{self.path}: {name} names {len(group)} files; expected {number + 1} at least: export it again"
             )
-        pixels = webp.decode(self.path, f"image {number} of {name}", group[number], self.count, self._most(self.count))
+        pixels = packing.decode(
+            self.path, f"image {number} of {name}", group[number], self.count, self._most(self.count)
+        )
         return pixels[: self.count]
 
     @staticmethod
@@ -195,9 +310,205 @@ class _Sog:
             )
         return np.array(value, np.float64)
 
-    def _whole(self, place: str, value: Any, most: int = webp.MAX_SIDE**2) -> int:
+    def _whole(self, place: str, value: Any, most: int = packing.MAX_SIDE**2) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most or math.isnan(value):
             raise DataError(
                 f"{self.path}: {place} is {quoted(value)}; expected a whole number from 1 to {most}: export it again"
             )
         return value
+
+
+# Write SOG, version 2 (layout: sog.py): the same model gives the same bytes.
+
+PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most, of a palette for all
+SHARES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # entries at most for a splat, of a palette for neighbours
+MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of its vectors, in 128ths
+TURN_STEP, ALPHA_STEP = 4, 2  # levels of 255
+SIZE_SHARE = 0.25  # of a Gaussian's size, for its position: of one of median weight
+SCALE_STEP = 0.1  # of logarithms of standard deviations
+COLOUR_STEP = 0.05  # of the coefficients of band 0; 1 changes a colour by 0.28
+SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
+DIGITS = 16  # of the SHA-256 of an image in a folder, in its name
+EPOCH = (1980, 1, 1, 0, 0, 0)  # of files in the ZIP: the same model gives the same bytes
+
+
+def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
+    """Write a `.sog`, or where the name is meta.json the files of a folder.  Raises OutputError, DataError.
+
+    The images of a folder have their content in their names, so that none of another model is replaced.
+    """
+    require_some(path, splats)
+    require_moderate(path, splats, "SOG")
+    ordered = splats.rows(morton_order(splats.parameters["means"]))
+    return write_as_ordered(path, ordered, log_weights(ordered.parameters, ordered.has_sky), options)
+
+
+def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: Writing) -> str:
+    """Write a SOG as `write_sog` does, whose splats stay in the order that they have.
+
+    weights: their binary logarithms, [N], of weights.py: of the model that the splats may be a part of.
+    """
+    in_folder = path.name == META
+    p, harmonics = _quantised(splats.parameters, weights, options)
+    width = -(-int(np.ceil(np.sqrt(len(splats)))) // 4) * 4
+    images: dict[str, bytes] = {}
+    meta: dict[str, Any] = {"version": 2, "count": len(splats), "asset": {"generator": "clsplat"}}
+    if splats.mode == "mip":
+        meta |= {"model": "antialiased", "antialias": True}
+    if splats.rendering:
+        meta["extras"] = {"clsplat": splats.rendering}
+
+    def image(name: str, *planes: NDArray[Any], across: int = width) -> str:
+        pixels = np.full((len(planes[0]), 4), 255, np.uint8)
+        pixels[:, : len(planes)] = np.stack(planes, axis=1)
+        data = packing.encode(path, pixels, across)
+        name += f"_{sha256(data).hexdigest()[:DIGITS]}" * in_folder + ".webp"
+        images[name] = data
+        return name
+
+    meta["means"] = _means(p, image)
+    largest, others = smallest_three(unit(p["quats"]))
+    levels = np.clip(np.rint(255 * (others * 0.5**0.5 + 0.5)), 0, 255)
+    meta["quats"] = {"files": [image("quats", *levels.T, ROTATED + largest)]}
+    for name, table, more in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
+        entries = codebook(p[table])
+        planes = nearest(p[table], entries).T
+        meta[name] = {"codebook": [_short(number) for number in entries], "files": [image(name, *planes, *more)]}
+    if harmonics is not None:
+        meta["shN"] = _write_harmonics(harmonics, splats.sh_degree, image)
+    images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
+    return _write_beside(path, images) if in_folder else _write(path, _zipped(images))
+
+
+def _write_beside(path: Path, images: dict[str, bytes]) -> str:
+    """Write images and then their meta.json: until it is renamed, the model before is whole.  Images of no use go."""
+    before, new = set(with_images(path)), {path.with_name(name) for name in images}
+    kept = before
+    try:
+        sums = [_write(path.with_name(name), data) for name, data in images.items()]
+        kept = new
+    finally:
+        for one in (before | new) - kept - set(with_images(path)):
+            if one.suffix == ".webp":
+                with suppress(OSError):
+                    one.unlink()
+    return sums[-1]
+
+
+def _write(path: Path, data: bytes) -> str:
+    with written(path) as file:
+        file.write(data)
+    return file.sha256
+
+
+def _means(p: Parameters, image: Any) -> dict[str, Any]:
+    wide = p["means"].astype(np.float64)
+    t = np.sign(wide) * np.log1p(np.abs(wide))
+    ends = zip((t.min(axis=0), t.max(axis=0)), (ROUND_FLOOR, ROUND_CEILING), strict=True)
+    lows, highs = (np.array([_short(end, way) for end in row]) for row, way in ends)
+    span = np.where(highs > lows, highs - lows, 1)
+    levels = np.rint(65535 * (t - lows) / span).astype(np.uint16)
+    files = [image("means_l", *(levels & 255).T), image("means_u", *(levels >> 8).T)]
+    return {"mins": lows.tolist(), "maxs": highs.tolist(), "files": files}
+
+
+def _alpha(p: Parameters) -> NDArray[np.float64]:
+    """Opacities in 255 steps, 1 at least: lossless WebP forgets the colour under 0."""
+    return np.maximum(np.rint(255 * opacities(p["logit_opacity"][:, 0])), 1)
+
+
+@dataclass(frozen=True)
+class Harmonics:
+    """What a SOG holds of harmonics: numbers [256], a palette [E, c] of their indices, and a label for each splat."""
+
+    numbers: NDArray[np.float64]
+    palette: NDArray[np.uint8]
+    labels: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls,
+        rest: NDArray[np.float32],
+        quality: Quality,
+        clustering: Clustering = HostClusters,
+        weights: NDArray[np.float64] | None = None,
+        better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]] | None = None,
+        step: float | None = None,
+    ) -> "Harmonics":
+        """Quantise harmonics [N, c] by vectors for all; errors count by `weights` [N].  Those of `values` come out as
+        they are.
+
+        better: makes of a palette [E, c] another one, and the label of each splat.  step: of numbers, where those are
+        few enough.
+        """
+        vectors, labels = palette(rest, _few(len(rest), quality), clustering, weights)
+        if better and not np.array_equal(vectors[labels].astype(np.float32), rest):
+            vectors, labels = better(vectors)
+        return cls.by(vectors, labels, step)
+
+    @classmethod
+    def by(cls, vectors: NDArray[np.float64], labels: NDArray[np.int64], step: float | None = None) -> "Harmonics":
+        """Those that vectors [E, c] and labels [N] stand for."""
+        numbers = np.array([_short(number) for number in codebook(vectors, step)])
+        return cls(numbers, nearest(vectors, numbers), labels)
+
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """The harmonics as they are read back, [N, c]."""
+        return self.numbers.astype(np.float32)[self.palette][self.labels]
+
+
+def _few(count: int, quality: Quality) -> int:
+    """Entries of a palette for all Gaussians."""
+    return min(PALETTES[quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(count / SMALLEST)))))
+
+
+def _quantised(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
+    """The tables, rounded, and a palette of the harmonics.
+
+    Harmonics that are a palette already stay as they are, and so do the tables then: whoever made it rounded them.
+    In `high` the tables have the precision of the format.
+    """
+    rest, base = p["sh_rest"], p["sh_base"]
+    most, few = min(MAX_PALETTE, int(SHARES[options.quality] * len(rest))), _few(len(rest), options.quality)
+    kept = (different(rest, few) or different(rest, most, padded=False)) if rest.shape[1] else None
+    harmonics = None if kept is None else Harmonics.by(*kept)
+    if harmonics and rest.any():
+        return p, harmonics
+    if rest.any():
+        harmonics = Harmonics.by(*tree_palette(rest, weights, max(most, few), MEDIAN_STEPS[options.quality]))
+        base = base_for(base, rest - harmonics.values, visible_form(rest))
+    if options.quality == "high":
+        return {**p, "sh_base": base}, harmonics
+    quats, log_scales = rounded_quats(p["quats"], p["log_scales"], TURN_STEP)
+    changed = {
+        "means": weighed_means(p["means"], p["log_scales"], weights, SIZE_SHARE),
+        "quats": quats,
+        "log_scales": rounded(log_scales, SCALE_STEP),
+        "logit_opacity": rounded_opacities(p["logit_opacity"], ALPHA_STEP),
+        "sh_base": rounded(base, COLOUR_STEP),
+    }
+    return {**p, **changed}, harmonics
+
+
+def _write_harmonics(found: Harmonics, bands: int, image: Any) -> dict[str, Any]:
+    size = found.palette.shape[1] // 3
+    files = [image("shN_centroids", *found.palette.reshape(-1, 3).T, across=PER_ROW * size)]
+    files.append(image("shN_labels", found.labels & 255, found.labels >> 8, np.zeros_like(found.labels)))
+    return {"count": len(found.palette), "bands": bands, "codebook": found.numbers.tolist(), "files": files}
+
+
+def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:
+    """A number in few digits, as float32 has it: the last bit of logarithms and means is the processor's."""
+    return float(Context(8, rounding).create_decimal(float(number)))
+
+
+def _zipped(images: dict[str, bytes]) -> bytes:
+    """A ZIP without times, systems and compression of its own."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, data in images.items():
+            member = zipfile.ZipInfo(name, EPOCH)
+            member.create_system, member.external_attr = 3, 0o644 << 16
+            archive.writestr(member, data)
+    return packed.getvalue()

@@ -7,13 +7,17 @@ The largest and most opaque come first, for viewers that show a file while it ar
 """
 
 import logging
+import struct
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.formats.output import written
-from clsplat.formats.packing import beyond_bytes, tell_cut
+from clsplat.core.errors import DataError
+from clsplat.core.reading import read_file
+from clsplat.formats.packing import beyond_bytes, tell_cut, written
 from clsplat.formats.splats import (
     MAX_FILE,
     SH_C0,
@@ -23,10 +27,11 @@ from clsplat.formats.splats import (
     logits,
     logs,
     opacities,
+    require_held,
     require_some,
+    sh_coefficients,
     unit,
 )
-from clsplat.reading import read_file
 
 LOG = logging.getLogger("clsplat")
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
@@ -89,3 +94,149 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     with written(path) as file:
         file.write(rows[order].tobytes())
     return file.sha256
+
+
+# `.ksplat` of GaussianSplats3D, which is read only: a header, sections, and in each its buckets and its splats.
+
+HEADER, SECTION = 4096, 1024  # bytes
+MAX_DEGREE = 2
+SH_ENDS = (-1.5, 1.5)
+RANGE = 32767
+KINDS = (
+    ("<f4", "<f4", "<f4"),
+    ("<u2", "<f2", "<f2"),
+    ("<u2", "<f2", "u1"),
+)  # position, scale and rotation, SH by level
+
+
+@dataclass(frozen=True)
+class Section:
+    """Where the splats of one section lie."""
+
+    count: int
+    rows: int  # at least `count`
+    degree: int
+    bucket_size: int
+    buckets: int
+    block: float  # scene units
+    bucket_bytes: int
+    range: int
+    full: int
+    partial: int
+
+    @classmethod
+    def of(cls, data: bytes, start: int) -> "Section":
+        """Take the numbers of a header."""
+        count, rows, bucket_size, buckets = struct.unpack_from("<4I", data, start)
+        (block,) = struct.unpack_from("<f", data, start + 16)
+        (bucket_bytes,) = struct.unpack_from("<H", data, start + 20)
+        scale, _, full, partial = struct.unpack_from("<4I", data, start + 24)
+        (degree,) = struct.unpack_from("<H", data, start + 40)
+        return cls(count, rows, degree, bucket_size, buckets, block, bucket_bytes, scale or RANGE, full, partial)
+
+    def row(self, level: int) -> np.dtype[Any]:
+        """The layout of one splat."""
+        position, scale, sh = KINDS[level]
+        fields: list[Any] = [("position", position, 3), ("scale", scale, 3), ("rotation", scale, 4)]
+        fields += [("colour", "u1", 4), ("sh", sh, 3 * (sh_coefficients(self.degree) - 1))]
+        return np.dtype(fields)
+
+    def sizes(self, level: int) -> tuple[int, int, int]:
+        """Bytes of the counts of partial buckets, of the buckets, and of the splats."""
+        return 4 * self.partial, self.bucket_bytes * self.buckets, self.row(level).itemsize * self.rows
+
+
+def looks_like_ksplat(data: bytes, size: int) -> bool:
+    """Return whether bytes that begin a file can be its header: the format has no mark."""
+    if size < HEADER + SECTION or len(data) < HEADER or data[0] != 0 or not 1 <= data[1] < 32:
+        return False
+    most, sections, _, splats = struct.unpack_from("<4I", data, 4)
+    (level,) = struct.unpack_from("<H", data, 20)
+    return bool(1 <= sections <= most <= size // SECTION and level < len(KINDS) and splats <= size // 24)
+
+
+def read_ksplat(path: Path) -> SplatFile:
+    """Read a `.ksplat` file.  Raises DataError when it is missing or damaged."""
+    data = read_file(path, "a .ksplat file", limit=MAX_FILE)
+    if not looks_like_ksplat(data, len(data)):
+        raise DataError(
+            f"{path}: not a .ksplat file of version 0.1; expected its header of {HEADER} bytes: copy it again"
+        )
+    most, sections = struct.unpack_from("<2I", data, 4)
+    (level,) = struct.unpack_from("<H", data, 20)
+    ends = struct.unpack_from("<2f", data, 36)
+    start = HEADER + SECTION * most
+    require_held(path, len(data), start, f"{most} sections")
+    parts = []
+    for number in range(sections):
+        section = Section.of(data, HEADER + SECTION * number)
+        _check(path, section, number)
+        sizes = section.sizes(level)
+        require_held(path, len(data), start + sum(sizes), f"{section.rows} splats in section {number}")
+        parts.append(_tables(path, data, start, section, level, ends if any(ends) else SH_ENDS))
+        start += sum(sizes)
+    width = max(part["sh_rest"].shape[1] for part in parts)
+    for part in parts:
+        part["sh_rest"] = np.pad(part["sh_rest"], ((0, 0), (0, width - part["sh_rest"].shape[1])))
+    return SplatFile({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+
+
+def _check(path: Path, section: Section, number: int) -> None:
+    """Raise DataError for a section that cannot be."""
+    if section.degree > MAX_DEGREE or section.count > section.rows:
+        raise DataError(
+            f"{path}: section {number} has {section.count} of {section.rows} splats with SH degree {section.degree}; "
+            f"expected no more splats than places, and degree 0 to {MAX_DEGREE}: the file is damaged, copy it again"
+        )
+    if (section.buckets and section.bucket_bytes < 12) or section.full + section.partial > section.buckets:
+        raise DataError(f"{path}: the buckets of section {number} do not fit their numbers; copy the file again")
+
+
+def _tables(
+    path: Path, data: bytes, start: int, section: Section, level: int, ends: tuple[float, ...]
+) -> dict[str, NDArray[np.float32]]:
+    """The parameters of one section."""
+    partial, buckets, _ = section.sizes(level)
+    rows = np.frombuffer(data, section.row(level), section.count, start + partial + buckets)
+    position = rows["position"].astype(np.float64)
+    if level and section.count:
+        position = (position - section.range) * (section.block / 2 / section.range)
+        position += _centres(path, data, start, section)
+    sh = rows["sh"].astype(np.float64)
+    if level == 2:
+        sh = ends[0] + sh / 255 * (ends[1] - ends[0])
+    colour = rows["colour"] / 255.0
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+        return {
+            "means": position.astype(np.float32),
+            "quats": rows["rotation"].astype(np.float32),
+            "log_scales": logs(rows["scale"]),
+            "logit_opacity": logits(colour[:, 3:]),
+            "sh_base": ((colour[:, :3] - 0.5) / SH_C0).astype(np.float32),
+            "sh_rest": _interleaved(sh).astype(np.float32),
+        }
+
+
+def _centres(path: Path, data: bytes, start: int, section: Section) -> NDArray[np.float64]:
+    """The centre of each splat's bucket, [count, 3]: full buckets come first, then partial ones."""
+    partial = np.frombuffer(data, "<u4", section.partial, start).astype(np.int64)
+    filled = section.full * section.bucket_size
+    if filled + int(partial.sum()) < section.count or filled > section.rows:
+        raise DataError(f"{path}: its buckets hold fewer splats than it declares, {section.count}; copy the file again")
+    held = np.concatenate([np.full(section.full, section.bucket_size), np.minimum(partial, section.count)])
+    ends = np.minimum(np.cumsum(held), section.count)
+    bucket = np.repeat(np.arange(len(held)), np.diff(ends, prepend=0))
+    table = np.frombuffer(data, "u1", section.bucket_bytes * section.buckets, start + 4 * section.partial)
+    centres = table.reshape(section.buckets, section.bucket_bytes)[:, :12].copy().view("<f4")
+    return centres[bucket].astype(np.float64)
+
+
+def _interleaved(sh: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Each degree's red, green and blue coefficients as red, green, blue of each coefficient."""
+    bands, first = [], 0
+    for size in (3, 5):
+        if first < sh.shape[1]:
+            band = sh[:, first : first + 3 * size].reshape(len(sh), 3, size)
+            bands.append(band.transpose(0, 2, 1).reshape(len(sh), 3 * size))
+            first += 3 * size
+    return np.concatenate(bands, axis=1) if bands else sh

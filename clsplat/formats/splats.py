@@ -3,12 +3,14 @@
     means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
     filter_variance [1] scene units², the world filter; only in our own PLY, as is
-    motion [5 or more], where Gaussians move (clsplat/formats/motion.py)
+    motion [5 or more], where Gaussians move (clsplat/formats/splats.py)
 
 Axes are those of the PLY of 3DGS: x right, y down, z ahead.
 """
 
 import logging
+import math
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,12 +18,64 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.formats.motion import MOTION
+from clsplat.core.errors import DataError
+
+# The table `motion` of Gaussians that move: its columns, and their names in a PLY.
+
+MOTION = "motion"
+FIELDS = {"velocity": 3, "time_centre": 1, "log_duration": 1, "acceleration": 3, "jerk": 3, "turn": 4}
+TURN = 4  # columns of the turn
+MAX_DEGREE = 3
+EXPECTED = "expected a number from 0, the first moment of the scene, to 1, its last"
+STILL = 12.0  # log of a duration: what is there always, exp(-1/2 exp(-24)) being 1 in float32
+
+
+def is_moment(time: float) -> bool:
+    """Return whether a number is a moment of a scene."""
+    return math.isfinite(time) and 0 <= time <= 1
+
+
+def width_of(degree: int, turns: bool) -> int:
+    """Return the number of columns for polynomials of a degree from 1 to 3."""
+    return 2 + 3 * degree + TURN * turns
+
+
+WIDTHS = {width_of(degree, turns): (degree, turns) for degree in range(1, MAX_DEGREE + 1) for turns in (False, True)}
+
+
+def motion_degree_of(width: int) -> int:
+    """Return the degree of the polynomials of a table with so many columns."""
+    return WIDTHS[width][0]
+
+
+def fields_of(width: int) -> dict[str, slice]:
+    """Return the columns of each field in a table with so many columns, by name, in their order."""
+    degree, turns = WIDTHS[width]
+    present = ["velocity", "time_centre", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * turns]
+    ends: dict[str, slice] = {}
+    start = 0
+    for name in present:
+        ends[name] = slice(start, start + FIELDS[name])
+        start += FIELDS[name]
+    return ends
+
+
+def columns_of(width: int) -> tuple[str, ...]:
+    """Return the names of the columns in a PLY."""
+    names = []
+    for name in fields_of(width):
+        names += [name] if FIELDS[name] == 1 else [f"{name}_{i}" for i in range(FIELDS[name])]
+    return tuple(names)
+
+
+def columns_among(names: Collection[str]) -> tuple[str, ...] | None:
+    """Return the columns of the motion among the properties of a file; () of none, None of some but no whole table."""
+    own = {column for width in WIDTHS for column in columns_of(width)} & set(names)
+    return next((columns_of(width) for width in WIDTHS if set(columns_of(width)) == own), None) if own else ()
+
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 SH_C0 = 0.28209479177387814  # basis function of band 0
-MAX_DEGREE = 3
 NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: nearest distance and screen filter of 3DGS
 MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
@@ -57,7 +111,7 @@ class SplatFile:
 
     @property
     def has_sky(self) -> bool:
-        """Whether some Gaussians are a sky, as clsplat/gaussians/sky_splats.py notes in the comment."""
+        """Whether some Gaussians are a sky, as clsplat/gaussians/conversion.py notes in the comment."""
         return bool(self.rendering.get("sky") == "splats")
 
     def rows(self, chosen: Any) -> "SplatFile":

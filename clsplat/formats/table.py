@@ -2,22 +2,19 @@
 
 import logging
 import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from clsplat.errors import ConfigError, DataError, OutputError, quoted, shortened
-from clsplat.formats.codec import Codec, Start
+from clsplat.core.errors import ConfigError, DataError, OutputError, quoted, shortened
+from clsplat.core.reading import opened
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
-from clsplat.formats.glb import read_glb, write_glb
-from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
-from clsplat.formats.lod import LOD_META, looks_like_lod, read_lod
-from clsplat.formats.model_files import located
-from clsplat.formats.ply import checked_numbers, read_ply, write_ply
-from clsplat.formats.sog import looks_like_sog, read_sog
-from clsplat.formats.sog_files import META
-from clsplat.formats.sog_writing import write_sog
-from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
+from clsplat.formats.gltf_usd import read_glb, write_glb, write_usda
+from clsplat.formats.ply import MAX_HEADER, PlyHeader, checked_numbers, parse_ply_header, read_ply, write_ply
+from clsplat.formats.sog import META, looks_like_sog, read_sog, with_images, write_sog
+from clsplat.formats.splat import looks_like_ksplat, looks_like_splat, read_ksplat, read_splat, write_splat
 from clsplat.formats.splats import (
     MIP_VARIANCE,
     NEAR,
@@ -30,9 +27,77 @@ from clsplat.formats.splats import (
     settled,
 )
 from clsplat.formats.spz import read_spz, write_spz
-from clsplat.formats.usda import write_usda
-from clsplat.ply_header import MAX_HEADER
-from clsplat.reading import opened
+from clsplat.formats.streamed_sog import LOD_META, files_of_lod, looks_like_lod, read_lod
+
+# What the table of formats holds for each: words, and functions that tell, read and write it.
+
+
+@dataclass(frozen=True)
+class Start:
+    """How a file begins."""
+
+    path: Path
+    data: bytes  # at most MAX_HEADER
+    size: int  # bytes of the file
+
+    def ply(self) -> PlyHeader | None:
+        """The header, where it is a PLY file that can be read."""
+        if not self.data.startswith(b"ply"):
+            return None
+        try:
+            return parse_ply_header(self.path, self.data)
+        except DataError:  # its reader says what is wrong
+            return None
+
+
+@dataclass(frozen=True)
+class Codec:
+    """One format."""
+
+    name: str
+    endings: tuple[str, ...]  # of names of files; the first is the usual one
+    reads: str  # in words; "" where there is no reader
+    writes: str  # in words; "" where there is no writer, "by …" where a command alone writes it
+    loses: str  # in words: what writing changes
+    is_one: Callable[[Start], bool] = lambda start: False
+    read: Callable[[Path, Reading], SplatFile] | None = None
+    write: Callable[[Path, SplatFile, Writing], str] | None = None  # returns the SHA-256 of the file
+    keeps_filter: bool = False  # filter_3D
+    keeps_motion: bool = False
+    keeps_mode: bool = True  # the mark of a mip model
+    keeps_numbers: bool = False  # of the rasterizer
+    keeps_nan: bool = False
+    has_quality: bool = False  # writing heeds Writing.quality
+    has_axes: bool = False  # reading and writing heed axes, of which nothing in the file tells
+    has_bits: bool = False  # writing heeds Writing.sh_bits and Writing.spz_version
+
+
+# Where a model lies, and which files belong to it.
+
+
+def located(path: Path) -> Path:
+    """Return the file of a model: of a folder with a meta.json, or a lod-meta.json, that one."""
+    places = (path / name for name in (META, LOD_META)) if path.is_dir() else ()
+    return next(filter(Path.is_file, places), path)
+
+
+def files_of(place: Path) -> list[Path]:
+    """Return all files of a model's file: of the JSON of SOG, or of levels, those that it names, too."""
+    return {META: with_images, LOD_META: files_of_lod}.get(place.name, lambda one: [one])(place)
+
+
+def bytes_of(path: Path) -> int:
+    """Return the size of a model: of a folder of SOG, or of levels, that of all files that its JSON names.
+
+    Raises DataError where one is missing.
+    """
+    place = located(path)
+    try:
+        return sum(one.stat().st_size for one in files_of(place))
+    except OSError as error:
+        missing = "" if error.filename == str(place) else f"names {quoted(error.filename)}, which "
+        raise DataError(f"{place}: {missing}cannot be read ({error.strerror}); copy or export it again") from error
+
 
 LOG = logging.getLogger("clsplat")
 

@@ -1,7 +1,11 @@
 """Model files into one of another format: merged, moved, cropped, and with fewer Gaussians or harmonics."""
 
+import logging
+import os
 import re
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -9,15 +13,52 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import ConfigError, DataError, quoted
-from clsplat.formats.model_files import bytes_of
+from clsplat.core.errors import ConfigError, DataError, quoted
+from clsplat.core.files import check_no_file_of_a_run, is_there, scratch_folder, told_as
 from clsplat.formats.ply import MAX_NUMBER
-from clsplat.formats.splats import MAX_DEGREE, Quality, Reading, Writing, with_degree
-from clsplat.formats.table import detect, for_writing
-from clsplat.gaussians.merging import merged
-from clsplat.gaussians.model import Model, load
-from clsplat.gaussians.run_model import model_at
-from clsplat.results import check_no_file_of_a_run
+from clsplat.formats.splats import EXPECTED, MAX_DEGREE, SH_C0, Quality, Reading, Writing, is_moment, with_degree
+from clsplat.formats.table import bytes_of, detect, for_writing, named
+from clsplat.gaussians.model import Model, load, model_at
+from clsplat.gaussians.motion import alike, still
+from clsplat.gaussians.sky import sampled, sky_file
+
+# Several models as one.
+
+LOG = logging.getLogger("clsplat")
+KEPT = ("near", "screen_variance", "background", "alpha")  # of the first model
+
+
+def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
+    """Return one model of all Gaussians, with the numbers of the first for rendering and the largest SH degree.
+
+    Where one has a world filter and another has none, it is baked; where some move, the others stand still.  Raises
+    DataError where some are mip models and others are not, or of the pixel's box, for one filter serves all, and where
+    they move in different ways.
+    """
+    first = models[0]
+    if len(models) == 1:
+        return first
+    for model, name in zip(models, names, strict=True):
+        kinds = [_kind(m) for m in (first, model)]
+        if kinds[0] != kinds[1]:
+            raise DataError(f"{name}: is {kinds[1]}, {names[0]} is {kinds[0]}; expected the same: one filter draws all")
+        own, kept = model.rendering.comment(), first.rendering.comment()
+        if other := [f"{one} = {own.get(one, 'not given')}" for one in KEPT if own.get(one) != kept.get(one)]:
+            LOG.warning("%s: has %s; what %s says is kept", name, ", ".join(other), names[0])
+    if any(model.filter_variance is None for model in models):
+        models = [model.baked() for model in models]
+    degree = max(model.sh_degree for model in models)
+    tables = alike([with_degree(model.tables(), degree) for model in models], names)
+    merged: dict[str, Any] = {n: np.concatenate([t[n] for t in tables]) for n in tables[0]}
+    return Model(**merged, rendering=first.rendering, sky=first.sky)
+
+
+def _kind(model: Model) -> str:
+    """Say whether a model is a mip model."""
+    if model.rendering.pixel_box:
+        return "one of the pixel's box"
+    return "a mip model" if model.rendering.compensate else "none"
+
 
 WORDS = ("scale", "rotate", "translate")
 AXES, QUALITIES = ("spz", "ply"), ("small", "balanced", "high")
@@ -221,3 +262,163 @@ def _is_same(one: Path, other: Path) -> bool:
         return one.samefile(other)
     except (OSError, ValueError):  # there is no such file
         return False
+
+
+# A moving model as files that stand still: one of a moment, or one of each of many moments.
+
+MOST = 10_000  # files
+
+
+def checked_time(time: float | None) -> float | None:
+    """Return a time.  Raises ConfigError for one that is not of a scene."""
+    if time is not None and not is_moment(time):
+        raise ConfigError(f"--time {time:g}: {EXPECTED}")
+    return time
+
+
+def convert_frames(
+    sources: Sequence[Path], out: Path, frames: int, changes: Changes, options: Options
+) -> dict[str, Any]:
+    """Write one static model of each of so many moments, evenly spaced from the first to the last.
+
+    out: a folder, in which they are PLYs with a number for a name; or a file, to whose name a number is added.
+    Returns what `convert` does, with the sums over files, the largest number of `gaussians`, and `files`.
+    Raises ConfigError, DataError, OutputError.
+    """
+    if not 2 <= frames <= MOST:
+        raise ConfigError(f"--frames {frames}: expected 2 to {MOST:,} moments; `--time T` writes one")
+    if changes.time is not None:
+        raise ConfigError("--frames and --time: expected one of them")
+    folder, begin, end = _name_of(out)
+    digits = max(4, len(str(frames - 1)))
+    places = [folder / f"{begin}{number:0{digits}}{end}" for number in range(frames)]
+    for place in places:
+        check_place(sources, place)
+    _require_no_others(folder, re.compile(re.escape(begin) + r"\d{4,}" + re.escape(end)), places)
+    reading, writing = options.of(sources, places[0])
+    model = read(sources, reading)
+    moments = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
+    for moment in moments:  # before anything is written
+        try:
+            moment.of(model)
+        except DataError as error:
+            raise DataError(f"--frames {frames}: the moment {moment.time:g}: {error}; nothing was written") from error
+    done: list[dict[str, Any]] = []
+    with _all_or_as_before([*places, *map(sky_file, places)]):
+        for place, moment in zip(places, moments, strict=True):
+            done.append(written(sources, moment.of(model), place, replace(writing, quiet=bool(done))))
+    return {
+        **done[0],
+        "file": str(out),
+        "files": [str(place) for place in places],
+        "gaussians": max(one["gaussians"] for one in done),
+        "bytes": sum(one["bytes"] for one in done),
+    }
+
+
+@contextmanager
+def _all_or_as_before(places: Sequence[Path]) -> Iterator[None]:
+    """Where the block fails, as on a disk that fills, give places in one folder what they had; a new folder goes.
+
+    Raises OutputError.
+    """
+    folder = places[0].parent
+    was_there = is_there(folder)
+    try:
+        with scratch_folder(folder / "series") as kept, told_as(folder):
+            before = [place for place in places if place.is_file()]
+            for place in before:
+                _keep(place, kept / place.name)
+            try:
+                yield
+            except BaseException:
+                for place in places:
+                    if place in before:
+                        os.replace(kept / place.name, place)
+                    elif place.is_file():
+                        place.unlink()
+                raise
+    finally:
+        if not was_there:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
+
+
+def _keep(place: Path, other: Path) -> None:
+    """Give a file, which is replaced and not changed, another name; where a disk has no links, copy it."""
+    try:
+        os.link(place, other)
+    except OSError:
+        shutil.copy2(place, other)
+
+
+def _require_no_others(folder: Path, names: re.Pattern[str], places: Sequence[Path]) -> None:
+    """Raise ConfigError where a folder has frames of another series, which a player would take for this one's."""
+    own = {place.name for place in places}
+    with told_as(folder):
+        there = sorted(os.listdir(folder)) if folder.is_dir() else []
+    if others := [name for name in there if names.fullmatch(name) and name not in own]:
+        raise ConfigError(
+            f"{folder / others[0]}: is not of {len(places):,} frames, and would be taken for one; give a new name"
+        )
+
+
+def _name_of(out: Path) -> tuple[Path, str, str]:
+    """The folder of frames, and what stands before and after the number in their names."""
+    if named(out) is None and out.suffix == "":
+        return out, "", ".ply"
+    codec = for_writing(out)
+    ending = next((end for end in sorted(codec.endings, key=len, reverse=True) if out.name.lower().endswith(end)), "")
+    if not ending.startswith("."):
+        raise ConfigError(f"{out}: --frames adds a number to a name; expected a folder, or a name such as frame.spz")
+    return out.parent, f"{out.name[: -len(ending)]}_", out.name[-len(ending) :]
+
+
+# A sky as Gaussians on a far sphere, for programs that know no map of directions.
+
+COUNT = 10_000  # Gaussians, 2 degrees from each other
+RADIUS = 10.0  # of the sphere, by the distance that holds SHARE of the model (WildGaussians, Kulhanek et al. 2024)
+SHARE = 0.97
+WIDTH = 0.65  # standard deviation, by the distance of neighbours: gaps let 2 % through (ours)
+FLAT = 0.1  # standard deviation along the ray, by that across
+LOGIT = 6.0  # of the opacity
+
+
+def with_sky_splats(model: Model, count: int = COUNT) -> Model:
+    """Return a model without a sky, and with Gaussians in its place; one without a sky stays as it is."""
+    if (sky := model.sky) is None:
+        return model
+    model = model.baked()
+    means = model.means.astype(np.float64)
+    centre = np.median(means, axis=0)
+    radius = RADIUS * float(np.quantile(np.linalg.norm(means - centre, axis=1), SHARE))
+    directions = fibonacci(count)
+    across = np.log(radius * np.sqrt(4 * np.pi / count) * WIDTH)
+    added: dict[str, NDArray[Any]] = {
+        "means": centre + radius * directions,
+        "quats": _turns(directions),
+        "log_scales": np.tile([across, across, across + np.log(FLAT)], (count, 1)),
+        "logit_opacity": np.full((count, 1), LOGIT),
+        "sh_base": (np.clip(sampled(sky.texels, directions), 0, 1) - 0.5) / SH_C0,
+        "sh_rest": np.zeros((count, model.sh_rest.shape[1])),
+    }
+    tables: dict[str, Any] = {name: np.concatenate([getattr(model, name), rows]) for name, rows in added.items()}
+    if model.motion is not None:
+        tables["motion"] = np.concatenate([model.motion, still(count, model.motion.shape[1])])
+    notes = {**model.rendering.notes, "sky": "splats"}
+    return replace(model, **tables, rendering=replace(model.rendering, notes=notes), sky=None)
+
+
+def fibonacci(count: int) -> NDArray[np.float64]:
+    """Return directions that lie evenly on a sphere, unit vectors, [count, 3]."""
+    number = np.arange(count)
+    z = 1 - (2 * number + 1) / count
+    angle = number * np.pi * (3 - np.sqrt(5))
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
+def _turns(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternions, [N, 4], that turn the z axis into unit vectors."""
+    x, y, z = directions.T
+    return np.stack([1 + z, -y, x, np.zeros_like(x)], axis=1)

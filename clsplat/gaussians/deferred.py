@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from clsplat.gaussians.moments import HARMONICS
-from clsplat.gaussians.on_host import defines_of, slots_of
-from clsplat.gaussians.tables import Gaussians, sh_coefficients
+from clsplat.formats.splats import sh_coefficients
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.sh_offload import defines_of, slots_of
+from clsplat.gaussians.structs import HARMONICS
 from clsplat.opencl.device import Array
 
 LONGEST = 32  # updates that wait at most; then all rows have theirs, in one pass over the tables

@@ -1,22 +1,30 @@
 """A model on the host: NumPy arrays in the units of model files, and the numbers with which they are rendered."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.formats import motion as columns
+from clsplat.core.errors import DataError
+from clsplat.core.files import METRICS, is_inside
+from clsplat.core.harmonics import rotated_sh
+from clsplat.core.quaternions import multiply, unit_quaternions
+from clsplat.core.reading import read_json
+from clsplat.formats import splats as columns
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import (
     LARGEST,
     MAX_DEGREE,
     MAX_EXPONENT,
     MAX_LOG,
+    MIP_VARIANCE,
+    NEAR,
     PARAMETERS,
     SH_C0,
+    VARIANCE,
     Reading,
     SplatFile,
     Writing,
@@ -26,15 +34,79 @@ from clsplat.formats.splats import (
     opacities,
     sh_coefficients,
 )
-from clsplat.formats.table import for_writing, read, write
+from clsplat.formats.table import for_writing, located, read, write
+from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.motion import at_time, transformed_motion
-from clsplat.gaussians.rendering import Rendering as Rendering
-from clsplat.gaussians.run_model import model_at
 from clsplat.gaussians.sky import Sky, keep_sky, sky_beside
-from clsplat.gaussians.tables import DeviceModel, Gaussians
-from clsplat.harmonics import rotated_sh
 from clsplat.opencl.device import Device
-from clsplat.quaternions import multiply, unit_quaternions
+
+# The numbers with which a model is rendered, as its file says them.
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """The numbers with which a model is rendered."""
+
+    near: float = NEAR  # scene units; nearer Gaussians are not drawn
+    screen_variance: float = VARIANCE  # px², added to every splat
+    compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
+    background: Literal["black", "white"] | None = None  # None: what the scene says
+    alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was
+    notes: Mapping[str, Any] = field(default_factory=dict)  # what else the file says
+    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead; screen_variance is for viewers
+
+    @classmethod
+    def of(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
+        """Take the numbers from a file's comment; files of other programs get those of 3DGS or Mip-Splatting."""
+        mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
+        names = ("near", "screen_variance", "compensate", "pixel_box")
+        given = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
+        return cls(
+            **{**mip, **given},
+            background=comment["background"] if comment.get("background") in ("black", "white") else None,
+            alpha="mask" if comment.get("alpha") == "mask" else "transparency",
+            notes=dict(comment),
+        )
+
+    def comment(self) -> dict[str, Any]:
+        """What a model file says about rendering."""
+        numbers = {"near": self.near, "screen_variance": self.screen_variance, "compensate": self.compensate}
+        known: dict[str, Any] = {"background": self.background} if self.background else {}
+        if self.pixel_box or "pixel_box" in self.notes:  # files of other models stay as they are
+            known["pixel_box"] = self.pixel_box
+        return {**self.notes, **numbers, **known, "alpha": self.alpha}
+
+
+# Where a run folder, or another path, has its model.
+
+MODEL = "point_cloud.ply"  # of a run that does not name its own
+
+
+def model_at(path: Path) -> Path:
+    """Return the model file that a path names: of a folder of SOG its meta.json, of a run folder its model."""
+    place = located(path)
+    return model_of_run(place) if place.is_dir() else place
+
+
+def model_of_run(folder: Path) -> Path:
+    """Return the model file of a run folder: the last export, as its metrics.json names it."""
+    return file_of_run(folder, "export", MODEL)
+
+
+def file_of_run(folder: Path, stage: str, default: str) -> Path:
+    """Return the file of the last stage of a name, as metrics.json of a run folder has it, else the default one."""
+    try:
+        name = read_json(folder / METRICS)["files"][stage]
+    except (DataError, KeyError, TypeError):  # not finished
+        name = default
+    return folder / (name if isinstance(name, str) and is_inside(name) else default)
+
+
+def as_trained(file: Path) -> Path:
+    """Return the PLY beside a model of a run that holds its world filter apart, where there is one, else the model."""
+    raw = file.with_name(f"{file.stem}_raw.ply")
+    return raw if raw.is_file() else file
+
 
 Floats = NDArray[np.float32]
 WIDTHS = {  # of the tables
@@ -66,7 +138,7 @@ class Model:
     )
     rendering: Rendering = NUMBERS
     sky: Sky | None = None  # behind the Gaussians, in place of a background of one colour
-    motion: Floats | None = None  # [N, 5 or more] of Gaussians that move, see clsplat/formats/motion.py
+    motion: Floats | None = None  # [N, 5 or more] of Gaussians that move, see clsplat/formats/splats.py
 
     def __post_init__(self) -> None:
         count = len(self.means)
@@ -207,7 +279,7 @@ class Model:
         return f"Model({len(self):,} Gaussians{moving}, SH degree {self.sh_degree})"
 
     def _repr_html_(self) -> str:
-        from clsplat.pages.notebook import summary
+        from clsplat.core.page import summary
 
         low, high = (self.means.min(axis=0), self.means.max(axis=0)) if len(self) else (np.zeros(3), np.zeros(3))
         rows = {

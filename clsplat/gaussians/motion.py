@@ -1,6 +1,6 @@
 """Gaussians that move, on the host: one moment of them, and the motion of those that stand still.
 
-The columns of the table are told in clsplat/formats/motion.py, and the formulas in cl_kernels/motion.cl.
+The columns of the table are told in clsplat/formats/splats.py, and the formulas in cl_kernels/motion.cl.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.formats.motion import MOTION, STILL, fields_of
-from clsplat.formats.splats import Parameters
-from clsplat.quaternions import multiply, unit_quaternions
+from clsplat.core.errors import DataError
+from clsplat.core.quaternions import multiply, unit_quaternions
+from clsplat.formats.splats import MOTION, STILL, Parameters, fields_of
 
 FAINTEST = 1 / 255  # of a presence: what is fainter is nowhere to be seen
 LOGIT = 80.0  # of an opacity, at most where it fades

@@ -1,5 +1,5 @@
 """Losses that compare images, and penalties on Gaussians.  Each module defines its own variants."""
 
-from clsplat.settings import import_modules
+from clsplat.core.settings import import_modules
 
 import_modules(__name__, __path__)

@@ -5,18 +5,18 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-from clsplat.errors import ConfigError
-from clsplat.gaussians.tables import Gaussians, Gradients
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import Schedule
+from clsplat.core.settings import Settings
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.structs import Gradients
 from clsplat.opencl.device import Array
+from clsplat.photos.depths import KnownDepths
+from clsplat.photos.transforms import PhotographTransform, learned_of, name_of
 from clsplat.render.camera import DeviceCamera
-from clsplat.render.layer import Layer
+from clsplat.render.overlay import Layer
 from clsplat.render.rasterizer import Content, Frame
 from clsplat.render.workspace import Workspace
-from clsplat.schedule import Schedule
-from clsplat.settings import Settings
-from clsplat.views.known_depths import KnownDepths
-from clsplat.views.learned import learned_of, name_of
-from clsplat.views.transforms import PhotographTransform
 
 
 @dataclass

@@ -4,11 +4,11 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import at_step
+from clsplat.core.settings import ReadPath
 from clsplat.losses.base import Comparison, ImageLoss, LossValue
 from clsplat.render.rasterizer import Content
-from clsplat.schedule import at_step
-from clsplat.settings import ReadPath
 
 
 class InverseDepth(ImageLoss):

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PrivateAttr, ValidationError
 
-from clsplat.errors import ConfigError, NumericError, quoted
+from clsplat.core.errors import ConfigError, NumericError, quoted
+from clsplat.core.schedule import NonNegative, Schedule, at_step
 from clsplat.losses.base import Comparison, ImageLoss, LossValue
-from clsplat.schedule import NonNegative, Schedule, at_step
 
 HostFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[float, NDArray[np.floating]]]
 

@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from clsplat.gaussians.tables import INTERVAL2
+from clsplat.core.schedule import at_step
+from clsplat.gaussians.gaussians import INTERVAL2
 from clsplat.losses.base import LossValue, Penalty, PenaltyInputs
-from clsplat.schedule import at_step
 
 
 class CovarianceTrace(Penalty):

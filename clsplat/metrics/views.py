@@ -1,27 +1,226 @@
 """The metrics of a model at the views of a scene, and their means."""
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, NumericError
+from clsplat.core.errors import DataError, NumericError
+from clsplat.formats.splats import inverse_opacities
+from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison
 from clsplat.losses.image import ssim_maps
-from clsplat.metrics.colours import colour_figures, mean_figures
-from clsplat.metrics.held_out import by_moment
-from clsplat.metrics.images import psnr, ssim, to_8_bits
+from clsplat.metrics.images import Mask, psnr, ssim, to_8_bits
 from clsplat.metrics.perceptual import Image, Perceptual
-from clsplat.metrics.stillness import Stillness, means
+from clsplat.photos.appearance import OwnColours
+from clsplat.photos.photographs import Photograph, Photographs, unpack
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.painter import Painter
 from clsplat.render.workspace import Workspace
-from clsplat.scene.scene import View
-from clsplat.views.colours import OwnColours
-from clsplat.views.photographs import Photograph, Photographs, unpack
+from clsplat.scene.times import by_camera, camera_key, moments_of
+from clsplat.scene.view import View, load_mask
+
+# What should not move, measured: PSNR of the static pixels of a scene that moves, and how much its pictures flicker.
+
+STILL = 3.0  # levels of standard deviation: the noise of a camera; what moves through a pixel gives more
+MOST_CAMERAS = 8  # whose sums are held, 48 bytes a pixel each
+LEAST_MOMENTS = 2
+FLICKER, OF_PHOTOGRAPHS, STATIC, SHARE = "flicker", "flicker_photographs", "psnr_static", "static_share"
+
+
+@dataclass
+class Spread:
+    """Sums over the moments of one camera, exact in whole numbers, in whatever order they come."""
+
+    count: int = 0
+    total: NDArray[np.uint32] = field(default_factory=lambda: np.zeros((), np.uint32))  # [H, W, 3]
+    squares: NDArray[np.uint32] = field(default_factory=lambda: np.zeros((), np.uint32))
+
+    def add(self, image: Image) -> None:
+        """Add an 8-bit image, [H, W, 3]."""
+        values = image.astype(np.uint32)
+        self.count += 1
+        self.total, self.squares = self.total + values, self.squares + values * values
+
+    def deviation(self) -> NDArray[np.float64]:
+        """Return the standard deviation over the moments, [H, W, 3], levels."""
+        mean = self.total / self.count
+        return np.asarray(np.sqrt(np.maximum(self.squares / self.count - mean * mean, 0)))
+
+
+@dataclass
+class Station:
+    """One camera: its renders, its photographs, and the pixels that may be static."""
+
+    views: list[str] = field(default_factory=list)
+    renders: Spread = field(default_factory=Spread)
+    photographs: Spread = field(default_factory=Spread)
+    counted: Mask | None = None  # static by the file, and counted by the masks of all moments
+    told: bool = False  # whether a file says what is static
+
+
+class Stillness:
+    """Gathers the views of a measurement, camera by camera.
+
+    Of a camera that shows one moment, as of one that moves, nothing is held.
+    """
+
+    def __init__(self, views: Sequence[View]) -> None:
+        """views: all that are to be added, in any order."""
+        cameras = [group for group in by_camera(views) if len(moments_of(group)) >= LEAST_MOMENTS]
+        self._stations = {camera_key(group[0]): Station() for group in cameras[:MOST_CAMERAS]}
+
+    @property
+    def held(self) -> int:
+        """The number of cameras whose sums are held."""
+        return len(self._stations)
+
+    def add(self, view: View, rendered: Image, photograph: Image, counted: Mask | None) -> dict[str, float]:
+        """Take a view's 8-bit images, [H, W, 3]; return its PSNR of static pixels where a file says which these are."""
+        still = static_pixels(view)
+        known = still if counted is None else counted if still is None else still & counted
+        if view.time is not None:
+            self._gather(view, rendered, photograph, known, still is not None)
+        if still is None or known is None or not known.any():
+            return {}
+        return {STATIC: psnr(rendered, photograph, known)}
+
+    def _gather(self, view: View, rendered: Image, photograph: Image, known: Mask | None, told: bool) -> None:
+        if (station := self._stations.get(camera_key(view))) is None:
+            return
+        station.views.append(view.name)
+        station.renders.add(rendered)
+        station.photographs.add(photograph)
+        station.told |= told
+        if known is not None:
+            station.counted = known if station.counted is None else station.counted & known
+
+    def figures(self) -> dict[str, dict[str, float]]:
+        """Return the flicker of each view's camera by the name of the view; none of cameras with one moment."""
+        found = dict[str, dict[str, float]]()
+        for station in self._stations.values():
+            if station.renders.count < LEAST_MOMENTS:
+                continue
+            shown, taken = station.renders.deviation(), station.photographs.deviation()
+            still = np.ones(shown.shape[:2], bool) if station.counted is None else station.counted
+            if not station.told:
+                still = still & (taken.max(axis=2) <= STILL)
+            if still.any():
+                one = {FLICKER: float(shown[still].mean()), OF_PHOTOGRAPHS: float(taken[still].mean())}
+                found |= {name: {**one, SHARE: float(still.mean())} for name in station.views}
+        return found
+
+
+def static_pixels(view: View) -> Mask | None:
+    """Return which pixels of a view show nothing that moves, [H, W]; None where no file says that."""
+    if view.static_path is None:
+        return None
+    return load_mask(replace(view, mask_path=view.static_path, alpha="transparency"))
+
+
+def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Return the mean of each figure over the views that have it, in the order in which the figures came."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    return {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
+
+
+# PSNR of a rendered image in the colours of its photograph, which no training has seen.
+
+LEAST = 1e-3  # slope of a regression, below which there is nothing to divide by
+# Usable pixels for each number that is fitted to a channel: p numbers of n independent errors add p / n of their
+# variance to what is measured elsewhere, here 1 / 64, which is 0.07 dB.
+PIXELS = 64
+
+
+def colour_figures(
+    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: OwnColours
+) -> dict[str, float]:
+    """Return `psnr_colour` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
+
+    mask: pixels that count, [height, width].  Without `psnr_colour` where a half has too few pixels to fit colours to.
+    Of the image NaN counts as black, and what is infinite as white or black.
+    """
+    truth, finite = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
+    counted = np.ones(truth.shape[:2], bool) if mask is None else mask
+    changed = in_colours_of(finite, photograph, counted, model)
+    corrected = corrected_by_regression(finite, truth, counted)
+    own = {} if changed is None else {"psnr_colour": psnr(changed, photograph, counted)}
+    return {**own, "psnr_affine": psnr(corrected, photograph, counted)}
+
+
+def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
+    """Return the averages over views of what colour_figures returned, with the keys of metrics.json.
+
+    Where views have no `psnr_colour`, `psnr_colour_views` is the number of those that have, and `psnr_colour_reason`
+    says why; where none has, it is None.
+    """
+    found, has = means(rows), [row for row in rows if "psnr_colour" in row]
+    if not found or len(has) == len(rows):
+        return found
+    reason = f"{len(rows) - len(has)} of {len(rows)} views have a half with too few pixels to fit colours to"
+    return {"psnr_colour": None, **found, "psnr_colour_views": len(has), "psnr_colour_reason": reason}
+
+
+def in_colours_of(
+    image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: OwnColours
+) -> NDArray[np.float64] | None:
+    """Return the image with each half, left and right, in the colours that the other half of the photograph asks for.
+
+    Pixels that are black or white in the photograph say nothing of its colours.  None where a half has fewer than
+    PIXELS others for each number that is fitted to a channel: that depends on the photograph and the mask alone, so
+    that models are compared on the same views.  Those beyond white in the image are left out of the fit where enough
+    others are left; else all count.
+    """
+    usable = counted & ((photograph > 0) & (photograph < 255)).all(axis=2)
+    middle, truth, changed = image.shape[1] // 2, photograph / 255.0, image.copy()
+    left, right = np.s_[:, :middle], np.s_[:, middle:]
+    fewest = PIXELS * model.fitted_to_a_channel
+    if min(np.count_nonzero(usable[half]) for half in (left, right)) < fewest:
+        return None
+    for half, other in ((left, right), (right, left)):
+        below = usable[other] & (image[other] < 1).all(axis=2)
+        fitted_to = below if np.count_nonzero(below) >= fewest else usable[other]
+        matrix = model.fitted(image[other][fitted_to], truth[other][fitted_to])
+        changed[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
+    return changed
+
+
+def corrected_by_regression(
+    image: NDArray[np.float64], truth: NDArray[np.float64], counted: Mask
+) -> NDArray[np.float64]:
+    """Return (image - b) / a of each channel, where a truth + b is nearest to the image (gsplat).
+
+    Regressing the image on the photograph divides by a slope that noise makes too small: no least-squares correction.
+    """
+    corrected = image.copy()
+    for channel in range(3):
+        x, y = truth[..., channel][counted], image[..., channel][counted]
+        variance = float(np.mean((x - x.mean()) ** 2))
+        slope = float(np.mean((x - x.mean()) * (y - y.mean()))) / variance if variance > 0 else 1.0
+        if abs(slope) > LEAST:
+            corrected[..., channel] = (image[..., channel] - (y.mean() - slope * x.mean())) / slope
+    return np.clip(corrected, 0, 1)
+
+
+# PSNR of a scene that moves, apart for moments that training has seen and for those that it has not.
+
+HELD_OUT, OTHERS = "psnr_held_out_moments", "psnr_other_moments"
+
+
+def by_moment(psnr: Mapping[str, float], views: Sequence[View], trained: Sequence[View]) -> dict[str, dict[str, float]]:
+    """Return the PSNR of views, dB, by their names, once more by whether the moment is one of the views trained on.
+
+    There is none where only one of both kinds is there, as where nothing moves.
+    """
+    known, times = set(moments_of(trained)), {view.name: view.time for view in views}
+    kinds = {name: OTHERS if time in known else HELD_OUT for name, time in times.items() if time is not None}
+    if not known or {kinds.get(name) for name in psnr} != {HELD_OUT, OTHERS}:
+        return {}
+    return {name: {kinds[name]: value} for name, value in psnr.items()}
+
 
 LOG = logging.getLogger("clsplat")
 PSNR_AND_SSIM = Perceptual()
@@ -139,3 +338,19 @@ def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM)
         **perceptual.mean([r.perceptual for r in results]),
         "views": len(results),
     }
+
+
+# The distributions of size, anisotropy and opacity over the Gaussians of a model.
+
+SHARES = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+
+def distribution(gaussians: Gaussians) -> dict[str, list[float]]:
+    """Return quantiles, at SHARES: size (rms scale, scene units), anisotropy (longest by shortest axis), opacity."""
+    log_scales = gaussians.get("log_scales").astype(np.float64)
+    columns = {
+        "size": np.sqrt(np.exp(2 * log_scales).mean(axis=1)),
+        "anisotropy": np.exp(log_scales.max(axis=1) - log_scales.min(axis=1)),
+        "opacity": 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0]),
+    }
+    return {name: [float(value) for value in np.quantile(column, SHARES)] for name, column in columns.items()}

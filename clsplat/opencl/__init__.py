@@ -1,0 +1,1 @@
+"""OpenCL devices, their programs and their caches; nothing else imports pyopencl."""

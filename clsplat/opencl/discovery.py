@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from clsplat.errors import ConfigError, DeviceError, one_line, quoted
+from clsplat.core.errors import ConfigError, DeviceError, one_line, quoted
 from clsplat.opencl import runtimes
 
 runtimes.prepare()

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import platformdirs
 
-from clsplat.caches import LIBRARIES, cache_folder, named_by_user
-from clsplat.errors import DataError, OutputError
-from clsplat.files import write_text
-from clsplat.reading import read_text, regular
+from clsplat.core.errors import DataError, OutputError
+from clsplat.core.files import write_text
+from clsplat.core.machine import LIBRARIES, cache_folder, named_by_user
+from clsplat.core.reading import read_text, regular
 
 LOG = logging.getLogger("clsplat")
 SQLITE, SQLITE_HEADER = b"SQLite format 3\0", 100  # bytes

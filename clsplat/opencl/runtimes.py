@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from clsplat.caches import cache_folder
-from clsplat.errors import OutputError
-from clsplat.files import write_text
+from clsplat.core.errors import OutputError
+from clsplat.core.files import write_text
+from clsplat.core.machine import cache_folder
 from clsplat.opencl.kernel_caches import damaged_kernels, empty_kernel_caches, remove_cut_kernels
 
 SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")

@@ -1,174 +1,251 @@
-"""Choices that a run makes by its photographs, and what it writes of them into its pipeline file."""
+"""Make the choices of a pipeline that follow from its photographs, and undo them."""
 
+import copy
 import json
-import math
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Callable, Collection, Iterator, Sequence
+from itertools import compress
+from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import ValidationError
 
-from clsplat.scene.capture import Measure, Measures, told
-from clsplat.settings import Settings
+from clsplat.core.errors import ConfigError, OverrideError, shortened
+from clsplat.pipeline.capture_choice import CaptureChoice, Others, without_choices
+from clsplat.pipeline.explanation import first_fault, place_text
+from clsplat.pipeline.file import PipelineFile
+from clsplat.pipeline.overrides import apply, split, value_at
+from clsplat.pipeline.yaml_file import Place
+from clsplat.scene.quality import Measures
+from clsplat.stages.optimize import Optimize
+from clsplat.training.stage import Training
 
-WRITTEN = ("chosen", "reason")  # keys of a choice
-Others = Literal["row", "file"]
-Row = Annotated[list[Any], Field(min_length=2)]  # the least measure, or of each measure, then the value of each key
+# Where the choices of a pipeline file's data are, and where their keys lead.
 
 
-def _is_number(bound: Any) -> bool:
-    return isinstance(bound, int | float) and not isinstance(bound, bool) and abs(bound) < math.inf
+def choices_in(data: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield the choices of a file's data that have the shape of one, with their numbers."""
+    choices = data.get("choices")
+    for number, one in enumerate(choices if isinstance(choices, list) else ()):
+        keys, rows = (one.get("keys"), one.get("values")) if isinstance(one, dict) else (None, None)
+        if not isinstance(keys, list) or not isinstance(rows, list) or not isinstance(one.get("given", {}), dict):
+            continue
+        if all(isinstance(key, str) for key in keys) and all(isinstance(row, list) and row for row in rows):
+            yield number, one
 
 
-class CaptureChoice(Settings):
-    """Settings that go together, and follow from a measure of the photographs.
+def set_at(data: dict[str, Any], key: str, value: Any) -> Place:
+    """Set a key of a choice in a file's data; return its place.  Raises OverrideError where there is none."""
+    return apply(data, f"{key}={json.dumps(value)}", PipelineFile)
 
-    They replace what the file says at their places, before training; `--set` of one of these places, or of one that
-    holds it or lies inside, wins there alone.  Where the others do not go together with it, or the dataset does not
-    have the measure, the file's values stay.
+
+def place_in(data: dict[str, Any], key: str) -> Place:
+    """Return the place of a key of a choice in a file's data.  Raises ConfigError where there is none."""
+    try:
+        return set_at(copy.deepcopy(data), key, None)
+    except OverrideError as error:
+        raise ConfigError(f"choices: {shortened(key)}: {error.reason}") from error
+
+
+def touch(one: Place, other: Place) -> bool:
+    """Return whether one of two places is the other, or holds it."""
+    shorter = min(len(one), len(other))
+    return shorter > 0 and one[:shorter] == other[:shorter]
+
+
+# What a training that keeps its best model needs.
+
+
+def check_keeping(settings: PipelineFile) -> None:
+    """Raise ConfigError where a training has nothing to choose its model by, or one of several is a refit."""
+    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
+    if any(stage.keep == "best" for stage in trainings) and settings.scene.validation == 0:
+        raise ConfigError("optimize.keep: best chooses by validation views; expected scene.validation: auto")
+    if any(stage.refit for stage in trainings) and len(trainings) > 1:
+        raise ConfigError(f"optimize.refit: expected one stage that trains, found {len(trainings)}")
+    begun = 0  # global step
+    for stage in settings.stages:
+        if isinstance(stage, Optimize):
+            stage.require_measured(begun)
+            if stage.patience:  # nobody knows at which step the next one begins
+                return
+        begun += stage.steps if isinstance(stage, Training) else 0
+
+
+LATE = ("model", "stages")  # parts of a pipeline that are used after the photographs are read
+
+
+def choose(settings: PipelineFile, measures: Measures) -> PipelineFile:
+    """Return the settings with the values that follow from the measures; choices that are made stay.
+
+    Where those of a row do not go together with what `--set` gave for one of them, the file's stay.
+    Raises ConfigError where they do not go together either.
     """
+    data = settings.model_dump(mode="json")
+    before = [[value_at(data, key, PipelineFile) for key in one.keys] for one in settings.choices]
 
-    output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "instead_of", "reason"})
+    def made(others: Others) -> PipelineFile:
+        pairs = zip(settings.choices, before, strict=True)
+        choices = [one if one.reason else one.of(measures, old, others) for one, old in pairs]
+        return _with(settings, choices, [pair for one in choices for pair in one.settings])
 
-    keys: Annotated[list[str], Field(min_length=1)]
-    """Places of the settings, as in `--set`: keys of the model, of stages, or `scene.validation`."""
-    by: Measure | Annotated[list[Measure], Field(min_length=2)]
-    """What is measured; a list of several, whose bounds in each row are a list too."""
-    values: list[Row]
-    """Rows [from, a value of each key]: those of the last row all of whose bounds the measures reach.  Of several
-    measures, one that the dataset does not have reaches 0 alone."""
-    since: str | list[str]
-    """Why these values, in a few words: of all rows, or of each."""
-    given: dict[str, Any] = Field({})
-    """Written for `--set`: values that take the place of those in the rows, by key."""
-    chosen: list[Any] | None = None
-    """Written by a run: the values."""
-    instead_of: list[Any] | None = None
-    """Written by a run: what stood there before."""
-    reason: str = ""
-    """Written by a run: what was measured."""
-
-    @model_validator(mode="after")
-    def _in_order(self) -> "CaptureChoice":
-        several = isinstance(self.by, list)
-        if len(set(self.measures)) < len(self.measures):
-            raise ValueError("expected measures, each once, in 'by'")
-        if any(isinstance(row[0], list) != several for row in self.values):
-            raise ValueError(f"expected rows [{'[from, …]' if several else 'from'}, values…], as 'by' is")
-        bounds = [self.bounds(row) for row in self.values]
-        if wrong := next((row for row in bounds if len(row) != len(self.measures)), None):
-            raise ValueError(
-                f"values: expected a bound of each of {', '.join(self.measures)}, got {len(wrong)} of them"
-            )
-        shaped = all(_is_number(bound) for row in bounds for bound in row)
-        if not bounds or not shaped or bounds != sorted(set(bounds)) or any(bounds[0]):
-            raise ValueError("expected rows [from, values…], the first one from 0, with growing finite numbers")
-        return self
-
-    @model_validator(mode="after")
-    def _of_each_key(self) -> "CaptureChoice":
-        if wrong := next((row for row in self.values if len(row) != 1 + len(self.keys)), None):
-            raise ValueError(f"values: expected [from, {', '.join(self.keys)}], got {len(wrong)} of them")
-        if isinstance(self.since, list) and len(self.since) != len(self.values):
-            raise ValueError(f"since: expected words, or words for each of {len(self.values)} rows")
-        if wrong_key := next((key for key in self.given if key not in self.keys), None):
-            raise ValueError(f"given: expected some of {', '.join(self.keys)}, got {wrong_key}")
-        written = [len(values or []) for values in (self.chosen, self.instead_of)]
-        if written != [len(self.keys) if self.reason else 0] * 2:
-            raise ValueError(
-                f"expected chosen and instead_of with a value of each of {len(self.keys)} keys, and reason, as a run "
-                "writes them; without all three the run chooses anew"
-            )
-        return self
-
-    @property
-    def measures(self) -> list[Measure]:
-        """What is measured."""
-        return self.by if isinstance(self.by, list) else [self.by]
-
-    def bounds(self, row: Row) -> tuple[float, ...]:
-        """The bound of each measure in a row."""
-        return tuple(row[0]) if isinstance(self.by, list) else (row[0],)
-
-    def row(self, measures: Measures) -> int:
-        """Return the number of the row that measures reach; one that is missing counts as 0."""
-        found = [measures.get(name, 0) for name in self.measures]
-        bounds = [zip(found, self.bounds(row), strict=True) for row in self.values]
-        return max(number for number, row in enumerate(bounds) if all(value >= bound for value, bound in row))
-
-    def depends(self, measure: Measure, measures: Measures) -> bool:
-        """Whether the row depends on one more measure, beside those that are known."""
-        return len({self.row({**measures, measure: value}) for value in (0.0, math.inf)}) > 1
-
-    def of(self, measures: Measures, before: list[Any], others: Others = "row") -> "CaptureChoice":
-        """Return it with what follows from the measures; before: the values that are replaced.
-
-        others: whether what stands beside `given` values is of the row that the measure reaches, or of the file.
-        """
-        found = [told(name, measures[name]) for name in self.measures if name in measures]
-        missing = [name for name in self.measures if name not in measures and self.depends(name, measures)]
-        untold = [f"the dataset does not tell {name}" for name in missing]
-        if not found:
-            reason, chosen = f"the dataset does not tell {', '.join(self.measures)}", before
-        else:
-            at = self.row(measures)
-            chosen = self.values[at][1:]
-            why = self.since if isinstance(self.since, str) else self.since[at]
-            reason = f"{', '.join(found + untold)}; {why}"
-        if self.given:
-            keys = ", ".join(self.given)
-            alone = others == "file" and bool(found)
-            reason += f"; {keys} as set" + (", with which the rest does not go together" if alone else "")
-            beside = before if alone else chosen
-            chosen = [self.given.get(key, value) for key, value in zip(self.keys, beside, strict=True)]
-        return self.model_copy(update={"chosen": chosen, "instead_of": before, "reason": reason})
-
-    @property
-    def settings(self) -> list[tuple[str, Any]]:
-        """Each key with what was chosen for it."""
-        return list(zip(self.keys, self.chosen or [], strict=True))
-
-    @property
-    def told(self) -> str:
-        """What was chosen, and why."""
-        return f"{self._text([value for _, value in self.settings])}, since {self.reason}"
-
-    def is_settled(self, known: Measures) -> bool:
-        """Whether it is made, or measures that are known make it whatever the others are."""
-        return bool(self.reason) or (len(self._open(known)) == 1 and any(name in known for name in self.measures))
-
-    def possible(self, known: Measures) -> str:
-        """Return what can be chosen, in words, where some measures are known; of later rows the values alone."""
-        rows = self._open(known)
-        values = [
-            [self.given.get(key, value) for key, value in zip(self.keys, self.values[row][1:], strict=True)]
-            for row in rows
-        ]
-        texts = [self._text(values[0]), *(", ".join(map(json.dumps, one)) for one in values[1:])]
-        return "; ".join(text + self._condition(row, known) for row, text in zip(rows, texts, strict=True))
-
-    def _open(self, known: Measures) -> list[int]:
-        """The rows that the measures may reach: they do where those that are not known have the bounds of the row."""
-        bounds = [dict(zip(self.measures, self.bounds(row), strict=True)) for row in self.values]
-        return [number for number, own in enumerate(bounds) if self.row({**own, **known}) == number]
-
-    def _condition(self, number: int, known: Measures) -> str:
-        """The bounds of a row, of measures that are not known."""
-        bounds = zip(self.measures, self.bounds(self.values[number]), strict=True)
-        least = " and ".join(told(name, bound) for name, bound in bounds if bound and name not in known)
-        return f" if at least {least}" if least else ""
-
-    def _text(self, values: list[Any]) -> str:
-        return ", ".join(f"{key}={json.dumps(value)}" for key, value in zip(self.keys, values, strict=True))
-
-    def undone(self) -> "CaptureChoice":
-        """Return it before a choice."""
-        return self.model_copy(update={"chosen": None, "instead_of": None, "reason": ""})
+    what = f"at {', '.join(f'{value:,.4g} {measure}' for measure, value in measures.items())}"
+    try:
+        return _checked(lambda: made("row"), what)
+    except ConfigError:
+        if not any(one.given and not one.reason for one in settings.choices):
+            raise
+        return _checked(lambda: made("file"), what)
 
 
-def without_choices(data: Any) -> Any:
-    """Return plain data of a resolved pipeline without what `auto` keys chose."""
-    if isinstance(data, list):
-        return [without_choices(item) for item in data]
-    if not isinstance(data, dict):
+def _checked(made: Callable[[], PipelineFile], what: str) -> PipelineFile:
+    """Settings that go together.  Raises ConfigError; what: what they are made of."""
+    try:
+        settings = made()
+        check_keeping(settings)
+    except ValidationError as error:
+        place, complaint = first_fault(error, PipelineFile)
+        raise ConfigError(f"choices, {what}: {place_text(place)}: {complaint}") from error
+    except ConfigError as error:
+        raise ConfigError(f"choices, {what}: {error}") from error
+    return settings
+
+
+def as_asked(settings: PipelineFile) -> PipelineFile:
+    """Return the settings with what `--set` gave for keys of choices, and nothing that follows from photographs.
+
+    Where that does not go together without what follows, they are as they were.
+    """
+    try:
+        return choose(settings, {}) if any(one.given for one in settings.choices) else settings
+    except ConfigError:
+        return settings
+
+
+def undone(settings: PipelineFile) -> PipelineFile:
+    """Return the settings as they were before a run chose by `choices`.
+
+    Raises ConfigError where what stood there does not fit its place, as after an edit.
+    """
+    made = [one for one in settings.choices if one.reason]
+    before = [pair for one in made for pair in zip(one.keys, one.instead_of or [], strict=True)]
+    if not made:
+        return settings
+    return _checked(lambda: _with(settings, [one.undone() for one in settings.choices], before), "instead_of")
+
+
+def check_choices(settings: PipelineFile) -> None:
+    """Raise ConfigError where a choice has no place, where two have the same, or where values do not go together.
+
+    Beside what `--set` gave for one of them, those of one row need to.
+    """
+    data, places = settings.model_dump(mode="json"), list[Place]()
+    for number, key in [(number, key) for number, one in enumerate(settings.choices) for key in one.keys]:
+        place, what = place_in(data, key), f"choices[{number}]: {key}"
+        if place[0] not in LATE and place != ("scene", "validation"):
+            raise ConfigError(f"{what} is used before photographs are measured; expected a key of {' or '.join(LATE)}")
+        if any(touch(place, other) for other in places):
+            raise ConfigError(f"{what} is chosen twice; expected one choice for each place")
+        places.append(place)
+    still_open, faults = undone(settings), list[ConfigError]()
+    rows = {tuple(zip(one.measures, one.bounds(row), strict=True)) for one in settings.choices for row in one.values}
+    for row in sorted(rows):
+        try:
+            choose(still_open, dict(row))
+        except ConfigError as error:
+            faults.append(error)
+    if faults and (len(faults) == len(rows) or not any(one.given for one in settings.choices)):
+        raise faults[0]
+
+
+def _with(settings: PipelineFile, choices: Sequence[CaptureChoice], values: Sequence[tuple[str, Any]]) -> PipelineFile:
+    data = settings.model_dump(mode="json")
+    for key, value in values:
+        set_at(data, key, value)
+    return PipelineFile.model_validate({**data, "choices": [one.model_dump(mode="json") for one in choices]})
+
+
+# What overrides do to the data of a pipeline file with choices: `--set` of a key wins over what would be chosen.
+
+
+def overridden(tagged: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """Return a file's data with overrides, also in its choices; with other photographs what a run chose is forgotten.
+
+    Raises OverrideError.
+    """
+    if any(_is_of_photographs(override) for override in overrides):
+        tagged = forgotten(tagged)
+    data, places = _applied(tagged, overrides)
+    chosen = held(data, places)
+    if not chosen:
+        return without_overridden(data, places)
+    less, _ = _applied(tagged, [one for one, place in zip(overrides, places, strict=True) if place not in chosen])
+    for number, key in chosen.values():
+        choice, value = less["choices"][number], value_at(data, key, PipelineFile)
+        choice["given"] = {**choice.get("given", {}), key: value}
+        if isinstance(chosen_values := choice.get("chosen"), list):  # by a run
+            pairs = zip(choice["keys"], chosen_values, strict=False)
+            choice["chosen"] = [value if one == key else old for one, old in pairs]
+            set_at(less, key, value)
+    return without_overridden(less, [place for place in places if place not in chosen])
+
+
+def held(data: dict[str, Any], places: Sequence[Place]) -> dict[Place, tuple[int, str]]:
+    """Return those places of overrides that are one of several keys of a choice, with its number and the key.
+
+    It has the value in the place of its rows', so that the file's need not go together with it.
+    """
+    found: dict[Place, tuple[int, str]] = {}
+    for number, choice in choices_in(data):
+        if len(choice["keys"]) < 2:
+            continue
+        for key in choice["keys"]:
+            own = place_in(data, key)
+            if {place for place in places if touch(place, own)} == {own}:
+                found[own] = number, key
+    return found
+
+
+def forgotten(data: dict[str, Any]) -> dict[str, Any]:
+    """Return a file's data as they were before a run chose for its own photographs, by `choices` and keys `auto`."""
+    data, before = copy.deepcopy(data), list[tuple[str, Any]]()
+    for _, choice in choices_in(data):
+        made = [choice.pop(name, None) for name in ("reason", "chosen", "instead_of")]
+        if made[0] and isinstance(made[2], list):
+            before += zip(choice["keys"], made[2], strict=False)
+    for key, value in before:
+        set_at(data, key, value)
+    return dict(without_choices(data))
+
+
+def without_overridden(data: dict[str, Any], places: Collection[Place]) -> dict[str, Any]:
+    """Return a file's data with choices without the keys that an override has set, around them or inside of them."""
+    if not places or not isinstance(choices := data.get("choices"), list):
         return data
-    chooses = all(key in data for key in WRITTEN)
-    return {key: without_choices(value) for key, value in data.items() if not (chooses and key in WRITTEN)}
+    left = list(choices)
+    for number, choice in choices_in(data):
+        own = [place_in(data, key) for key in choice["keys"]]
+        kept = [not any(touch(one, place) for place in places) for one in own]
+        if not all(kept):
+            left[number] = _columns(choice, kept)
+    return {**data, "choices": [one for one in left if one is not None]}
+
+
+def _is_of_photographs(override: str) -> bool:
+    """Whether an override sets which photographs are trained with, by which a run may have chosen."""
+    names, _ = split(override)
+    return names[0] == "scene" and names[1:2] != ["validation"]
+
+
+def _applied(tagged: dict[str, Any], overrides: Sequence[str]) -> tuple[dict[str, Any], list[Place]]:
+    """A file's data with overrides at their places, and these."""
+    data = copy.deepcopy(tagged)
+    return data, [apply(data, override, PipelineFile) for override in overrides]
+
+
+def _columns(choice: dict[str, Any], kept: list[bool]) -> dict[str, Any] | None:
+    """A choice of some of its keys; None of none."""
+    own = {name: choice[name] for name in ("keys", "chosen", "instead_of") if isinstance(choice.get(name), list)}
+    rows = [[row[0], *compress(row[1:], kept)] for row in choice["values"]]
+    less = {**choice, **{name: list(compress(values, kept)) for name, values in own.items()}, "values": rows}
+    if given := choice.get("given"):
+        less["given"] = {key: value for key, value in given.items() if key in less["keys"]}
+    return less if any(kept) else None

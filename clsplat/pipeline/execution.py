@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
+from clsplat.core.settings import ReadPath, Settings
 from clsplat.pipeline.explanation import explain, first_fault
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.settings import ReadPath, Settings
 
 STORE = "runs/store"
 ENGINE = r"^(inline|local|(dask|tls)://[^/:\s]+:(\d{1,5}))$"

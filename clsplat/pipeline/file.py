@@ -12,25 +12,24 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, field_validator
 
-from clsplat.errors import ConfigError
-from clsplat.filters import ModelSettings
-from clsplat.names import fault_of_name
+from clsplat.core.errors import ConfigError
+from clsplat.core.files import fault_of_name
+from clsplat.core.settings import OneOf, ReadPath, Settings
 from clsplat.opencl.discovery import Schedule
-from clsplat.pipeline.choices import CaptureChoice
+from clsplat.pipeline.capture_choice import CaptureChoice
 from clsplat.prepare.steps import Step
+from clsplat.render.filters import ModelSettings
 from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
 from clsplat.render.tiles import Sort
-from clsplat.scene.choice import Choice, Chosen, ChosenOrAuto
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import Missing
-from clsplat.scene.masks import with_masks
-from clsplat.scene.scene import HOLDOUT, Alpha, Background, Scene
-from clsplat.scene.split import Split
-from clsplat.settings import OneOf, ReadPath, Settings
-from clsplat.stages.base import Stage
+from clsplat.scene.photographs import with_masks
+from clsplat.scene.scene import HOLDOUT, Background, Scene
+from clsplat.scene.view import Alpha
+from clsplat.scene.view_selection import Choice, Chosen, ChosenOrAuto, Split
 from clsplat.stages.optimize import Optimize
-from clsplat.stages.training import Training
 from clsplat.training.memory import Harmonics
+from clsplat.training.stage import Stage, Training
 
 
 class SceneSettings(Settings):

@@ -3,9 +3,9 @@
 import difflib
 from pathlib import Path
 
-from clsplat.errors import ConfigError, in_shell, quoted
-from clsplat.names import PIPELINE
-from clsplat.version import resource_dir
+from clsplat.core.errors import ConfigError, in_shell, quoted
+from clsplat.core.files import PIPELINE
+from clsplat.core.resources import resource_dir
 
 
 def shipped() -> dict[str, Path]:

@@ -9,28 +9,20 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from clsplat import plugins
-from clsplat.cadence import is_act
-from clsplat.errors import ConfigError, OverrideError, one_line
-from clsplat.names import PREPARED
-from clsplat.pipeline.choosing import check_choices
+from clsplat.core.errors import ConfigError, OverrideError, one_line
+from clsplat.core.files import PREPARED
+from clsplat.core.schedule import is_act
+from clsplat.core.settings import variants
+from clsplat.pipeline import plugins
+from clsplat.pipeline.checks import check_moving, check_on_host, check_screen_filter, check_sky, kinds_of
+from clsplat.pipeline.choices import check_choices, check_keeping, held, overridden
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
-from clsplat.pipeline.keeping import check_keeping
-from clsplat.pipeline.kinds import kinds_of
-from clsplat.pipeline.moving import check_moving
-from clsplat.pipeline.on_host import check_on_host
-from clsplat.pipeline.overridden import held, overridden
-from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
-from clsplat.pipeline.screen_filter import check_screen_filter
-from clsplat.pipeline.settable import CADENCE, settable
-from clsplat.pipeline.sky import check_sky
+from clsplat.pipeline.overrides import CADENCE, NoSuchKey, apply, settable, split, suggestion
 from clsplat.pipeline.yaml_file import Document, read_yaml, yaml_text
 from clsplat.prepare.cache import Planned, plan
-from clsplat.settings import variants
-from clsplat.stages.base import Scheduled, Stage, written_twice
-from clsplat.stages.training import Training
+from clsplat.training.stage import Scheduled, Stage, Training, written_twice
 
 LOG = logging.getLogger("clsplat")
 

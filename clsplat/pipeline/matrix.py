@@ -23,17 +23,35 @@ from typing import Annotated, Any
 
 from pydantic import Field, JsonValue, ValidationError, model_validator
 
-from clsplat.errors import ConfigError, OverrideError, quoted, shortened
-from clsplat.names import fault_of_output
+from clsplat.core.errors import ConfigError, OverrideError, quoted, shortened
+from clsplat.core.files import fault_of_output
+from clsplat.core.settings import ReadPath, Settings
 from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.explanation import explain, place_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
-from clsplat.pipeline.labels import distinct, value_text
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.stretching import in_steps
 from clsplat.pipeline.yaml_file import Document, Place, read_pipeline, read_yaml, yaml_text
-from clsplat.settings import ReadPath, Settings
+
+# Short names for the values of a matrix, from which those of its cells are made.
+
+
+def distinct(paths: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return the shortest ends of the paths that differ from each other."""
+    for length in range(1, max((len(parts) for parts in paths), default=0) + 1):
+        names = ["-".join(parts[-length:]) for parts in paths]
+        if len(set(names)) == len(names):
+            return names
+    return ["-".join(parts) for parts in paths]
+
+
+def value_text(value: Any) -> str:
+    """Return a value as a part of a name."""
+    if isinstance(value, list):
+        return "+".join(value_text(item) for item in value)
+    return value if isinstance(value, str) else json.dumps(value)
+
 
 MAX_CELLS = 1000
 

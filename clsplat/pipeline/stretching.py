@@ -13,15 +13,13 @@ from fractions import Fraction
 from itertools import pairwise
 from typing import Any, TypeVar
 
-from clsplat.cadence import acts, places
-from clsplat.pipeline.choices import CaptureChoice
+from clsplat.core.schedule import acts, divided, places
+from clsplat.core.settings import Settings
+from clsplat.pipeline.capture_choice import CaptureChoice
 from clsplat.pipeline.file import PipelineFile
-from clsplat.schedule import divided
-from clsplat.settings import Settings
-from clsplat.stages.base import Scheduled
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
-from clsplat.stages.training import Training
+from clsplat.training.stage import Scheduled, Training
 
 Value = TypeVar("Value")
 Kind = TypeVar("Kind", bound=Training)

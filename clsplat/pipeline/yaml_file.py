@@ -15,8 +15,8 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
-from clsplat.errors import ConfigError, quoted, shortened
-from clsplat.reading import read_text
+from clsplat.core.errors import ConfigError, quoted, shortened
+from clsplat.core.reading import read_text
 
 SIZE_LIMIT = 1 << 20  # bytes
 NODE_LIMIT = 20_000  # values after aliases are expanded, so that aliases to aliases cannot fill the memory

@@ -1,1 +1,1 @@
-"""From a folder of photographs to a scene, in steps whose results are kept."""
+"""Photographs to a scene: features, matches, mapping, undistortion; and the inspection of datasets."""

@@ -8,8 +8,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from clsplat.errors import ConfigError, DataError
-from clsplat.signals import stopping_on_signals
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.signals import stopping_on_signals
 
 DATABASE, IMAGES, PAIRS, MODEL = "database.db", "images", "pairs.txt", "sparse"
 MATCHING = "matching.json"  # how photographs were matched, for further attempts

@@ -10,10 +10,10 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import amount, first_few
+from clsplat.core.errors import amount, first_few
 from clsplat.prepare.database import feature_counts, verified
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS
-from clsplat.scene.sharpness import is_blurred, sharpness_of
+from clsplat.scene.quality import is_blurred, sharpness_of
 
 FEW_FEATURES = 300  # of a photograph: a wall of one colour has tens, a garden thousands
 TEXTURED = 1000  # features: photographs with as many are not weakly textured; three times FEW_FEATURES

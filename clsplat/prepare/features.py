@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.progress import counted
 from clsplat.prepare.database import (
     DATABASE,
     IMAGES,
@@ -25,10 +26,8 @@ from clsplat.prepare.database import (
     require_pycolmap,
     without_features,
 )
-from clsplat.prepare.gather import gather, list_photographs
-from clsplat.prepare.messages import warn_of
+from clsplat.prepare.gather import gather, list_photographs, warn_of
 from clsplat.prepare.shared_intrinsics import Cameras, sharing, sharing_text
-from clsplat.progress import counted
 from clsplat.scene.images import read_grey
 
 LOG = logging.getLogger("clsplat")

@@ -6,17 +6,27 @@ import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from clsplat.errors import DataError, amount, first_few, in_shell
-from clsplat.files import atomic
-from clsplat.progress import Count
-from clsplat.reading import read_file, regular
-from clsplat.scene.exif import copied, exposure_of, write_exposures
-from clsplat.scene.image_headers import JPEG, TAIL_SIZE, parse_header
-from clsplat.scene.images import IMAGE_SUFFIXES, MAX_BYTES, decode_image, read_grey
+from clsplat.core.errors import DataError, amount, first_few, in_shell
+from clsplat.core.files import atomic
+from clsplat.core.progress import Count
+from clsplat.core.reading import read_file, regular
+from clsplat.scene.images import (
+    IMAGE_SUFFIXES,
+    JPEG,
+    MAX_BYTES,
+    TAIL_SIZE,
+    copied,
+    decode_image,
+    exposure_of,
+    parse_header,
+    read_grey,
+    write_exposures,
+)
 from clsplat.scene.multicamera import VIDEO_SUFFIXES
 from clsplat.scene.times_file import read_times, write_times
 
@@ -190,3 +200,37 @@ def link(source: Path, target: Path) -> None:
 def _is_there(source: Path, target: Path) -> bool:
     """Whether a target is a copy, which is complete, or a link to this source."""
     return target.exists() and (not target.is_symlink() or target.resolve() == source.resolve())
+
+
+# What steps from photographs to cameras have left out, in sentences.
+
+
+def warn_of(figures: Mapping[str, Any]) -> None:
+    """Log what a step has left out."""
+    for text in left_out(figures):
+        LOG.warning("%s", text)
+
+
+def left_out(figures: Mapping[str, Any]) -> list[str]:
+    """Return warnings of the photographs that a step has left out, by what it returned."""
+    texts = []
+    if damaged := figures.get("damaged"):
+        names = [f"{name} ({reason})" for name, reason in damaged.items()]
+        count = figures["photographs"] + len(names)
+        texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; {remedy(damaged)}")
+    if missing := figures.get("not_registered"):
+        reasons = figures.get("reasons", {})
+        named = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])
+        more = "" if figures.get("denser_tried") else ", or find more features (find_features.long_side)"
+        texts.append(
+            f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed: {named}; "
+            f"the scene is made of the others: for more, add photographs from places between{more}"
+        )
+    if others := figures.get("other_models"):
+        are = "is" if len(others) == 1 else "are"
+        sizes = ", ".join([*map(str, others[:-1]), amount(others[-1], "photograph")])
+        texts.append(
+            f"{amount(len(others), 'smaller model')}, of {sizes}, {are} left out: add photographs that join "
+            f"{'it' if len(others) == 1 else 'them'} to the largest"
+        )
+    return texts

@@ -14,7 +14,8 @@ from typing import Any, Literal
 
 import cv2
 
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
+from clsplat.core.progress import Count
 from clsplat.prepare.database import (
     DATABASE,
     IMAGES,
@@ -27,11 +28,9 @@ from clsplat.prepare.database import (
 )
 from clsplat.prepare.diagnosis import Matched, diagnosis, reasons
 from clsplat.prepare.features import Sought, add_features
-from clsplat.prepare.gather import MIN_PHOTOGRAPHS, link
+from clsplat.prepare.gather import MIN_PHOTOGRAPHS, link, warn_of
 from clsplat.prepare.matching import Pairing, match_pairs, match_within, more_pairs
-from clsplat.prepare.messages import warn_of
 from clsplat.prepare.rotation_only import without_depth
-from clsplat.progress import Count
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]

@@ -15,8 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, amount
-from clsplat.files import write_text
+from clsplat.core.errors import DataError, amount
+from clsplat.core.files import write_text
+from clsplat.core.progress import Count, watched
+from clsplat.core.reading import read_json
 from clsplat.prepare.database import (
     DATABASE,
     IMAGES,
@@ -30,8 +32,6 @@ from clsplat.prepare.database import (
     verified,
 )
 from clsplat.prepare.gather import link
-from clsplat.progress import Count, watched
-from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]

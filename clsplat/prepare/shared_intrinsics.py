@@ -5,9 +5,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
-from clsplat.errors import amount
-from clsplat.scene.exif import optics_of
-from clsplat.scene.images import read_header
+from clsplat.core.errors import amount
+from clsplat.scene.images import optics_of, read_header
 
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
 Key = Callable[[Path, str], object]

@@ -1,0 +1,1 @@
+"""Images of Gaussians: tile lists, projection, blending, filters, backgrounds."""

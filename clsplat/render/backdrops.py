@@ -4,9 +4,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from clsplat.core.schedule import NonNegative
+from clsplat.core.settings import Settings
 from clsplat.gaussians.sky import SIDES
-from clsplat.schedule import NonNegative
-from clsplat.settings import Settings
 
 
 class Backdrop(Settings):

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.opencl.device import Array, Device
-from clsplat.opencl.program import constants
-from clsplat.scene.scene import View
+from clsplat.core.errors import DataError
+from clsplat.opencl.device import Array, Device, constants
+from clsplat.scene.view import View
 
 RAY_MARGIN = constants()["RAY_MARGIN"]
 TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # to a side

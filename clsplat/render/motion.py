@@ -6,8 +6,9 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-from clsplat.formats.motion import MOTION, TURN, WIDTHS
-from clsplat.gaussians.tables import DeviceModel, Gaussians, Gradients, Table
+from clsplat.formats.splats import MOTION, TURN, WIDTHS
+from clsplat.gaussians.gaussians import DeviceModel, Gaussians, Table
+from clsplat.gaussians.structs import Gradients
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace

@@ -1,24 +1,152 @@
 """Render Gaussians to an image, and compute their gradients from the image's."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from clsplat.errors import MemoryLimitError
-from clsplat.gaussians.tables import DeviceModel, Gradients
-from clsplat.opencl.device import Array, Device
-from clsplat.opencl.program import Program, constants
-from clsplat.render.arguments import shape_arguments
+from clsplat.core.errors import MemoryLimitError
+from clsplat.gaussians.gaussians import DeviceModel, Gaussians, left_out_arguments
+from clsplat.gaussians.sh_offload import slots_of
+from clsplat.gaussians.structs import Gradients
+from clsplat.opencl.device import Array, Device, Program, constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.motion import at_moment, to_centres
-from clsplat.render.projection import RECORD as RECORD
-from clsplat.render.projection import catch_up, project
-from clsplat.render.records import add_inverse_depth_gradient, sum_inverse_depths, sum_records
 from clsplat.render.sky import Skies
-from clsplat.render.tiles import Band, Sort, TileLists, Tiler, TooManyPairs
+from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
+
+# Sums of gradient records over the pairs of each Gaussian, and what the blended inverse depth has beside them.
+
+INVERSE_DEPTHS = "inverse_depth_sums"  # in the workspace
+
+
+def sum_records(
+    pair_sums: Array,
+    lists: TileLists,
+    gaussians: Gaussians,
+    pixel_sums: Array,
+    defines: Mapping[str, int],
+    accumulate: int,
+) -> None:
+    """Write the sums of the records [P, RECORD] of each Gaussian, [PIXEL_SUMS, S].
+
+    defines: has PIXEL_SUMS where it is not the usual number; accumulate: 1 adds to the sums.
+    """
+    device = gaussians.device
+    device.program("gather.cl", **defines).sum_records(
+        items=-(-gaussians.count // int(device.tuning["LANES"])),
+        pair_sums=pair_sums,
+        first_pair=lists.first_pair,
+        tile_count=lists.tile_count,
+        pixel_sums=pixel_sums,
+        accumulate=accumulate,
+        stride=gaussians.capacity,
+        count=gaussians.count,
+    )
+
+
+def sum_inverse_depths(
+    workspace: Workspace, pair_sums: Array, lists: TileLists, gaussians: Gaussians, accumulate: int
+) -> Array:
+    """Return the sum over pixels of w dL/dD of each Gaussian, [S], of its records; `accumulate`: 1 adds to it."""
+    sums = workspace.array(INVERSE_DEPTHS, gaussians.capacity)
+    workspace.device.program("inverse_depth.cl").sum_inverse_depths(
+        items=gaussians.count,
+        pair_sums=pair_sums,
+        first_pair=lists.first_pair,
+        tile_count=lists.tile_count,
+        sums=sums,
+        accumulate=accumulate,
+        count=gaussians.count,
+    )
+    return sums
+
+
+def add_inverse_depth_gradient(workspace: Workspace, camera: DeviceCamera, splats: Array, grad_means: Array) -> None:
+    """Add to the gradient of the means, [3, S], what the last sums and the splats [N, RECORD] give."""
+    count, capacity = splats.shape[0], grad_means.shape[1]
+    workspace.device.program("inverse_depth.cl").inverse_depth_backward(
+        items=count,
+        splats=splats,
+        sums=workspace.array(INVERSE_DEPTHS, capacity),
+        camera=camera.array,
+        grad_means=grad_means,
+        stride=capacity,
+        count=count,
+    )
+
+
+# The arguments of kernels that project Gaussians.
+
+
+def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
+    """Return the arguments of every kernel that projects Gaussians, by name.
+
+    Harmonics of rows that the camera does not see may wait for updates; those kernels do not read them.
+    """
+    gaussians = model.gaussians
+    names = ("means", "quats", "log_scales", "logit_opacity", "sh_rest", "filter_variance")
+    return {
+        **{name: gaussians.tables[name].array for name in names},
+        "camera": camera.array,
+        "near_plane": model.near,
+        "screen_variance": 0.0 if model.pixel_box else model.screen_variance,
+        "compensate": 0.0 if model.pixel_box else model.compensate,
+        "degree": model.degree,
+        **slots_of(gaussians),
+        "stride": gaussians.capacity,
+        "count": gaussians.count,
+    }
+
+
+# Project Gaussians to splats, those of the view being up to date.
+
+RECORD = int(constants()["RECORD"])
+
+
+def project(
+    workspace: Workspace, model: DeviceModel, camera: DeviceCamera, band: Band, splats: Array, radius: Array
+) -> Footprints:
+    """Write the records and radii of splats; return where they lie among the tiles of a band.
+
+    splats: [N, RECORD]; radius: [S] px.  The footprints are valid until the next call.
+    """
+    gaussians = model.gaussians
+    device, count, stride = gaussians.device, gaussians.count, gaussians.capacity
+    footprints = Footprints(*(workspace.array(field.name, stride, np.uint32) for field in fields(Footprints)))
+    device.program("project.cl", **model.defines).project_forward(
+        items=-(-count // int(device.tuning["LANES"])),
+        **shape_arguments(model, camera),
+        sh_base=gaussians["sh_base"],
+        **left_out_arguments(model, camera.view, workspace.array("left_out", stride)),
+        splats=splats,
+        **vars(footprints),
+        radius=radius,
+        row_begin=band.row_begin,
+        row_end=band.row_end,
+    )
+    return footprints
+
+
+def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> None:
+    """Do the updates that Gaussians in the view wait for, and fetch from the host what lies there.
+
+    A projection without harmonics says which Gaussians those are.
+    """
+    deferred, on_host = model.gaussians.deferred, model.gaussians.on_host
+    if on_host or (deferred and deferred.updates):
+        splats = workspace.array("splats", (model.gaussians.count, RECORD))
+        radius = workspace.array("radius", model.gaussians.capacity)
+        no_band = Band(camera.tiles_x, camera.tiles_y, 0, 0)
+        depth_key = project(workspace, replace(model, degree=0), camera, no_band, splats, radius).depth_key
+        if on_host:
+            on_host.bring(depth_key)
+        if deferred:
+            deferred.catch_up(depth_key)
+
 
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 MAX_PAIRS = 2**31  # more than fit in memory, and few enough for sums of 32 bits: no other limit

@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.octahedral import corners, places, signs
-from clsplat.gaussians.sky import DeviceSky
-from clsplat.opencl.device import Array, Device
-from clsplat.opencl.program import Program, constants
+from clsplat.gaussians.sky import DeviceSky, corners, places, signs
+from clsplat.opencl.device import Array, Device, Program, constants
 from clsplat.render.camera import CAMERA, DeviceCamera
 from clsplat.render.workspace import Workspace
 

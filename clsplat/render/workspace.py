@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from clsplat.errors import MemoryLimitError
+from clsplat.core.errors import MemoryLimitError
 from clsplat.opencl.device import Array, Device
 
 GROWTH = 1.25

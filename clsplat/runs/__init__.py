@@ -1,1 +1,1 @@
-"""Runs of pipelines and matrices in their folders, and what is done with a finished one."""
+"""One run in its folder: start, resume, verify, status, render, live preview."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Literal
 
-from clsplat.errors import ClsplatError, Interrupted, OutputError, as_clsplat_error, in_shell, one_line
+from clsplat.core.errors import ClsplatError, Interrupted, OutputError, as_clsplat_error, in_shell, one_line
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")

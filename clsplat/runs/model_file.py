@@ -1,30 +1,321 @@
 """A model, or a field, at the views of a scene: rendering and measuring without training."""
 
+import io
+import json
+import logging
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clsplat.conformance.quick import open_correct
-from clsplat.errors import ConfigError, DataError
-from clsplat.gaussians.model import Model
-from clsplat.metrics.lpips import InputRange
-from clsplat.metrics.perceptual import Perceptual, metric_names
+from clsplat.core.errors import ConfigError, DataError, in_shell
+from clsplat.core.files import METRICS, PIPELINE, atomic, is_there, told_as, write_text
+from clsplat.core.progress import counted
+from clsplat.core.reading import read_json
+from clsplat.formats.table import located
+from clsplat.gaussians.model import MODEL, Model, load, model_at, model_of_run
+from clsplat.metrics.perceptual import InputRange, Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure
+from clsplat.nerf.files import FieldModel, field_of_run, is_field, load_field
 from clsplat.opencl.device import Device
-from clsplat.render.painter import Painter
-from clsplat.runs.loaded import moves, painter_of, read, size_of
-from clsplat.runs.pictures import KINDS, write_pictures
-from clsplat.runs.source import Source, of_a_field
-from clsplat.scene.view import View
-from clsplat.training.colours import colours_beside
-from clsplat.training.field_file import FieldModel
-from clsplat.training.poses import poses_beside
-from clsplat.video.moments import require_motion, times_of
-from clsplat.video.pictures import LAYERS, Canvas
-from clsplat.views.photographs import Photographs
+from clsplat.photos.photographs import Photographs
+from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.loading import Pipeline
+from clsplat.pipeline.loading import load as load_pipeline
+from clsplat.prepare.cache import noted
+from clsplat.render.painter import Painter, Splats
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.runs.results import read_metrics
+from clsplat.runs.state import has_pipeline
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import is_image, write_image
+from clsplat.scene.scene import Background, Scene, scene_name
+from clsplat.scene.view import Alpha, View
+from clsplat.stages.export import Export, image_paths
+from clsplat.stages.train_field import ExportField
+from clsplat.training.modules.appearance import colours_beside
+from clsplat.training.modules.camera_optimizer import poses_beside
+from clsplat.viewer.video.film import require_motion, times_of
+from clsplat.viewer.video.pictures import LAYERS, Canvas, shown, values
+
+# What pictures are made of, on the host: Gaussians, or a field.
+
+Loaded = Model | FieldModel
+
+
+def read(file: Path) -> Loaded:
+    """Read a model file, or that of a field.  Raises DataError when it is missing, damaged or something else."""
+    return load_field(file) if is_field(file) else load(file)
+
+
+def painter_of(loaded: Loaded, device: Device, background: Background) -> Painter:
+    """Return what renders it on a device; Gaussians before a background, a field before its own."""
+    if isinstance(loaded, FieldModel):
+        return loaded.upload(device)
+    return Splats(Rasterizer(device), loaded.upload(device), Photographs(device, background).background)
+
+
+def points_of(loaded: Loaded, scene: Scene | None) -> NDArray[np.float32]:
+    """Return where something is, [M, 3]: means of Gaussians; for a field the scene's points, if it has any."""
+    if isinstance(loaded, Model):
+        return loaded.means
+    points = scene.points if scene else None
+    return np.zeros((0, 3), np.float32) if points is None else points.positions
+
+
+def moves(loaded: Loaded) -> bool:
+    """Whether it is of a scene that moves."""
+    return isinstance(loaded, Model) and loaded.motion is not None
+
+
+def size_of(loaded: Loaded) -> dict[str, int | None]:
+    """Return what metrics.json says of its size."""
+    if isinstance(loaded, Model):
+        return {"gaussians": len(loaded)}
+    return {"gaussians": None, "parameters": loaded.shape.learned}
+
+
+# Which model and which photographs a command names: by a file, by the folder of a scene, or by that of a run.
+
+
+@dataclass(frozen=True)
+class Source:
+    """A model file, and the photographs whose cameras look at it."""
+
+    file: Path
+    folder: Path  # of the photographs
+    settings: SceneSettings  # how they are read
+    scene_name: str  # on pages
+    alpha: Alpha | None = None  # None: as the model file says
+
+    @classmethod
+    def of(cls, model: Path, scene: Path | None) -> "Source":
+        """Take a run folder, or a file that a run has exported, with its photographs; other files need `scene`.
+
+        `scene`, a folder of photographs or of a run, replaces those of the model's run.  Raises DataError or
+        ConfigError when one is not known.
+        """
+        run = run_of(model)
+        trained = scene if scene is not None and has_pipeline(scene) else run
+        if trained is None and scene is None:
+            if model.is_dir() and not located(model).is_file():
+                raise _no_model(model)
+            if not model.exists():
+                raise DataError(f"{model}: not found; expected a model file or a run folder")
+            raise ConfigError(
+                f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
+            )
+        settings = load_pipeline(str(trained / PIPELINE)).settings.scene if trained is not None else SceneSettings()
+        file = shown_of_run(model) if run == model else model
+        if run == model and not file.is_file():
+            raise _no_model(model, file.name)
+        given = scene if scene is not None else run or model
+        folder = photographs_of(given)
+        name = scene_name(settings.path if settings.path and has_pipeline(given) else folder)
+        return cls(file, folder, settings, name, settings.alpha)
+
+    def scene(self, model: Model | FieldModel) -> Scene:
+        """Read the photographs as the model was trained on, at their full size."""
+        found = self.settings.masked(read_scene(self.folder, self.settings.split))
+        return found.with_alpha(self.alpha or model.rendering.alpha)
+
+
+def require_model(path: Path) -> None:
+    """Raise DataError for a folder that holds no Gaussians, and for the file of a field."""
+    refuse_field(path)
+    if path.is_dir() and not (file := model_at(path)).is_file():
+        raise _no_model(path, file.name)
+
+
+def _no_model(folder: Path, name: str = MODEL) -> DataError:
+    """The error of a folder without a model, with the remedy for what it is."""
+    if _has_field(folder):
+        return DataError(f"{folder}: has no file of its field; run its pipeline again with the stage export_field")
+    if has_pipeline(folder):
+        return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {in_shell(folder)}`")
+    fault = f"{folder}: has no {PIPELINE}; expected a model file or a run folder"
+    if any(map(is_image, chain(folder.glob("*"), folder.glob("images/*")))):
+        return DataError(
+            f"{fault}; for a model of its photographs, run `clsplat run photos --scene {in_shell(folder)}` first"
+        )
+    return DataError(fault)
+
+
+def refuse_field(path: Path) -> None:
+    """Raise DataError for the file of a field, and for a run that has trained one."""
+    if is_field(path) or (has_pipeline(path) and _has_field(path) and not model_of_run(path).is_file()):
+        raise of_a_field(path)
+
+
+def of_a_field(path: Path) -> DataError:
+    """The error of a field where Gaussians are expected."""
+    shown = "`clsplat render` makes pictures of it where a stage export_field has written it, with --video a film"
+    return DataError(f"{path}: is a field, a network in the place of Gaussians; expected Gaussians: {shown}")
+
+
+def shown_of_run(run: Path) -> Path:
+    """The file of what a run has trained: Gaussians, or a field."""
+    file = model_of_run(run)
+    return file if file.is_file() or not _has_field(run) else field_of_run(run)
+
+
+def _has_field(run: Path) -> bool:
+    """Whether a run that is done has trained a field in the place of Gaussians."""
+    try:
+        return read_metrics(run / METRICS).gaussians is None
+    except DataError:
+        return False
+
+
+def run_of(model: Path) -> Path | None:
+    """Return the folder of the run that a model is of: itself, or one that has exported the file; None without one."""
+    if model.is_dir():
+        return model if has_pipeline(model) else None
+    file = model.resolve()
+    for folder in filter(has_pipeline, file.parents):
+        with suppress(ConfigError):
+            if file in {
+                path for stage in _exports(load_pipeline(str(folder / PIPELINE))) for path in stage.outputs(folder)
+            }:
+                return folder
+    return None
+
+
+def photographs_of(scene: Path) -> Path:
+    """Return the folder of a scene: of a run that of the photographs it was trained on, else the folder itself.
+
+    Raises ConfigError for a run whose pipeline names none or cannot be read, DataError where the folder is missing.
+    """
+    if not has_pipeline(scene):
+        return scene
+    prepared = noted(scene)
+    folder = Path(prepared["folder"]) if prepared else load_pipeline(str(scene / PIPELINE)).settings.scene.folder
+    if not folder.is_dir():
+        raise DataError(f"{scene}: the folder of its photographs, {folder}, is missing; give the folder of a scene")
+    return folder
+
+
+def _exports(pipeline: Pipeline) -> list[Export | ExportField]:
+    stages = [part for stage in pipeline.stages for part in (stage, *getattr(stage, "during", ()))]
+    return [stage for stage in stages if isinstance(stage, Export | ExportField)]
+
+
+def overrides_of(overrides: Sequence[str], scene: Path | None) -> list[str]:
+    """Return `overrides` with the folder of the photographs, where one is given.  Raises ConfigError, DataError."""
+    return [*overrides, *([f"scene.path={as_setting(photographs_of(scene))}"] if scene is not None else [])]
+
+
+def as_setting(folder: Path) -> str:
+    """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
+    path = str(folder.resolve())
+    try:
+        path.encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"--scene {path!r}: expected a path of UTF-8 text; rename the folder") from None
+    return json.dumps(path)
+
+
+# Pictures of a model in a folder, one file for each view and layer.
+
+FRAME = re.compile(r"frame_\d{5,6}(_[a-z]+)?\.[a-z]+")  # of a film; those of the path `views` are called as views
+LOG = logging.getLogger("clsplat")
+KINDS = ("png", "npy")  # of files
+RECORD = ".renders.json"  # beside renders: a table of their names, and whether each is a frame of a film
+
+
+def write_pictures(
+    canvas: Canvas,
+    views: Sequence[View],
+    out: Path,
+    kind: str,
+    layers: Sequence[str],
+    photographs: Sequence[Path],
+    film: bool = False,
+) -> list[Path]:
+    """Write images (`kind` png) or float32 arrays (npy) of the layers of each view; return their files.
+
+    A layer but the colours has its name in that of the file.  photographs: files that no picture may mix with; film:
+    the views are a film, and frames of this kind that an earlier one has left are removed at the end.
+    """
+    own = image_paths(out, [view.name for view in views], f".{kind}")
+    files = [{layer: _of_layer(path, layer) for layer in layers} for path in own]
+    paths = [path for of_view in files for path in of_view.values()]
+    if len(set(paths)) < len(paths):
+        raise ConfigError(f"{out}: two pictures would have one name, as a view is called _depth or _alpha; rename it")
+    _check_folder(out, paths, photographs)
+    names = [path.relative_to(out).as_posix() for path in paths]
+    rendered = {**_rendered(out), **dict.fromkeys(names, film)}
+    _note(out, rendered)
+    depths = canvas.depth_range(views) if "depth" in layers and kind == "png" else (0.0, 0.0)
+    for view, of_view in counted(zip(views, files, strict=True), "views rendered", len(views)):
+        found = canvas.layers(view, "depth" in layers)
+        for layer, path in of_view.items():
+            if kind == "png":
+                write_image(path, shown(found, layer, depths))
+            else:
+                _write_array(path, values(found, layer))
+    if film:
+        _remove(out, {name for name, framed in rendered.items() if framed and name.endswith(f".{kind}")} - {*names})
+    return paths
+
+
+def _remove(out: Path, frames: set[str]) -> None:
+    """Remove frames of an earlier film from a folder and its record."""
+    with told_as(out):
+        for name in frames:
+            (out / name).unlink(missing_ok=True)
+    _note(out, {name: framed for name, framed in _rendered(out).items() if name not in frames})
+    if frames:
+        LOG.info("%s: removed %d pictures of an earlier film", out, len(frames))
+
+
+def _of_layer(path: Path, layer: str) -> Path:
+    return path if layer == LAYERS[0] else path.with_name(f"{path.stem}_{layer}{path.suffix}")
+
+
+def _write_array(path: Path, array: NDArray[np.float32]) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    with atomic(path) as stream:
+        stream.write(buffer.getvalue())
+
+
+def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path]) -> None:
+    """Raise ConfigError where renders would mix with photographs, or replace what no earlier call has rendered."""
+    folder = out.resolve()
+    for images in {path.resolve().parent for path in photographs}:
+        if folder == images or folder in images.parents or images in folder.parents:
+            raise ConfigError(
+                f"{out}: is, holds or lies in the folder of the photographs, {images}; give another --out"
+            )
+    own = _rendered(out)
+    for path in paths:
+        if is_there(path) and path.relative_to(out).as_posix() not in own:
+            raise ConfigError(f"{path}: exists, and is no render of an earlier call; give another --out")
+
+
+def _rendered(out: Path) -> dict[str, bool]:
+    """The files that earlier calls have rendered into a folder, and whether each is a frame of a film."""
+    try:
+        found = read_json(out / RECORD)
+    except DataError:
+        return {}
+    table = found if isinstance(found, dict) else {}
+    return {name: film is True and FRAME.fullmatch(name) is not None for name, film in table.items()}
+
+
+def _note(out: Path, rendered: Mapping[str, bool]) -> None:
+    write_text(out / RECORD, json.dumps(rendered, indent=1, sort_keys=True) + "\n")
+
 
 SPLITS = ("train", "test", "all")
 

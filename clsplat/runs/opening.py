@@ -1,25 +1,96 @@
 """Open what a run needs: the device, the photographs' preparation, the scene."""
 
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clsplat.conformance.quick import open_correct
-from clsplat.errors import ConfigError
-from clsplat.names import UNDISTORTED
+from clsplat.core.errors import ConfigError, amount
+from clsplat.core.files import UNDISTORTED
+from clsplat.core.machine import Owner
+from clsplat.core.progress import Listener, heard_by
 from clsplat.opencl.device import Device
+from clsplat.photos.photographs import Photographs
+from clsplat.pipeline.checks import harmonics_of
+from clsplat.pipeline.choices import choose
+from clsplat.pipeline.file import PipelineFile, SceneSettings
+from clsplat.pipeline.input_files import contents
 from clsplat.pipeline.loading import Pipeline, prepared_folder
-from clsplat.pipeline.on_host import harmonics_of
-from clsplat.pipeline.places import contents
-from clsplat.prepare.cache import Planned, note, noted, prepare
-from clsplat.prepare.facts import facts
-from clsplat.processes import Owner
-from clsplat.progress import Listener, heard_by
+from clsplat.pipeline.stretching import of_trainings
+from clsplat.prepare.cache import Planned, facts, note, noted, prepare
+from clsplat.render.backdrops import Auto as AutoSky
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.runs.folders import Start
-from clsplat.runs.scenes import ReadScene, RunScene, read_run_scene
-from clsplat.runs.unprepared import check_preparation
+from clsplat.runs.preflight import check_preparation
+from clsplat.runs.run_folder import Start
+from clsplat.scene.detect import read_scene
+from clsplat.scene.identity import Identity, decode_all, require_whole
+from clsplat.scene.quality import measured, nearest_points
+from clsplat.scene.scene import SPLITS, Background, Scene
+from clsplat.stages.init import settled as settled_sky
+from clsplat.stages.init import share_with_sky
+from clsplat.stages.optimize import Optimize
+from clsplat.training.modules.appearance import settled
+from clsplat.training.modules.exposure import Auto
+from clsplat.training.modules.random_background import is_drawn
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
-from clsplat.views.photographs import Photographs
+
+# The scene of a run as it is trained on, with every photograph decoded.
+
+LOG = logging.getLogger("clsplat")
+FEWEST = 3  # training photographs without a warning at the start
+
+
+@dataclass(frozen=True, eq=False)
+class RunScene:
+    """A scene with the settings of a run."""
+
+    original: Scene  # as read
+    scene: Scene  # as trained on: at one size or several
+    background: Background
+    identity: Identity
+
+    @classmethod
+    def of(cls, settings: SceneSettings, scene: Scene) -> "RunScene":
+        """Apply the settings to a scene, and decode its photographs.
+
+        Raises DataError, naming the files, when some of the training or test photographs and masks cannot be used.
+        """
+        original, background = settings.applied(scene)
+        downscaled = original.downscaled(*settings.downscales)
+        camera = downscaled.views[0].camera
+        LOG.info(
+            "scene: %s, %d training%s and %d test views, %d x %d px, %s background, extent %.3g",
+            *(
+                scene.path,
+                len(downscaled.train),
+                f", {len(downscaled.validation)} validation" if downscaled.validation else "",
+                len(downscaled.test),
+                camera.width,
+                camera.height,
+                background,
+                downscaled.extent,
+            ),
+        )
+        if len(original.train) < FEWEST:
+            LOG.warning(
+                "%s: is trained on %s: a model of fewer than %d fits these and shows little else; add photographs, or "
+                "put back those that are missing",
+                *(scene.path, amount(len(original.train), "photograph"), FEWEST),
+            )
+        files = decode_all(view for one in (original, downscaled) for split in SPLITS for view in one.split(split))
+        require_whole(scene.path, files)
+        return cls(original, downscaled, background, Identity.of(original, files))
+
+
+ReadScene = Callable[[SceneSettings, Path], RunScene]
+
+
+def read_run_scene(settings: SceneSettings, folder: Path) -> RunScene:
+    """Read the scene in a folder with these settings.  Raises DataError."""
+    return RunScene.of(settings, read_scene(folder, settings.split))
+
 
 READ_SCENE = "read_scene"  # the last stage of the preparation
 
@@ -112,3 +183,93 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         identity=scene.identity,
         read=contents(pipeline),
     )
+
+
+# Choices that follow from the photographs, made before the first step and written into the run's pipeline.
+
+WITH_POSES = "optimize.poses are learned, which a sky does not go with"
+WITH_DRAWN = "optimize.background is drawn, which a sky does not go with"
+
+
+def settle(pipeline: Pipeline, run: Run, tell: Callable[[str], None] = LOG.info) -> Pipeline:
+    """Return the pipeline with what its `choices` and its keys `auto` choose by the photographs of a run, which takes
+    it; log reasons, those of `choices` by `tell`.
+
+    Choices that are made already stay.
+    """
+    with run.status.stage("choose"):
+        settled_pipeline = _taken(_with_colours(_by_capture(pipeline, run, tell), run), run)
+        if any(isinstance(stage, Optimize) for stage in pipeline.stages):
+            _warn_of_near(settled_pipeline.settings.model.near, nearest_points(run.scene))
+        return settled_pipeline
+
+
+def _warn_of_near(near: float, nearest: float | None) -> None:
+    """Warn where points begin before the near plane; both in scene units."""
+    if nearest is not None and nearest < near:
+        LOG.warning(
+            "nothing is drawn nearer than model.near=%g scene units, and the points of the training photographs "
+            "begin at %.3g: set model.near to %.2g",
+            *(near, nearest, nearest / 2),
+        )
+
+
+def _by_capture(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pipeline:
+    """The pipeline with what its `choices` choose."""
+    still_open = [one for one in pipeline.settings.choices if not one.reason]
+    if not still_open:
+        return pipeline
+    measures = measured(run.scene)
+    if any(one.depends("sky", measures) for one in still_open) and (share := share_with_sky(run)) is not None:
+        measures["sky"] = share
+    chosen = replace(pipeline, settings=choose(pipeline.settings, measures))
+    if chosen.settings.scene.validation != pipeline.settings.scene.validation:
+        run.divide(chosen.settings.scene.split.with_validation(run.original.with_fold()))
+        run.identity = run.identity and run.identity.divided(run.original)  # as of a run that begins with that split
+    for one in chosen.settings.choices:
+        tell(one.told)
+    return chosen
+
+
+def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
+    """The same; the run has its settings."""
+    run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
+    run.harmonics = harmonics_of(pipeline.settings)
+    return pipeline
+
+
+def _with_colours(pipeline: Pipeline, run: Run) -> Pipeline:
+    """The pipeline with what its keys `auto` choose."""
+    open_ones = [one.colours for one in pipeline.stages if isinstance(one, Optimize) and isinstance(one.colours, Auto)]
+    background = pipeline.settings.model.background
+    if all(colours.chosen for colours in open_ones) and (getattr(background, "chosen", "") is not None):
+        return pipeline
+
+    def chosen(training: Optimize) -> Optimize:
+        if not isinstance(training.colours, Auto):
+            return training
+        colours = settled(training.colours, run)
+        LOG.info("optimize.colours: %s, since %s", colours.chosen, colours.reason)
+        return training.model_copy(update={"colours": colours})
+
+    return replace(pipeline, settings=_with_sky(of_trainings(pipeline.settings, Optimize, chosen), run))
+
+
+def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
+    """Settings with the choice of a sky, where it is open: none beside what it does not go with."""
+    background = settings.model.background
+    if isinstance(background, AutoSky) and background.chosen is None and (reason := _against_a_sky(settings, run)):
+        background = background.model_copy(update={"chosen": "off", "reason": reason})
+        LOG.info("model.background: off, since %s", reason)
+    background = settled_sky(background, run)
+    if background is settings.model.background:
+        return settings
+    return settings.model_copy(update={"model": settings.model.model_copy(update={"background": background})})
+
+
+def _against_a_sky(settings: PipelineFile, run: Run) -> str:
+    """What a sky does not go with, of what the trainings do; "" where there is nothing."""
+    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
+    if any(one.poses for one in trainings):
+        return WITH_POSES
+    return WITH_DRAWN if any(is_drawn(one.background, run.scene) for one in trainings) else ""

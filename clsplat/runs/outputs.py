@@ -5,19 +5,30 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from clsplat.compare.run_folder import read_metrics
-from clsplat.errors import ConfigError, DataError, OutputError
-from clsplat.files import is_there, write_text
-from clsplat.names import BEFORE_A_RUN, CHECKSUMS, LOCK, LOG_FILE, METRICS, OF_A_RUN, PIPELINE, RECORDS, STATUS, TRIAL
+from clsplat.core.errors import ConfigError, DataError, OutputError
+from clsplat.core.files import (
+    BEFORE_A_RUN,
+    CHECKSUMS,
+    LOCK,
+    LOG_FILE,
+    METRICS,
+    OF_A_RUN,
+    PIPELINE,
+    RECORDS,
+    STATUS,
+    TRIAL,
+    is_there,
+    write_text,
+)
+from clsplat.core.machine import Owner
+from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.processes import Owner
-from clsplat.reading import read_file, read_json, sha256
-from clsplat.report.parting import is_by_heart
-from clsplat.runs.course import Course, is_below
-from clsplat.runs.found import has_begun, not_whole, read_sums, sum_of
-from clsplat.stages.base import Stage
-from clsplat.stages.training import Training
+from clsplat.runs.recovery import Course, is_below
+from clsplat.runs.results import read_metrics
+from clsplat.runs.state import has_begun, not_whole, read_sums, sum_of
+from clsplat.stages.report import is_by_heart
 from clsplat.training.run import Run
+from clsplat.training.stage import Stage, Training
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:

@@ -2,29 +2,133 @@
 
 import json
 import logging
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
-from clsplat.errors import ConfigError, DataError, Interrupted, in_shell
-from clsplat.files import write_text
-from clsplat.inspect.findings import few_views
-from clsplat.names import CHECKSUMS, NOTE, PIPELINE
+from clsplat.core.errors import ConfigError, DataError, Interrupted, in_shell, shortened
+from clsplat.core.files import CHECKSUMS, INPUTS, NOTE, PIPELINE, write_text
+from clsplat.core.progress import Progress, Stopped
+from clsplat.core.reading import read_json
+from clsplat.core.signals import stop_at_once, stopping_on_signals
 from clsplat.pipeline.loading import Pipeline
-from clsplat.progress import Progress, Stopped
-from clsplat.report.parting import parting
-from clsplat.runs.course import Course, is_below
-from clsplat.runs.folders import RESOLVED, Start, clear
-from clsplat.runs.inputs import require_same_inputs, write_inputs
+from clsplat.prepare.inspect.findings import few_views
 from clsplat.runs.outputs import Lost, check_outputs, keep_checksums, renew_checksums, write_checksums, write_metrics
-from clsplat.runs.refitting import as_trained, begin_if_due, is_due
-from clsplat.runs.signals import finishing_on_interrupt
-from clsplat.stages.training import Training
+from clsplat.runs.recovery import Course, is_below
+from clsplat.runs.run_folder import RESOLVED, Start, clear
+from clsplat.scene.identity import Identity
+from clsplat.stages.densify import Densify
+from clsplat.stages.optimize import Optimize
+from clsplat.stages.report import parting
 from clsplat.training import checkpoint
-from clsplat.training.rescue import saved_on_failure
+from clsplat.training.best_model import Best
+from clsplat.training.checkpoint import saved_on_failure
 from clsplat.training.run import Run
+from clsplat.training.stage import Stage, Training
+
+# Training again on all photographs, for the number of steps that validation has found best.
 
 LOG = logging.getLogger("clsplat")
+WITHOUT = {"keep": "last", "patience": None, "refit": False}
+
+
+def is_due(run: Run) -> bool:
+    """Whether validation has found the number of steps, and they are not begun."""
+    return run.best is not None and run.best.refit == "due"
+
+
+def begin_if_due(run: Run) -> None:
+    """Come to the beginning of the pipeline where a refit is due."""
+    if run.best is None or run.best.refit != "due":
+        return
+    LOG.info(
+        "refit: all %d training photographs, for %d steps",
+        len(run.original.train) + len(run.original.validation),
+        run.best.found.step,
+    )
+    run.records.set_aside()
+    run.begin_again(run.best.model_copy(update={"refit": "begun"}))
+
+
+def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
+    """Return the pipeline with as many steps as validation leaves its training; in a refit that keeps its last model.
+
+    The bits of a refit are those of a run of this pipeline without validation views.
+    """
+    stages, before = list[Stage](), 0
+    for stage in pipeline.stages:
+        now = _as_trained(stage, run, before) if isinstance(stage, Optimize) and stage.keep == "best" else stage
+        before += stage.steps if isinstance(stage, Optimize) else 0
+        stages.append(now)
+    return replace(pipeline, settings=pipeline.settings.model_copy(update={"stages": stages}))
+
+
+def _as_grown(stage: Densify, best: Best) -> Densify:
+    """The same, with the step from which on nothing grew in the place of its patience."""
+    ended = [step for step in (stage.grow_until, best.growth_ended if stage.patience else None) if step is not None]
+    return stage.model_copy(update={"patience": None, "grow_until": min(ended, default=None)})
+
+
+def _as_trained(stage: Optimize, run: Run, before: int) -> Optimize:
+    if run.is_refit and run.best:
+        during = [_as_grown(inner, run.best) if isinstance(inner, Densify) else inner for inner in stage.during]
+        return stage.model_copy(update={"steps": run.best.found.step, "during": during, **WITHOUT})
+    taken = run.best.taken if run.best else None
+    ended = taken is not None and before < taken < before + stage.steps
+    return stage.model_copy(update={"steps": taken - before}) if taken and ended else stage
+
+
+# The record of what a run was started with, inputs.json, and its comparison when the run goes on.
+
+
+def write_inputs(run: Run) -> None:
+    """Write the identity of the run's scene into its folder.  Raises OutputError."""
+    if run.identity:
+        write_text(run.out / INPUTS, json.dumps(run.identity.data()) + "\n")
+
+
+def require_same_inputs(run: Run) -> None:
+    """Raise ConfigError, saying what changed, when the run was started with other photographs, cameras or points."""
+    before = _read(run.out / INPUTS)
+    digest = run.inputs_before or (before.digest if before else "")
+    if not digest:
+        LOG.warning("%s: missing or damaged; photographs that have changed go unnoticed", run.out / INPUTS)
+    elif run.identity and run.identity.digest != digest:
+        changes = ", ".join(run.identity.changes(before)) if before else ""
+        changes = changes or f"{INPUTS} is missing or damaged, so what changed is not known"
+        raise ConfigError(
+            f"{run.scene.path}: not what the run was started with: {shortened(changes, 500)}; put that back, or "
+            "begin anew: `clsplat run` with --restart or another --out"
+        )
+
+
+def _read(path: Path) -> Identity | None:
+    try:
+        return Identity.from_data(read_json(path))
+    except (DataError, ValueError):
+        return None
+
+
+# What a run does on Ctrl-C, SIGTERM and SIGHUP.
+
+
+@contextmanager
+def finishing_on_interrupt(run: Run) -> Iterator[None]:
+    """Finish the step, or the view of a longer stage, and save the state at the first signal.
+
+    The second signal stops at once, and so does the first where there is no model to save.
+    """
+
+    def finish() -> None:
+        if run.interrupted or not run.has_model:
+            stop_at_once()
+            return
+        run.interrupted = True
+        LOG.info("finishing the step; press Ctrl-C again to stop at once")
+
+    with stopping_on_signals(finish):
+        yield
 
 
 def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress], None]) -> None:

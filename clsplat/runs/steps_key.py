@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-from clsplat.errors import ClsplatError
-from clsplat.names import PIPELINE
+from clsplat.core.errors import ClsplatError
+from clsplat.core.files import PIPELINE
+from clsplat.core.settings import variants
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.settings import variants
-from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
-from clsplat.stages.training import Training
+from clsplat.training.stage import Stage, Training
 
 TRAINERS = (Optimize, TrainField)  # imported, so that their names are known
 

@@ -5,7 +5,7 @@ from itertools import takewhile
 
 from clsplat.losses.base import ViewLosses
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.refitting import as_trained, begin_if_due, is_due
+from clsplat.runs.runner import as_trained, begin_if_due, is_due
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
 

@@ -1,8 +1,17 @@
 """The pinhole camera of all rendering."""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, replace
+from functools import cached_property, lru_cache
 from numbers import Integral
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError, quoted
 
 MAX_SIDE = 4096 * 8  # px: the tiles that cl_kernels/tiles.h can name, of the smallest size that a device has
 MIN_FOCAL = 1e-3  # px, in a dataset: with less an image shows half of all directions
@@ -50,3 +59,211 @@ class Camera:
         if factor == 1:
             return self
         return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
+
+
+# Lenses with distortion: COLMAP's camera models, and undistorted photographs.
+
+Floats = NDArray[np.float64]
+Distortion = Callable[[Floats, Floats, Sequence[float]], tuple[Floats, Floats]]
+BORDER_POINTS = 200  # along each edge of a photograph
+MAX_ROUNDS = 50  # of Newton's method
+MAX_ERROR = 1.0e-6  # of its result, normalised units
+MAX_DIFFERENCE = 1.0e-3  # of a ray that was distorted and undistorted, normalised units
+MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond, a pinhole image is mostly stretched edges
+MAX_GROWTH = 2.0  # of an undistorted photograph's size by the photograph's
+
+
+def _radial(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    r2 = u * u + v * v
+    factor = 1 + sum(c * r2 ** (i + 1) for i, c in enumerate(k))
+    return u * factor, v * factor
+
+
+def _tangential(u: Floats, v: Floats, p1: float, p2: float) -> tuple[Floats, Floats]:
+    r2 = u * u + v * v
+    return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+
+
+def _opencv(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    (x, y), (dx, dy) = _radial(u, v, k[:2]), _tangential(u, v, k[2], k[3])
+    return x + dx, y + dy
+
+
+def _full_opencv(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    r2 = u * u + v * v
+    factor = (1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3) / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
+    dx, dy = _tangential(u, v, k[2], k[3])
+    return u * factor + dx, v * factor + dy
+
+
+def _fisheye(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    r = np.hypot(u, v)
+    theta = np.arctan(r)
+    angle = theta * (1 + sum(c * theta ** (2 * i + 2) for i, c in enumerate(k)))
+    factor = np.where(r > 1e-12, angle / np.maximum(r, 1e-12), 1.0)
+    return u * factor, v * factor
+
+
+def _thin_prism(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    u, v = _fisheye(u, v, ())
+    r2 = u * u + v * v
+    (x, y), (dx, dy) = _radial(u, v, (k[0], k[1], k[4], k[5])), _tangential(u, v, k[2], k[3])
+    return x + dx + k[6] * r2, y + dy + k[7] * r2
+
+
+def _fov(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    r, omega = np.hypot(u, v), k[0]
+    if abs(omega) < 1e-9:
+        return u, v
+    radius = np.arctan(2 * r * np.tan(omega / 2)) / omega
+    factor = np.where(r > 1e-12, radius / np.maximum(r, 1e-12), 2 * np.tan(omega / 2) / omega)
+    return u * factor, v * factor
+
+
+MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and the distortion
+    "SIMPLE_PINHOLE": (1, lambda u, v, k: (u, v)),
+    "PINHOLE": (2, lambda u, v, k: (u, v)),
+    "SIMPLE_RADIAL": (1, _radial),
+    "RADIAL": (1, _radial),
+    "OPENCV": (2, _opencv),
+    "FULL_OPENCV": (2, _full_opencv),
+    "FOV": (2, _fov),
+    "OPENCV_FISHEYE": (2, _fisheye),
+    "SIMPLE_RADIAL_FISHEYE": (1, _fisheye),
+    "RADIAL_FISHEYE": (1, _fisheye),
+    "THIN_PRISM_FISHEYE": (2, _thin_prism),
+}
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The camera of a distorted photograph: size in pixels, a model of MODELS, its parameters in COLMAP's order."""
+
+    width: int
+    height: int
+    model: str
+    params: tuple[float, ...]
+    whole: bool = False  # keep the whole photograph, with blank pixels, not only the part without them
+
+    @property
+    def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
+        focals = MODELS[self.model][0]
+        cx, cy = self.params[focals : focals + 2]
+        return self.params[0], self.params[focals - 1], cx, cy, self.params[focals + 2 :]
+
+    @property
+    def distorts(self) -> bool:
+        """Whether the lens has distortion; a fisheye always has it."""
+        return "FISHEYE" in self.model or any(self._split[4])
+
+    def distort(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
+        """Return the pixels of normalised coordinates."""
+        fx, fy, cx, cy, rest = self._split
+        x, y = MODELS[self.model][1](u, v, rest)
+        return fx * x + cx, fy * y + cy
+
+    def project(self, points: Floats) -> Floats:
+        """Return the pixels [M, 2] of points [M, 3] in camera space, in front of the camera."""
+        return np.stack(self.distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]), axis=1)
+
+    def undistort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Return the normalised coordinates of pixels, by Newton's method; NaN where it does not converge."""
+        fx, fy, cx, cy, rest = self._split
+        distortion = MODELS[self.model][1]
+        goal = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
+        found, moving = goal.copy(), np.arange(x.size)
+        with np.errstate(all="ignore"):
+            for _ in range(MAX_ROUNDS):
+                before = found[:, moving]
+                found[:, moving] = after = _nearer(distortion, rest, before, goal[:, moving])
+                moving = moving[(before.view(np.int64) != after.view(np.int64)).any(axis=0)]  # the others stay for ever
+                if not moving.size:
+                    break
+            error = np.abs(np.stack(distortion(found[0], found[1], rest)) - goal)
+            u, v = np.where((error < MAX_ERROR).all(axis=0), found, np.nan)
+        return u.reshape(x.shape), v.reshape(x.shape)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera without the distortion, at the photograph's own size."""
+        fx, fy, cx, cy, _ = self._split
+        return Camera(self.width, self.height, fx, fy, cx, cy)
+
+    @cached_property
+    def pinhole(self) -> Camera:
+        """The camera of the undistorted photograph: same focal lengths, the largest upright part without blank pixels.
+
+        With `whole` it is the smallest image that contains the photograph, up to 60 degrees to each side and twice its
+        size.  Raises DataError when no such image exists.
+        """
+        fx, fy, _, _, _ = self._split
+        along_x, along_y = np.linspace(0, self.width, BORDER_POINTS), np.linspace(0, self.height, BORDER_POINTS)
+        left = self.undistort(np.zeros(BORDER_POINTS), along_y)[0]
+        right = self.undistort(np.full(BORDER_POINTS, float(self.width)), along_y)[0]
+        top = self.undistort(along_x, np.zeros(BORDER_POINTS))[1]
+        bottom = self.undistort(along_x, np.full(BORDER_POINTS, float(self.height)))[1]
+        if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
+            raise DataError(
+                f"the lens {self.model} {quoted(self.params)} cannot be inverted; calibrate the camera again"
+            )
+        u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
+        if self.whole:
+            across, down = np.concatenate([left, right]), np.concatenate([top, bottom])
+            wide, high = self.width * (MAX_GROWTH / 2) / fx, self.height * (MAX_GROWTH / 2) / fy
+            u0, u1 = max(np.nanmin(across), -MAX_TANGENT, -wide), min(np.nanmax(across), MAX_TANGENT, wide)
+            v0, v1 = max(np.nanmin(down), -MAX_TANGENT, -high), min(np.nanmax(down), MAX_TANGENT, high)
+        width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
+        if min(width, height) < 1:
+            raise DataError(
+                f"the lens {self.model} {quoted(self.params)} leaves no pixel of its image; calibrate the camera again"
+            )
+        return Camera(width, height, fx, fy, float(-u0 * fx), float(-v0 * fy))
+
+    def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the undistorted photograph, as `pinhole` sees it, [H, W, C] of the same type."""
+        camera = self.pinhole
+        undistorted = cv2.remap(pixels, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return undistorted.reshape(camera.height, camera.width, -1)
+
+    @cached_property
+    def shown(self) -> NDArray[np.bool_]:
+        """Which pixels of `pinhole`, [H, W], the photograph shows: distorted rays lie in it and undistort back."""
+        u, v = _rays(self.pinhole)
+        x, y = self.distort(u, v)
+        back_u, back_v = self.undistort(x, y)
+        inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
+        return inside & (np.abs(back_u - u) < MAX_DIFFERENCE) & (np.abs(back_v - v) < MAX_DIFFERENCE)
+
+
+def _rays(camera: Camera) -> tuple[Floats, Floats]:
+    """Normalised coordinates of all pixel centres, [H, W] each."""
+    u, v = np.meshgrid(
+        (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
+        (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
+    )
+    return u, v
+
+
+def _nearer(distortion: Distortion, k: Sequence[float], point: Floats, goal: Floats) -> Floats:
+    """One step of Newton's method towards the points [2, M] that are distorted to `goal`."""
+    step, (u, v) = 1e-7, point
+    a, b = distortion(u, v, k)
+    au, bu = distortion(u + step, v, k)
+    av, bv = distortion(u, v + step, k)
+    j00, j10, j01, j11 = (au - a) / step, (bu - b) / step, (av - a) / step, (bv - b) / step
+    det = j00 * j11 - j01 * j10
+    da, db = goal[0] - a, goal[1] - b
+    return np.stack([u + (j11 * da - j01 * db) / det, v + (j00 * db - j10 * da) / det])
+
+
+@lru_cache(maxsize=2)  # of a phone held upright and across; each has 8 bytes a pixel
+def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where in the photograph the pixels of `pinhole` lie, [H, W] each; OpenCV's pixels have whole centres."""
+    x, y = lens.distort(*_rays(lens.pinhole))
+    return (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)
+
+
+@lru_cache(maxsize=64)
+def shared(lens: Lens) -> Lens:
+    """Return the first lens that equals this one, so that views share what is slow to compute: `pinhole`, `shown`."""
+    return lens

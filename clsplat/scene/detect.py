@@ -2,17 +2,15 @@
 
 from pathlib import Path
 
-from clsplat.errors import ConfigError, DataError, in_shell
+from clsplat.core.errors import ConfigError, DataError, in_shell
 from clsplat.formats.table import detect as model_format
-from clsplat.scene.blender import BlenderReader
 from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.images import is_image
 from clsplat.scene.multicamera import MulticameraReader
-from clsplat.scene.multiscale import MultiscaleReader
-from clsplat.scene.nerfstudio import NerfstudioReader
-from clsplat.scene.readers import Reader, reader_classes
+from clsplat.scene.reader import Reader, reader_classes
 from clsplat.scene.scene import HOLDOUT, Scene
-from clsplat.scene.split import Split
+from clsplat.scene.transforms_json import BlenderReader, MultiscaleReader, NerfstudioReader
+from clsplat.scene.view_selection import Split
 
 PRECEDENCE = (MulticameraReader, ColmapReader, BlenderReader, MultiscaleReader, NerfstudioReader)
 

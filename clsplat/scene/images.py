@@ -1,8 +1,14 @@
 """The files of a dataset: allowed paths, bytes and images."""
 
+import json
 import logging
+import math
 import os
-from collections.abc import Iterable, Sequence
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any, Literal
 
@@ -10,11 +16,137 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, quoted, shortened
-from clsplat.files import atomic
-from clsplat.reading import opened, read_file
-from clsplat.scene.image_headers import HEAD_SIZE, JPEG, TAIL_SIZE, Header, is_cut, parse_header
-from clsplat.scene.png import pixels_only
+from clsplat.core.errors import DataError, quoted, shortened
+from clsplat.core.files import atomic, write_text
+from clsplat.core.reading import opened, read_file, read_json
+
+# The size, the orientation and the end of a photograph, from its bytes, without decoding it.
+
+HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes that are looked at, at either end
+PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+JPEG, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of a frame header
+ORIENTATION = 0x0112  # Exif tag
+
+
+@dataclass(frozen=True)
+class Header:
+    """Size in pixels as stored, the Exif orientation (1: upright), and whether the file is complete."""
+
+    width: int
+    height: int
+    orientation: int = 1
+    complete: bool = True
+
+
+def parse_header(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None:
+    """Return the header of a PNG or JPEG file from its first and last bytes; None for anything else.
+
+    `whole` returns all bytes: it is called where neither end holds what is looked for.
+    """
+    found = None
+    if head.startswith(PNG) and head[12:16] == b"IHDR" and len(head) >= 24:
+        width, height = struct.unpack_from(">II", head, 16)
+        found = Header(width, height, complete=PNG_END in tail or PNG_END in whole())
+    elif head.startswith(JPEG):
+        found = _jpeg(head, tail, whole)
+    return found if found and found.width and found.height else None
+
+
+def is_cut(data: bytes) -> bool:
+    """Return whether the end of a PNG or JPEG file is missing; False for other formats."""
+    header = parse_header(data, data[-TAIL_SIZE:], lambda: data)
+    return header is not None and not header.complete
+
+
+def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None:
+    """Walk the segments up to the frame header; None when the walk fails."""
+    orientation = 1
+    for marker, at, length in segments(head):
+        if marker in FRAMES:
+            height, width = struct.unpack_from(">HH", head, at + 5)
+            # An end marker cannot be part of the pixels; that of a thumbnail lies before them.
+            complete = JPEG_END in tail or whole().find(JPEG_END, at) >= 0
+            return Header(width, height, orientation, complete)
+        if _is_exif(head, marker, at):
+            orientation = _orientation(head[at + 10 : at + 2 + length])
+    return None
+
+
+def exif_segment(head: bytes) -> tuple[int, int] | None:
+    """Return the place and the length of the Exif segment in the first bytes of a JPEG file; None without one.
+
+    Its block of tags begins 10 bytes behind the place.
+    """
+    found = ((at, length) for marker, at, length in segments(head) if _is_exif(head, marker, at))
+    return next(found, None) if head.startswith(JPEG) else None
+
+
+def _is_exif(head: bytes, marker: int, at: int) -> bool:
+    return marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0"
+
+
+def segments(head: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield the marker, the place and the length of the segments of a JPEG file; none behind a damaged one."""
+    at = 2
+    while at + 9 <= len(head) and head[at] == 0xFF:
+        marker = head[at + 1]
+        if marker == 0xFF:  # fill
+            at += 1
+            continue
+        (length,) = struct.unpack_from(">H", head, at + 2)
+        yield marker, at, length
+        at += 2 + length
+
+
+def _orientation(exif: bytes) -> int:
+    """The orientation in a TIFF block, 1 to 8; 1 where there is none."""
+    at = orientation_place(exif)
+    value = struct.unpack_from({b"II": "<", b"MM": ">"}[exif[:2]] + "H", exif, at)[0] if at else 1
+    return int(value) if 1 <= value <= 8 else 1
+
+
+def orientation_place(exif: bytes) -> int | None:
+    """Return where the orientation, 2 bytes, lies in a TIFF block; None where there is none."""
+    order = {b"II": "<", b"MM": ">"}.get(exif[:2])
+    if order is None or len(exif) < 8:
+        return None
+    (start,) = struct.unpack_from(order + "I", exif, 4)
+    entries = struct.unpack_from(order + "H", exif, start)[0] if start + 2 <= len(exif) else 0
+    for at in range(start + 2, min(start + 2 + 12 * entries, len(exif) - 11), 12):
+        if struct.unpack_from(order + "H", exif, at)[0] == ORIENTATION:
+            return at + 8
+    return None
+
+
+# PNG files as OpenCV gets them: checked, and without what has nothing to do with pixels.
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+USED = {b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"}  # beside the critical ones, whose names begin with a capital
+
+
+def pixels_only(data: bytes) -> bytes:
+    """Return a PNG without metadata; what is no PNG is returned as it is.
+
+    Raises ValueError, with the place, where the file is cut or the checksum of a chunk that matters is wrong.
+    """
+    if not data.startswith(SIGNATURE):
+        return data
+    view, at, kept = memoryview(data), len(SIGNATURE), [memoryview(SIGNATURE)]
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        kind, end = data[at + 4 : at + 8], at + 12 + length
+        if end > len(data):
+            break
+        if kind in USED or not kind[0] & 0x20:
+            if zlib.crc32(view[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+                raise ValueError(f"byte {at}: the checksum of the chunk {quoted(kind.decode('latin-1'))} is wrong")
+            kept.append(view[at:end])
+        if kind == b"IEND":
+            return b"".join(kept)
+        at = end
+    raise ValueError(f"byte {at}: expected another chunk, of which {len(data) - at} bytes are left")
+
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines name no file; errors here do
 logger = logging.getLogger("clsplat")
@@ -137,3 +269,133 @@ def _decoded(data: bytes, path: Path, flags: int) -> NDArray[Any]:
     if pixels is None:
         raise DataError(f"{path}: not an image, or a damaged one{fault}; copy or export it again")
     return np.asarray(pixels)
+
+
+# What a camera noted of a photograph's exposure: Exif 2.3 in JPEG files, or a file beside images that lost it.
+
+BESIDE = "exposures.json"  # in a folder of images
+SUB_FOLDER = 0x8769  # tags: where those of the exposure are
+SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
+MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm on film of 35 mm
+TEXT, SHORT, LONG, RATIONAL = 2, 3, 4, 5  # kinds of values
+POSSIBLE = ((1e-7, 1e5), (0.1, 1e3), (0.1, 1e8))  # seconds, f-number, ISO
+Value = float | str
+
+
+@dataclass(frozen=True)
+class CameraExposure:
+    """The settings that decide how bright a photograph of the same light is."""
+
+    seconds: float
+    aperture: float  # f-number
+    iso: float
+
+    @property
+    def value(self) -> float:
+        """The logarithm to base 2 of the light that makes a photograph, by its sensitivity."""
+        return math.log2(self.seconds * self.iso / self.aperture**2)
+
+
+def exposure_of(path: Path) -> CameraExposure | None:
+    """Return the exposure that a JPEG file tells; None where it does not.  Raises DataError when it cannot be read."""
+    with opened(path, "an image") as file:
+        return parsed(file.read(HEAD_SIZE))
+
+
+def parsed(head: bytes) -> CameraExposure | None:
+    """Return the exposure in the first bytes of a JPEG file, or None."""
+    tags = _tags(head)
+    return checked(tags.get(SECONDS), tags.get(APERTURE), tags.get(ISO))
+
+
+def optics_of(path: Path) -> tuple[Value, ...] | None:
+    """Return make, model and focal lengths of the camera that took a JPEG file; None where it does not tell them.
+
+    Raises DataError when it cannot be read.
+    """
+    with opened(path, "an image") as file:
+        tags = _tags(file.read(HEAD_SIZE))
+    told = [tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL, FOCAL_35)]
+    return tuple(told) if any(told[2:]) else None
+
+
+def copied(head: bytes, jpeg: bytes) -> bytes:
+    """Return a JPEG file of upright pixels with the EXIF data in the first bytes of another, but for the rotation."""
+    found = exif_segment(head)
+    if found is None:
+        return jpeg
+    at, length = found
+    block = bytearray(head[at : at + 2 + length])
+    if place := orientation_place(bytes(block[10:])):
+        block[10 + place : 12 + place] = struct.pack({b"II": "<H", b"MM": ">H"}[bytes(block[10:12])], 1)
+    return jpeg[:2] + bytes(block) + jpeg[2:]
+
+
+def _tags(head: bytes) -> dict[int, Value]:
+    """What the first bytes of a JPEG file tell by tag, as far as it can be read."""
+    found = exif_segment(head)
+    tags: dict[int, Value] = {}
+    if found is None:
+        return tags
+    at, length = found
+    block = head[at + 10 : at + 2 + length]
+    with suppress(struct.error, KeyError, ValueError):  # cut, without such a folder, or with no number for its place
+        order = {b"II": "<", b"MM": ">"}[block[:2]]
+        (start,) = struct.unpack_from(order + "I", block, 4)
+        tags.update(_values(block, order, int(start)))
+        tags.update(_values(block, order, int(tags[SUB_FOLDER])))
+    return tags
+
+
+def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
+    """The numbers and texts of a folder of tags; of several numbers the first."""
+    found: dict[int, Value] = {}
+    (entries,) = struct.unpack_from(order + "H", block, start)
+    for at in range(start + 2, start + 2 + 12 * entries, 12):
+        tag, kind, count, value = struct.unpack_from(order + "HHII", block, at)
+        if kind == RATIONAL:
+            above, below = struct.unpack_from(order + "II", block, value)
+            if below:
+                found[tag] = above / below
+        elif kind in (SHORT, LONG):
+            (found[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, at + 8)
+        elif kind == TEXT:
+            place = value if count > 4 else at + 8
+            found[tag] = block[place : place + count].split(b"\0")[0].decode("ascii", "replace").strip()
+    return found
+
+
+def checked(seconds: object, aperture: object, iso: object) -> CameraExposure | None:
+    """Return an exposure, or None where a value is no number that a camera can have."""
+    numbers = [float(one) for one in (seconds, aperture, iso) if isinstance(one, int | float)]
+    possible = len(numbers) == 3 and all(low < one < high for one, (low, high) in zip(numbers, POSSIBLE, strict=True))
+    return CameraExposure(*numbers) if possible else None
+
+
+def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]) -> None:
+    """Write the exposures of the images of a folder, by name, where any is known.  Raises OutputError."""
+    known = {name: asdict(exposure) for name, exposure in exposures.items() if exposure}
+    if known:
+        write_text(folder / BESIDE, json.dumps(known, indent=1) + "\n")
+
+
+def read_exposures(folder: Path) -> dict[str, CameraExposure]:
+    """Return the exposures that lie beside the images of a folder; none where there is no such file.
+
+    Raises DataError where it is damaged.
+    """
+    path = folder / BESIDE
+    if not path.is_file():
+        return {}
+    data, expected = (
+        read_json(path, "exposures of images"),
+        "expected {name: {seconds, aperture, iso}}: remove it",
+    )
+    if not isinstance(data, dict):
+        raise DataError(f"{path}: {expected}")
+    found = {}
+    for name, row in data.items():
+        if not isinstance(row, dict) or not (exposure := checked(*map(row.get, ("seconds", "aperture", "iso")))):
+            raise DataError(f"{path}: the exposure of one image is not three positive numbers; {expected}")
+        found[name] = exposure
+    return found

@@ -6,15 +6,14 @@ import re
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from clsplat.errors import DataError, first_few, in_shell
-from clsplat.scene.colmap import camera_views, find_models
-from clsplat.scene.colmap_files import read_images
+from clsplat.core.errors import DataError, first_few, in_shell
+from clsplat.scene.colmap import camera_views, find_models, read_images
 from clsplat.scene.images import is_image, read_header
-from clsplat.scene.nerfstudio import FILE as TRANSFORMS
-from clsplat.scene.readers import Reader
+from clsplat.scene.reader import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.times import Clock
-from clsplat.scene.transforms import Transforms, view_name, view_of
+from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
+from clsplat.scene.transforms_json import Transforms, view_name, view_of
 from clsplat.scene.view import View
 
 LOG = logging.getLogger("clsplat")

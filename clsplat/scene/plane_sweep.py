@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.scene.detail import spacing
-from clsplat.scene.scene import PointCloud, View
+from clsplat.scene.quality import spacing
+from clsplat.scene.scene import PointCloud
+from clsplat.scene.view import View
 
 Floats = NDArray[np.floating]
 Places = NDArray[np.integer]

@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, quoted, shortened
-from clsplat.files import atomic
-from clsplat.ply_header import PlyHeader, format_ply_header, parse_ply_header
-from clsplat.reading import read_file
-from clsplat.scene.scene import Floats, PointCloud
+from clsplat.core.errors import DataError, quoted, shortened
+from clsplat.core.files import atomic
+from clsplat.core.reading import read_file
+from clsplat.formats.ply import PlyHeader, format_ply_header, parse_ply_header
+from clsplat.scene.scene import PointCloud
 from clsplat.scene.times import Clock
+from clsplat.scene.view import Floats
 
 logger = logging.getLogger("clsplat")
 

@@ -8,22 +8,35 @@ Conventions of the whole project
     colours     as the image files store them, in [0, 1]
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, quoted
-from clsplat.scene.camera import Camera as Camera
-from clsplat.scene.tracks import Tracks as Tracks
-from clsplat.scene.view import Alpha as Alpha
-from clsplat.scene.view import Floats as Floats
-from clsplat.scene.view import View as View
-from clsplat.scene.view import load_image
+from clsplat.core.errors import DataError, quoted
+from clsplat.scene.view import Alpha, Floats, View, load_image
+
+# Which points of a dataset each photograph shows, and where: what structure from motion has found.
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Points, and the photographs that show them."""
+
+    positions: NDArray[np.floating]  # [M, 3], scene units
+    seen: Mapping[str, NDArray[np.int64]]  # rows of `positions`, ascending by id of the point, by the name of a view
+    misses: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)  # of the views whose places are known:
+    # [K, 2] px of the photograph as it was taken, from where the camera shows each point to where the photograph does
+
+    def renamed(self, names: Mapping[str, str]) -> "Tracks":
+        """Return the tracks of some views under other names, by their old ones."""
+        seen = {names[old]: rows for old, rows in self.seen.items() if old in names}
+        return Tracks(self.positions, seen, {names[old]: one for old, one in self.misses.items() if old in names})
+
 
 Background = Literal["black", "white"]
 HOLDOUT = 8  # every 8th view is for testing where the dataset has no split: the default of pipelines
@@ -127,7 +140,7 @@ class Scene:
         return f"Scene({self.path.name}: {len(self.train)} training and {len(self.test)} test views{fold})"
 
     def _repr_html_(self) -> str:
-        from clsplat.pages.notebook import summary
+        from clsplat.core.page import summary
 
         camera, count = self.views[0].camera, len(self.points) if self.points else 0
         rows = {

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.errors import DataError, first_few
+from clsplat.core.errors import DataError, first_few
 from clsplat.scene.view import View
 
 LOG = logging.getLogger("clsplat")

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from clsplat.errors import DataError, quoted
-from clsplat.files import write_text
-from clsplat.reading import read_json
+from clsplat.core.errors import DataError, quoted
+from clsplat.core.files import write_text
+from clsplat.core.reading import read_json
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE
 from clsplat.scene.times import clock_of
 from clsplat.scene.view import View

@@ -1,21 +1,55 @@
 """A photograph with its camera: reading its pixels at the size of the camera."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import cache
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.errors import DataError, quoted
-from clsplat.scene.camera import Camera
-from clsplat.scene.images import read_image
-from clsplat.scene.lens import Lens
-from clsplat.scene.pose import Floats as Floats
-from clsplat.scene.pose import checked_pose, checked_time
+from clsplat.core.errors import DataError, PoseError, quoted
+from clsplat.formats.splats import EXPECTED, is_moment
+from clsplat.scene.camera import MODELS, Camera, Lens
+from clsplat.scene.images import CameraExposure, exposure_of, read_exposures, read_image
+
+# What a view says of its place: a pose with a rotation, and the moment of a scene that moves.
+
+Floats = NDArray[np.floating]
+ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are read to 1e-3, and an inverse has a little more
+
+
+def checked_pose(name: str, pose: ArrayLike) -> Floats:
+    """Return a world-to-camera pose, [3, 4] float64, of the view `name`.  Raises PoseError without a rotation."""
+    found = np.asarray(pose, np.float64)
+    if found.shape != (3, 4):
+        raise PoseError(f"the pose of {quoted(name)} has shape {found.shape}; expected (3, 4)")
+    rotation = found[:, :3]
+    if not np.isfinite(found).all():
+        raise PoseError(f"the pose of {quoted(name)} has values that are not finite; expected finite numbers")
+    with np.errstate(all="ignore"):  # numbers near the end of the range
+        turned = rotation @ rotation.T
+    if not np.allclose(turned, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
+        raise PoseError(
+            f"the pose of {quoted(name)} has no rotation in its first three columns; "
+            "expected axes of length 1 at right angles, not mirrored"
+        )
+    return found
+
+
+def checked_time(name: str, time: float | None) -> float | None:
+    """Return the time of the view `name`, in [0, 1], or None.  Raises PoseError for anything else."""
+    if time is None:
+        return None
+    if isinstance(time, bool) or not isinstance(time, int | float | np.floating | np.integer):
+        raise PoseError(f"the time of {quoted(name)} is {quoted(time)}; expected a number from 0 to 1, or None")
+    if not is_moment(time):
+        raise PoseError(f"the time of {quoted(name)} is {float(time):g}; {EXPECTED}")
+    return float(time)
+
 
 Size = tuple[int, int]  # width, height, px
 Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
@@ -240,3 +274,79 @@ def _scales_to(file: Size, camera: Size) -> bool:
     smallest = max(1.0, *(f / (c + 0.5) for f, c in zip(file, camera, strict=True)))
     largest = min(f / (c - 0.5) if c > 1 else np.inf for f, c in zip(file, camera, strict=True))
     return smallest <= largest
+
+
+# Lenses whose focal length is another one than was calibrated: the photograph that they undistort stays the same.
+
+ROUNDING = 1e-12
+
+DEGREES: dict[str, tuple[int, ...]] = {  # n of each coefficient after the middle, in COLMAP's order
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": (2,),
+    "RADIAL": (2, 4),
+    "OPENCV": (2, 4, 1, 1),
+    "FULL_OPENCV": (2, 4, 1, 1, 6, 2, 4, 6),
+}
+
+
+def zooms(lens: Lens) -> bool:
+    """Return whether there is such a lens for any factor: a fisheye has none of its model."""
+    return lens.model in DEGREES
+
+
+def zoomed(lens: Lens, factor: float) -> Lens:
+    """Return a lens with the focal length times a factor, whose undistorted photograph is the same.
+
+    Raises DataError where its model has none.
+    """
+    if factor == 1:
+        return lens
+    if not zooms(lens):
+        raise DataError(
+            f"the lens {lens.model} has no form with another focal length; expected one of {', '.join(DEGREES)}: "
+            "`clsplat data undistort` first"
+        )
+    focals = MODELS[lens.model][0]
+    lengths, middle, rest = lens.params[:focals], lens.params[focals : focals + 2], lens.params[focals + 2 :]
+    scaled = [value * factor**degree for value, degree in zip(rest, DEGREES[lens.model], strict=True)]
+    return replace(lens, params=(*(factor * length for length in lengths), *middle, *scaled))
+
+
+def lens_of(view: View) -> Lens:
+    """Return the lens of a view's photograph as it is on disk: a pinhole where it has no distortion.
+
+    Raises DataError where its focal length was learned and its model has none with another.
+    """
+    c, lens = view.camera, view.lens
+    if lens is None:
+        return Lens(c.width, c.height, "PINHOLE", (c.fx, c.fy, c.cx, c.cy))
+    factor = c.fx / lens.pinhole.resized(c.width, c.height).fx  # 1, unless the focal length was learned
+    return lens if math.isclose(factor, 1, rel_tol=ROUNDING) else zoomed(lens, factor)
+
+
+# What cameras noted of the exposures of views.
+
+
+def camera_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
+    """Return the exposure of each view: what lies beside its image, or else what its image tells; None: nothing.
+
+    Raises DataError where a file cannot be read.
+    """
+    beside = cache(read_exposures)
+    found: list[CameraExposure | None] = []
+    for view in views:
+        if view.image_path == NO_FILE:
+            found.append(None)
+            continue
+        told = (beside(folder).get(name) for folder, name in _below(view))
+        found.append(next(filter(None, told), None) or exposure_of(view.image_path))
+    return found
+
+
+def _below(view: View) -> Iterator[tuple[Path, str]]:
+    """The folders of its image, up to that below which the name of the view is a path, and its path below each."""
+    parts = PurePosixPath(view.name).parts
+    for number, folder in enumerate(view.image_path.parents[: len(parts)], 1):
+        if view.image_path.parts[-number:] == parts[-number:]:
+            yield folder, "/".join(parts[-number:])

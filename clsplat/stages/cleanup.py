@@ -1,22 +1,28 @@
 """Rules that remove Gaussians, applied once: behind a training, or between two."""
 
 import logging
+from collections.abc import Collection
 from dataclasses import asdict
-from typing import ClassVar, Literal
+from itertools import pairwise
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, field_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
 
-from clsplat.density.basic import PruneFaint
-from clsplat.density.control import apply_marks, mark
+from clsplat.core.errors import NoneInsideError, NumericError
+from clsplat.core.settings import OneOf
+from clsplat.density.control import SCORES, Box, Score, apply_marks, best, keep, mark
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.importance import PruneUseless
-from clsplat.density.outliers import PruneFar
 from clsplat.density.statistics import SplatStats
-from clsplat.density.thresholds import SceneScale
-from clsplat.errors import NumericError
-from clsplat.settings import OneOf
-from clsplat.stages.base import Stage
+from clsplat.density.thresholds import SceneScale, Share
+from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
+from clsplat.gaussians.gaussians import HIDDEN, HIDDEN_VIEWS, hide
+from clsplat.methods.adc import PruneFaint
+from clsplat.methods.mini_splatting import PruneUseless, useless
+from clsplat.methods.outliers import PruneFar
 from clsplat.training.run import Run
+from clsplat.training.stage import Scheduled, Stage
 
 LOG = logging.getLogger("clsplat")
 
@@ -74,3 +80,165 @@ class Cleanup(Stage):
         run.records.add(run.step, "densify", **asdict(change))
         removed = ", ".join(f"{name} {number:,}" for name, number in change.causes.items())
         LOG.info("%s Gaussians kept; removed: %s", f"{change.after:,} of {change.before:,}", removed)
+
+
+# The Gaussians in a part of space, without the others.
+
+
+class Crop(Stage):
+    """Remove the Gaussians whose means lie outside a box."""
+
+    stage: Literal["crop"] = "crop"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
+
+    inside: Box
+    """The part of space that stays."""
+
+    def run(self, run: Run) -> None:
+        gaussians = run.model.gaussians
+        kept = np.flatnonzero(self.inside.holds(gaussians.get("means")))
+        if not len(kept):
+            raise NoneInsideError(f"crop: none of {gaussians.count:,} Gaussians lies inside; expected a larger box")
+        change = keep(gaussians, kept, self.stage)
+        run.refresh_filter()
+        run.records.add(run.step, "densify", **asdict(change))
+        LOG.info("%s Gaussians kept, which lie inside", f"{change.after:,} of {change.before:,}")
+
+
+# Make a trained model smaller: fewer Gaussians, fewer harmonics, fewer values of them.
+
+Part = Annotated[float, Field(gt=0, lt=1)]
+
+
+def scores(run: Run, score: Score = "weight") -> NDArray[np.float64]:
+    """Return what each Gaussian does to the training views, [N], summed over their pixels: its blend weight, or the
+    squares of the image's derivatives by its value."""
+    views = run.scene.split("train")
+    looks = run.survey().looks(run.status.counted(views, "views", len(views)))
+    return SCORES[score](looks, run.model.gaussians.count).astype(np.float64)
+
+
+class PruneLeast(Scheduled):
+    """Remove the Gaussians that contribute least to the training views.
+
+    The score of a Gaussian is a sum over all pixels of all training views; pixels that a mask leaves out do not count.
+    """
+
+    stage: Literal["prune_least"] = "prune_least"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"keep", "remove", "score"})
+
+    keep: Part | None = None
+    """Share of the Gaussians that stays; this or `remove`."""
+    remove: Part | None = None
+    """Share of the Gaussians that is removed; this or `keep`."""
+    score: Score = "weight"
+    """Of its weights in the image, or of the squared derivatives of the image by its value (Hanson et al. 2025)."""
+
+    @model_validator(mode="after")
+    def _one_share(self) -> "PruneLeast":
+        if (self.keep is None) == (self.remove is None):
+            raise ValueError("expected one of 'keep' and 'remove', a share of the Gaussians")
+        return self
+
+    def stale(self, run: Run) -> Collection[str]:
+        return run.model.gaussians.trained
+
+    def run(self, run: Run) -> None:
+        gaussians, score = run.model.gaussians, scores(run, self.score)
+        share = 1 - (self.remove or 0) if self.keep is None else self.keep
+        kept = best(score, max(1, round(share * len(score))))
+        change = keep(gaussians, kept, self.stage)
+        run.refresh_filter()
+        run.records.add(run.step, "densify", **asdict(change))
+        lost = 100 * (1 - score[kept].sum() / (score.sum() or 1))
+        LOG.info(
+            "%s Gaussians kept; the others had %.2g %% of the %s", f"{len(kept):,} of {len(score):,}", lost, self.score
+        )
+
+
+class ReduceSh(Scheduled):
+    """Drop bands of spherical harmonics: those above a degree, and of the others those that matter least.
+
+    What a band of a Gaussian matters is the mean square of its colours over all directions, times the Gaussian's weight
+    in the training views.  Bands that are dropped by `share` are zeros, which formats store in few bytes; training that
+    follows gives them values again.
+    """
+
+    stage: Literal["reduce_sh"] = "reduce_sh"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
+
+    degree: Annotated[int, Field(ge=0, le=MAX_DEGREE)] = MAX_DEGREE
+    """Highest degree that stays, for all Gaussians."""
+    share: Share = 0
+    """Share of all bands of all Gaussians that become zero: those that matter least."""
+
+    def stale(self, run: Run) -> Collection[str]:
+        return ("sh_rest",)
+
+    def run(self, run: Run) -> None:
+        model, gaussians = run.model, run.model.gaussians
+        gaussians.lower_sh_degree(self.degree)
+        model.degree = min(model.degree, self.degree)
+        if not self.share or not gaussians.sh_degree:
+            return
+        rest = gaussians.get("sh_rest")
+        energy = band_energy(rest) * scores(run)[:, None]
+        dropped = np.ones(energy.size, bool)
+        dropped[best(energy.ravel(), energy.size - round(self.share * energy.size))] = False
+        gaussians.set("sh_rest", np.where(columns_of(dropped.reshape(energy.shape)), 0, rest))
+        if run.adam is not None:
+            run.adam.forget("sh_rest")
+        LOG.info("%d of %d bands of harmonics are zero", dropped.sum(), dropped.size)
+
+
+def band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the mean square over the sphere of each band above 0, [N, degree], of coefficients [N, (K-1)*3].
+
+    The basis is orthonormal: the mean square of a function is the sum of its squared coefficients by 4 pi.
+    """
+    squares = np.square(rest.astype(np.float64)) / (4 * np.pi)
+    return np.stack([squares[:, first:end].sum(axis=1) for first, end in _bands(rest.shape[1])], axis=1)
+
+
+def columns_of(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return for each coefficient whether its band, [N, degree], is set, [N, (K-1)*3]."""
+    widths = [3 * (2 * band + 3) for band in range(bands.shape[1])]
+    return np.repeat(bands, widths, axis=1)
+
+
+def _bands(columns: int) -> list[tuple[int, int]]:
+    """First column and end of each band above 0."""
+    ends = [3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)]
+    return [(first, end) for first, end in pairwise(ends) if end <= columns]
+
+
+# What a training view need not draw.
+
+
+class HideUseless(Scheduled):
+    """Leave out of the steps on each training view the Gaussians that make little of it, which saves time
+    (Mini-Splatting2, Fang and Wang 2024).
+
+    Useful in a view are those that make most of its weight, alpha T over all pixels, the largest first.  What is new
+    later is hidden where its source was.  All are drawn in other pictures, and in all after the training.
+    """
+
+    stage: Literal["hide_useless"] = "hide_useless"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"of_view"})
+    edits: ClassVar[bool] = True
+
+    of_view: Share = 0.99
+    """Share of a view's weight that is made by what it shows."""
+
+    def attach(self, run: Run) -> None:
+        if HIDDEN not in run.model.gaussians.tables:
+            run.model.gaussians.add(HIDDEN, -(-len(run.scene.split("train")) // HIDDEN_VIEWS))
+
+    def run(self, run: Run) -> None:
+        hide(run.model.gaussians, useless(run.survey(), self.of_view))

@@ -5,19 +5,18 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, field_validator
 
-from clsplat.errors import amount
+from clsplat.core.errors import amount
+from clsplat.core.files import fault_of_output
+from clsplat.core.settings import ReadPath
 from clsplat.gaussians.model import load
-from clsplat.metrics.lpips import InputRange
-from clsplat.metrics.perceptual import Metric, Perceptual
+from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
 from clsplat.metrics.views import mean, measure
-from clsplat.names import fault_of_output
 from clsplat.render.painter import Painter, Splats
 from clsplat.scene.view import some_of
-from clsplat.settings import ReadPath
-from clsplat.stages.base import CADENCE, Scheduled
-from clsplat.training.colours import colours_of, tell_of_colours
-from clsplat.training.poses import refined
+from clsplat.training.modules.appearance import colours_of, tell_of_colours
+from clsplat.training.modules.camera_optimizer import refined
 from clsplat.training.run import Run
+from clsplat.training.stage import CADENCE, Scheduled
 
 LOG = logging.getLogger("clsplat")
 Downscale = Annotated[float, Field(ge=1)]

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -11,24 +11,199 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.errors import ConfigError, DataError
-from clsplat.formats.splats import Parameters, with_degree
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.settings import ReadPath
+from clsplat.formats.splats import SH_C0, Parameters, sh_coefficients, with_degree
+from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import load
-from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
-from clsplat.scene.detail import laplacian_chance
-from clsplat.scene.middle import random_points
+from clsplat.gaussians.sky import Sky
+from clsplat.photos.sky_detection import Seen, looked_at, panorama
+from clsplat.render.backdrops import Auto, Backdrop, Directions
+from clsplat.scene.plane_sweep import swept_points
+from clsplat.scene.quality import is_transparent, laplacian_chance, opaque_pixels, require_ahead
 from clsplat.scene.scene import PointCloud, Scene
-from clsplat.scene.transparency import is_transparent
-from clsplat.settings import ReadPath
-from clsplat.stages.base import Stage
-from clsplat.stages.first_motion import moving, require_times, with_motion
-from clsplat.stages.first_points import enough_swept, on_hull, own_points, points_and_sweep, swept
+from clsplat.scene.view import View, load_image, load_rgba
+from clsplat.scene.viewpoint import centre_of, looked_at_box, random_points
+from clsplat.scene.visual_hull import hull_points
+from clsplat.stages.init_motion import moving, require_times, with_motion
 from clsplat.training.memory import first_tables, last_place
-from clsplat.training.placing import more_room
+from clsplat.training.modules.sky import LearnedSky
 from clsplat.training.run import Run
-from clsplat.training.skies import begin_sky
+from clsplat.training.sh_offload import more_room
+from clsplat.training.stage import Stage
+
+# Where the first Gaussians lie: at the scene's points, on surfaces that a sweep finds, or on a hull.
 
 LOG = logging.getLogger("clsplat")
+MIN_POINTS = 100  # with fewer from a sweep or a hull, random ones are used
+Chance = Callable[[NDArray[np.floating]], NDArray[np.floating]]
+
+
+def own_points(scene: Scene) -> PointCloud:
+    """Return the points of a scene.  Raises DataError where it has none, or all lie behind its cameras."""
+    if scene.points is None:
+        raise DataError(f"{scene.path}: has no points to start from; use init: {{source: sweep}}")
+    require_ahead(scene.points, scene)
+    return scene.points
+
+
+def swept(run: Run, count: int, chance: Chance | None) -> PointCloud:
+    """Return at most `count` points of a sweep over the training photographs; `chance` as of `swept_points`."""
+    views = _views(run)
+    return swept_points(views, centre_of(views), load_image, count, run.seed, chance)
+
+
+def points_and_sweep(run: Run, count: int, chance: Chance | None) -> PointCloud:
+    """Return the scene's points, and at most `count` of a sweep that are not there already.
+
+    Transparent pixels, and those that do not count, give none.  Raises DataError where the scene has no points.
+    """
+    own, views = own_points(run.scene), _views(run)
+    beside = own.positions.astype(np.float64)
+    new = swept_points(views, centre_of(views), load_image, count, run.seed, chance, beside, opaque_pixels)
+    if not len(new):
+        LOG.warning("the photographs agree on no points beside the scene's; starting from these alone")
+    return own.joined(new)
+
+
+def enough_swept(run: Run, count: int, chance: Chance | None) -> PointCloud | None:
+    """Return the points of `swept`, or None, with a warning, where they are too few."""
+    points = swept(run, count, chance)
+    if len(points) < MIN_POINTS:
+        remedy = "photographs from places that lie closer together agree on more"
+        LOG.warning("the photographs agree on %d points only; starting from random ones; %s", len(points), remedy)
+        return None
+    return points
+
+
+def on_hull(run: Run, count: int) -> PointCloud | None:
+    """Return at most `count` points on the hull of the silhouettes, or None, with a warning, where they are too few."""
+    points = hull_points(_views(run), *looked_at_box(run.scene), load_rgba, count, run.seed)
+    if len(points) < MIN_POINTS:
+        remedy = "they need transparency around what they show, and no masks; or use init: {source: sweep}"
+        LOG.warning(
+            "the photographs' silhouettes give %d points only; starting from random ones; %s", len(points), remedy
+        )
+        return None
+    return points
+
+
+def _views(run: Run) -> list[View]:
+    """The training views of the size that is trained on."""
+    return [view for view in run.scene.split("train") if view.downscale == run.downscale]
+
+
+# The sky of a run: whether there is one, and what it begins with.
+
+
+def begin_sky(run: Run, own: Sky | None = None) -> None:
+    """Give the run's new model its first sky, where it is to have one.
+
+    own: what a model had that is trained further; without it, or at another size of the map, the colours of the sky
+    that the photographs show.
+    """
+    settings = settled(run.model_settings.background, run)
+    background = settings.in_use if isinstance(settings, Auto) else settings
+    if not isinstance(background, Directions):
+        run.sky = None
+        if own:
+            LOG.warning("the sky of the model is left out; model.background: directions keeps it")
+        return
+    if is_transparent(run.scene):
+        LOG.warning(
+            "model.background: the photographs have transparency: what is learned and exported as a sky is the colour "
+            "that clsplat puts behind them; leave model.background out"
+        )
+    texels, free = _first(run, background.side)
+    sky = own if own and own.side == background.side else Sky(texels)
+    run.sky = LearnedSky(background, sky.upload(run.device), free)
+    LOG.info("sky: %d of %d x %d colours by direction are learned", free.sum(), background.side, background.side)
+
+
+def will_learn_sky(run: Run) -> bool:
+    """Whether the model of a run has a sky, once its choices are made."""
+    background = run.model_settings.background
+    return isinstance(background.in_use if isinstance(background, Auto) else background, Directions)
+
+
+def settled(background: Backdrop | None, run: Run) -> Backdrop | None:
+    """Return what is behind the Gaussians, with the choice that follows from a run's photographs; one that is made
+    stays."""
+    if not isinstance(background, Auto) or background.chosen is not None:
+        return background
+    chosen, reason = _choice(background, run)
+    LOG.info("model.background: %s, since %s", chosen, reason)
+    return background.model_copy(update={"chosen": chosen, "reason": reason})
+
+
+def share_with_sky(run: Run) -> float | None:
+    """Return the share of the training photographs that show a sky; None where that is not known.
+
+    Views for validation count as training views.
+    """
+    if _unknown(run):
+        return None
+    background = run.model_settings.background
+    number, count = _counted(run, (background if isinstance(background, Auto) else Auto()).share)
+    return number / count
+
+
+def _unknown(run: Run) -> str:
+    """Why photographs do not tell whether they show a sky; empty where they do."""
+    if run.scene.points is None:
+        return "the dataset has no points, and what is far from them is not known"
+    return "the photographs have transparency" if is_transparent(run.scene) else ""
+
+
+def _counted(run: Run, share: float) -> tuple[int, int]:
+    """How many training photographs show the sky in such a share of their upper third, or more, and how many there are.
+
+    Views for validation count as training views.
+    """
+    seen = _seen(run, run.scene.with_fold())
+    return sum(one.share >= share for one in seen), len(seen)
+
+
+def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
+    """Whether there is a sky, and why."""
+    if why := _unknown(run):
+        return "off", why
+    number, count = _counted(run, background.share)
+    text = (
+        f"{number} of {count} photographs show bright or blue regions above the horizon, without points, in "
+        f"{background.share:.0%} or more of their upper third"
+    )
+    enough = number >= background.photographs * count
+    return ("on" if enough else "off"), f"{text}; {'' if enough else 'not '}{background.photographs:.0%} of them"
+
+
+def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The first colours of the map and which are learned; all, from the mean of the upper thirds of photographs, where
+    none shows a sky."""
+    seen = _seen(run, run.scene)
+    if found := panorama(seen, side):
+        return found
+    uppers = [one.upper.mean(axis=0) / 255 for one in seen if len(one.upper)]
+    if not uppers:
+        LOG.warning("masks leave out the upper thirds of all photographs: the sky begins black")
+    mean = np.mean(uppers, axis=0) if uppers else np.zeros(3)
+    return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
+
+
+def _seen(run: Run, scene: Scene) -> list[Seen]:
+    """What each training photograph of a scene shows of the sky."""
+    return list(looked_at(scene, _photographs(run, scene)))
+
+
+def _photographs(run: Run, scene: Scene) -> Iterator[tuple[View, NDArray[np.uint8], NDArray[np.bool_] | None]]:
+    """The training photographs of a scene at the first size that they have, [height, width, 3], and which pixels
+    count, [height, width]; None: all."""
+    views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
+    for view in run.status.counted(views, "photographs", len(views)):
+        photograph = run.photographs.get(view)
+        yield view, photograph.image(), photograph.counted()
+
+
 MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
 CHANCES = {"uniform": None, "laplacian": laplacian_chance}  # of a pixel to become a point of a sweep
 

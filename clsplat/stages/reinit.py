@@ -8,19 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.density.control import Change
-from clsplat.density.sampling import drawn_order
-from clsplat.errors import NumericError
-from clsplat.gaussians.tables import Gaussians
+from clsplat.core.errors import NumericError
+from clsplat.density.control import Change, drawn_order
+from clsplat.gaussians.gaussians import Gaussians
 from clsplat.metrics.images import to_8_bits
-from clsplat.scene.scene import PointCloud, View
-from clsplat.stages.base import Stage
+from clsplat.scene.scene import PointCloud
+from clsplat.scene.view import View
 from clsplat.stages.init import from_points
-from clsplat.training.colours import colours_of
 from clsplat.training.memory import first_tables, last_place
-from clsplat.training.placing import more_room
-from clsplat.training.poses import refined
+from clsplat.training.modules.appearance import colours_of
+from clsplat.training.modules.camera_optimizer import refined
 from clsplat.training.run import Run
+from clsplat.training.sh_offload import more_room
+from clsplat.training.stage import Stage
 
 LOG = logging.getLogger("clsplat")
 Floats = NDArray[np.float64]

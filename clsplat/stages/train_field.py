@@ -3,25 +3,25 @@
 import logging
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from clsplat.errors import ConfigError, NotFiniteError
-from clsplat.fields.place import require_seen
-from clsplat.fields.shape import FieldShape
-from clsplat.schedule import Decay, NonNegative, at_step
-from clsplat.settings import OneOf
-from clsplat.stages.base import Scheduled
-from clsplat.stages.progress import report
-from clsplat.stages.training import Training
+from clsplat.core.errors import ConfigError, DataError, NotFiniteError, OutputError
+from clsplat.core.reading import sha256
+from clsplat.core.schedule import Decay, NonNegative, at_step
+from clsplat.core.settings import OneOf
+from clsplat.gaussians.model import Rendering
+from clsplat.nerf.files import ENDING, FILE, FieldModel, load_field
+from clsplat.nerf.shape import FieldShape
+from clsplat.nerf.training import AdamStep, LearnedField, Shown, field_plan, require_seen
+from clsplat.photos.sampling import Order, Uniform, ViewPool
+from clsplat.stages.optimize import report
 from clsplat.training import checkpoint
-from clsplat.training.field import AdamStep, LearnedField, Shown
-from clsplat.training.field_memory import field_plan
-from clsplat.training.forecast import Forecast
-from clsplat.training.profile import clocks
+from clsplat.training.records import Forecast, clocks
 from clsplat.training.run import Run
-from clsplat.views.order import Order, Uniform, ViewPool
+from clsplat.training.stage import Scheduled, Stage, Training, path_in_run
 
 LOG = logging.getLogger("clsplat")
 
@@ -146,3 +146,38 @@ class TrainField(Training):
         if broken or not math.isfinite(loss):
             raise NotFiniteError(f"step {run.step}: the loss is {loss}; {checkpoint.set_aside(run, broken)}")
         return loss, -10 * math.log10(max(error, 1e-12))
+
+
+# The field as a file.
+
+
+class ExportField(Stage):
+    """Write the field that `train_field` has trained, and read it back: a file that clsplat alone reads.
+
+    `clsplat render` and `clsplat evaluate` take it, or the run folder that holds it.
+    """
+
+    stage: Literal["export_field"] = "export_field"
+    needs: ClassVar[frozenset[str]] = frozenset({"field"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"file"})
+
+    file: Annotated[str, path_in_run(ENDING)] = FILE
+    """Path inside the run folder; .npz."""
+
+    def run(self, run: Run) -> None:
+        assert isinstance(run.learned_field, LearnedField)
+        field, file = run.learned_field.field, run.out / self.file
+        rendering = Rendering(background=run.photographs.background_name, alpha=run.original.views[0].alpha)
+        run.written[self.file] = FieldModel(field.shape, field.parameters.get(), rendering).save(file)
+        try:
+            load_field(file)
+        except DataError as error:
+            raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
+        LOG.info("a field of %s parameters written to %s", f"{field.shape.learned:,}", file)
+
+    def verify(self, run: Run) -> None:
+        file: Path = run.out / self.file
+        if self.file not in run.written:
+            raise DataError(f"{file}: this run has no record of writing it; move it away, and use --restart")
+        if not file.is_file() or sha256(file) != run.written[self.file]:
+            raise DataError(f"{file}: differs from what was written; `clsplat resume` writes it again")

@@ -1,5 +1,6 @@
 """The model as a video."""
 
+import difflib
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -9,18 +10,111 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from clsplat.progress import counted, heard_by
+from clsplat.core.errors import ConfigError, DataError, quoted
+from clsplat.core.progress import counted, heard_by
+from clsplat.core.settings import ReadPath
+from clsplat.scene.images import image_size, read_image, write_image
 from clsplat.scene.view import View
-from clsplat.settings import ReadPath
-from clsplat.stages.base import Stage, path_in_run
-from clsplat.stages.timelapse import verify_video
 from clsplat.training.run import Run
-from clsplat.video import encoding
-from clsplat.video.film import FPS, FRAMES, Film, Wish, plan, shoot
-from clsplat.video.lenses import MAX_FRAMES, RATES, size_of
-from clsplat.video.pictures import Canvas
+from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
+from clsplat.viewer.video import encoding
+from clsplat.viewer.video.film import FPS, FRAMES, Film, Wish, plan, shoot, still
+from clsplat.viewer.video.paths import MAX_FRAMES, RATES, checked_size, size_of
+from clsplat.viewer.video.pictures import Canvas, letterboxed
+
+# Pictures of one camera while the model is trained, and the video that they make.
 
 LOG = logging.getLogger("clsplat")
+KIND = "snapshot"  # of lines in metrics.jsonl
+FOLDER = "timelapse"
+
+
+class Snapshot(Scheduled):
+    """Write a picture of the model from one camera, for a later stage `timelapse`.
+
+    The model has the same bits with it and without it.  A run that was killed and goes on ends with the same pictures.
+    """
+
+    stage: Literal["snapshot"] = "snapshot"
+    needs: ClassVar[frozenset[str]] = frozenset({"painter"})
+    makes: ClassVar[frozenset[str]] = frozenset({"snapshots"})
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"view", "size", "folder"}
+
+    view: str | None = None
+    """Name of the view whose camera is taken; without it, the first test view, else the first of all."""
+    size: str | None = None
+    """WIDTHxHEIGHT of the pictures, even numbers; without it, that of the photograph in training."""
+    folder: Annotated[str, path_in_run()] = FOLDER
+    """Path inside the run folder."""
+
+    @field_validator("size")
+    @classmethod
+    def _of_a_video(cls, size: str | None) -> str | None:
+        return None if size is None else size_of(size)
+
+    def check_in(self, run: Run) -> None:
+        self._view(run)
+
+    def _view(self, run: Run) -> View:
+        """The camera.  Raises ConfigError where the scene has no such view."""
+        scene = run.scene.downscaled(run.downscale)
+        if self.view is None:
+            return (scene.split("test") or scene.views)[0]
+        found = {view.name: view for view in scene.views}
+        if self.view not in found:
+            near = difflib.get_close_matches(self.view, found, n=1, cutoff=0.0)
+            raise ConfigError(f"snapshot: the scene has no view {quoted(self.view)}; did you mean {quoted(near[0])}?")
+        return found[self.view]
+
+    def run(self, run: Run) -> None:
+        view = still(self._view(run), checked_size(self.size) if self.size else None)
+        path = run.out / self.folder / f"step_{run.step:06d}.png"
+        write_image(path, Canvas(run.painter()).picture(view))
+        run.records.add(run.step, KIND, folder=self.folder, file=path.name)
+
+
+class Timelapse(Stage):
+    """Make a video of the pictures that a stage `snapshot` has written during training."""
+
+    stage: Literal["timelapse"] = "timelapse"
+    needs: ClassVar[frozenset[str]] = frozenset({"painter", "snapshots"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"folder", "file", "fps"})
+
+    folder: str = FOLDER
+    """That of the stage snapshot."""
+    file: Annotated[str, path_in_run(*encoding.WRITERS)] = "timelapse.webm"
+    """Path inside the run folder; .webm, or .mp4 with the extra video."""
+    fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] = 15.0
+    """Pictures a second."""
+
+    def check(self) -> None:
+        encoding.check_encoder(Path(self.file))
+
+    def _files(self, run: Run) -> list[Path]:
+        """The pictures of the run, by step: those of an earlier one may lie beside them."""
+        found = {line["step"]: line["file"] for line in run.records.read(KIND) if line.get("folder") == self.folder}
+        return [run.out / self.folder / found[step] for step in sorted(found)]
+
+    def run(self, run: Run) -> None:
+        files = self._files(run)
+        if not files:
+            raise ConfigError(f"timelapse: no stage snapshot has written into {quoted(self.folder)}; name its folder")
+        size = image_size(files[-1])
+        with encoding.opened(run.out / self.file, size, self.fps) as write:
+            for path in run.status.counted(run.until_interrupted(files), "frames", len(files)):
+                write(letterboxed(np.asarray(read_image(path), np.uint8)[:, :, :3], size))  # one size for all
+        LOG.info("time-lapse of %d frames written to %s", len(files), run.out / self.file)
+
+    def verify(self, run: Run) -> None:
+        verify_video(run.out / self.file, len(self._files(run)))
+
+
+def verify_video(path: Path, frames: int) -> None:
+    """Raise DataError unless a video has its frames."""
+    if (found := encoding.frames_of(path)) != frames:
+        raise DataError(f"{path}: {found} of {frames} frames can be read; it is missing or damaged")
+
+
 Moment = Annotated[float, Field(ge=0, le=1)]
 
 

@@ -6,18 +6,16 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from clsplat.errors import ConfigError
-from clsplat.formats.motion import MOTION
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import Decay, NonNegative, Schedule, at_step, divided, explained
+from clsplat.core.settings import Settings
+from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients
 from clsplat.gaussians.deferred import Deferred
-from clsplat.gaussians.on_host import defines_of, slots_of
-from clsplat.gaussians.struct import Waiting
-from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables, sh_coefficients
-from clsplat.opencl.device import Array
-from clsplat.opencl.program import constants
-from clsplat.render.arguments import shape_arguments
-from clsplat.render.rasterizer import Frame
-from clsplat.schedule import Decay, NonNegative, Schedule, at_step, divided, explained
-from clsplat.settings import Settings
+from clsplat.gaussians.gaussians import DeviceModel, Gaussians
+from clsplat.gaussians.sh_offload import defines_of, slots_of
+from clsplat.gaussians.structs import Gradients, Waiting, moment_tables
+from clsplat.opencl.device import Array, constants
+from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.training.motion import MotionRates, update_motion
 
 
@@ -231,3 +229,48 @@ class Adam:
     def forget(self, name: str) -> None:
         """Set the moments of one parameter to zero."""
         self.gaussians.zero_rows(moment_tables(name), np.arange(self.gaussians.count))
+
+
+# The average of the parameters over steps, in tables beside them (Polyak and Juditsky 1992).
+
+FOLDER = "average/"  # before the names of the parameters
+NUMBER = f"{FOLDER}number"  # [1] of steps in the average of a row
+
+
+def attach(gaussians: Gaussians) -> None:
+    """Add the tables, unless they are there: no step so far.  Rows of new Gaussians begin anew."""
+    if NUMBER not in gaussians.tables:
+        for name in gaussians.trained:
+            gaussians.add(FOLDER + name, gaussians.tables[name].components, zero_fresh=True)
+        gaussians.add(NUMBER, 1, zero_fresh=True)
+
+
+def add(gaussians: Gaussians) -> None:
+    """Add the present parameters to their averages."""
+    program, count = gaussians.device.program("average.cl"), gaussians.count
+    for name in gaussians.trained:
+        program.add_to_average(
+            items=(count, gaussians.tables[name].components),
+            values=gaussians[name],
+            average=gaussians[FOLDER + name],
+            number=gaussians[NUMBER],
+            stride=gaussians.capacity,
+            count=count,
+        )
+    program.count_step(items=count, number=gaussians[NUMBER], count=count)
+
+
+def take(gaussians: Gaussians) -> None:
+    """Replace the parameters by their averages, those of rows without one stay, and remove the tables."""
+    program = gaussians.device.program("average.cl")
+    for name in gaussians.trained:
+        program.take_average(
+            items=(gaussians.count, gaussians.tables[name].components),
+            values=gaussians[name],
+            average=gaussians[FOLDER + name],
+            number=gaussians[NUMBER],
+            stride=gaussians.capacity,
+            count=gaussians.count,
+        )
+    for table in (NUMBER, *(FOLDER + name for name in gaussians.trained)):
+        del gaussians.tables[table]

@@ -19,8 +19,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, OutputError, one_line, shortened
-from clsplat.reading import regular
+from clsplat.core.errors import DataError, OutputError, one_line, shortened
+from clsplat.core.reading import regular
 
 META, META_DIGEST, DIGESTS = "meta", "meta_sha256", "sha256"
 DAMAGE = {None, errno.EINVAL, errno.EISDIR, errno.EIO}  # a place before the beginning, a folder, a bad part of the disk

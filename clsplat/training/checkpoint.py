@@ -5,25 +5,257 @@ finite is no checkpoint: it lies beside them as failed_N.npz, and a run goes on 
 """
 
 import logging
+import math
 import re
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ValidationError
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from clsplat.errors import ClsplatError, ConfigError, DataError, NotFiniteError, OutputError, in_shell
-from clsplat.files import atomic
-from clsplat.names import CHECKPOINTS, PIPELINE
-from clsplat.training import archive, run_tables
-from clsplat.training.advice import lower_rate
-from clsplat.training.archive import Arrays
-from clsplat.training.changes import differences
+from clsplat.core.errors import (
+    ClsplatError,
+    ConfigError,
+    DataError,
+    Interrupted,
+    NotFiniteError,
+    OutputError,
+    in_shell,
+    one_line,
+)
+from clsplat.core.files import CHECKPOINTS, PIPELINE, atomic
+from clsplat.core.resources import full_version
+from clsplat.core.schedule import at_step
+from clsplat.density.statistics import FOLDER as STATS_FOLDER
+from clsplat.density.statistics import SEEN, SplatStats
+from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.model import WIDTHS
+from clsplat.gaussians.structs import moment_tables
+from clsplat.losses.base import ViewLosses
+from clsplat.losses.image import psnr
+from clsplat.render.backdrops import Auto, Directions
+from clsplat.training import archive, best_model, field
+from clsplat.training.adam import Adam, Rates
+from clsplat.training.archive import Arrays, split
+from clsplat.training.best_model import Best, Tables, model_tables
+from clsplat.training.modules import distractors, exposure, sky
+from clsplat.training.modules.sky import LearnedSky
 from clsplat.training.run import Run
-from clsplat.training.state import State
-from clsplat.version import full_version
+from clsplat.training.settings_diff import differences
+from clsplat.training.sh_offload import make_room
+
+# The notes of a checkpoint: all of a run's state but its tables.
+
+Count = Annotated[int, Field(ge=0)]
+
+
+class State(BaseModel):
+    """What a checkpoint holds beside its tables."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    format: int
+    version: str
+    step: Count
+    cursor: Count
+    stage_step: Count
+    acted: Count
+    edited: bool
+    field: dict[str, Any] | None  # kind, shape and parameters of the field that is trained instead of Gaussians
+    degree: Annotated[int, Field(ge=0, le=3)]
+    zero_fresh: list[str]
+    updates: dict[str, Count]
+    numbers: dict[str, float]  # that parts of the run keep
+    best: Best | None  # what validation has found
+    train_seconds: float
+    cpu_seconds: float  # in the same time
+    metrics: dict[str, dict[str, Any]]
+    records: Count  # lines of metrics.jsonl
+    written: dict[str, str]  # models, by path in the run folder, with their SHA-256
+    changes: list[str]
+    device: str
+    inputs: str  # identity of the scene
+    read: dict[str, str]  # hashes of the files that settings name, by their text
+    pipeline: dict[str, Any]
+
+    def is_trained(self, pipeline: dict[str, Any]) -> bool:
+        """Whether all the steps that a resolved pipeline gives the training in progress are done."""
+        (stage,) = pipeline["stages"][self.cursor].values()
+        return bool(stage.get("steps") == self.stage_step)
+
+
+def check_tables(state: State, tables: Arrays) -> None:
+    """Raise DataError for tables that are not those of a run."""
+    if missing := [name for name in PARAMETERS if name not in tables]:
+        raise DataError(f"lacks {', '.join(missing)}")
+    count = len(tables["means"])
+    for name, table in tables.items():
+        if table.dtype != np.float32 or table.ndim != 2 or len(table) != count:
+            raise DataError(f"{name} is not [{count}, components] of float32")
+    if count == 0:
+        raise DataError("it holds no Gaussians")
+    trained = [*PARAMETERS, *([MOTION] if MOTION in tables else [])]
+    for name in trained:
+        if tables[name].shape[1] not in WIDTHS[name]:
+            raise DataError(f"{name} has {tables[name].shape[1]} components")
+        if name == "sh_rest" and tables[name].shape[1] < 3 * (sh_coefficients(state.degree) - 1):
+            raise DataError(f"{name} has {tables[name].shape[1]} components, too few for degree {state.degree}")
+        moments = [moment for moment in moment_tables(name) if moment in tables]
+        if broken := [key for key in (name, *moments) if not np.isfinite(tables[key]).all()]:
+            raise DataError(f"{broken[0]} holds values that are not finite")
+        if [tables[moment].shape for moment in moments] != [tables[name].shape] * (2 if state.updates else 0):
+            raise DataError(f"the moments of {name} are not like it")
+    if state.updates and state.updates.keys() != set(trained):
+        raise DataError("it counts updates of other parameters")
+
+
+# The tables of the best model of a run: copied to the host, and put back.
+
+
+def copied_of(run: Run) -> Tables:
+    """Copy what the run's model needs to be rendered, and to be trained from anew, to the host."""
+    own = run.sky.tables() if run.sky else {}
+    behind = {sky.FOLDER + name: table for name, table in own.items()}
+    of_colours = run.colour_grids.tables(["values"]) if run.colour_grids else {}
+    photographs = {exposure.FOLDER + name: table for name, table in of_colours.items()}
+    return {**model_tables(run.model), **behind, **photographs}
+
+
+def put_back(run: Run, tables: Tables, degree: int) -> None:
+    """Make what was copied the run's model."""
+    own, of_gaussians = split(tables, sky.FOLDER)
+    of_colours, of_gaussians = split(of_gaussians, exposure.FOLDER)
+    if of_colours and run.colour_grids:
+        run.colour_grids.set(of_colours)
+    run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), degree)
+    restore_sky(run, own)
+
+
+def restore_sky(run: Run, tables: Tables) -> None:
+    """Give a run the sky of its tables, by their own names; without any it has none."""
+    given = run.model_settings.background
+    background = given.model if isinstance(given, Auto) else given
+    run.sky = None
+    if tables and isinstance(background, Directions):
+        run.sky = LearnedSky.of_tables(background, tables, run.device)
+
+
+# The tables of a run in its checkpoint: those of a field, or of Gaussians, what is behind them, and the best model.
+
+UPDATES = "field"  # name of their number
+
+
+def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    """Yield the tables by their keys in the file, each copied to the host when it is its turn."""
+    if run.learned_field:
+        yield from ((field.FOLDER + name, table) for name, table in run.learned_field.tables().items())
+        return
+    gaussians = run.model.gaussians
+    yield from ((_key(name), gaussians.get(name)) for name in gaussians.tables)
+    yield from ((sky.FOLDER + name, table) for name, table in (run.sky.tables() if run.sky else {}).items())
+    of_colours = run.colour_grids.tables() if run.colour_grids else {}
+    yield from ((exposure.FOLDER + name, table) for name, table in of_colours.items())
+    of_photographs = run.distractors.tables() if run.distractors else {}
+    yield from ((distractors.FOLDER + name, table) for name, table in of_photographs.items())
+    yield from ((best_model.FOLDER + name, table) for name, table in run.best_tables.items())
+
+
+def updates_of(run: Run) -> dict[str, int]:
+    """Return how often Adam has updated each of its tables."""
+    if run.learned_field:
+        return {UPDATES: run.learned_field.updates}
+    return run.adam.updates if run.adam else {}
+
+
+def check_run_tables(state: State, tables: Arrays) -> None:
+    """Raise DataError for tables that are not those of the state."""
+    if state.field:
+        if state.updates.keys() != {UPDATES}:
+            raise DataError("it counts updates of other parameters than those of its field")
+        kind = field.kind_of(state.field)
+        kind.check_tables(state.field["shape"], *split(tables, field.FOLDER))
+        return
+    best, own = split(tables, best_model.FOLDER)
+    best_model.check(state.best, best)
+    behind, own = split(own, sky.FOLDER)
+    sky.check_tables(behind)
+    of_colours, own = split(own, exposure.FOLDER)
+    exposure.check_tables(of_colours)
+    exposure.require_tables(of_colours, state.numbers)
+    of_photographs, own = split(own, distractors.FOLDER)
+    distractors.check_tables(of_photographs)
+    check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
+
+
+def restore_tables(run: Run, state: State, tables: Arrays) -> None:
+    """Put the tables of a state into a run."""
+    if state.field:
+        own, _ = split(tables, field.FOLDER)
+        kind = field.kind_of(state.field)
+        run.learned_field = kind.of_tables(state.field["shape"], own, run.photographs.background)
+        run.learned_field.updates = state.updates[UPDATES]
+        return
+    run.best_tables, tables = split(tables, best_model.FOLDER)
+    behind, tables = split(tables, sky.FOLDER)
+    of_colours, tables = split(tables, exposure.FOLDER)
+    run.colour_grids = exposure.restored(of_colours, run.device)
+    of_photographs, tables = split(tables, distractors.FOLDER)
+    run.distractors = distractors.restored(of_photographs, run.device)
+    gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
+    run.model = run.model_settings.model(gaussians, state.degree)
+    if state.updates:
+        make_room(run, gaussians.count)
+        run.adam = Adam(gaussians)
+        run.adam.updates = state.updates
+        columns = [name for name in tables if name.startswith(STATS_FOLDER) and name != SEEN]
+        run.stats = SplatStats(gaussians, [name.removeprefix(STATS_FOLDER) for name in columns])
+    for key, table in tables.items():  # those of rules, penalties and plug-ins too
+        name = key.removeprefix("gaussians/")
+        if name not in gaussians.tables:
+            gaussians.add(name, table.shape[1], zero_fresh=name in state.zero_fresh)
+        gaussians.set(name, table)
+    restore_sky(run, behind)
+
+
+def _key(table: str) -> str:
+    """The key of a table in the file: parameters are in the folder `gaussians`."""
+    return table if "/" in table else f"gaussians/{table}"
+
+
+# What to try after values that are not finite.
+
+LOWER = 0.1  # times the present rate
+VELOCITY = "motion.velocity"  # whose rate is lowered where a motion is broken
+
+
+def lower_rate(run: Run, broken: Collection[str]) -> str:
+    """Return 'place=value' for `--set`: a lower rate of that broken parameter whose rate is the largest by its default.
+
+    The value is a tenth of the present one, or the default where that is smaller.  A field has one rate.
+    """
+    if run.learned_field:
+        (stage,) = run.pipeline["stages"][run.cursor]
+        return f"{stage}.rate={LOWER * run.learned_field.rate:.2g}"
+    stages, default = run.pipeline["stages"], Rates()
+    trains = [(i, name) for i, stage in enumerate(stages) for name, fields in stage.items() if "rates" in fields]
+    place, stage = next((found for found in reversed(trains) if found[0] <= run.cursor), (0, "optimize"))
+    present = Rates.model_validate(stages[place].get(stage, {}).get("rates", {}))
+
+    def rate(rates: Rates, name: str) -> float:
+        return at_step(rates.motion.velocity if name == VELOCITY else getattr(rates, name), run.step)
+
+    names = [VELOCITY if name == MOTION else name for name in broken or PARAMETERS]
+    name = max(names, key=lambda name: rate(present, name) / rate(default, name))
+    alone = [other for _, other in trains].count(stage) <= 1
+    value = min(LOWER * rate(present, name), rate(default, name))
+    return f"{stage if alone else f'stages.{place}'}.rates.{name}={value:.2g}"
+
 
 FORMAT = 4
 LOG = logging.getLogger("clsplat")
@@ -90,7 +322,7 @@ def load(path: Path) -> tuple[State, Arrays]:
         raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     if state.cursor > len(state.pipeline.get("stages", ())):  # equal to it: all stages have ended
         raise DataError(f"it has no stage {state.cursor}")
-    run_tables.check(state, tables)
+    check_run_tables(state, tables)
     return state, tables
 
 
@@ -163,7 +395,7 @@ def _write(run: Run, kind: str) -> Path:
         field=_field_of(run),
         degree=0 if run.learned_field else run.model.degree,
         zero_fresh=[] if run.learned_field else run.model.gaussians.zero_fresh,
-        updates=run_tables.updates_of(run),
+        updates=updates_of(run),
         numbers=run.numbers,
         best=run.best,
         train_seconds=run.train_seconds,
@@ -179,7 +411,7 @@ def _write(run: Run, kind: str) -> Path:
     )
     path = run.out / CHECKPOINTS / f"{kind}_{run.step:06d}.npz"
     with atomic(path) as file:
-        archive.write(file, state.model_dump(), run_tables.tables_of(run))
+        archive.write(file, state.model_dump(), tables_of(run))
     return path
 
 
@@ -216,8 +448,48 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
     run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
     run.best = state.best
-    run_tables.restore(run, state, tables)
+    restore_tables(run, state, tables)
     if run.is_refit:
         run.divide(run.original.with_fold())
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
+
+
+# Save the state of a run that fails.
+
+
+@contextmanager
+def saved_on_failure(run: Run) -> Iterator[None]:
+    """Where the block fails, save the state of the last whole step, and tell where it is; the failure is raised."""
+    try:
+        yield
+    except (Interrupted, NotFiniteError):  # saved already, or set aside
+        raise
+    except (Exception, SystemExit, GeneratorExit):  # what a plug-in may raise; a second Ctrl-C stops at once
+        if run.step > 0 and not run.status.lost:
+            LOG.warning(_rescue(run))
+        raise
+
+
+def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float]:
+    """Read the loss and the PSNR, dB, of a step at a view.
+
+    Raises NotFiniteError, with the state set aside, where the loss or the model is not finite.
+    """
+    broken, loss = run.not_finite(), losses.loss
+    if broken or not math.isfinite(loss):
+        told = set_aside(run, broken)
+        raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {told}")
+    return loss, psnr(losses.comparison)
+
+
+def _rescue(run: Run) -> str:
+    """Save the state where it is whole; return a sentence about it."""
+    try:
+        if run.whole and not run.not_finite() and run.gaussians != 0:
+            return f"the state of step {run.step} is saved in {save(run)}; `clsplat resume` goes on from it"
+        why = "the step that failed was not whole" if not run.whole else "the model is not finite"
+    except Exception as error:  # the failure itself is what the user must see
+        why = f"the state could not be saved ({one_line(error)})"
+    files = saved(run.out)
+    return f"{why}; {f'the last good state is {files[-1]}' if files else 'no state was saved before'}"

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from clsplat.errors import MemoryLimitError
-from clsplat.formats.motion import MOTION
-from clsplat.gaussians.moments import HARMONICS
-from clsplat.gaussians.tables import ALIGNMENT, GROWTH, PARAMETERS, moment_tables, sh_coefficients
+from clsplat.core.errors import MemoryLimitError
+from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients
+from clsplat.gaussians.gaussians import ALIGNMENT, GROWTH
+from clsplat.gaussians.structs import HARMONICS, moment_tables
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 
 SEEN_SHARE = 0.5  # of the Gaussians, in one view, an estimate; their harmonics come to the device

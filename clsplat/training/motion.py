@@ -6,12 +6,12 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field
 
-from clsplat.formats.motion import MOTION, fields_of
-from clsplat.gaussians.tables import Gaussians, Gradients, moment_tables
-from clsplat.opencl.device import Array
-from clsplat.opencl.program import constants
-from clsplat.schedule import Bounded, Decay, Schedule, at_step, divided
-from clsplat.settings import Settings
+from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, divided
+from clsplat.core.settings import Settings
+from clsplat.formats.splats import MOTION, fields_of
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.structs import Gradients, moment_tables
+from clsplat.opencl.device import Array, constants
 
 LONGEST = 15.0  # log of a duration: nothing changes beyond it
 FAR = 3.0e38  # a bound beyond all values

@@ -9,32 +9,33 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.errors import ConfigError
+from clsplat.core.progress import Progress, Stopped
+from clsplat.core.resources import __version__
+from clsplat.core.settings import Settings
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
-from clsplat.errors import ConfigError
-from clsplat.filters import FilterViews, ModelSettings, measure_intervals
-from clsplat.gaussians.tables import HIDDEN, INTERVAL2, DeviceModel
+from clsplat.gaussians.gaussians import HIDDEN, INTERVAL2, DeviceModel
+from clsplat.gaussians.model import Model, Rendering
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
-from clsplat.progress import Progress, Stopped
+from clsplat.photos.appearance import GridTables
+from clsplat.photos.exposure_estimate import Exposures
+from clsplat.photos.photographs import Photographs, texture_quantile
+from clsplat.render.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.render.painter import Painter, Splats
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene, scene_name
-from clsplat.settings import Settings
 from clsplat.training.adam import Adam
-from clsplat.training.colour_grids import GridTables, bytes_needed
-from clsplat.training.kept import Best, Tables
+from clsplat.training.best_model import Best, Tables
+from clsplat.training.field import TrainedField
 from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, plan
-from clsplat.training.own_gaussians import OwnGaussians, distractor_bytes
-from clsplat.training.profile import clocks
-from clsplat.training.records import Records
-from clsplat.training.sky import LearnedSky
+from clsplat.training.modules.distractors import OwnGaussians, distractor_bytes
+from clsplat.training.modules.exposure import bytes_needed
+from clsplat.training.modules.sky import LearnedSky
+from clsplat.training.records import Records, clocks
 from clsplat.training.status import StatusFile
-from clsplat.training.trained_field import TrainedField
-from clsplat.views.exposures import Exposures
-from clsplat.views.photographs import Photographs
-from clsplat.views.texture import texture_quantile
 
 Item = TypeVar("Item")
 
@@ -245,3 +246,36 @@ class Run:
         views = self.scene.split("train")
         for view in self.status.counted(views, "photographs", len(views)):
             yield self.photographs.get(view).image()
+
+
+# The model of a run as it goes into files: its tables on the host, and how it was rendered in training.
+
+
+def host_model(run: Run) -> Model:
+    """Copy the model to the host, as it is trained: with a world filter that is not part of its scales.
+
+    Raises ConfigError when no stage has made one.
+    """
+    gaussians = run.model.gaussians
+    tables = {name: gaussians.get(name) for name in (*gaussians.trained, "filter_variance")}
+    if not tables["filter_variance"].any():
+        del tables["filter_variance"]
+    rendering = Rendering.of({"version": __version__, **_rendering(run)}, "default")
+    return Model(**tables, rendering=rendering, sky=run.sky.sky.host() if run.sky else None)
+
+
+def _rendering(run: Run) -> dict[str, Any]:
+    """The numbers for rendering a model file as in training."""
+    model = run.model
+    found: dict[str, Any] = {
+        "near": model.near,
+        "screen_variance": model.screen_variance,
+        "compensate": model.compensate,
+        "background": run.photographs.background_name,
+        "alpha": run.original.views[0].alpha,
+    }
+    if model.pixel_box:
+        found["pixel_box"] = model.pixel_box
+    if run.sky:
+        found["sky"] = "directions"
+    return found

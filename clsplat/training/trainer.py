@@ -3,8 +3,9 @@
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
+from clsplat.core.schedule import Schedule, at_step
 from clsplat.density.statistics import SplatStats
-from clsplat.gaussians.tables import DeviceModel, Dropout
+from clsplat.gaussians.gaussians import DeviceModel, Dropout
 from clsplat.losses.base import (
     Comparison,
     ImageLoss,
@@ -19,23 +20,19 @@ from clsplat.losses.base import (
     require_symmetric,
     returned,
 )
-from clsplat.opencl.device import Array
-from clsplat.opencl.program import constants
+from clsplat.opencl.device import Array, constants
+from clsplat.photos.appearance import ViewColours
+from clsplat.photos.depths import PointDepths
+from clsplat.photos.photographs import Photograph, apply_mask, known_gradient
+from clsplat.photos.transforms import LearnedTransform, PhotographTransform, Planes, learned_of, name_of
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.schedule import Schedule, at_step
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.own_gaussians import PhotographDistractors
-from clsplat.training.sky import LearnedSky
-from clsplat.views.backgrounds import Backgrounds
-from clsplat.views.known_depths import PointDepths
-from clsplat.views.learned import LearnedTransform, learned_of, name_of
-from clsplat.views.photograph_poses import PhotographPoses
-from clsplat.views.photographs import Photograph, apply_mask
-from clsplat.views.texture import known_gradient
-from clsplat.views.transforms import PhotographTransform, Planes
-from clsplat.views.transients import Transients, without_transients
-from clsplat.views.view_colours import ViewColours
+from clsplat.training.modules.camera_optimizer import PhotographPoses
+from clsplat.training.modules.distractors import PhotographDistractors
+from clsplat.training.modules.random_background import Backgrounds
+from clsplat.training.modules.sky import LearnedSky
+from clsplat.training.modules.transients import Transients, without_transients
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 

@@ -1,0 +1,1 @@
+"""What people look at: the viewer page, charts, video."""

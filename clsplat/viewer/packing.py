@@ -6,7 +6,7 @@
               is origin + unit · sign(t) (e^|t| - 1): as fine as cameras in the middle see it, near and far
     quats     [N] uint32: index of the largest component in bits 31-30, the others, from x on, 10 bits each
     scales    [3, N], opacity [1, N], colours [3 K, N] uint8: indices; colours by coefficient, then channel
-    motion    [columns, N] float16, where the model moves: those of clsplat/formats/motion.py, the turn as change of
+    motion    [columns, N] float16, where the model moves: those of clsplat/formats/splats.py, the turn as change of
               the unit quaternion above, x, y, z, w
 
 All numbers are little-endian.  Splats stand in LEVELS parts of falling importance, so that the first parts alone show
@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.formats.motion import degree_of, fields_of
 from clsplat.formats.packing import morton_order, smallest_three
-from clsplat.formats.splats import MAX_LOG
+from clsplat.formats.splats import MAX_LOG, fields_of, motion_degree_of
 from clsplat.gaussians.model import Model
 
 BLOCK = 256  # splats
@@ -163,7 +162,7 @@ def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArra
 def _motion_header(columns: int) -> dict[str, int]:
     """What the page needs to know of the columns: their number, that of the powers above the first, and the turn's."""
     turn = fields_of(columns).get("turn")
-    return {"columns": columns, "bends": degree_of(columns) - 1, "turns": turn.start if turn else 0}
+    return {"columns": columns, "bends": motion_degree_of(columns) - 1, "turns": turn.start if turn else 0}
 
 
 def _table(values: NDArray[np.floating]) -> Floats:

@@ -2,20 +2,49 @@
 
 import base64
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from clsplat.errors import OutputError
-from clsplat.files import write_text
-from clsplat.pages.page import inline, render
-from clsplat.reading import read_file
-from clsplat.scene.stand import Stand
-from clsplat.viewer.cameras import stand_data
+from clsplat.core.errors import OutputError
+from clsplat.core.files import write_text
+from clsplat.core.page import embedded, inline, render, shrunk
+from clsplat.core.reading import read_file
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import View
+from clsplat.scene.viewpoint import Stand
 from clsplat.viewer.packing import Packed
+
+# Cameras as the scripts of a page read them.
+
+
+def stand_data(stand: Stand) -> dict[str, Any]:
+    """Return where a page begins to look, as main.js reads it."""
+    return {
+        "pivot": rounded(stand.pivot),
+        "up": rounded(stand.up),
+        "radius": stand.radius,
+        "focal": stand.focal,
+        "start": camera_data(stand.start),
+    }
+
+
+def camera_data(view: View) -> dict[str, Any]:
+    """Return a view's pose, by rows, and its lens as camera.js reads them."""
+    c = view.camera
+    moment = {} if view.time is None else {"time": view.time}
+    lens = [c.fx, c.fy, c.cx, c.cy, c.width, c.height]
+    return {"pose": rounded(view.world_to_camera.ravel()), "lens": lens, **moment}
+
+
+def rounded(values: NDArray[np.floating]) -> list[float]:
+    """Return numbers as short as single precision reads them."""
+    return [float(f"{value:.9g}") for value in np.asarray(values, np.float64).tolist()]
+
 
 FOLDER = Path(__file__).parent
 SCRIPTS = (
@@ -138,3 +167,46 @@ def joined(names: Sequence[str], others: Sequence[str] = ()) -> str:
 def style() -> str:
     """Return the style of the page."""
     return (FOLDER / "viewer.css").read_text("utf-8")
+
+
+# The views of a page: cameras, thumbnails, and photographs as far as a budget of bytes goes.
+
+Which = Literal["none", "test", "all"]  # views whose photographs are in the page
+THUMBNAIL, LARGEST = 128, 1000  # px, the longer side
+BUDGET = 4.0  # MB of photographs
+Image = NDArray[np.uint8]
+
+
+def described(
+    scene: Scene,
+    read: Callable[[View], Image],
+    which: Which,
+    budget: float = BUDGET,
+    through: Callable[[Iterable[View]], Iterable[View]] = lambda views: views,
+) -> list[dict[str, Any]]:
+    """Return every view of a scene as photographs.js reads it.
+
+    read: returns a photograph, RGB at the camera's size; budget: MB of photographs, of which every second, third, …
+    is left out until the others fit; through: what the views pass, such as a display of progress.
+    """
+    test = {view.name for view in scene.split("test")}
+    views: list[dict[str, Any]] = []
+    for view in through(scene.views):
+        pixels, split = read(view), "test" if view.name in test else "train"
+        wanted = which == "all" or which == split
+        photograph = embedded(shrunk(pixels, LARGEST)) if wanted else None
+        thumbnail = embedded(shrunk(pixels, THUMBNAIL))
+        views.append(
+            {"name": view.name, "split": split, "thumbnail": thumbnail, "photograph": photograph, **camera_data(view)}
+        )
+    held = [view for view in views if view["photograph"]]
+    for i in left_out([len(view["photograph"]) for view in held], round(1e6 * budget)):
+        held[i]["photograph"] = None
+    return views
+
+
+def left_out(sizes: list[int], budget: int) -> set[int]:
+    """Return the indices to leave out, so that every n-th stays and their sum is at most `budget`."""
+    every = next((n for n in range(1, len(sizes) + 1) if sum(sizes[::n]) <= budget), len(sizes) + 1)
+    kept = set(range(0, len(sizes), every)) if every <= len(sizes) else set()
+    return set(range(len(sizes))) - kept

@@ -15,7 +15,7 @@ import clsplat
 from clsplat.api.arguments import overrides
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.scene.scene import Scene, make_scene
 from tests.support.models import model_of
 

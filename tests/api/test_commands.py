@@ -9,9 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 import clsplat
-from clsplat import terminal
 from clsplat.cli import app
-from clsplat.errors import ConfigError, DataError
+from clsplat.core import terminal
+from clsplat.core.errors import ConfigError, DataError
 from tests.support.commands import process
 
 pytestmark = pytest.mark.slow

@@ -11,9 +11,9 @@ import pytest
 from clsplat.api import device as devices
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case, with_world_filter
-from clsplat.errors import NumericError
+from clsplat.core.errors import NumericError
 from clsplat.gaussians.model import Model, Rendering
-from clsplat.opencl import program
+from clsplat.opencl import device as program
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 SIZE = 33, 21  # px: neither side is whole tiles

@@ -7,8 +7,8 @@ import pytest
 
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.motion import still
-from clsplat.gaussians.tables import PARAMETERS
 from tests.support.models import model_of
 
 torch = pytest.importorskip("torch")

@@ -13,15 +13,15 @@ import pytest
 import clsplat
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import ConfigError, DataError
 from clsplat.losses.base import Comparison
 from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, Dssim
+from clsplat.photos.photographs import Photographs
 from clsplat.render.camera import upload_camera
 from clsplat.render.workspace import Workspace
 from clsplat.training import trainer as steps
-from clsplat.views.photographs import Photographs
 from tests.support.models import equal
 
 pytestmark = pytest.mark.slow

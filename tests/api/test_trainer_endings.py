@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import clsplat
+from clsplat.core.errors import ClsplatError, ConfigError, NumericError
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import ClsplatError, ConfigError, NumericError
-from clsplat.stages.schedule import RaiseSh
-from clsplat.views.photographs import Photographs
+from clsplat.photos.photographs import Photographs
+from clsplat.stages.densify import RaiseSh
 from tests.support.models import equal
 
 pytestmark = pytest.mark.slow

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from clsplat import cli
-from clsplat.errors import ClsplatError, OutputError
-from clsplat.files import write_text
+from clsplat.core.errors import ClsplatError, OutputError
+from clsplat.core.files import write_text
 from clsplat.opencl.device import Device
 from tests.support.commands import process as clsplat
 
@@ -120,7 +120,7 @@ def test_a_plugin_that_fails_is_code_2(tiny_scene, tmp_path):
 STOPPING_PLUGIN = """
 from typing import Literal
 
-from clsplat.stages.base import Scheduled
+from clsplat.training.stage import Scheduled
 
 class Stopping(Scheduled):
     '''Fails.'''

@@ -12,14 +12,14 @@ from unittest.mock import ANY
 import pytest
 
 from clsplat.cli.app import ORDER, SYNONYMS
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
+from clsplat.core.resources import full_version
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
+from clsplat.pipeline.overrides import settable
 from clsplat.pipeline.recipes import copy, manual, summaries, summary
-from clsplat.pipeline.settable import settable
 from clsplat.runs.status import run_status, status_text
 from clsplat.training.records import Records
-from clsplat.version import full_version
 from tests.support.commands import clsplat, process
 from tests.support.runs import train, write_status
 

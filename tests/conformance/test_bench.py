@@ -6,19 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.bench.cases import Case, Result, run_bench
-from clsplat.bench.comparison import beside, read_measurement
-from clsplat.bench.floors import Work
-from clsplat.bench.peaks import Peaks
-from clsplat.bench.scenes import case, synthetic
-from clsplat.bench.table import table
-from clsplat.errors import ConfigError
-from clsplat.formats.motion import MOTION
-from clsplat.gaussians.tables import INTERVAL2, PARAMETERS
-from clsplat.pages.columns import text_table
+from clsplat.conformance.bench.cases import Case, Peaks, Result, Work, case, run_bench, synthetic
+from clsplat.conformance.bench.measurement import beside, read_measurement, table
+from clsplat.core.errors import ConfigError
+from clsplat.core.text_table import text_table
+from clsplat.formats.splats import MOTION, PARAMETERS
+from clsplat.gaussians.gaussians import INTERVAL2
+from clsplat.photos.photographs import Photograph
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
-from clsplat.views.photographs import Photograph
 
 SIZE = (64, 48, 300)  # width, height, Gaussians
 

@@ -9,8 +9,8 @@ import pytest
 from clsplat.conformance import supervision, worker
 from clsplat.conformance.check import Note
 from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS
-from clsplat.opencl.program import parse_kernels
-from clsplat.version import resource_dir
+from clsplat.core.resources import resource_dir
+from clsplat.opencl.device import parse_kernels
 from tests.support.figures import hold
 
 

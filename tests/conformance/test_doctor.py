@@ -13,19 +13,15 @@ import pytest
 import clsplat
 from clsplat import cli
 from clsplat.conformance import doctor, reference, supervision
-from clsplat.conformance.check import Check, Note
+from clsplat.conformance.check import Check, Figure, Note
 from clsplat.conformance.checks import BY_NAME, KERNELS, SPEED, whole
-from clsplat.conformance.comparison import Figure
-from clsplat.conformance.doctor import examine
-from clsplat.conformance.page import report_page
-from clsplat.conformance.report import DeviceReport
+from clsplat.conformance.doctor import DeviceReport, examine, judge, report_page
 from clsplat.conformance.supervision import Result, supervised
-from clsplat.conformance.verdict import judge
-from clsplat.errors import ConfigError, MemoryLimitError, OutputError
+from clsplat.core.errors import ConfigError, MemoryLimitError, OutputError
+from clsplat.core.machine import is_alive
 from clsplat.opencl import runtimes
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import resolve_schedule
-from clsplat.processes import is_alive
 from tests.support.doctor_worker import worker
 from tests.support.html_page import Page
 
@@ -118,7 +114,7 @@ def test_a_process_is_given_time_for_its_code(monkeypatch, info, end, fault):
 
 def test_device_that_cannot_open_for_lack_of_memory_is_reported(monkeypatch, info):
     script = (
-        "import sys; from clsplat.conformance import worker; from clsplat.errors import MemoryLimitError\n"
+        "import sys; from clsplat.conformance import worker; from clsplat.core.errors import MemoryLimitError\n"
         "def refuse(*_): raise MemoryLimitError('opening it: no memory')\n"
         "worker.Device = refuse; worker.main(int(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:4], sys.argv[4:])"
     )
@@ -307,7 +303,7 @@ def test_the_verdict_is_printed_where_the_page_fails_at_the_end(monkeypatch, cap
         raise OutputError("page.html: cannot be written (No space left on device)")
 
     worker(monkeypatch)
-    monkeypatch.setattr("clsplat.conformance.page.write_page", full)
+    monkeypatch.setattr("clsplat.conformance.doctor.write_page", full)
     monkeypatch.setattr(sys, "argv", ["clsplat", "doctor", "--html", str(tmp_path / "page.html")])
     with pytest.raises(SystemExit) as ended:
         cli.main()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.conformance.reference import Camera, cones, field
+from clsplat.conformance.reference import Camera, nerf
 
 SAMPLES, STEP = 5, 1e-5
 
@@ -17,14 +17,14 @@ def some_cones(rng: np.random.Generator, count: int = 3) -> np.ndarray:
     """Rays of a camera that is turned and moved."""
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     pose = np.column_stack([turn * np.linalg.det(turn), [0.3, -0.2, 4.0]])
-    return cones.cones(Camera(pose, 20.0, 24.0, 7.5, 5.0, 16, 12), rng.integers(0, 192, count))
+    return nerf.cones(Camera(pose, 20.0, 24.0, 7.5, 5.0, 16, 12), rng.integers(0, 192, count))
 
 
 def test_ray_meets_pixel_center_and_cone_has_its_width(rng):
     camera = Camera(np.eye(3, 4), 20.0, 24.0, 8.0, 6.0, 16, 12)
-    (ray,) = cones.cones(camera, np.array([3 * 16 + 5]))
+    (ray,) = nerf.cones(camera, np.array([3 * 16 + 5]))
     np.testing.assert_allclose(ray[3:6], [(5.5 - 8) / 20, (3.5 - 6) / 24, 1])
-    neighbour = cones.cones(camera, np.array([3 * 16 + 6]))[0]
+    neighbour = nerf.cones(camera, np.array([3 * 16 + 6]))[0]
     assert ray[6] == pytest.approx(np.linalg.norm(neighbour[3:6] - ray[3:6]) * 2 / np.sqrt(12))
     assert ray[7] == pytest.approx(np.linalg.norm(ray[3:6]))
 
@@ -33,7 +33,7 @@ def test_the_moments_of_a_frustum_are_those_of_points_in_it(rng):
     (ray,) = some_cones(rng, 1)
     ray[6] = 0.2  # a wide cone
     t0, t1 = 1.0, 2.5
-    means, variances = cones.frustums(ray[None], np.array([[t0, t1]]))
+    means, variances = nerf.frustums(ray[None], np.array([[t0, t1]]))
     t = (t0**3 + rng.random(400_000) * (t1**3 - t0**3)) ** (1 / 3)  # sections grow with the square of the distance
     along = ray[3:6] / ray[7]
     one = np.cross(along, [0.0, 0.6, 0.8])
@@ -55,14 +55,14 @@ def test_features_are_mean_sines_of_a_normal_distribution(rng):
         for function in (np.sin, np.cos)
         for degree in range(3)
     ]
-    np.testing.assert_allclose(cones.encoded_frustums(mean, variance, 3)[0, 0], np.concatenate(expected), atol=1e-9)
+    np.testing.assert_allclose(nerf.encoded_frustums(mean, variance, 3)[0, 0], np.concatenate(expected), atol=1e-9)
 
 
 def test_fine_edges_are_where_the_weights_are():
     edges = np.linspace(2, 6, 9)
     weights = np.zeros(8)
     weights[5] = 1.0
-    fine = cones.fine_edges(edges, weights, 100)
+    fine = nerf.fine_edges(edges, weights, 100)
     assert (np.diff(fine) >= 0).all()
     inside = (fine >= edges[4]) & (fine <= edges[7])  # the interval and its neighbours: weights are blurred
     assert inside.mean() > 0.95
@@ -70,11 +70,11 @@ def test_fine_edges_are_where_the_weights_are():
 
 def test_even_weights_leave_edges_even():
     edges = np.linspace(2, 6, 9)
-    np.testing.assert_allclose(cones.fine_edges(edges, np.full(8, 0.1), 16), np.linspace(2, 6, 17), atol=1e-6)
+    np.testing.assert_allclose(nerf.fine_edges(edges, np.full(8, 0.1), 16), np.linspace(2, 6, 17), atol=1e-6)
 
 
 def test_drawn_coarse_edges_keep_their_order(rng):
-    edges = cones.coarse_edges(2, 6, 8, rng.random(9))
+    edges = nerf.coarse_edges(2, 6, 8, rng.random(9))
     assert (np.diff(edges) > 0).all()
     assert edges[0] >= 2
     assert edges[-1] <= 6
@@ -82,7 +82,7 @@ def test_drawn_coarse_edges_keep_their_order(rng):
 
 @pytest.mark.parametrize("skip", [None, 0, 1])
 def test_the_gradient_of_a_field_is_that_of_finite_differences(rng, skip):
-    network, rays, width, position, direction = field.Network(3, skip), 2, 4, 6, 5
+    network, rays, width, position, direction = nerf.Network(3, skip), 2, 4, 6, 5
     joined = [position if i - 1 == skip and skip is not None else 0 for i in range(3)]
     shapes = [(position, width), (width + joined[1], width), (width + joined[2], width)]
     shapes += [(width, 1), (width, width), (width + direction, width), (width, 3)]
@@ -92,10 +92,10 @@ def test_the_gradient_of_a_field_is_that_of_finite_differences(rng, skip):
     lengths, background = rng.uniform(0.1, 0.5, (rays, SAMPLES)), np.array([1.0, 0.5, 0.2])
     wanted = rng.random((rays, 3))
 
-    def composite() -> tuple[field.Composite, field.Inputs]:
+    def composite() -> tuple[nerf.Composite, nerf.Inputs]:
         colours, densities, inputs = network.forward(weights, positions, directions)
         shaped = colours.reshape(rays, SAMPLES, 3), densities.reshape(rays, SAMPLES)
-        return field.Composite(*shaped, lengths, background), inputs
+        return nerf.Composite(*shaped, lengths, background), inputs
 
     def loss() -> float:
         return float(((composite()[0].colours() - wanted) ** 2).sum())
@@ -117,7 +117,7 @@ def test_the_gradient_of_a_field_is_that_of_finite_differences(rng, skip):
 
 
 def test_weights_of_a_ray_and_what_is_left_sum_to_one(rng):
-    found = field.Composite(rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 5)), np.full((2, 5), 0.3), np.ones(3))
+    found = nerf.Composite(rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 5)), np.full((2, 5), 0.3), np.ones(3))
     weights, left = found.weights()
     np.testing.assert_allclose(weights.sum(axis=1) + left[:, -1], 1)
     np.testing.assert_allclose(found.samples[1], np.log1p(np.exp(found.raw_densities - 1)))

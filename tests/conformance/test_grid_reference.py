@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from clsplat.conformance.reference import field
-from clsplat.conformance.reference.grid import Level
-from clsplat.fields.grid import FEATURES, GridShape
-from clsplat.fields.shape import FieldShape
+from clsplat.conformance.reference import nerf
+from clsplat.conformance.reference.nerf import Level
+from clsplat.nerf.shape import FEATURES, FieldShape, GridShape
 
 STEP = 1e-6
 
@@ -22,7 +21,7 @@ def rng() -> np.random.Generator:
 @pytest.mark.parametrize("level", [Level(3, 64), Level(7, 16)], ids=["dense", "shared"])
 def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
     """Through a network that reads the position twice, for samples inside and outside of the cube."""
-    samples, network = 12, field.Network(2, 0)
+    samples, network = 12, nerf.Network(2, 0)
     at, variances = rng.uniform(-0.2, 1.2, (samples, 3)), rng.uniform(1e-3, 1e-1, samples)
     table, sines, direction = (
         rng.normal(size=(level.entries, 2)),
@@ -33,7 +32,7 @@ def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
     weights = [(rng.normal(0, 0.7, shape), rng.normal(0, 0.5, shape[1])) for shape in shapes]
     by_colours, by_densities = rng.normal(size=(samples, 3)), rng.normal(size=(samples, 1))
 
-    def outputs() -> tuple[np.ndarray, np.ndarray, field.Inputs]:
+    def outputs() -> tuple[np.ndarray, np.ndarray, nerf.Inputs]:
         position = np.concatenate([level.forward(table, at, variances), sines], axis=1)
         return network.forward(weights, position, direction)
 

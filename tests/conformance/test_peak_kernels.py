@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.bench.peaks import measure_peaks
+from clsplat.conformance.bench.cases import measure_peaks
 
 
 @pytest.mark.parametrize("items", [1, 15, 16, 17, 64, 65])

@@ -6,11 +6,10 @@ import pytest
 
 from clsplat.conformance.check import Check, Note
 from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS, SPEED
-from clsplat.opencl import program
-from clsplat.opencl.device import Device
+from clsplat.core.resources import resource_dir
+from clsplat.opencl import device as program
+from clsplat.opencl.device import Device, parse_kernels
 from clsplat.opencl.discovery import choose
-from clsplat.opencl.program import parse_kernels
-from clsplat.version import resource_dir
 from tests.support.devices import NAMES
 
 pytestmark = pytest.mark.slow  # most programs are built anew

@@ -14,14 +14,15 @@ import pyopencl as cl
 import pytest
 
 import clsplat
-from clsplat import processes
-from clsplat.conformance import checks, host, quick, supervision, uses
+from clsplat.conformance import checks, host, quick, supervision
+from clsplat.conformance import quick as uses
 from clsplat.conformance import worker as worker_process
 from clsplat.conformance.check import Check
 from clsplat.conformance.checks import ESSENTIAL
 from clsplat.conformance.doctor import examine
 from clsplat.conformance.scenes import random_case
-from clsplat.errors import DeviceError, MemoryLimitError
+from clsplat.core import machine
+from clsplat.core.errors import DeviceError, MemoryLimitError
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import tuning_of
 from clsplat.render.tiles import known_sort
@@ -129,7 +130,7 @@ def test_the_first_processes_of_two_containers_have_a_mark_each(monkeypatch, tmp
     """An orderly end of one says nothing of the other."""
     marks = []
     for namespace in ("pid:[1]", "pid:[2]"):
-        monkeypatch.setattr(processes, "_pid_namespace", lambda namespace=namespace: namespace)
+        monkeypatch.setattr(machine, "_pid_namespace", lambda namespace=namespace: namespace)
         monkeypatch.setattr(uses, "_own", set())
         uses.begin([tmp_path / "conformance" / "record"])
         marks += uses._own

@@ -17,8 +17,8 @@ from types import SimpleNamespace
 import platformdirs
 import pytest
 
-from clsplat.caches import cache_folder
-from clsplat.errors import OutputError
+from clsplat.core.errors import OutputError
+from clsplat.core.machine import cache_folder
 from clsplat.opencl import runtimes
 from clsplat.opencl.device import Device
 from clsplat.opencl.kernel_caches import damaged_kernels, kernel_caches, remove_cut_kernels

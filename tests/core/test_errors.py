@@ -11,7 +11,7 @@ import pytest
 import clsplat
 import clsplat.data_tools
 from clsplat import cli
-from clsplat.errors import (
+from clsplat.core.errors import (
     MESSAGE_LIMIT,
     QUOTE_LIMIT,
     DataError,

@@ -1,4 +1,4 @@
-"""Files are read by `clsplat.reading` alone, which takes regular files only; and what happens where they are none."""
+"""Files are read by `clsplat.core.reading` alone, which takes regular files only; and what happens where they are none."""
 
 import ast
 import json
@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 import clsplat
+from clsplat.core.errors import ClsplatError, ConfigError, DataError
+from clsplat.core.manifest import Made, hash_of
 from clsplat.data_tools.video import write_frames
-from clsplat.errors import ClsplatError, ConfigError, DataError
-from clsplat.manifest import Made, hash_of
 from clsplat.pipeline import recipes
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.plugins import digest_of
-from clsplat.runs.summary import summary
-from clsplat.scene import decoding
+from clsplat.pipeline.plugins import digest_of
+from clsplat.runs.status import summary
+from clsplat.scene import identity
 from clsplat.training import archive
 from tests.support.timeouts import failing
 
@@ -24,23 +24,23 @@ METHODS = {"read_text", "read_bytes", "file_digest"}
 FUNCTIONS = {"json.load", "np.load", "np.fromfile", "cv2.imread", "cv2.VideoCapture", "os.open", "tarfile.open"}
 FUNCTIONS |= {"zipfile.ZipFile"}
 ALLOWED = {  # module and function -> why it reads by itself
-    "clsplat/reading.py:regular": "the place where files are opened",
-    "clsplat/reading.py:sha256": "the place where they are hashed",
-    "clsplat/streams.py": "opens the null device",
-    "clsplat/files.py:_sync": "syncs what was written",
+    "clsplat/core/reading.py:regular": "the place where files are opened",
+    "clsplat/core/reading.py:sha256": "the place where they are hashed",
+    "clsplat/core/signals.py": "opens the null device",
+    "clsplat/core/files.py:_sync": "syncs what was written",
     "clsplat/training/archive.py:read": "takes a file that `regular` has opened",
     "clsplat/training/archive.py:write": "writes",
-    "clsplat/lock.py:check_free": "locks what it opens",
-    "clsplat/lock.py:_opened": "opens for writing too",
-    "clsplat/formats/sog_files.py:sog_files": "takes the bytes that `reading` has read",
-    "clsplat/formats/sog_writing.py:_zipped": "writes",
-    "clsplat/video/encoding.py:opened": "syncs what it has written",
-    "clsplat/video/encoding.py:frames_of": "decodes what was written before",
-    "clsplat/video/webm.py:without_chance": "changes what was written before",
+    "clsplat/core/lock.py:check_free": "locks what it opens",
+    "clsplat/core/lock.py:_opened": "opens for writing too",
+    "clsplat/formats/sog.py:sog_files": "takes the bytes that `reading` has read",
+    "clsplat/formats/sog.py:_zipped": "writes",
+    "clsplat/viewer/video/encoding.py:opened": "syncs what it has written",
+    "clsplat/viewer/video/encoding.py:frames_of": "decodes what was written before",
+    "clsplat/viewer/video/encoding.py:without_chance": "changes what was written before",
     "clsplat/viewer/page.py": "reads files of the package",
-    "clsplat/live/page.py": "reads files of the package",
+    "clsplat/runs/live/server.py": "reads files of the package",
     "clsplat/conformance/quick.py:_hash_of": "reads files of the package",
-    "clsplat/opencl/program.py": "reads kernels, of the package and of plug-ins: code that is trusted",
+    "clsplat/opencl/device.py": "reads kernels, of the package and of plug-ins: code that is trusted",
     "clsplat/opencl/runtimes.py": "reads files of the system's loader, before clsplat can be imported",
     "clsplat/conformance/host.py:available_memory": "reads what the kernel tells, which has no size",
     "clsplat/opencl/kernel_caches.py:_start_of_the_machine": "reads what the kernel tells, which has no size",
@@ -79,7 +79,7 @@ def reads(path: Path) -> set[str]:
 def test_files_are_read_in_one_place():
     found = {one for room in ("clsplat", "data_tools") for path in (ROOT / room).rglob("*.py") for one in reads(path)}
     known = {one for one in found for place in ALLOWED if one == place or one.startswith(f"{place}:")}
-    assert sorted(found - known) == [], "read with clsplat.reading, or say in ALLOWED why not"
+    assert sorted(found - known) == [], "read with clsplat.core.reading, or say in ALLOWED why not"
     unused = [place for place in ALLOWED if not any(one == place or one.startswith(f"{place}:") for one in found)]
     assert unused == [], "is not needed any more"
 
@@ -127,10 +127,10 @@ def test_records_of_ours_that_are_pipes_count_as_missing(pipe, tmp_path, monkeyp
         pipe.rename(tmp_path / ".made.jsonl")
         assert not Made(tmp_path).knows(tmp_path / "x.png")
         os.mkfifo(tmp_path / "known.txt")
-        monkeypatch.setattr(decoding, "cache_folder", lambda: tmp_path)
+        monkeypatch.setattr(identity, "cache_folder", lambda: tmp_path)
         (tmp_path / "decoded").mkdir()
-        os.mkfifo(tmp_path / "decoded" / f"opencv-{decoding.cv2.__version__}.txt")
-        assert decoding.Memory()._known == {}
+        os.mkfifo(tmp_path / "decoded" / f"opencv-{identity.cv2.__version__}.txt")
+        assert identity.Memory()._known == {}
 
 
 def test_a_pipeline_that_is_no_text_is_not_copied(tmp_path):

@@ -11,16 +11,15 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat import files
-from clsplat.errors import OutputError
-from clsplat.files import append, atomic, write_text
-from clsplat.manifest import RECORD as RECORD_OF_A_TOOL
-from clsplat.manifest import Made
-from clsplat.prepare.cache import RECORD, Planned, prepare
-from clsplat.prepare.place import STEPS, _show
+from clsplat.core import files
+from clsplat.core.errors import OutputError
+from clsplat.core.files import append, atomic, write_text
+from clsplat.core.manifest import RECORD as RECORD_OF_A_TOOL
+from clsplat.core.manifest import Made
+from clsplat.core.settings import Settings
+from clsplat.prepare.cache import RECORD, STEPS, Planned, _show, prepare
 from clsplat.prepare.steps import Step
-from clsplat.runs import folders
-from clsplat.settings import Settings
+from clsplat.runs import run_folder
 from clsplat.training import checkpoint
 from tests.support.commands import clsplat as command
 from tests.support.runs import NO_PROCESS
@@ -55,7 +54,7 @@ def test_what_a_process_still_writes_is_not_swept(tmp_path):
         path.write_text("x")
     with atomic(tmp_path / "c") as file:
         file.write(b"x")
-        with folders.opened(tmp_path, "new", step=0):
+        with run_folder.opened(tmp_path, "new", step=0):
             pass
     assert (tmp_path / "c").read_bytes() == b"x"
     assert other.exists()
@@ -64,7 +63,7 @@ def test_what_a_process_still_writes_is_not_swept(tmp_path):
 
 def test_process_killed_at_any_write_leaves_what_is_swept_next(tmp_path):
     code = (
-        "import os, signal, sys; from pathlib import Path; from clsplat.files import atomic\n"
+        "import os, signal, sys; from pathlib import Path; from clsplat.core.files import atomic\n"
         "with atomic(Path(sys.argv[1]) / 'a.txt') as file:\n"
         "    file.write(b'x'); file.flush(); os.kill(os.getpid(), signal.SIGKILL)"
     )
@@ -131,7 +130,7 @@ def test_checkpoint_and_records_are_synced_before_old_ones_go(tiny_scene, tmp_pa
 
 @has_proc
 def test_a_run_folder_is_on_the_disk_with_the_folders_above_it(tmp_path, calls):
-    with folders.opened(tmp_path / "a" / "run", "new"):
+    with run_folder.opened(tmp_path / "a" / "run", "new"):
         synced = [name for kind, name in calls if kind == "sync"]
     assert {tmp_path.name, "a"} <= {*synced}
 

@@ -15,13 +15,13 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 import clsplat
-from clsplat import holder as holder_file
-from clsplat import lock
-from clsplat.errors import OutputError
-from clsplat.names import LOCK
-from clsplat.processes import Owner
-from clsplat.runs import folders
-from clsplat.runs.default_folder import free_folder
+from clsplat.core import lock
+from clsplat.core import lock as holder_file
+from clsplat.core.errors import OutputError
+from clsplat.core.files import LOCK
+from clsplat.core.machine import Owner
+from clsplat.runs import run_folder
+from clsplat.runs.run_folder import free_folder
 from clsplat.training import status as writing
 from tests.support.commands import clsplat as command
 
@@ -111,7 +111,7 @@ no_windows = pytest.mark.skipif(sys.platform == "win32", reason="has no fcntl to
 def test_of_many_that_want_a_folder_at_once_one_has_it(before, tmp_path):
     code = before + (
         "import sys, time; from pathlib import Path; from clsplat import lock\n"
-        "from clsplat.errors import OutputError\n"
+        "from clsplat.core.errors import OutputError\n"
         "folder, n = Path(sys.argv[1]), 0\n"
         "for _ in range(60):\n"
         "    try:\n"
@@ -327,7 +327,7 @@ def test_a_run_that_was_silent_and_goes_on_notices_who_took_over(tmp_path, monke
 
 def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "BEAT", 0.002)
-    with folders.opened(tmp_path / "run", "new") as status:
+    with run_folder.opened(tmp_path / "run", "new") as status:
         pass
     (tmp_path / "run" / "status.json").write_text("of the next")
     status._thread.join(5)

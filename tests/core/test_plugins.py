@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from clsplat import plugins
+from clsplat.core.errors import ConfigError, as_clsplat_error
+from clsplat.core.settings import Settings, variants
 from clsplat.density.edit import Rule
-from clsplat.errors import ConfigError, as_clsplat_error
+from clsplat.pipeline import plugins
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import readers
-from clsplat.settings import Settings, variants
 from tests.support.runs import train
 
 ROOT = Path(__file__).parents[2]
@@ -58,7 +58,7 @@ def test_a_class_in_a_file_is_a_variant(tmp_path):
 def test_a_curve_in_a_file_is_a_schedule(tmp_path):
     text = """
 import math
-from clsplat.schedule import Curve
+from clsplat.core.schedule import Curve
 
 class Wave(Curve):
     mean: float
@@ -83,7 +83,7 @@ def test_shipped_pipelines_name_no_plugin():
 
 
 def test_the_schema_knows_plugins(tmp_path):
-    from clsplat.pipeline.schema import json_schema
+    from clsplat.pipeline.recipes import json_schema
 
     plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
     assert "Nothing" in json_schema()["$defs"]
@@ -308,7 +308,7 @@ def test_a_taken_name_is_found_in_the_first_call_of_a_process(tmp_path):
 import clsplat
 try:
     clsplat.load_plugin({str(file)!r})
-except clsplat.errors.ConfigError as error:
+except clsplat.core.errors.ConfigError as error:
     print(error)
 clsplat.check("splat")
 """
@@ -388,7 +388,7 @@ def test_a_run_with_a_plugin_resumes_only_with_it(tiny_scene, tmp_path):
 
 
 def test_a_comparison_says_which_plugins_are_missing(tiny_scene, tmp_path, caplog):
-    from clsplat.compare.page import write_comparison
+    from clsplat.sweeps.compare.page import write_comparison
 
     plugins.load_file(EXAMPLES / "opacity_entropy.py")
     out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]").out

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from clsplat import processes
-from clsplat.processes import Owner
+from clsplat.core import machine
+from clsplat.core.machine import Owner
 
 
 def test_a_number_counts_in_its_own_namespace(monkeypatch):
@@ -17,7 +17,7 @@ def test_a_number_counts_in_its_own_namespace(monkeypatch):
     assert Owner.named_by(asdict(this)) == this
     assert Owner.named_by({"process": this.process}) == this, "an older file says no more"
     for elsewhere in ({"host": "another"}, {"pid_namespace": "pid:[1]"}):
-        monkeypatch.setattr(processes, "is_alive", lambda process: False)
+        monkeypatch.setattr(machine, "is_alive", lambda process: False)
         other = replace(this, **elsewhere)
         assert not other.is_here
         assert not other.has_ended, "nothing is known of it"
@@ -27,9 +27,9 @@ def test_a_number_counts_in_its_own_namespace(monkeypatch):
 def test_a_process_before_the_machine_started_again_has_ended(monkeypatch, tmp_path):
     """Its number may be another's by now.  In containers, host name and namespace may be those of two machines."""
     boot = tmp_path / "boot_id"
-    monkeypatch.setattr(processes, "BOOT_ID", boot)
-    for namespace, ended in ((processes.FIRST_PID_NAMESPACE, True), ("pid:[4026532000]", False), (None, False)):
-        monkeypatch.setattr(processes, "_pid_namespace", lambda namespace=namespace: namespace)
+    monkeypatch.setattr(machine, "BOOT_ID", boot)
+    for namespace, ended in ((machine.FIRST_PID_NAMESPACE, True), ("pid:[4026532000]", False), (None, False)):
+        monkeypatch.setattr(machine, "_pid_namespace", lambda namespace=namespace: namespace)
         boot.write_text("first\n")
         before = Owner.this()
         assert (before.boot, before.is_here, before.has_ended) == ("first", True, False)
@@ -80,8 +80,8 @@ def test_a_process_of_windows_is_probed_without_ending_it(code, error, alive, mo
         CloseHandle=Function(lambda handle: handles.remove(handle.value)),
     )
     monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.setattr(processes.ctypes, "WinDLL", lambda name, use_last_error: kernel, raising=False)
-    monkeypatch.setattr(processes.ctypes, "get_last_error", lambda: error, raising=False)
-    monkeypatch.setattr(processes.os, "kill", lambda *arguments: pytest.fail("it would end the process"))
-    assert processes.is_alive(1234) is alive
+    monkeypatch.setattr(machine.ctypes, "WinDLL", lambda name, use_last_error: kernel, raising=False)
+    monkeypatch.setattr(machine.ctypes, "get_last_error", lambda: error, raising=False)
+    monkeypatch.setattr(machine.os, "kill", lambda *arguments: pytest.fail("it would end the process"))
+    assert machine.is_alive(1234) is alive
     assert handles == [], "the handle is closed"

@@ -6,12 +6,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from clsplat import progress, terminal
+from clsplat.core import progress, terminal
+from clsplat.core.progress import Count, Progress, clock, heard_by, watched
 from clsplat.prepare.cache import Planned, prepare
-from clsplat.prepare.steps import FindFeatures, MapCameras
-from clsplat.progress import Count, Progress, clock, heard_by, watched
+from clsplat.prepare.steps import FindFeatures, MapCameras, photographs_text
 from clsplat.runs.opening import READ_SCENE, counts_of
-from clsplat.training.found import photographs_text
 from clsplat.training.status import StatusFile
 
 

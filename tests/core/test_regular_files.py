@@ -7,18 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.bench.comparison import read_measurement
-from clsplat.errors import ConfigError, DataError
+from clsplat.conformance.bench.measurement import read_measurement
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.reading import read_file, read_json
 from clsplat.formats.table import detect
 from clsplat.formats.table import read as read_ply
-from clsplat.metrics.lpips import Lpips
+from clsplat.metrics.perceptual import Lpips
 from clsplat.pipeline.loading import load
-from clsplat.reading import read_file, read_json
-from clsplat.scene.colmap_binary import cameras_binary
-from clsplat.scene.colmap_text import cameras_text
+from clsplat.scene.colmap import cameras_binary, cameras_text
 from clsplat.scene.images import read_header, read_image
 from clsplat.scene.points import read_points_ply
-from clsplat.scene.transforms import Transforms
+from clsplat.scene.transforms_json import Transforms
 from clsplat.training.records import Records
 from tests.support.timeouts import failing
 

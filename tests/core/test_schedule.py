@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import Every, at_step
 from clsplat.losses.image import L1
 from clsplat.pipeline.loading import load
-from clsplat.schedule import Every, at_step
 
 POINTS = [[100, 0.8], [200, 0.4], [300, 4.0]]
 STEPS = {"points": POINTS, "between": "steps"}

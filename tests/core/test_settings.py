@@ -6,16 +6,16 @@ from typing import Literal
 
 import pytest
 
+from clsplat.core.errors import ConfigError
+from clsplat.core.settings import OneOf, Settings, descriptions, rebuild, tag_of, variants
 from clsplat.density.edit import Edit, Rule
-from clsplat.errors import ConfigError
 from clsplat.losses.base import ImageLoss, Loss, Penalty
+from clsplat.photos.sampling import Order, Paper
+from clsplat.photos.transforms import PhotographTransform
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.pipeline.schema import json_schema
-from clsplat.settings import OneOf, Settings, descriptions, rebuild, tag_of, variants
-from clsplat.stages.base import Scheduled, Stage
+from clsplat.pipeline.recipes import json_schema
 from clsplat.training.run import Run
-from clsplat.views.order import Order, Paper
-from clsplat.views.transforms import PhotographTransform
+from clsplat.training.stage import Scheduled, Stage
 
 PIPELINE = """\
 name: small
@@ -121,7 +121,7 @@ def test_two_variants_of_one_name_are_refused():
     with pytest.raises(ConfigError) as error:
         variants(Order)
     assert str(error.value) == (
-        "two variants of Order have the name 'paper': clsplat.views.order.Paper and tests.core.test_settings.Other; "
+        "two variants of Order have the name 'paper': clsplat.photos.sampling.Paper and tests.core.test_settings.Other; "
         "rename one"
     )
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from clsplat import cli, streams, terminal
-from clsplat.errors import OutputError
+from clsplat import cli
+from clsplat.core import signals, terminal
+from clsplat.core.errors import OutputError
 from clsplat.runs import opening
 
 full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
@@ -122,8 +123,8 @@ class Broken:
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), BrokenPipeError(32, "x"), ValueError("closed")])
 def test_what_prints_never_fails_and_what_is_wanted_is_missed(error, monkeypatch):
     monkeypatch.setattr(sys, "stdout", Broken(error))
-    monkeypatch.setattr(streams.STDOUT, "fault", None)
-    streams.STDOUT.install()
+    monkeypatch.setattr(signals.STDOUT, "fault", None)
+    signals.STDOUT.install()
     print("by a plug-in")
     terminal.remark("by a command")
     if isinstance(error, BrokenPipeError):
@@ -137,9 +138,9 @@ def test_what_prints_never_fails_and_what_is_wanted_is_missed(error, monkeypatch
 
 def test_a_signal_within_a_write_loses_its_line_alone(monkeypatch):
     monkeypatch.setattr(sys, "stdout", Broken(RuntimeError("reentrant call inside <_io.BufferedWriter>")))
-    monkeypatch.setattr(streams.STDOUT, "fault", None)
+    monkeypatch.setattr(signals.STDOUT, "fault", None)
     terminal.remark("finishing the step")
-    assert streams.STDOUT.fault is None
+    assert signals.STDOUT.fault is None
 
 
 ENDS = {

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from clsplat import lock, processes
-from clsplat.errors import OutputError
-from clsplat.names import LOCK
+from clsplat.core import lock, machine
+from clsplat.core.errors import OutputError
+from clsplat.core.files import LOCK
 
 pytest.importorskip("fcntl", reason="what they change is of POSIX")
 pytestmark = pytest.mark.slow
@@ -49,8 +49,8 @@ def test_missing_locks_are_warned_of_and_a_dead_owner_replaced(tmp_path, without
 
 def test_the_owner_before_a_start_of_the_machine_has_ended(tmp_path, without_locks, monkeypatch):
     """Its number is that of a living process by now."""
-    monkeypatch.setattr(processes, "_pid_namespace", lambda: processes.FIRST_PID_NAMESPACE)
-    monkeypatch.setattr(processes, "_boot", lambda: "now")
+    monkeypatch.setattr(machine, "_pid_namespace", lambda: machine.FIRST_PID_NAMESPACE)
+    monkeypatch.setattr(machine, "_boot", lambda: "now")
     owned_by(tmp_path, process=os.getppid(), boot="before")
     with lock.held(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["boot"] == "now"

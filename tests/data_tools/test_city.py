@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat.core.errors import DataError
 from clsplat.data_tools.city import FLIGHT, City
 from clsplat.data_tools.synthetic import Options, write_dataset
-from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
 
 TINY = City(size=16, train=4, test=1, lots=3)

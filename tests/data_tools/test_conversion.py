@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from clsplat import cli
+from clsplat.core.errors import DataError
 from clsplat.data_tools import resize as resize_tool
 from clsplat.data_tools import video as video_tool
 from clsplat.data_tools.masks import write_masks
 from clsplat.data_tools.resize import write_pyramid
 from clsplat.data_tools.video import sharpest, write_frames
-from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import read_image
 from tests.support.colmap_writer import CameraEntry, ColmapModel, ImageEntry, write_scene

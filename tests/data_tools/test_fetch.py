@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat.core.errors import ConfigError
 from clsplat.data_tools import fetch as fetching
 from clsplat.data_tools.fetch import Source, fetch, named
-from clsplat.errors import ConfigError
 from tests.support.refusals import refusal
 
 

@@ -11,11 +11,11 @@ import pytest
 from numpy.typing import NDArray
 
 from clsplat import cli
+from clsplat.core.errors import DataError, OutputError
 from clsplat.data_tools import synthetic
 from clsplat.data_tools.shapes import Box, Cylinder, Shape, Sphere
 from clsplat.data_tools.still_life import SCENE
 from clsplat.data_tools.synthetic import STILL_LIFE, Options, write_dataset
-from clsplat.errors import DataError, OutputError
 from clsplat.scene.points import read_points_ply
 
 Array = NDArray[Any]

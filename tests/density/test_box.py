@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from clsplat.density.box import Box
+from clsplat.density.control import Box
 from clsplat.formats.table import read
 from clsplat.scene.detect import read_scene
 from tests.support.runs import digest, train

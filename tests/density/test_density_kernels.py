@@ -5,12 +5,14 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case, with_world_filter
-from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
 from clsplat.density.control import cap_opacity, densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import SceneScale
-from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
+from clsplat.formats.splats import PARAMETERS
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.structs import moment_tables
+from clsplat.methods.adc import Clone, PruneFaint, PruneLarge, Split
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clsplat.cadence import is_act, places
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import is_act, places
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import Axis, fewest_steps, in_steps, last_edit, with_steps
-from clsplat.stages.training import Training
+from clsplat.training.stage import Training
 from tests.support.pipelines import TRAINING
 
 

@@ -4,13 +4,13 @@ from typing import Literal
 
 import pytest
 
+from clsplat.core.errors import Interrupted
+from clsplat.core.progress import Progress
+from clsplat.core.settings import rebuild
 from clsplat.density.edit import Edit, Rule
-from clsplat.errors import Interrupted
-from clsplat.gaussians.tables import Gaussians
+from clsplat.gaussians.gaussians import Gaussians
 from clsplat.pipeline.loading import load
-from clsplat.progress import Progress
 from clsplat.runs import opening, runner
-from clsplat.settings import rebuild
 from tests.support.runs import train
 
 pytestmark = pytest.mark.slow

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.scenes import random_case
-from clsplat.density.control import densify
+from clsplat.core.errors import MemoryLimitError
+from clsplat.density.control import apply_edit, densify
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.rows import apply_edit
 from clsplat.density.statistics import SplatStats
 from clsplat.density.thresholds import SceneScale
-from clsplat.errors import MemoryLimitError
-from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
+from clsplat.formats.splats import PARAMETERS
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.structs import moment_tables
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.tiles import Tiler
 from clsplat.render.workspace import Workspace

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.comparison import relative_error
+from clsplat.conformance.check import relative_error
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
-from clsplat.density.basic import Clone, PruneFaint, Split
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.losses.base import ViewGradients
+from clsplat.methods.adc import Clone, PruneFaint, Split
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 

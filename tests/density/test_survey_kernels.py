@@ -8,12 +8,12 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import Case, random_case, safe_case
-from clsplat.density.contribution import sensitivities
+from clsplat.density.control import sensitivities
 from clsplat.density.survey import BLENDED, SQUARE, WEIGHT, Look, Survey
 from clsplat.losses.image import L1, Dssim
 from clsplat.opencl.device import Device
+from clsplat.photos.photographs import Mask, Photograph
 from clsplat.render.rasterizer import PIXEL_SUMS, Budget, Rasterizer
-from clsplat.views.photographs import Mask, Photograph
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 SIZES = [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 24, 24)]

@@ -13,17 +13,16 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat.cli import app
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.files import check_no_file_of_a_run
+from clsplat.core.harmonics import basis
 from clsplat.density.mixture import mass_of
-from clsplat.errors import ConfigError, DataError
-from clsplat.formats.model_files import bytes_of
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import inverse_opacities, opacities
-from clsplat.formats.table import CODECS, detect, read, write
-from clsplat.gaussians.checkup import examine, lines, verdict
+from clsplat.formats.table import CODECS, bytes_of, detect, read, write
 from clsplat.gaussians.conversion import transform_of
 from clsplat.gaussians.model import Rendering, load
-from clsplat.harmonics import basis
-from clsplat.results import check_no_file_of_a_run
+from clsplat.gaussians.validate import examine, lines, verdict
 from clsplat.viewer.packing import pack
 from tests.support.models import splats
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clsplat.errors import DataError
-from clsplat.formats.glb import write_glb
+from clsplat.core.errors import DataError
+from clsplat.core.reading import sha256
+from clsplat.formats.gltf_usd import write_glb
 from clsplat.formats.splats import Writing, opacities, unit
 from clsplat.formats.table import detect, read, write
 from clsplat.gaussians.model import Model, load
-from clsplat.reading import sha256
 from tests.support.models import angles, assert_close, glued, interop, parts, splats, there_and_back
 
 KHR = "KHR_gaussian_splatting"
@@ -208,7 +208,7 @@ def test_json_that_cannot_be_read_is_told_in_words(text, words, tmp_path):
 
 
 def test_json_that_is_too_long_is_told_with_the_limit(tmp_path, rng, monkeypatch):
-    monkeypatch.setattr("clsplat.formats.glb.MAX_JSON", 100)
+    monkeypatch.setattr("clsplat.formats.gltf_usd.MAX_JSON", 100)
     write(tmp_path / "a.glb", splats(rng, 4, 0))
     with pytest.raises(DataError, match=r"its JSON has \d+ bytes; expected 100 at most"):
         read(tmp_path / "a.glb")

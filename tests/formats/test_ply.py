@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.scenes import random_case
-from clsplat.errors import DataError, OutputError
+from clsplat.core.errors import DataError, OutputError
 from clsplat.formats import ply
 from clsplat.formats.ply import write_ply
+from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import read as read_ply
 from clsplat.gaussians.model import Rendering, load
-from clsplat.gaussians.tables import PARAMETERS
 from tests.support.data_sets import data_set
 
 

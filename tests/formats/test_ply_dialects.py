@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
 from clsplat.formats.compressed_ply import CHUNK
 from clsplat.formats.packing import morton_order
 from clsplat.formats.ply import write_ply

@@ -7,17 +7,26 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from clsplat.formats import sh_rounding
+from clsplat.core.harmonics import basis, mean_basis
+from clsplat.formats import sog_quantize
 from clsplat.formats.packing import morton_order
-from clsplat.formats.sh_rounding import base_for, rounded_rows, steps, usual_step, visible_form
-from clsplat.formats.sh_tree import LEVELS, tree_palette
+from clsplat.formats.sog_quantize import (
+    LARGEST,
+    SH_LEVELS,
+    base_for,
+    before_a_gap,
+    log_weights,
+    rounded_rows,
+    steps,
+    tree_palette,
+    usual_step,
+    visible_form,
+)
 from clsplat.formats.splats import SH_C0, SplatFile, Writing, unit
 from clsplat.formats.table import write
-from clsplat.formats.weights import LARGEST, before_a_gap, log_weights
+from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import Sky
-from clsplat.gaussians.sky_splats import with_sky_splats
-from clsplat.harmonics import basis, mean_basis
 from tests.support.models import splats, there_and_back
 
 
@@ -168,10 +177,10 @@ def test_rounding_is_the_same_in_any_blocks(rows, rng, monkeypatch):
     form = visible_form(rest)
     table = rest.astype(np.float64).reshape(150, 8, 3)
     moments = np.einsum("nkc,nlc->kl", table, table)
-    expected = 8 * moments / np.trace(moments) + sh_rounding.ISOTROPIC * np.eye(8)
+    expected = 8 * moments / np.trace(moments) + sog_quantize.ISOTROPIC * np.eye(8)
     np.testing.assert_allclose(form, expected, atol=0.02)
     found = rounded_rows(rest, step, form)
-    monkeypatch.setattr(sh_rounding, "ROWS", rows)
+    monkeypatch.setattr(sog_quantize, "ROWS", rows)
     np.testing.assert_array_equal(visible_form(rest), form)
     np.testing.assert_array_equal(rounded_rows(rest, step, form), found)
     assert np.isfinite(rounded_rows(0 * rest, step, visible_form(0 * rest))).all()
@@ -264,8 +273,8 @@ def test_a_palette_for_neighbours_has_the_means_of_its_parts(count, entries, rng
     sums = np.zeros((len(vectors), 45))
     np.add.at(sums, labels, np.exp2(weights)[:, None] * rest)
     means = sums / np.bincount(labels, np.exp2(weights))[:, None]
-    np.testing.assert_allclose(np.rint(vectors * LEVELS), vectors * LEVELS)
-    assert np.abs(vectors - means).mean() < 16 / LEVELS
+    np.testing.assert_allclose(np.rint(vectors * SH_LEVELS), vectors * SH_LEVELS)
+    assert np.abs(vectors - means).mean() < 16 / SH_LEVELS
     for _ in range(2):
         np.testing.assert_array_equal(tree_palette(rest, weights, entries, 1.0)[1], labels)
 
@@ -287,14 +296,14 @@ def test_a_palette_that_the_model_had_before_is_shared_by_all(rng):
     rest = few[rng.integers(0, 300, 2000)]
     vectors, labels = tree_palette(rest, rng.normal(size=2000), 400, 1.0)
     assert len(vectors) <= 300
-    assert np.abs(vectors[labels] - rest).mean() < 4 / LEVELS
+    assert np.abs(vectors[labels] - rest).mean() < 4 / SH_LEVELS
 
 
 def test_small_harmonics_have_smaller_steps(rng):
     rest = rng.normal(0, 0.1, (500, 45))
     assert usual_step(rest, 4.0, 6.0) == 6
     assert usual_step(np.zeros((0, 45)), 4.0, 6.0) < 1
-    np.testing.assert_allclose(usual_step(rest / 10, 4.0, 6.0), 4 * 0.01 / sh_rounding.USUAL, rtol=0.05)
+    np.testing.assert_allclose(usual_step(rest / 10, 4.0, 6.0), 4 * 0.01 / sog_quantize.USUAL, rtol=0.05)
 
 
 def test_sog_has_the_models_shape_and_converts_again_losslessly(tmp_path, rng):

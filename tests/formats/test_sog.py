@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError, OutputError
+from clsplat.core.errors import DataError, OutputError
 from clsplat.formats.packing import morton_order
 from clsplat.formats.palette import ENTRIES, codebook, nearest, palette
 from clsplat.formats.splats import Writing

@@ -8,7 +8,7 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.formats.packing import morton_order
 from clsplat.formats.palette import ENTRIES, codebook
-from clsplat.formats.sog_steps import LEVELS, rounded, rounded_means, rounded_opacities, rounded_quats, weighed_means
+from clsplat.formats.sog_quantize import LEVELS, rounded, rounded_means, rounded_opacities, rounded_quats, weighed_means
 from clsplat.formats.splats import Writing, opacities, unit
 from clsplat.formats.table import write
 from tests.support.models import splats, there_and_back

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.formats.splats import opacities
 from clsplat.formats.table import detect, read, write
 from tests.support.models import angles, assert_close, interop, ksplat, splats, there_and_back

@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.formats.packing import morton_order
+from clsplat.formats.sog_quantize import log_weights
 from clsplat.formats.splats import Reading, Writing
 from clsplat.formats.table import detect, read, write
-from clsplat.formats.weights import log_weights
 from tests.support.models import angles, assert_close, interop, splats, there_and_back
 
 UNTURNED = Reading(axes="ply")

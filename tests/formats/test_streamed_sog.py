@@ -9,19 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, DataError, OutputError
-from clsplat.files import new_folder
-from clsplat.formats import lod
-from clsplat.formats.lod_tree import Limits, half_boxes, tree
-from clsplat.formats.lod_writing import write_lod
-from clsplat.formats.model_files import bytes_of
+from clsplat.core.errors import ConfigError, DataError, OutputError
+from clsplat.core.files import new_folder
+from clsplat.formats import streamed_sog
 from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import SplatFile, Writing
-from clsplat.formats.table import detect, read, write
-from clsplat.gaussians.checkup import examine, verdict
+from clsplat.formats.streamed_sog import Limits, half_boxes, tree, write_lod
+from clsplat.formats.table import bytes_of, detect, read, write
 from clsplat.gaussians.conversion import convert
 from clsplat.gaussians.model import load
-from clsplat.lod.levels import levels_of_detail
+from clsplat.gaussians.validate import examine, verdict
+from clsplat.workflows.lod import levels_of_detail
 from tests.support.models import assert_close, interop, splats
 from tests.support.runs import NO_PROCESS
 
@@ -292,9 +290,9 @@ def test_a_damaged_one_is_refused_in_a_line(written, name):
 
 def test_the_tree_is_walked_once_whatever_the_number_of_levels(written, monkeypatch):
     folder, _ = written
-    walks, real = [], lod._leaves
-    monkeypatch.setattr(lod, "_leaves", lambda path, tree: walks.append(path) or real(path, tree))
-    assert lod.faults_of_levels(folder / "lod-meta.json") == []
+    walks, real = [], streamed_sog._leaves
+    monkeypatch.setattr(streamed_sog, "_leaves", lambda path, tree: walks.append(path) or real(path, tree))
+    assert streamed_sog.faults_of_levels(folder / "lod-meta.json") == []
     assert len(walks) == 1
 
 

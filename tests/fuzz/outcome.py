@@ -4,7 +4,7 @@ import signal
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from clsplat.errors import MESSAGE_LIMIT, ConfigError, DataError
+from clsplat.core.errors import MESSAGE_LIMIT, ConfigError, DataError
 
 SECONDS = 60  # of a reader that hangs; a small file takes milliseconds
 Result = TypeVar("Result")

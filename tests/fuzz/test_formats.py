@@ -10,13 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError
-from clsplat.formats.lod_tree import Limits
-from clsplat.formats.lod_writing import write_lod
-from clsplat.formats.model_files import bytes_of
+from clsplat.core.errors import ConfigError
 from clsplat.formats.splats import Reading, Writing
-from clsplat.formats.table import CODECS, detect, read, write
-from clsplat.gaussians.checkup import examine
+from clsplat.formats.streamed_sog import Limits, write_lod
+from clsplat.formats.table import CODECS, bytes_of, detect, read, write
+from clsplat.gaussians.validate import examine
 from tests.fuzz.mutation import damaged, fuzzed, misbuilt, one_of
 from tests.fuzz.outcome import outcome
 from tests.support.models import glued, ksplat, parts, splats

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.compare.run_folder import read_metrics
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.pipeline.settable import settable
+from clsplat.pipeline.overrides import settable
+from clsplat.runs.results import read_metrics
 from clsplat.training.records import Records
 from tests.fuzz.mutation import WORDS, damaged, fuzzed, one_of
 from tests.fuzz.outcome import outcome

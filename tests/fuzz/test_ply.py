@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.formats.ply import write_ply
+from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import detect
 from clsplat.gaussians.model import load
-from clsplat.gaussians.tables import PARAMETERS
 from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud
 from tests.fuzz.mutation import damaged, fuzzed

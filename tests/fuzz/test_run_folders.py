@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.fields.shape import FieldShape
+from clsplat.core.files import INPUTS
+from clsplat.core.reading import sha256
 from clsplat.gaussians.model import Rendering
 from clsplat.gaussians.sky import Sky, sky_beside
-from clsplat.names import INPUTS
-from clsplat.reading import sha256
+from clsplat.nerf.files import FieldModel, load_field
+from clsplat.nerf.shape import FieldShape
 from clsplat.runs.verify import verify
 from clsplat.training import archive
-from clsplat.training.field_file import FieldModel, load_field
 from clsplat.training.status import read_status
 from tests.fuzz.mutation import damaged, fuzzed
 from tests.fuzz.outcome import outcome

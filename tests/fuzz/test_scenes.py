@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.inspect.inspection import Inspection
+from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene.detect import read_scene
 from tests.fuzz.mutation import damaged, fuzzed
 from tests.fuzz.outcome import outcome

@@ -11,10 +11,10 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
 from clsplat.formats.palette import LEVELS, HostClusters, palette
-from clsplat.formats.sog_writing import Harmonics
-from clsplat.gaussians import members
+from clsplat.formats.sog import Harmonics
+from clsplat.gaussians import clusters as members
 from clsplat.gaussians.clusters import AT_ONCE, DeviceClusters, most_alike
-from clsplat.gaussians.tables import Gaussians
+from clsplat.gaussians.gaussians import Gaussians
 from tests.support.models import splats
 
 

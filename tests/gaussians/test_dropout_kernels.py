@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.dropout import DROPOUT, dropout_figures, hidden_figures
+from clsplat.conformance.checks.training import DROPOUT, dropout_figures, hidden_figures
 from clsplat.conformance.scenes import random_case, with_world_filter
-from clsplat.gaussians.tables import Dropout
+from clsplat.gaussians.gaussians import Dropout
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.figures import hold
 

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.reference import sh_basis
 from clsplat.conformance.scenes import random_case, with_world_filter
-from clsplat.errors import OutputError
+from clsplat.core.errors import OutputError
+from clsplat.core.harmonics import basis, rotated_sh
 from clsplat.gaussians.model import Model, Rendering, load
-from clsplat.harmonics import basis, rotated_sh
 from clsplat.scene.view import View
 from tests.support.html_page import HOSTILE, Page
 from tests.support.models import WIDTHS, model_of

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, DataError, OutputError
-from clsplat.formats.motion import MOTION, STILL, WIDTHS, columns_of, width_of
-from clsplat.gaussians.merging import merged
+from clsplat.core.errors import ConfigError, DataError, OutputError
+from clsplat.formats.splats import MOTION, STILL, WIDTHS, columns_of, width_of
+from clsplat.gaussians.conversion import merged
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.motion import presence, still
 from clsplat.gaussians.sky import Sky

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.depths import depth_figures, gradients_of, inverse_depths, losses_of_depths
-from clsplat.conformance.comparison import relative_error
+from clsplat.conformance.check import relative_error
+from clsplat.conformance.checks.blending import depth_figures, gradients_of, inverse_depths, losses_of_depths
 from clsplat.conformance.scenes import random_case, safe_case
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.losses.depth import InverseDepth
-from clsplat.losses.entropy import WeightEntropy
-from clsplat.losses.image import L1
+from clsplat.losses.image import L1, WeightEntropy
 from clsplat.opencl.device import Device
-from clsplat.scene.tracks import Tracks
+from clsplat.photos.depths import PointDepths, nearest_in_pixels
+from clsplat.scene.scene import Tracks
 from clsplat.stages.optimize import Optimize
-from clsplat.views.known_depths import PointDepths, nearest_in_pixels
 from tests.support.device_images import trainer_of
 from tests.support.figures import hold, same_of_schedules
 

@@ -9,14 +9,14 @@ from clsplat.density.statistics import SplatStats
 from clsplat.losses.depth import InverseDepth
 from clsplat.losses.image import L1
 from clsplat.metrics.views import render_floats
+from clsplat.photos.depths import PointDepths
+from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import upload_camera
 from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.scene.tracks import Tracks
+from clsplat.scene.scene import Tracks
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
-from clsplat.views.known_depths import PointDepths
-from clsplat.views.photographs import Photograph
 
 DEPTH, BEGUN, STEPS, NAMES = 4.0, 3.4, 160, ["0", "1", "2"]
 RATES = Rates(means=8e-3, quats=0, log_scales=1e-3, logit_opacity=1e-2, sh_base=1e-2, sh_rest=0)

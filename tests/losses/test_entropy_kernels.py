@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
+from clsplat.conformance.check import GRADIENT, relative_error
 from clsplat.conformance.checks.blending import BACKGROUND, dim
 from clsplat.conformance.checks.images import comparison_of
-from clsplat.conformance.comparison import GRADIENT, relative_error
 from clsplat.conformance.scenes import Case, random_case, safe_case
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.losses.base import Comparison
-from clsplat.losses.entropy import WeightEntropy
 from clsplat.losses.host import HostLoss
-from clsplat.losses.image import L1
+from clsplat.losses.image import L1, WeightEntropy
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Budget, Rasterizer
 from clsplat.stages.optimize import Optimize

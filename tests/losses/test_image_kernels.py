@@ -8,12 +8,12 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.images import LOSSES, camera_of, comparison_of, loss_figures
 from clsplat.conformance.checks.images import pictures as images
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
+from clsplat.core.settings import variants
 from clsplat.losses.base import ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, ssim_maps
+from clsplat.photos.photographs import Photograph, apply_mask, unpack
 from clsplat.render.workspace import Workspace
-from clsplat.settings import variants
-from clsplat.views.photographs import Photograph, apply_mask, unpack
 from tests.support.device_images import SIZES, gradient_of
 from tests.support.figures import hold
 

@@ -5,7 +5,8 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
-from clsplat.gaussians.tables import INTERVAL2, Gradients
+from clsplat.gaussians.gaussians import INTERVAL2
+from clsplat.gaussians.structs import Gradients
 from clsplat.losses.base import LossValue, PenaltyInputs
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
 from clsplat.render.workspace import Workspace

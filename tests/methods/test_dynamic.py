@@ -13,13 +13,13 @@ import pytest
 
 import clsplat
 from clsplat.api.renderer import Renderer
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.data_tools.moving import Moving
 from clsplat.data_tools.synthetic import write_dataset
-from clsplat.errors import ConfigError, DataError
-from clsplat.formats.motion import MOTION
+from clsplat.formats.splats import MOTION
 from clsplat.gaussians.model import load
-from clsplat.gaussians.tables import moment_tables
-from clsplat.stages.first_motion import drift, moving
+from clsplat.gaussians.structs import moment_tables
+from clsplat.stages.init_motion import drift, moving
 from clsplat.training import checkpoint
 from clsplat.training.memory import first_tables, plan
 from tests.support.recipes import ONE_THREAD, STEPS, digest, short, train
@@ -169,6 +169,6 @@ def test_points_among_those_of_all_times_begin_at_rest(rng):
 
 
 def load_settings():
-    from clsplat.filters import Motion
+    from clsplat.render.filters import Motion
 
     return Motion()

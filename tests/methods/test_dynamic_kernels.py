@@ -7,20 +7,20 @@ import pytest
 
 from clsplat.conformance.checks.motion import moving_case
 from clsplat.conformance.scenes import random_case
+from clsplat.core.errors import ConfigError
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
-from clsplat.density.motion import PruneAbsent, SplitInTime
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
-from clsplat.errors import ConfigError
-from clsplat.formats.motion import MOTION, width_of
+from clsplat.formats.splats import MOTION, PARAMETERS, width_of
+from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.motion import presence
-from clsplat.gaussians.tables import PARAMETERS, Gaussians
+from clsplat.methods.dynamic import PruneAbsent, SplitInTime
+from clsplat.photos.photographs import Photographs
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
-from clsplat.views.photographs import Photographs
 
 WIDTH = width_of(3, True)
 

@@ -7,17 +7,17 @@ from pydantic import ValidationError
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.images import comparison_of, pictures
 from clsplat.conformance.scenes import random_case
-from clsplat.density.basic import Clone
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
 from clsplat.density.thresholds import SceneScale
-from clsplat.gaussians.tables import SH_C0
+from clsplat.formats.splats import SH_C0
 from clsplat.losses.base import ViewGradients
 from clsplat.losses.image import L1, L2, Dssim, view_error
+from clsplat.methods.adc import Clone
+from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
-from clsplat.views.photographs import Photograph
 
 SIZES = ((1, 1), (5, 3), (16, 16), (17, 33), (255, 12), (257, 9), (600, 4))
 COLUMNS = ("screen_grad", "gain")

@@ -10,15 +10,15 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import Case, safe_case
 from clsplat.density.edit import Edit
-from clsplat.density.importance import drawn_weights
-from clsplat.density.sparing import PruneSpare, most, squared_error
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
-from clsplat.gaussians.tables import SH_C0
+from clsplat.formats.splats import SH_C0
+from clsplat.methods.error_pruning import PruneSpare, most, squared_error
+from clsplat.methods.mini_splatting import drawn_weights
 from clsplat.opencl.device import Device
+from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.views.photographs import Photograph
 
 BACKGROUND = np.array([0.25, 0.5, 0.125], np.float32)
 

@@ -8,18 +8,17 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import Case, random_case, safe_case
-from clsplat.density.accuracy import PruneInaccurate, PruneSampled, UngrowAccurate, Wrong, wrong_pixels
-from clsplat.density.basic import Clone, Split
-from clsplat.density.control import densify
+from clsplat.core.errors import ConfigError
+from clsplat.density.control import densify, drawn_order
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.sampling import drawn_order
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey, scaled
 from clsplat.density.thresholds import SceneScale
-from clsplat.errors import ConfigError
+from clsplat.methods.adc import Clone, Split
+from clsplat.methods.fastgs import PruneInaccurate, PruneSampled, UngrowAccurate, Wrong, wrong_pixels
 from clsplat.opencl.device import Device
+from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.views.photographs import Photograph
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 

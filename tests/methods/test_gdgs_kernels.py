@@ -5,13 +5,13 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
-from clsplat.density.basic import Clone
 from clsplat.density.control import densify
-from clsplat.density.crowding import CloneCrowded, cells_of
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import SceneScale
-from clsplat.gaussians.tables import Gaussians
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.methods.adc import Clone
+from clsplat.methods.gdgs import CloneCrowded, cells_of
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam

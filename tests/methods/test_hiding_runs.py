@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from clsplat.density.importance import useless
 from clsplat.formats.table import read as read_ply
-from clsplat.gaussians.tables import HIDDEN
+from clsplat.gaussians.gaussians import HIDDEN
+from clsplat.methods.mini_splatting import useless
 from clsplat.training import checkpoint
 from tests.support.runs import train
 

@@ -8,8 +8,8 @@ import pytest
 
 from clsplat.conformance.scenes import random_case
 from clsplat.formats.table import read as read_ply
-from clsplat.metrics.distribution import SHARES, distribution
-from clsplat.pages.svg import Line, curve
+from clsplat.metrics.views import SHARES, distribution
+from clsplat.viewer.charts import Line, curve
 from tests.support.runs import train
 
 pytestmark = pytest.mark.slow

@@ -5,16 +5,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.conformance.scenes import random_case
-from clsplat.density.basic import Clone, PruneFaint
-from clsplat.density.control import densify
-from clsplat.density.detail import SplitOversized, SplitTextured
+from clsplat.density.control import densify, largest
 from clsplat.density.edit import Edit
 from clsplat.density.mixture import covariance_of, mass_of, merged
-from clsplat.density.sampling import largest
 from clsplat.density.statistics import SEEN, SplatStats
-from clsplat.density.thinning import MergeNeighbours, PruneUnimportant
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale
-from clsplat.gaussians.tables import INTERVAL2
+from clsplat.gaussians.gaussians import INTERVAL2
+from clsplat.methods.adc import Clone, PruneFaint
+from clsplat.methods.micro_splatting import MergeNeighbours, PruneUnimportant, SplitOversized, SplitTextured
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
 

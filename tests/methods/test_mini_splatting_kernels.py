@@ -7,14 +7,14 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
-from clsplat.conformance.checks.compression import photograph_of
+from clsplat.conformance.checks.density import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
-from clsplat.density.contribution import Weights, largest_of
+from clsplat.density.control import Weights, largest_of
 from clsplat.density.edit import Edit
-from clsplat.density.importance import PruneUseless, drawn_weights, useless
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
+from clsplat.methods.mini_splatting import PruneUseless, drawn_weights, useless
 from clsplat.render.rasterizer import Rasterizer
 
 

@@ -7,13 +7,13 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
-from clsplat.conformance.checks.compression import photograph_of
+from clsplat.conformance.checks.density import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.edit import Edit
-from clsplat.density.outliers import PruneFar, PruneWide, largest_on_screen
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
+from clsplat.methods.outliers import PruneFar, PruneWide, largest_on_screen
 from clsplat.render.rasterizer import Rasterizer
 
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.comparison import GRADIENT, relative_error
+from clsplat.conformance.check import GRADIENT, relative_error
 from clsplat.conformance.scenes import Case, random_case, safe_case
-from clsplat.density.basic import Clone, PruneFaint
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.mixture import covariance_of
-from clsplat.density.saddle import UPPER, SplitSaddle, divided_logits, least_axes
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import SceneScale
-from clsplat.gaussians.tables import Gaussians
+from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
+from clsplat.methods.adc import Clone, PruneFaint
+from clsplat.methods.steepgs import UPPER, SplitSaddle, divided_logits, least_axes
 from clsplat.opencl.device import Array, Device
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace

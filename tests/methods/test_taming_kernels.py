@@ -9,16 +9,16 @@ from scipy.ndimage import convolve
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import random_case, safe_case
-from clsplat.density.basic import Clone, Split
 from clsplat.density.budget import Moment, Parabola
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
-from clsplat.density.score import GrowScored, PruneScored, by_median, view_scores
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
+from clsplat.methods.adc import Clone, Split
+from clsplat.methods.taming import GrowScored, PruneScored, by_median, view_scores
+from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.views.photographs import Photograph
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 

@@ -8,9 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 from clsplat.conformance import reference as ref
-from clsplat.errors import ConfigError, DataError
-from clsplat.metrics.lpips import Lpips
-from clsplat.metrics.perceptual import Perceptual, flip, metric_names, ms_ssim, ms_ssim_scales
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.metrics.perceptual import Lpips, Perceptual, flip, metric_names, ms_ssim, ms_ssim_scales
 from clsplat.stages.evaluate import Evaluate
 from tests.support.onnx_writer import distance_network
 

@@ -4,9 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.metrics.held_out import HELD_OUT, OTHERS, by_moment
-from clsplat.metrics.stillness import STILL, Stillness, means
-from clsplat.metrics.views import ViewMetrics, mean
+from clsplat.metrics.views import HELD_OUT, OTHERS, STILL, Stillness, ViewMetrics, by_moment, mean, means
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError
-from clsplat.fields.grid import GridShape
-from clsplat.fields.place import require_seen
-from clsplat.fields.shape import FieldShape
+from clsplat.core.errors import ConfigError
+from clsplat.nerf.shape import FieldShape, GridShape
+from clsplat.nerf.training import require_seen
 from clsplat.scene.camera import Camera
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View

@@ -11,26 +11,26 @@ import pytest
 from pydantic import ValidationError
 
 import clsplat
-from clsplat.compare.page import write_comparison
-from clsplat.errors import ConfigError, DataError, NotFiniteError
-from clsplat.fields.field import Field
-from clsplat.fields.shape import FieldShape
+from clsplat.core.errors import ConfigError, DataError, NotFiniteError
 from clsplat.gaussians.model import Rendering
+from clsplat.nerf.field import Field
+from clsplat.nerf.shape import FieldShape
+from clsplat.nerf.training import LearnedField
 from clsplat.opencl.device import open_device
+from clsplat.photos.sampling import ViewPool
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
-from clsplat.runs.prediction import Rehearsal
-from clsplat.runs.source import require_model
+from clsplat.runs.model_file import require_model
+from clsplat.runs.status import summary
 from clsplat.runs.steps_key import steps_key
-from clsplat.runs.summary import summary
+from clsplat.runs.time_budget import Rehearsal
 from clsplat.runs.verify import verify
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import read_image
 from clsplat.scene.view import View
 from clsplat.stages.train_field import TrainField
+from clsplat.sweeps.compare.page import write_comparison
 from clsplat.training import archive, checkpoint
-from clsplat.training.field import LearnedField
-from clsplat.views.order import ViewPool
 from tests.support.commands import clsplat as clsplat_command
 from tests.support.fields import PIPELINE, alone, bits, resumed
 from tests.support.runs import train
@@ -155,9 +155,10 @@ def test_a_description_of_a_run_tells_how_long_its_steps_take(tiny_scene, tmp_pa
 def test_a_field_is_trained_in_the_steps_that_fit_into_a_time(tiny_scene, tmp_path, pipeline, monkeypatch):
     """Schedules of the rate are stretched as those of Gaussians, and the pipeline that is written repeats the bits."""
     monkeypatch.setattr(
-        "clsplat.runs.minutes.rehearsals_of", lambda *given: [Rehearsal(12, [0.01], during=0.0, after=0.0, growth=0.0)]
+        "clsplat.runs.time_budget.rehearsals_of",
+        lambda *given: [Rehearsal(12, [0.01], during=0.0, after=0.0, growth=0.0)],
     )
-    monkeypatch.setattr("clsplat.runs.minutes.most_steps", lambda rehearsals, seconds: 24)
+    monkeypatch.setattr("clsplat.runs.time_budget.most_steps", lambda rehearsals, seconds: 24)
     out = clsplat.run(pipeline, tiny_scene, tmp_path / "run", minutes=0.002)
     (stage, *_) = load(str(out / "pipeline.yaml")).stages
     assert stage.warm_up == 4

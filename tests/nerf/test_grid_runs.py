@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, DataError, MemoryLimitError
-from clsplat.fields.shape import FieldShape
+from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
+from clsplat.nerf.shape import FieldShape
+from clsplat.nerf.training import field_plan
 from clsplat.pipeline.loading import load
 from clsplat.stages.train_field import TrainField
 from clsplat.training import archive
-from clsplat.training.field_memory import field_plan
 from tests.support.fields import PIPELINE, SHAPE, alone, bits, resumed
 from tests.support.runs import train
 

@@ -6,7 +6,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from clsplat.errors import DeviceError, MemoryLimitError, as_clsplat_error
+from clsplat.core.errors import DeviceError, MemoryLimitError, as_clsplat_error
 from clsplat.opencl import device as device_module
 from clsplat.opencl.device import Device
 

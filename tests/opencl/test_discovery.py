@@ -13,8 +13,9 @@ import pytest
 from pyopencl import _cl
 
 from clsplat.conformance.scenes import random_case
-from clsplat.errors import DeviceError, KernelError
-from clsplat.opencl import discovery, probe, program, runtimes
+from clsplat.core.errors import DeviceError, KernelError
+from clsplat.opencl import device as program
+from clsplat.opencl import discovery, probe, runtimes
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.opencl.kernel_caches import kernel_caches

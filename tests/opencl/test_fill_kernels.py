@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clsplat.opencl import program
+from clsplat.opencl import device as program
 from clsplat.opencl.device import Array
 
 

@@ -6,8 +6,8 @@ from pickle import UnpicklingError
 import pyopencl as cl
 import pytest
 
-from clsplat.errors import KernelError
-from clsplat.opencl.program import Program
+from clsplat.core.errors import KernelError
+from clsplat.opencl.device import Program
 
 
 def test_a_missing_kernel_file_is_named(device, tmp_path):

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import at_step
+from clsplat.photos.appearance import IDENTITY, ViewTable
 from clsplat.pipeline.loading import load
-from clsplat.schedule import at_step
-from clsplat.views.colours import IDENTITY, Affine, Auto, Gain
-from clsplat.views.photograph_colours import PhotographColours
-from clsplat.views.view_table import ViewTable
+from clsplat.training.modules.exposure import Affine, Auto, Gain, PhotographColours
 
 MODELS = pytest.mark.parametrize("model", [Gain(), Affine()], ids=lambda model: model.type)
 

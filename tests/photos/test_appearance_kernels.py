@@ -5,20 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.colours import colour_figures
+from clsplat.conformance.checks.appearance import colour_figures
 from clsplat.conformance.checks.images import camera_of, planes_of
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
-from clsplat.losses.entropy import WeightEntropy
-from clsplat.losses.image import L1, L2, Dssim
+from clsplat.losses.image import L1, L2, Dssim, WeightEntropy
+from clsplat.photos.appearance import IDENTITY, ViewTable
+from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
+from clsplat.training.modules.exposure import Affine, Gain, PhotographColours, change_colours
 from clsplat.training.trainer import Trainer
-from clsplat.views.colours import IDENTITY, Affine, Gain
-from clsplat.views.photograph_colours import PhotographColours, change_colours
-from clsplat.views.photographs import Photograph
-from clsplat.views.view_table import ViewTable
 from tests.support.figures import hold
 
 SMOOTH = (L2(),)

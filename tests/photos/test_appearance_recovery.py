@@ -13,13 +13,15 @@ from clsplat.metrics.images import psnr
 from clsplat.metrics.views import render_floats
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo
+from clsplat.photos.appearance import OwnColours
+from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
+from clsplat.training.modules.bilateral_grid import Grid
+from clsplat.training.modules.exposure import Gain
 from clsplat.training.trainer import Trainer
-from clsplat.views.colours import Gain, Grid, OwnColours
-from clsplat.views.photographs import Photograph
 
 VIEWS, STEPS = 8, 400
 RATES = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=2e-2, sh_rest=0)  # the colours alone are unknown

@@ -7,19 +7,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clsplat.compare.comparison import Comparison
-from clsplat.compare.tables import main_table
-from clsplat.errors import DataError
-from clsplat.pipeline.choices import without_choices
+from clsplat.core.errors import DataError
+from clsplat.photos.exposure_estimate import UNKNOWN, Exposures
+from clsplat.pipeline.capture_choice import without_choices
 from clsplat.pipeline.loading import load
-from clsplat.runs import folders, opening
-from clsplat.runs.found import has_ended
+from clsplat.runs import opening, run_folder
 from clsplat.runs.model_file import evaluate
-from clsplat.runs.single import run_pipeline
+from clsplat.runs.state import has_ended
+from clsplat.sweeps.compare.comparison import Comparison
+from clsplat.sweeps.compare.page import main_table
+from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
-from clsplat.training.colours import colours_beside, colours_of, settled
-from clsplat.views.colours import Affine, Auto, Gain
-from clsplat.views.exposures import UNKNOWN, Exposures
+from clsplat.training.modules.appearance import colours_beside, colours_of, settled
+from clsplat.training.modules.exposure import Affine, Auto, Gain
 from tests.support.exposed_wall import Wall
 from tests.support.runs import FEW, digest, killed, train
 
@@ -102,7 +102,7 @@ def test_where_colours_began_is_kept_with_them(rng, tmp_path):
     for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
         (tmp_path / "run" / name).unlink()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("clsplat.training.colours.exposures_of", lambda run: UNKNOWN)
+        patch.setattr("clsplat.training.modules.appearance.exposures_of", lambda run: UNKNOWN)
         again = train(tmp_path / "scene", tmp_path / "run", *gain, resume=True)
     assert again.numbers == run.numbers
 
@@ -159,7 +159,7 @@ def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
     photographs = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"]
     gains = np.log([np.diag(photographs[view.name]["matrix"]) for view in wall.views])
     assert gains == pytest.approx(wall.log_gains, abs=0.06), "twelve steps do not move them far"
-    with folders.opened(tmp_path / "run", "resume", step=0) as status:
+    with run_folder.opened(tmp_path / "run", "resume", step=0) as status:
         run = opening.open_run(load(str(tmp_path / "run" / "pipeline.yaml")), tmp_path / "run", None, "resume", status)
     assert run.settings.training.colours == found, "who goes on takes the choice"
 

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import choose
+from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
-from clsplat.runs.description import describe
+from clsplat.runs.describe import describe
 from clsplat.scene.detect import read_scene
 from clsplat.scene.view import load_image
-from clsplat.views.backgrounds import Backgrounds
-from clsplat.views.photographs import Photographs
+from clsplat.training.modules.random_background import Backgrounds
 from tests.support.runs import digest, train
 
 RANDOM = "optimize.background=random"

@@ -5,20 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.colour_grids import CASES, grid_figures, grids_of, table_figures
+from clsplat.conformance.checks.appearance import CASES, grid_figures, grids_of, table_figures
 from clsplat.conformance.checks.images import camera_of, planes_of
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.image import L2
+from clsplat.photos.appearance import GridTables
+from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
+from clsplat.training.modules.bilateral_grid import Grid, PhotographGrids
+from clsplat.training.modules.exposure import Affine, PhotographColours
 from clsplat.training.trainer import Trainer
-from clsplat.views.colours import Affine, Grid
-from clsplat.views.grid_tables import GridTables
-from clsplat.views.photograph_colours import PhotographColours
-from clsplat.views.photograph_grids import PhotographGrids
-from clsplat.views.photographs import Photograph
 from tests.support.figures import hold
 
 MORE = ((2, 1, (16, 16, 16)), (15, 4, (2, 2, 2)), (16, 16, (3, 3, 3)), (129, 65, (4, 4, 4)), (3, 257, (4, 16, 1)))

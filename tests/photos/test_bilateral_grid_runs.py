@@ -11,30 +11,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat import plugins
 from clsplat.api import commands
-from clsplat.conformance.checks.colour_grids import grids_of
+from clsplat.conformance.checks.appearance import grids_of
 from clsplat.conformance.checks.images import camera_of, planes_of
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.schedule import Decay, at_step
 from clsplat.opencl.device import Device
+from clsplat.photos.appearance import bytes_of
+from clsplat.pipeline import plugins
 from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
 from clsplat.runs.model_file import evaluate
-from clsplat.runs.summary import summary
-from clsplat.schedule import Decay, at_step
-from clsplat.training import archive, checkpoint, colour_grids, memory
-from clsplat.training.colours import colours_beside, photograph_colours
+from clsplat.runs.status import summary
+from clsplat.training import archive, checkpoint, memory
+from clsplat.training.modules import exposure
+from clsplat.training.modules.appearance import colours_beside, photograph_colours
+from clsplat.training.modules.bilateral_grid import Grid
+from clsplat.training.modules.exposure import Auto, Gain
 from clsplat.training.run import Run
-from clsplat.views.colours import Auto, Gain, Grid
-from clsplat.views.grid_tables import bytes_of
 from tests.support.runs import FEW, ONE_CORE, digest, killed, train
 
 PLAIN = '''
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 import numpy as np
-from clsplat.views.colours import IDENTITY, OwnColours
-from clsplat.views.view_colours import ViewColours, Written
+from clsplat.training.modules.exposure import IDENTITY, OwnColours
+from clsplat.photos.appearance import ViewColours, Written
 
 
 class Plain(OwnColours):
@@ -124,7 +126,7 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_grids, tiny_s
     files = [(folder / "view_colours.npy").read_bytes() for folder in (out, with_grids)]
     assert files[0] == files[1]
     _, tables = checkpoint.load(out / "checkpoints" / "step_000012.npz")
-    own, _ = archive.split(tables, colour_grids.FOLDER)
+    own, _ = archive.split(tables, exposure.FOLDER)
     assert own.keys() == {"values", "moment1", "moment2"}
     assert all((table == run.colour_grids.tables()[name]).all() for name, table in own.items())
     names = {view.name for view in run.scene.split("train")}
@@ -179,7 +181,7 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
     run = train(tiny_scene, tmp_path / "run", *GRID, *kept, "optimize.evaluate.every=4", wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     _, tables = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    own, _ = archive.split(tables, colour_grids.FOLDER)
+    own, _ = archive.split(tables, exposure.FOLDER)
     expected = own["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
     found = np.load(tmp_path / "run" / "view_colours.npy")
     assert (found == expected + np.eye(3, 4, dtype=np.float32)).all()
@@ -231,9 +233,9 @@ def test_a_dry_run_checks_them(tiny_scene, tmp_path):
 
 def test_damaged_tables_are_refused():
     good = {name: np.zeros((2, 12, 2, 1, 1), np.float32) for name in ("values", "moment1", "moment2")}
-    colour_grids.check_tables(good)
-    colour_grids.check_tables({"values": good["values"]})
-    colour_grids.check_tables({})
+    exposure.check_tables(good)
+    exposure.check_tables({"values": good["values"]})
+    exposure.check_tables({})
     for damaged in (
         {"values": good["values"][:, :5]},
         {**good, "moment2": good["values"][:1]},
@@ -242,26 +244,26 @@ def test_damaged_tables_are_refused():
         {**good, "moment1": good["values"] + np.float32(np.nan)},
     ):
         with pytest.raises(DataError, match=r"of its grids|other grids"):
-            colour_grids.check_tables(damaged)
+            exposure.check_tables(damaged)
 
 
 @pytest.mark.slow
 def test_a_checkpoint_that_lost_its_grids_is_refused(with_grids, tmp_path):
     notes, tables = archive.read(with_grids / "checkpoints" / "step_000012.npz")
-    left = {name: table for name, table in tables.items() if not name.startswith(colour_grids.FOLDER)}
+    left = {name: table for name, table in tables.items() if not name.startswith(exposure.FOLDER)}
     assert len(left) == len(tables) - 3
     with (tmp_path / "step_000012.npz").open("wb") as file:
         archive.write(file, notes, left.items())
     with pytest.raises(DataError, match="it has grids of the colours of 0 photographs, and its numbers name 8 rows"):
         checkpoint.load(tmp_path / "step_000012.npz")
-    own, _ = archive.split(tables, colour_grids.FOLDER)
+    own, _ = archive.split(tables, exposure.FOLDER)
     rows = {f"colours/{name}/row": float(row) for row, name in enumerate("abcdefgh")}
-    colour_grids.require_tables(own, rows)
+    exposure.require_tables(own, rows)
     for damage in ({"colours/h/row": 6.0}, {"colours/h/row": 500.0}, {"colours/a/row": 0.5}):
         with pytest.raises(DataError, match="grids of the colours of 8 photographs"):
-            colour_grids.require_tables(own, rows | damage)
+            exposure.require_tables(own, rows | damage)
     with pytest.raises(DataError, match="its numbers name 0 rows"):
-        colour_grids.require_tables(own, {})
+        exposure.require_tables(own, {})
 
 
 @pytest.mark.slow

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.reference import blurred
-from clsplat.conformance.reference.blur import averaged
+from clsplat.conformance.reference.images import averaged
+from clsplat.core.schedule import at_step
+from clsplat.photos.transforms import Blur, MeanFilter
 from clsplat.pipeline.loading import load
-from clsplat.schedule import at_step
 from clsplat.stages.optimize import Optimize
-from clsplat.views.transforms import Blur, MeanFilter
 from tests.support.device_images import colours_of, planes_of
 
 SIZES = ((1, 1), (2, 3), (15, 4), (16, 16), (17, 5), (33, 18), (63, 3), (64, 2), (65, 7))  # tiles and groups

@@ -7,12 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.photos.depths import FEWEST, MOST, DepthMaps, PointDepths, fitted
+from clsplat.pipeline.input_files import contents
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.places import contents
 from clsplat.render.camera import upload_camera
-from clsplat.views.depth_maps import FEWEST, MOST, DepthMaps, fitted
-from clsplat.views.known_depths import PointDepths
 from tests.support.outdoor_scene import HEIGHT, WIDTH, Yard
 from tests.support.runs import TWO_DOZEN, digest, train
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from tests.support.outdoor_scene import Yard, missing
 from tests.support.runs import TWO_DOZEN, digest, train
 

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import Decay
 from clsplat.density.budget import Moment, Momentum
-from clsplat.errors import ConfigError
+from clsplat.photos.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, course, knots
+from clsplat.photos.sampling import ViewSettings
 from clsplat.pipeline.loading import load
-from clsplat.schedule import Decay
 from clsplat.training.adam import Rates
-from clsplat.views.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, course, knots
-from clsplat.views.sampling import ViewSettings
 
 BOUNDS = np.linspace(0, 1, LEVELS + 1)
 NOISE = Spectrum(BOUNDS**2)  # as many amplitudes at every frequency of the plane

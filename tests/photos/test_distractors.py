@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.scenes import random_case
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
 from clsplat.formats.table import read as read_model
-from clsplat.gaussians.tables import DeviceModel, Gaussians
+from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
-from clsplat.training import checkpoint, own_gaussians
+from clsplat.training import checkpoint
 from clsplat.training.archive import split
-from clsplat.training.own_gaussians import NEAR, OwnGaussians, PhotographDistractors, first_tables
-from clsplat.views.distractors import Distractors
+from clsplat.training.modules import distractors
+from clsplat.training.modules.distractors import NEAR, Distractors, OwnGaussians, PhotographDistractors, first_tables
 from tests.support.runs import FEW, ONE_CORE, digest, killed, train
 
 ON = (*FEW, "optimize.distractors={count: 30, start: 4}")
@@ -136,11 +136,11 @@ def test_they_are_in_no_output_and_resumed_runs_keep_their_bits(tiny_scene, tmp_
     assert digest(tmp_path / "killed") == expected
     assert again.distractors is None
     (one, two) = (checkpoint.load(checkpoint.saved(tmp_path / name)[-1])[1] for name in ("one", "killed"))
-    own = split(one, own_gaussians.FOLDER)[0]
+    own = split(one, distractors.FOLDER)[0]
     assert own["means"].shape == (8 * 30, 3)
     assert own["updates"].sum() == 12 - 4
     for name, table in own.items():
-        np.testing.assert_array_equal(table, split(two, own_gaussians.FOLDER)[0][name])
+        np.testing.assert_array_equal(table, split(two, distractors.FOLDER)[0][name])
 
 
 @pytest.mark.slow
@@ -157,13 +157,13 @@ def test_they_go_with_other_parts_of_a_training(tiny_scene, tmp_path, others):
     assert run.distractors is None
     assert not run.not_finite()
     tables = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])[1]
-    assert split(tables, own_gaussians.FOLDER)[0]["updates"].sum() == 12 - 4
+    assert split(tables, distractors.FOLDER)[0]["updates"].sum() == 12 - 4
 
 
 def test_tables_that_are_not_theirs_are_refused(device, rng):
     tables = Pair(device, rng).own.tables()
-    own_gaussians.check_tables(tables)
-    own_gaussians.check_tables({})
+    distractors.check_tables(tables)
+    distractors.check_tables({})
     damaged = [
         ({"means": tables["means"][:-1]}, "as many for each photograph"),
         ({"updates": tables["updates"][:0]}, "as many for each photograph"),
@@ -173,4 +173,4 @@ def test_tables_that_are_not_theirs_are_refused(device, rng):
     ]
     for change, message in damaged:
         with pytest.raises(DataError, match=message):
-            own_gaussians.check_tables({**tables, **change})
+            distractors.check_tables({**tables, **change})

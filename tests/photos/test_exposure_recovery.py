@@ -10,8 +10,8 @@ import pytest
 
 import clsplat
 from clsplat.data_tools.synthetic import Options, write_dataset
-from clsplat.metrics.colours import colour_figures
-from clsplat.views.colours import Gain
+from clsplat.metrics.views import colour_figures
+from clsplat.training.modules.exposure import Gain
 from tests.support.runs import train
 
 pytestmark = pytest.mark.slow

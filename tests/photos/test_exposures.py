@@ -6,16 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clsplat.prepare.colmap_writer import write_model
-from clsplat.prepare.undistort import undistort_scene
-from clsplat.scene.colmap import tracks_of
-from clsplat.scene.colmap_files import read_images, read_point_table
+from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, _fitted, measured, samples, with_noted
+from clsplat.prepare.undistort import undistort_scene, write_model
+from clsplat.scene.colmap import read_images, read_point_table, tracks_of
 from clsplat.scene.detect import read_scene
-from clsplat.scene.exif import CameraExposure, write_exposures
-from clsplat.scene.scene import PointCloud, View
-from clsplat.scene.view import load_image
-from clsplat.training.colours import exposures_of
-from clsplat.views.exposures import UNKNOWN, Exposures, _fitted, measured, samples, with_noted
+from clsplat.scene.images import CameraExposure, write_exposures
+from clsplat.scene.scene import PointCloud
+from clsplat.scene.view import View, load_image
+from clsplat.training.modules.appearance import exposures_of
 from tests.support.exposed_wall import POINTS, SIZE, Wall
 
 

@@ -7,22 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.cameras.posed import posed
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
+from clsplat.core.schedule import at_step
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import camera_values, moved_camera, upload_camera
-from clsplat.runs import cameras
+from clsplat.runs import film
 from clsplat.runs.model_file import evaluate
-from clsplat.scene.camera import Camera
+from clsplat.scene.camera import Camera, Lens
+from clsplat.scene.camera_files import posed
 from clsplat.scene.detect import read_scene
-from clsplat.scene.lens import Lens
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import View
-from clsplat.scene.zoom import DEGREES, zoomed
-from clsplat.schedule import at_step
-from clsplat.training.poses import photograph_poses, poses_beside, refined, require_zoom
-from clsplat.views.focal_lengths import FocalLengths
-from clsplat.views.poses import Poses
+from clsplat.scene.view import DEGREES, View, zoomed
+from clsplat.training.modules.camera_optimizer import (
+    FocalLengths,
+    Poses,
+    photograph_poses,
+    poses_beside,
+    refined,
+    require_zoom,
+)
 from tests.support.camera_rings import FISHEYE, STRONG
 from tests.support.runs import FEW, digest, killed, train
 
@@ -142,7 +145,7 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
     scene = read_scene(tiny_scene, 5)
     assert lengths[0] != scene.views[0].camera.fx
     assert poses_beside(with_focals / "point_cloud.ply", scene).views[0].camera.fx == lengths[0]
-    cameras.write(with_focals, tmp_path / "cameras", "nerfstudio", "copy")
+    film.write(with_focals, tmp_path / "cameras", "nerfstudio", "copy")
     for view in read_scene(tmp_path / "cameras", 5).views:
         assert (view.camera.fx, view.camera.fy) == pytest.approx(lengths)
     for row in ({"focal_lengths": [1]}, {"focal_lengths": [1, -1]}, {"focal_lengths": [1e300, 60]}, []):

@@ -8,19 +8,18 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.images import camera_of, haar_figures, planes_of
 from clsplat.conformance.scenes import random_case
+from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import ConfigError
-from clsplat.losses.entropy import WeightEntropy
 from clsplat.losses.host import HostLoss
-from clsplat.losses.image import L1, L2, Dssim
+from clsplat.losses.image import L1, L2, Dssim, WeightEntropy
 from clsplat.losses.penalties import Anisotropy
+from clsplat.methods.opti3dgs import Haar
+from clsplat.photos.photographs import Photograph, apply_mask
+from clsplat.photos.transforms import Blur, Planes
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
-from clsplat.views.haar import Haar
-from clsplat.views.photographs import Photograph, apply_mask
-from clsplat.views.transforms import Blur, Planes
 from tests.support.figures import hold
 
 SIZES = ((1, 1), (2, 1), (1, 2), (3, 3), (15, 4), (16, 16), (17, 5), (33, 18), (127, 32), (128, 33), (129, 65))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.losses.host import HostLoss
 from clsplat.pipeline.loading import load
 from tests.support.runs import train

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
+from clsplat.photos.photographs import Photographs
 from clsplat.render.camera import upload_camera
 from clsplat.scene.detect import read_scene
-from clsplat.views.photographs import Photographs
 
 
 def test_buffers_are_counted_while_they_live(device):

@@ -7,21 +7,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.conformance.scenes import random_case
+from clsplat.core.schedule import Decay
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.image import L1, Dssim
 from clsplat.metrics.views import render_floats
 from clsplat.opencl.device import Device
+from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import upload_camera
 from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
-from clsplat.schedule import Decay
 from clsplat.training.adam import Adam, Rates
+from clsplat.training.modules.camera_optimizer import FocalLengths, Move, PhotographPoses, Poses
 from clsplat.training.trainer import Trainer
-from clsplat.views.focal_lengths import FocalLengths
-from clsplat.views.photograph_poses import PhotographPoses
-from clsplat.views.photographs import Photograph
-from clsplat.views.poses import Move, Poses
 
 VIEWS, STEPS, ANGLE, DEPTH = 6, 900, np.radians(0.3), 3.0
 STILL = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=0, sh_rest=0)  # cameras alone are unknown

@@ -8,14 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError, Interrupted
+from clsplat.core.errors import DataError, Interrupted
+from clsplat.core.progress import Progress
+from clsplat.photos.sampling import Paper, Sampler, ViewPool, ViewSettings
+from clsplat.photos.transforms import Blur
 from clsplat.pipeline.loading import load
-from clsplat.progress import Progress
 from clsplat.runs import opening, runner
 from clsplat.scene.detect import read_scene
-from clsplat.views.order import Paper, ViewPool
-from clsplat.views.sampling import Sampler, ViewSettings
-from clsplat.views.transforms import Blur
 from tests.support.runs import digest, train
 
 pytestmark = pytest.mark.slow

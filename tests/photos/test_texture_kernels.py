@@ -6,10 +6,9 @@ from scipy import ndimage
 
 from clsplat.conformance.checks.images import camera_of
 from clsplat.conformance.scenes import random_case
+from clsplat.photos.photographs import Photograph, known_gradient, texture_quantile
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
-from clsplat.views.photographs import Photograph
-from clsplat.views.texture import known_gradient, texture_quantile
 
 SIZES = ((1, 1), (2, 3), (7, 5), (8, 8), (9, 2), (15, 4), (16, 16), (17, 17), (40, 30), (65, 3))
 

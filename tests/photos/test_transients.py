@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.training import checkpoint
-from clsplat.views.transients import BINS, KEYS, Transients, measure_residuals
+from clsplat.training.modules.transients import BINS, KEYS, Transients, measure_residuals
 from tests.support.runs import FEW, digest, train
 
 ON = (*FEW, "optimize.transients={start: 4, above: 1, tail: 0}")

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.images import camera_of, planes_of
-from clsplat.conformance.checks.transients import SCALES, transient_figures
+from clsplat.conformance.checks.images import SCALES, camera_of, planes_of, transient_figures
 from clsplat.render.workspace import Workspace
-from clsplat.views.transients import BINS, mask_transients, measure_residuals
+from clsplat.training.modules.transients import BINS, mask_transients, measure_residuals
 from tests.support.device_images import SIZES
 from tests.support.figures import hold
 

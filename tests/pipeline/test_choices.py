@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError
-from clsplat.pipeline.choosing import choose, undone
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import at_step
+from clsplat.pipeline.choices import choose, undone
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import in_steps
 from clsplat.pipeline.yaml_file import yaml_text
-from clsplat.runs import minutes
-from clsplat.runs.description import describe
-from clsplat.runs.found import has_ended
-from clsplat.runs.single import run_pipeline
-from clsplat.scene.capture import measured, nearest_points
-from clsplat.scene.capture import told as text_of
+from clsplat.runs import time_budget
+from clsplat.runs.describe import describe
+from clsplat.runs.state import has_ended
 from clsplat.scene.detect import read_scene
+from clsplat.scene.quality import measured, nearest_points
+from clsplat.scene.quality import told as text_of
 from clsplat.scene.scene import Tracks
-from clsplat.schedule import at_step
 from clsplat.stages.densify import Densify
+from clsplat.sweeps.experiment import run_pipeline
 from tests.support.outdoor_scene import Yard
 from tests.support.runs import FEW, digest, train
 
@@ -258,7 +258,7 @@ def test_a_choice_with_a_refit_says_what_to_set_for_a_time():
     few = f"choices=[{{keys: [{keys}], by: photographs, values: {values}, since: few}}]"
     chosen = choose(load("splat_7k", [few]).settings, {"photographs": 20})
     with pytest.raises(ConfigError, match=r"chosen by 20 training photographs; .*add --set optimize\.refit=false"):
-        minutes.rehearsals_of(replace(load("splat_7k"), settings=chosen), None, 1.0)
+        time_budget.rehearsals_of(replace(load("splat_7k"), settings=chosen), None, 1.0)
     once = choose(load("splat_7k", [few, "optimize.refit=false"]).settings, {"photographs": 20}).training
     assert (once.refit, once.keep, once.patience) == (False, "best", 4)
 
@@ -384,7 +384,7 @@ def test_a_run_looks_for_a_sky_where_a_choice_asks(tmp_path, rng, clear, told):
 
 
 def test_a_run_does_not_look_for_a_sky_in_vain(tmp_path, rng, monkeypatch):
-    monkeypatch.setattr("clsplat.runs.choices.share_with_sky", lambda run: pytest.fail("looked for a sky"))
+    monkeypatch.setattr("clsplat.runs.opening.share_with_sky", lambda run: pytest.fail("looked for a sky"))
     many = SKY.replace("[20, 0]", "[9, 0]")
     asked = load("smoke", [f"scene.path='{Yard(rng).write(tmp_path / 'yard')}'", f"choices=[{many}]"])
     assert "since 10 training photographs; x" in describe(asked, tmp_path / "run", None, "new")

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.pipeline.schema import json_schema
+from clsplat.pipeline.recipes import json_schema
 from tests.support.pipelines import OWN, SMALL, STAGES, names
 
 pytestmark = pytest.mark.slow

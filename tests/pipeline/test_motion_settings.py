@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.pipeline.loading import load
 
 PIXELS = "optimize.losses=[l1, {type: covariance_trace, pixels: 2.0}]"

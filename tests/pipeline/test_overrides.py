@@ -2,10 +2,10 @@
 
 import pytest
 
-from clsplat.errors import ConfigError, OverrideError
+from clsplat.core.errors import ConfigError, OverrideError
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.settable import settable
+from clsplat.pipeline.overrides import settable
 
 
 @pytest.mark.parametrize("name", shipped())

@@ -8,14 +8,14 @@ import pytest
 from jsonschema import Draft202012Validator
 from ruamel.yaml import YAML
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
+from clsplat.core.resources import resource_dir
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.pipeline.schema import json_schema
+from clsplat.pipeline.plugins import load_file
+from clsplat.pipeline.recipes import json_schema
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.plugins import load_file
 from clsplat.stages.optimize import Optimize
-from clsplat.version import resource_dir
 from tests.support.pipelines import flat
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

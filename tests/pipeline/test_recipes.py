@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.gaussians.model import load as load_model
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint, records
-from clsplat.training.state import State
+from clsplat.training.checkpoint import State
 from tests.support.recipes import ONE_THREAD, digest, short, train
 
 pytestmark = pytest.mark.slow

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from clsplat.core.schedule import at_step
+from clsplat.core.settings import Settings
+from clsplat.photos.detail import DetailDivisor
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.stretching import in_steps, last_edit, stretched, with_steps
-from clsplat.schedule import at_step
-from clsplat.settings import Settings
-from clsplat.views.detail import DetailDivisor
 from tests.support.pipelines import TRAINING, flat
 
 STEPS = ("steps", "start", "stop", "over", "until", "every")

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml.composer import Composer
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.yaml_file import parse_value, read_yaml
 

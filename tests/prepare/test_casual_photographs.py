@@ -10,20 +10,18 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError, in_shell
+from clsplat.core.errors import DataError, in_shell
 from clsplat.prepare import diagnosis as reasons_tool
 from clsplat.prepare import mapping
 from clsplat.prepare.cache import fingerprint
 from clsplat.prepare.database import image_names, opened
 from clsplat.prepare.diagnosis import Matched, diagnosis, reasons
 from clsplat.prepare.features import Sought, find_features, sift
-from clsplat.prepare.gather import gather, list_photographs
+from clsplat.prepare.gather import gather, left_out, list_photographs
 from clsplat.prepare.mapping import map_cameras
 from clsplat.prepare.matching import match_features
-from clsplat.prepare.messages import left_out
 from clsplat.prepare.rotation_only import without_depth
-from clsplat.scene.exif import copied, exposure_of, optics_of
-from clsplat.scene.images import read_grey, read_header, read_image
+from clsplat.scene.images import copied, exposure_of, optics_of, read_grey, read_header, read_image
 from tests.support.pictures import blocks
 from tests.support.refusals import refusal
 

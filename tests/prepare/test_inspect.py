@@ -13,15 +13,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
 from clsplat.formats.table import write as write_splats
-from clsplat.inspect.inspection import Inspection
-from clsplat.inspect.page import MAX_NAMES, inspection_page
-from clsplat.inspect.survey import distortion
+from clsplat.prepare.inspect.facts import distortion
+from clsplat.prepare.inspect.findings import Inspection
+from clsplat.prepare.inspect.page import MAX_NAMES, inspection_page
+from clsplat.scene.camera import Lens
 from clsplat.scene.detect import read_scene
-from clsplat.scene.exif import CameraExposure, write_exposures
-from clsplat.scene.lens import Lens
-from clsplat.scene.reprojection import require_ahead
+from clsplat.scene.images import CameraExposure, write_exposures
+from clsplat.scene.quality import require_ahead
 from clsplat.scene.view import load_image, load_mask
 from tests.support.colmap_writer import (
     ImageEntry,

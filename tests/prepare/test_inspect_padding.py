@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.inspect.findings import findings
-from clsplat.inspect.inspection import Inspection
-from clsplat.inspect.padding import EDGES, WIDEST, filled, padding
+from clsplat.prepare.inspect.facts import EDGES, WIDEST, filled, padding
+from clsplat.prepare.inspect.findings import Inspection, findings
 from tests.support.data_sets import data_set
 
 SIDES = dict(

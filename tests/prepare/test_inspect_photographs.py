@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError
-from clsplat.inspect.inspection import Inspection
-from clsplat.inspect.looks import looks
+from clsplat.core.errors import DataError
 from clsplat.prepare.gather import list_photographs
-from clsplat.scene.exif import CameraExposure
+from clsplat.prepare.inspect.facts import looks
+from clsplat.prepare.inspect.findings import Inspection
+from clsplat.scene.images import CameraExposure
 from tests.support.orbit_scene import photograph, said
 
 

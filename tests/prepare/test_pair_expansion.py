@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
 from clsplat.prepare import mapping
 from clsplat.prepare.features import Sought, find_features
 from clsplat.prepare.mapping import map_cameras

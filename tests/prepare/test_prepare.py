@@ -8,16 +8,16 @@ from typing import Any, ClassVar, Literal
 import pytest
 from typer.testing import CliRunner
 
-from clsplat import cli, lock
-from clsplat.errors import ConfigError, DataError, OutputError
+from clsplat import cli
+from clsplat.core import lock
+from clsplat.core.errors import ConfigError, DataError, OutputError
+from clsplat.core.settings import Settings
 from clsplat.pipeline.loading import load
 from clsplat.prepare import steps as prepare_steps
-from clsplat.prepare.cache import fingerprint, plan, prepare
+from clsplat.prepare.cache import fingerprint, place_photographs, plan, prepare
 from clsplat.prepare.gather import link
-from clsplat.prepare.place import place_photographs
 from clsplat.prepare.steps import Step
 from clsplat.runs import opening, runner
-from clsplat.settings import Settings
 from tests.support.refusals import refusal
 
 

@@ -12,22 +12,20 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat import progress
-from clsplat.errors import DataError
+from clsplat.core import progress
+from clsplat.core.errors import DataError
+from clsplat.core.progress import heard_by
 from clsplat.prepare import features as features_tool
 from clsplat.prepare import mapping as mapping_tool
 from clsplat.prepare import undistort as undistort_tool
-from clsplat.prepare.colmap_writer import write_model
 from clsplat.prepare.features import Sought, find_features
 from clsplat.prepare.gather import list_photographs
 from clsplat.prepare.mapping import map_cameras, with_pairs
 from clsplat.prepare.matching import Pairing, alike, match_features
-from clsplat.prepare.undistort import undistort_scene
-from clsplat.progress import heard_by
+from clsplat.prepare.undistort import undistort_scene, write_model
+from clsplat.scene.camera import Camera, Lens
 from clsplat.scene.detect import read_scene
-from clsplat.scene.lens import Lens
-from clsplat.scene.scene import Camera, View
-from clsplat.scene.view import load_image, load_mask
+from clsplat.scene.view import View, load_image, load_mask
 from tests.support.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry
 from tests.support.colmap_writer import write_model as write_test_model
 from tests.support.data_sets import data_set

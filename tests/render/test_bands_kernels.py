@@ -7,7 +7,7 @@ import pyopencl as cl
 import pytest
 
 from clsplat.conformance.scenes import random_case
-from clsplat.errors import MemoryLimitError
+from clsplat.core.errors import MemoryLimitError
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import MAX_PAIRS, Budget, Rasterizer
 from clsplat.render.tiles import Band, Footprints, Tiler, TooManyPairs

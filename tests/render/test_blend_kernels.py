@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.blending import BACKGROUND, blend_figures
-from clsplat.conformance.checks.layer import layer_figures
+from clsplat.conformance.checks.blending import BACKGROUND, blend_figures, layer_figures
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer

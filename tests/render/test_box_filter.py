@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import clsplat
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.resources import resource_dir
+from clsplat.core.settings import variants
 from clsplat.density.statistics import Statistic
-from clsplat.errors import ConfigError, DataError
 from clsplat.formats.table import read, write
-from clsplat.gaussians.checkup import examine
 from clsplat.gaussians.model import Model, Rendering, load
+from clsplat.gaussians.validate import examine
 from clsplat.pipeline.loading import load as load_pipeline
-from clsplat.scene.stand import Stand
-from clsplat.settings import variants
-from clsplat.version import resource_dir
+from clsplat.scene.viewpoint import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
 from tests.support.models import splats

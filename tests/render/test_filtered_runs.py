@@ -8,20 +8,19 @@ import pytest
 
 from clsplat.conformance.reference import filtered
 from clsplat.conformance.scenes import random_case, with_world_filter
-from clsplat.errors import Interrupted
+from clsplat.core.errors import Interrupted
+from clsplat.core.progress import Progress
 from clsplat.formats.ply import write_ply
+from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import read as read_ply
 from clsplat.gaussians.model import Model
-from clsplat.gaussians.tables import PARAMETERS
 from clsplat.metrics.views import render_view
+from clsplat.photos.sampling import Code, Sampler, ViewSettings
 from clsplat.pipeline.loading import load
-from clsplat.progress import Progress
 from clsplat.render.painter import Splats
 from clsplat.runs import opening, runner
 from clsplat.runs.model_file import ModelFile
 from clsplat.training.run import Run
-from clsplat.views.order import Code
-from clsplat.views.sampling import Sampler, ViewSettings
 from tests.support.runs import digest, train
 
 pytestmark = pytest.mark.slow

@@ -8,12 +8,13 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.reference import sampling_interval
 from clsplat.conformance.scenes import Case, random_case
-from clsplat.filters import Dilation, Ewa, FilterViews, Mip, NoWorldFilter, Smoothing
-from clsplat.gaussians.tables import DeviceModel, Gaussians
+from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.camera import upload_camera
+from clsplat.render.filters import Dilation, Ewa, FilterViews, Mip, NoWorldFilter, Smoothing
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.scene.scene import Camera, View
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
 
 COUNTS = (1, 15, 16, 17, 63, 64, 65, 200)
 

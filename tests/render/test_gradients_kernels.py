@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.comparison import GRADIENT, relative_error
+from clsplat.conformance.check import GRADIENT, relative_error
 from clsplat.conformance.scenes import SHARP, Case, random_case, safe_case, with_world_filter
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame, Rasterizer

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
+from clsplat.conformance.check import CONIC, relative_error
 from clsplat.conformance.checks.motion import TIME, moment_figures, motion, moving_case
-from clsplat.conformance.comparison import CONIC, relative_error
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
-from clsplat.formats.motion import MOTION, STILL, WIDTHS, width_of
+from clsplat.formats.splats import MOTION, PARAMETERS, STILL, WIDTHS, width_of
+from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.model import Model
-from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.render.motion import at_moment
 from clsplat.render.rasterizer import Rasterizer

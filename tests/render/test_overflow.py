@@ -8,7 +8,7 @@ import pytest
 
 import clsplat
 from clsplat.conformance.scenes import random_case
-from clsplat.errors import DataError, NumericError
+from clsplat.core.errors import DataError, NumericError
 from tests.support.models import model_of
 
 WORK = {

@@ -11,7 +11,7 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import blend_figures, pixel_sums_of, render, sum_figures
 from clsplat.conformance.checks.pixel_box import BOX, CHECKS, SIZES, of_size
 from clsplat.conformance.checks.projection import not_drawable, record_figures, splats_of
-from clsplat.conformance.reference.pixel_box import box_derivatives, box_response
+from clsplat.conformance.reference.blending import box_derivatives, box_response
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer

@@ -5,17 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.poses import pose_figures, poses
 from clsplat.conformance.checks.projection import (
     beyond_the_clamp,
     gradient_figures,
     hidden_figures,
     not_drawable,
+    pose_figures,
+    poses,
     record_figures,
     splats_of,
 )
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
-from clsplat.gaussians.left_out import HIDDEN_VIEWS, hide
+from clsplat.gaussians.gaussians import HIDDEN_VIEWS, hide
 from clsplat.render.camera import CAMERA
 from clsplat.render.rasterizer import RECORD, Budget, Rasterizer
 from tests.support.figures import hold

@@ -11,13 +11,13 @@ from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.sky import Sky
 from clsplat.losses.image import L2
+from clsplat.photos.photographs import Photograph
 from clsplat.render.backdrops import Directions
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.sky import Skies
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.sky import LearnedSky
+from clsplat.training.modules.sky import LearnedSky
 from clsplat.training.trainer import Trainer
-from clsplat.views.photographs import Photograph
 from tests.support.figures import hold
 
 SIZES = ((1, 1, 8), (2, 1, 9), (15, 4, 8), (16, 16, 16), (17, 5, 33), (33, 18, 8), (127, 9, 21), (129, 17, 64))

@@ -10,8 +10,8 @@ import pytest
 
 from clsplat.conformance.checks.tiles import bitonic_figures, radix_figures, scan_figure, tiler_of
 from clsplat.conformance.scenes import random_case
-from clsplat.errors import DataError
-from clsplat.opencl import program
+from clsplat.core.errors import DataError
+from clsplat.opencl import device as program
 from clsplat.opencl.device import Device
 from clsplat.render.camera import camera_values
 from clsplat.render.rasterizer import Rasterizer

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.settings import variants
-from clsplat.views.transforms import PhotographTransform
+from clsplat.core.settings import variants
+from clsplat.photos.transforms import PhotographTransform
 from tests.support.device_images import colours_of, planes_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -13,7 +13,7 @@ import pytest
 from ruamel.yaml import YAML
 
 import clsplat
-from clsplat.errors import ClsplatError
+from clsplat.core.errors import ClsplatError
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "docker" / "Dockerfile"

@@ -16,10 +16,10 @@ import clsplat
 from clsplat.cli import app
 from clsplat.cli.data import app as tools
 from clsplat.losses.base import Loss
+from clsplat.photos.sampling import ViewSettings
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import readers
 from clsplat.training.adam import Rates
-from clsplat.views.sampling import ViewSettings
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs"))

@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat.version import _commit, full_version
+from clsplat.core.resources import _commit, full_version
 
 ROOT = Path(__file__).parents[2]
 SOURCES = "git ls-files --cached --others --exclude-standard"
 PROBE = """
 import importlib.util, clsplat
-from clsplat.version import resource_dir
+from clsplat.core.resources import resource_dir
 print(clsplat.__version__, resource_dir("cl_kernels").is_dir(), resource_dir("pipelines").is_dir())
 print([name for name in ("cl_kernels", "data_tools", "pipelines", "tests") if importlib.util.find_spec(name)])
 print(importlib.util.find_spec("clsplat.data_tools.synthetic") is not None)
@@ -135,11 +135,11 @@ def test_the_version_names_the_commit_of_a_clean_checkout(tmp_path):
 
 def test_the_version_of_other_code_is_another(monkeypatch):
     compute = full_version.__wrapped__
-    monkeypatch.setattr("clsplat.version._commit", lambda root: "")
-    monkeypatch.setattr("clsplat.version.__version__", "1.0.dev0")
+    monkeypatch.setattr("clsplat.core.resources._commit", lambda root: "")
+    monkeypatch.setattr("clsplat.core.resources.__version__", "1.0.dev0")
     first = compute()
     assert first.startswith("1.0.dev0+d")
-    monkeypatch.setattr("clsplat.version.list_sources", lambda: ["other"])
+    monkeypatch.setattr("clsplat.core.resources.list_sources", lambda: ["other"])
     assert compute() not in (first, "1.0.dev0")
-    monkeypatch.setattr("clsplat.version.__version__", "1.0")
+    monkeypatch.setattr("clsplat.core.resources.__version__", "1.0")
     assert compute() == "1.0"

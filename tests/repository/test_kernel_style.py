@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.opencl.device import Device
+from clsplat.opencl.device import Device, Program, parse_kernels
 from clsplat.opencl.discovery import choose
-from clsplat.opencl.program import Program, parse_kernels
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "cl_kernels").glob("*.[ch]*"))

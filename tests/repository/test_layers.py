@@ -62,17 +62,17 @@ def unit(module: str) -> str:
 
 
 TEXTS = {  # what turns results into lines of text
-    "clsplat.blocks.table": {"status_table", "table"},
-    "clsplat.cluster.overview": {"overview_text"},
-    "clsplat.compress.page": {"table"},
-    "clsplat.conformance.page": {"check_place", "write_page"},
-    "clsplat.gaussians.checkup": {"lines", "verdict"},
-    "clsplat.inspect.table": {"show"},
-    "clsplat.lod.table": {"table"},
+    "clsplat.workflows.blocks": {"status_table", "table"},
+    "clsplat.sweeps.status": {"overview_text"},
+    "clsplat.workflows.compress": {"table"},
+    "clsplat.conformance.doctor": {"check_place", "write_page"},
+    "clsplat.gaussians.validate": {"lines", "verdict"},
+    "clsplat.prepare.inspect.findings": {"show"},
+    "clsplat.workflows.lod": {"table"},
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
     "clsplat.runs.status": {"status_text"},
-    "clsplat.runs.summary": {"summary"},
-    "clsplat.runs.verdict": {"lines", "verdict"},
+    "clsplat.runs.status": {"summary"},
+    "clsplat.runs.verify": {"lines", "verdict"},
     "clsplat.pipeline.files": {"shipped"},  # for completion, which must be fast
 }
 BELOW_COMMANDS = {"api", "cli", "terminal", "errors", "files", "results", "signals", "streams", "version", ""}
@@ -156,7 +156,7 @@ def test_inside_a_folder_imports_are_acyclic():
         done.add(module)
 
     # the device builds programs and programs take devices: the only pair that uses each other, at run time
-    graph["clsplat.opencl.device"].discard("clsplat.opencl.program")
+    graph["clsplat.opencl.device"].discard("clsplat.opencl.device")
     for module in graph:
         visit(module, ())
 

@@ -5,7 +5,7 @@ import tomllib
 
 import pytest
 
-from clsplat.version import resource_dir
+from clsplat.core.resources import resource_dir
 from tests.support.sources import FILES, ROOT
 
 MAX_LINES = 250

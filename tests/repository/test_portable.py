@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from clsplat import files
-from clsplat.errors import OutputError
+from clsplat.core import files
+from clsplat.core.errors import OutputError
 from clsplat.opencl import runtimes
 from tests.support.sources import FILES, ROOT
 

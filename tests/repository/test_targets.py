@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
+from clsplat.opencl.device import BUILD_OPTIONS, parse_kernels
 from clsplat.opencl.discovery import tuning_of
-from clsplat.opencl.program import BUILD_OPTIONS, parse_kernels
 from tests.targets import accepted, amd, figures, intel, nvidia, page
 from tests.targets.__main__ import VENDOR_OF, VENDORS, compile_all, compile_one, versions_of
 from tests.targets.builds import GPU, KERNELS, PASSED, Build, builds

@@ -7,19 +7,18 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.cluster.batch import wanted_cell
-from clsplat.cluster.fingerprint import Scenes
-from clsplat.cluster.store import Store
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Cell
 from clsplat.prepare.matching import MAX_EXHAUSTIVE, most_pairs
-from clsplat.runs import expected as module
-from clsplat.runs.description import describe
-from clsplat.runs.experiment import Job
-from clsplat.runs.single import run_pipeline
-from clsplat.runs.unprepared import check_preparation, known, listed
+from clsplat.runs import estimate as module
+from clsplat.runs.describe import describe
+from clsplat.runs.preflight import check_preparation, known, listed
 from clsplat.stages.optimize import Optimize
+from clsplat.sweeps.batch import wanted_cell
+from clsplat.sweeps.cell import Scenes
+from clsplat.sweeps.experiment import Job, run_pipeline
+from clsplat.sweeps.store import Store
 
 COUNT = 23
 SKY = "of the training photographs show a sky"

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.errors import Interrupted
+from clsplat.core.errors import Interrupted
+from clsplat.core.signals import stop_at_once, stopping_on_signals
 from clsplat.runs import opening
-from clsplat.runs.experiment import Job
-from clsplat.signals import stop_at_once, stopping_on_signals
+from clsplat.sweeps.experiment import Job
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGTERM ends a process at once there")
 
@@ -69,7 +69,7 @@ def test_a_signal_in_an_import_waits_for_its_end(tmp_path, monkeypatch):
 
 
 def test_an_import_without_an_end_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr("clsplat.signals.IMPORT_SECONDS", 0.2)
+    monkeypatch.setattr("clsplat.core.signals.IMPORT_SECONDS", 0.2)
     loop = f"while time.monotonic() < {time.monotonic() + 30}:\n    time.sleep(0.01)\n"
     endless = "import signal, time\nsignal.raise_signal(signal.SIGTERM)\n" + loop
     (tmp_path / "endless_module.py").write_text(endless)

@@ -6,16 +6,16 @@ import re
 
 import pytest
 
+from clsplat.core.errors import DataError, DeviceError, InternalError, OutputError, as_clsplat_error
 from clsplat.density import control
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import DataError, DeviceError, InternalError, OutputError, as_clsplat_error
-from clsplat.opencl.program import Kernel
-from clsplat.runs.experiment import Job
+from clsplat.opencl.device import Kernel
+from clsplat.photos.photographs import Photographs
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.report import Report
+from clsplat.sweeps.experiment import Job
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile
-from clsplat.views.photographs import Photographs
 from tests.support.runs import FEW, digest, records, steps_saved, train
 
 pytestmark = pytest.mark.slow

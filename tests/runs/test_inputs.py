@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat import progress
-from clsplat.errors import ConfigError, DataError
+from clsplat.core import progress
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening
-from clsplat.scene import decoding
-from clsplat.scene.decoding import decode_all, require_whole
+from clsplat.scene import identity as decoding
 from clsplat.scene.detect import read_scene
-from clsplat.scene.identity import Identity
+from clsplat.scene.identity import Identity, decode_all, require_whole
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View
 from tests.support.colmap_writer import tiny_model

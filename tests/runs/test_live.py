@@ -12,18 +12,15 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, Interrupted, MemoryLimitError
-from clsplat.live import live as module
-from clsplat.live.budget import Budget
-from clsplat.live.curves import MOST, Curves
-from clsplat.live.live import Live
-from clsplat.live.orders import Order
-from clsplat.live.preview import AIMS, QUALITY, SIDES, Preview
+from clsplat.core.errors import ConfigError, Interrupted, MemoryLimitError
+from clsplat.core.progress import Progress
 from clsplat.metrics.views import render_view
-from clsplat.progress import Progress
 from clsplat.render.painter import Splats
-from clsplat.runs.experiment import Job
+from clsplat.runs.live import live as module
+from clsplat.runs.live.live import Live
+from clsplat.runs.live.preview import AIMS, MAX_POINTS, QUALITY, SIDES, Budget, Curves, Order, Preview
 from clsplat.scene.detect import read_scene
+from clsplat.sweeps.experiment import Job
 from tests.support.live import beside, trained
 from tests.support.runs import FEW, digest
 
@@ -109,7 +106,7 @@ def test_the_title_names_the_folder_that_the_user_gave(live, tiny_scene, tmp_pat
     """Not that of the prepared photographs, whose name is a hash."""
     prepared = tmp_path / "undistort-f22e16004ac0"
     shutil.copytree(tiny_scene, prepared)
-    monkeypatch.setattr("clsplat.runs.scenes.read_scene", lambda folder, holdout: read_scene(prepared, holdout))
+    monkeypatch.setattr("clsplat.runs.opening.read_scene", lambda folder, holdout: read_scene(prepared, holdout))
     trained(live, tiny_scene, tmp_path / "run")
     assert live.desk.shown.title == f"smoke · {tiny_scene.name}"
 
@@ -216,9 +213,9 @@ def test_the_side_of_a_picture_follows_its_time():
 
 def test_curves_stay_short_and_keep_their_ends():
     curves = Curves([])
-    for step in range(1, 3 * MOST):
+    for step in range(1, 3 * MAX_POINTS):
         curves.add(Progress(step, 9000, 0.1, 20.0, 7, 1.0, 1.0))
     points = curves.after(0)
-    assert len(points) <= MOST
-    assert (points[0][0], points[-1][0]) == (1, 3 * MOST - 1)
-    assert curves.after(3 * MOST - 2) == points[-1:]
+    assert len(points) <= MAX_POINTS
+    assert (points[0][0], points[-1][0]) == (1, 3 * MAX_POINTS - 1)
+    assert curves.after(3 * MAX_POINTS - 2) == points[-1:]

@@ -2,9 +2,9 @@
 
 import pytest
 
-from clsplat.live.live import Live
-from clsplat.live.page import FOLDER as LIVE
-from clsplat.live.page import OWN, page
+from clsplat.runs.live.live import Live
+from clsplat.runs.live.server import FOLDER as LIVE
+from clsplat.runs.live.server import OWN, page
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.html_page import Page
 from tests.support.live import beside, trained

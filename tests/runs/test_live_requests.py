@@ -4,9 +4,8 @@ import json
 
 import pytest
 
-from clsplat.live.answers import Answers, camera, moment
-from clsplat.live.desk import Desk
-from clsplat.live.requests import Answer, Refused, Request, host_name, read
+from clsplat.runs.live.preview import Desk
+from clsplat.runs.live.server import Answer, Answers, Refused, Request, camera, host_name, moment, read
 
 TOKEN = "secret-token"
 

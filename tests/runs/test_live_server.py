@@ -7,12 +7,10 @@ from contextlib import suppress
 
 import pytest
 
-from clsplat.errors import ConfigError
-from clsplat.live import server as module
-from clsplat.live.budget import Budget
-from clsplat.live.orders import MOST, Order, Orders, Picture
-from clsplat.live.requests import LONGEST, Answer
-from clsplat.live.server import Server
+from clsplat.core.errors import ConfigError
+from clsplat.runs.live import server as module
+from clsplat.runs.live.preview import MOST, Budget, Order, Orders, Picture
+from clsplat.runs.live.server import LONGEST, Answer, Server
 
 
 @pytest.fixture

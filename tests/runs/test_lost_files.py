@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat.errors import ClsplatError, ConfigError, DeviceError, InternalError, Interrupted, OutputError
+from clsplat.core.errors import ClsplatError, ConfigError, DeviceError, InternalError, Interrupted, OutputError
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.runs import found
-from clsplat.runs.experiment import run_matrix
-from clsplat.runs.source import Source
+from clsplat.runs import state
+from clsplat.runs.model_file import Source
 from clsplat.stages.report import Report
+from clsplat.sweeps.experiment import run_matrix
 from clsplat.training.status import read_status
-from clsplat.tuning.tuning import Tuning
+from clsplat.workflows.finetune import Tuning
 from tests.support.commands import clsplat as command
 
 pytestmark = pytest.mark.slow
@@ -80,7 +80,7 @@ def test_a_file_whose_bytes_changed_is_written_again(name, saved_late, tmp_path)
     shutil.copytree(saved_late, out)
     whole = (out / name).read_bytes()
     (out / name).write_bytes(whole[:40] + b"x" * 20 + whole[60:])
-    assert [path.name for path in found.changed(out)] == [Path(name).name]
+    assert [path.name for path in state.changed(out)] == [Path(name).name]
     said = command("resume", out).stderr
     assert f"{name}: is missing or was changed; it is written again" in said or f"{name}: differs from what" in said
     assert clsplat.check(out)["whole"]

@@ -7,15 +7,15 @@ from typing import Annotated, Any, Literal
 
 import pytest
 
-from clsplat import names
-from clsplat.errors import ConfigError
+from clsplat.core import files
+from clsplat.core.errors import ConfigError
+from clsplat.core.settings import TAGS, Settings, VariantName
 from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Matrix, MatrixFile, load_experiment
-from clsplat.settings import TAGS, Settings, VariantName
-from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
+from clsplat.training.stage import Stage, path_in_run
 
 READ = {  # text that is read, or compared, and never the name of something that is written
     "Auto.reason", "CaptureChoice.given", "CaptureChoice.reason", "CaptureChoice.since", "CaptureChoice.keys",
@@ -80,7 +80,7 @@ def test_no_stage_can_write_outside_its_folder_or_over_records(kind):
         suffix = next(iter(suffixes), "")
         for path in OUTSIDE:
             for text in {path, path + suffix} - ({"~\u0000/x"} if suffix else set()):
-                if suffix and text != path and names.fault_of_output(text) is None:
+                if suffix and text != path and files.fault_of_output(text) is None:
                     continue  # another name, which is allowed
                 with pytest.raises(ValueError, match="expected a path inside the run folder"):
                     kind.model_validate({field: text})

@@ -8,18 +8,18 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from clsplat import names
-from clsplat.errors import InternalError, OutputError
+from clsplat.core import files as names
+from clsplat.core.errors import InternalError, OutputError
+from clsplat.core.settings import rebuild
 from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, outputs, runner, verify
-from clsplat.runs.experiment import Job
 from clsplat.scene.images import write_image
-from clsplat.settings import rebuild
-from clsplat.stages.base import Stage
-from clsplat.stages.render import image_paths
+from clsplat.stages.export import image_paths
 from clsplat.stages.report import Report
+from clsplat.sweeps.experiment import Job
 from clsplat.training.run import Run
+from clsplat.training.stage import Stage
 from clsplat.training.status import read_status
 
 pytestmark = pytest.mark.slow

@@ -5,8 +5,8 @@ import json
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError
-from clsplat.runs import single
+from clsplat.core.errors import ConfigError
+from clsplat.sweeps import experiment
 from tests.support.commands import clsplat as command
 from tests.support.commands import ran
 
@@ -48,7 +48,7 @@ def test_a_folder_with_files_of_others_stays(tiny_scene, tmp_path, monkeypatch):
         (out / "notes.txt").write_text("mine")
         raise ConfigError("refused")
 
-    monkeypatch.setattr(single.opening, "open_run", open_run)
+    monkeypatch.setattr(experiment.opening, "open_run", open_run)
     with pytest.raises(ConfigError, match="refused"):
         clsplat.run("smoke", tiny_scene, tmp_path / "run")
     assert (tmp_path / "run" / "notes.txt").read_text() == "mine"

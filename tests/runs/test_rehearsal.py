@@ -5,26 +5,25 @@ from types import SimpleNamespace
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
+from clsplat.core.progress import Progress
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import in_steps
-from clsplat.progress import Progress
-from clsplat.runs import minutes, prediction, rehearsing
-from clsplat.runs.prediction import Rehearsal
-from clsplat.runs.rehearsing import Limit
+from clsplat.runs import time_budget
+from clsplat.runs.time_budget import Limit, Rehearsal
 
 
 @pytest.mark.slow
 def test_too_little_time_is_refused_before_the_rehearsal_ends(tiny_scene, tmp_path, monkeypatch):
     """Each report says how long the fewest steps take; what comes before them is done twice."""
     reports = []
-    show = rehearsing.Watch.show
+    show = time_budget.Watch.show
 
-    def shown(watch: rehearsing.Watch, progress: Progress) -> None:
+    def shown(watch: time_budget.Watch, progress: Progress) -> None:
         reports.append(progress.step)
         show(watch, progress)
 
-    monkeypatch.setattr(rehearsing.Watch, "show", shown)
+    monkeypatch.setattr(time_budget.Watch, "show", shown)
     with pytest.raises(
         ConfigError, match=r"expected [\d.]+ or more for this scene on this device, in which 200 steps fit"
     ):
@@ -33,12 +32,12 @@ def test_too_little_time_is_refused_before_the_rehearsal_ends(tiny_scene, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def watch(minutes: float, spent: dict[str, float], clock: float, monkeypatch: pytest.MonkeyPatch) -> rehearsing.Watch:
+def watch(minutes: float, spent: dict[str, float], clock: float, monkeypatch: pytest.MonkeyPatch) -> time_budget.Watch:
     """A rehearsal that began at 0 s, when its run had `minutes`, and has spent times in stages, at a later time."""
-    monkeypatch.setattr(rehearsing, "time", SimpleNamespace(perf_counter=lambda: clock))
+    monkeypatch.setattr(time_budget, "time", SimpleNamespace(perf_counter=lambda: clock))
     counting = SimpleNamespace(status=SimpleNamespace(count=lambda *values: None))
     status = SimpleNamespace(seconds=spent)
-    return rehearsing.Watch(Limit(minutes, 60 * minutes, 200), counting, status, "optimize", began=0.0)
+    return time_budget.Watch(Limit(minutes, 60 * minutes, 200), counting, status, "optimize", began=0.0)
 
 
 def reported(step: int, ms: float) -> Progress:
@@ -71,7 +70,7 @@ def test_the_steps_of_a_rehearsal_end_after_a_fifth_of_the_time(clock, monkeypat
     if clock < 16:
         at_work.show(reported(30, 100.0))
         return
-    with pytest.raises(rehearsing._Enough):
+    with pytest.raises(time_budget._Enough):
         at_work.show(reported(30, 100.0))
 
 
@@ -84,25 +83,25 @@ def test_stopped_rehearsal_runs_the_other_stages_and_continues(tiny_scene, tmp_p
         found.extend(rehearsals)
         raise ConfigError("seen")
 
-    monkeypatch.setattr(rehearsing, "LONGEST", 0.0)
-    monkeypatch.setattr(minutes, "SHARE", 1e-9)  # one rehearsal, however fast the machine is
-    monkeypatch.setattr(minutes, "FIRST", 10)
-    monkeypatch.setattr(minutes, "most_steps", stop)
+    monkeypatch.setattr(time_budget, "LONGEST", 0.0)
+    monkeypatch.setattr(time_budget, "SHARE", 1e-9)  # one rehearsal, however fast the machine is
+    monkeypatch.setattr(time_budget, "FIRST", 10)
+    monkeypatch.setattr(time_budget, "most_steps", stop)
     with pytest.raises(ConfigError, match="seen"):
         clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=1.0)
     (rehearsal,) = found
     assert (rehearsal.steps, len(rehearsal.course), rehearsal.growth) == (10, 10, 1.0)
     assert len({*rehearsal.course[2:]}) == 1
     assert rehearsal.after > 0
-    assert rehearsal.known == prediction.TWICE
+    assert rehearsal.known == time_budget.TWICE
 
 
 def test_edits_that_did_not_come_are_counted():
     """In 200 steps of splat the 144 edits of growth fall on 96, and half of them come in the first 50."""
     full = load("splat").settings.training
     short = in_steps(load("splat").settings, 200).training
-    assert rehearsing._times("densify", full, short, 200) == 144 / 96
-    assert rehearsing._times("densify", full, short, 50) == 144 / 47
-    assert rehearsing._times("init", full, short, 200) == 1
+    assert time_budget._times("densify", full, short, 200) == 144 / 96
+    assert time_budget._times("densify", full, short, 50) == 144 / 47
+    assert time_budget._times("init", full, short, 200) == 1
     noisy, brief = load("mcmc_7k").settings, in_steps(load("mcmc_7k").settings, 200).training
-    assert rehearsing._times("add_noise", noisy.training, brief, 200) == 1
+    assert time_budget._times("add_noise", noisy.training, brief, 200) == 1

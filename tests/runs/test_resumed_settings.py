@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from clsplat.errors import ConfigError
-from clsplat.runs.experiment import Job
+from clsplat.core.errors import ConfigError
+from clsplat.sweeps.experiment import Job
 from clsplat.training import archive
 from clsplat.training.status import read_status
 from tests.support.runs import FEW, crafted, digest, steps_saved, train

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from clsplat import cli, terminal
-from clsplat.errors import (
+from clsplat import cli
+from clsplat.core import terminal
+from clsplat.core.errors import (
     ConfigError,
     DataError,
     InternalError,
@@ -20,9 +21,10 @@ from clsplat.errors import (
     OutputError,
     as_clsplat_error,
 )
-from clsplat.runs import experiment, opening
-from clsplat.runs.experiment import Job
-from clsplat.signals import stopping_on_signals
+from clsplat.core.signals import stopping_on_signals
+from clsplat.runs import opening
+from clsplat.sweeps import experiment
+from clsplat.sweeps.experiment import Job
 from tests.support.commands import process as clsplat
 from tests.support.runs import write_status
 

@@ -6,13 +6,15 @@ from typing import get_args
 
 import pytest
 
-from clsplat import cli, names
-from clsplat.errors import ConfigError
+from clsplat import cli
+from clsplat.core import files
+from clsplat.core.errors import ConfigError
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
-from clsplat.runs import experiment, outputs
-from clsplat.runs.experiment import Job
-from clsplat.runs.folders import Start, check_run_folder
+from clsplat.runs import outputs
+from clsplat.runs.run_folder import Start, check_run_folder
+from clsplat.sweeps import experiment
+from clsplat.sweeps.experiment import Job
 
 
 def opened(scene: Path, out: Path, *changes: str) -> None:
@@ -35,7 +37,7 @@ def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name", ["renders", "report.html", "point_cloud.ply", *sorted(names.OF_A_RUN - {names.PIPELINE})]
+    "name", ["renders", "report.html", "point_cloud.ply", *sorted(files.OF_A_RUN - {files.PIPELINE})]
 )
 def test_a_link_that_leads_outside_is_not_followed(name, tiny_scene, tmp_path):
     out = tmp_path / "run"
@@ -66,7 +68,7 @@ def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path
     opened(tiny_scene, tmp_path)
 
 
-@pytest.mark.parametrize("name", sorted(names.OF_A_RUN - {names.PIPELINE, names.CHECKPOINTS, names.UNDISTORTED}))
+@pytest.mark.parametrize("name", sorted(files.OF_A_RUN - {files.PIPELINE, files.CHECKPOINTS, files.UNDISTORTED}))
 def test_foreign_files_with_names_of_a_run_are_not_replaced(name, tiny_scene, tmp_path):
     (tmp_path / name).write_text('{"state": "mine"}')
     for start in ("new", "resume", "restart"):
@@ -76,7 +78,7 @@ def test_foreign_files_with_names_of_a_run_are_not_replaced(name, tiny_scene, tm
     assert (tmp_path / name).read_text() == '{"state": "mine"}'
 
 
-@pytest.mark.parametrize("name", sorted(names.OF_A_MATRIX - {names.PIPELINE}))
+@pytest.mark.parametrize("name", sorted(files.OF_A_MATRIX - {files.PIPELINE}))
 def test_foreign_files_with_names_of_a_matrix_are_not_replaced(name, tmp_path):
     (tmp_path / name).write_text("mine")
     with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):

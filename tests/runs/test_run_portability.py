@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.gaussians.model import load
-from clsplat.runs.experiment import Job
-from clsplat.runs.source import Source, photographs_of, run_of
-from clsplat.runs.summary import summary
-from clsplat.training.found import photographs_text
+from clsplat.prepare.steps import photographs_text
+from clsplat.runs.model_file import Source, photographs_of, run_of
+from clsplat.runs.status import summary
+from clsplat.sweeps.experiment import Job
 from tests.support.html_page import Page
 from tests.support.runs import digest, steps_saved, train
 

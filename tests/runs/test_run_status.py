@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.runs import status as reading
-from clsplat.training.status import StatusFile
-from clsplat.training.status_schema import Amount
+from clsplat.training.status import Amount, StatusFile
 from tests.support.refusals import refusal
 from tests.support.runs import write_status
 

@@ -12,13 +12,12 @@ from types import SimpleNamespace
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, Interrupted
+from clsplat.core.errors import ConfigError, Interrupted
+from clsplat.core.progress import Progress
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.progress import Progress
-from clsplat.runs import minutes, prediction, single
-from clsplat.runs.minutes import pipeline_for
-from clsplat.runs.prediction import Rehearsal, most_steps, predicted
-from clsplat.runs.rehearsing import Limit
+from clsplat.runs import time_budget
+from clsplat.runs.time_budget import Limit, Rehearsal, most_steps, pipeline_for, predicted
+from clsplat.sweeps import experiment
 from clsplat.training.run import Run
 
 
@@ -39,7 +38,7 @@ def test_two_rehearsals_tell_how_the_time_of_a_step_grows():
     assert predicted(found, 1800) == pytest.approx(5 + 1800 * 0.02 * 9**0.25)
 
 
-@pytest.mark.parametrize(("later", "power"), [(0.2, prediction.TREND), (0.002, -prediction.TREND)])
+@pytest.mark.parametrize(("later", "power"), [(0.2, time_budget.TREND), (0.002, -time_budget.TREND)])
 def test_disturbed_rehearsal_claims_no_more_than_it_can(later, power):
     found = [rehearsal(200, 0.02), rehearsal(600, later)]
     assert predicted(found, 1200) == pytest.approx(5 + 1200 * later * 2**power)
@@ -98,7 +97,7 @@ def test_it_takes_the_time_that_was_given(monkeypatch, given, growth, until_shar
         clock[0] += 3 + 2 + steps * sum(course) / len(course)
         return Rehearsal(steps, course, during=3.0, after=2.0, growth=until_share)
 
-    def execute(pipeline: Pipeline, run: Run, start: str, show: minutes.Show) -> None:
+    def execute(pipeline: Pipeline, run: Run, start: str, show: time_budget.Show) -> None:
         steps = pipeline.settings.training.steps
         planned.append(steps)
         assert start == ("new" if len(planned) == 1 else "resume")
@@ -113,13 +112,13 @@ def test_it_takes_the_time_that_was_given(monkeypatch, given, growth, until_shar
         clock[0] += 2
 
     planned: list[int] = []
-    monkeypatch.setattr(minutes, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
-    monkeypatch.setattr(minutes, "rehearse", rehearse)
-    monkeypatch.setattr(minutes, "new_run", lambda *given: SimpleNamespace(interrupted=False))
-    monkeypatch.setattr(minutes, "write_pipeline", lambda *given: None)
-    monkeypatch.setattr(minutes, "check_in", lambda *given: None)
+    monkeypatch.setattr(time_budget, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(time_budget, "rehearse", rehearse)
+    monkeypatch.setattr(time_budget, "new_run", lambda *given: SimpleNamespace(interrupted=False))
+    monkeypatch.setattr(time_budget, "write_pipeline", lambda *given: None)
+    monkeypatch.setattr(time_budget, "check_in", lambda *given: None)
     run = SimpleNamespace(status=SimpleNamespace(stage=lambda name: nullcontext(), note=lambda **values: None))
-    minutes.execute_within(given, load("splat_7k"), run, "new", lambda progress: None, execute)
+    time_budget.execute_within(given, load("splat_7k"), run, "new", lambda progress: None, execute)
     assert clock[0] == pytest.approx(60 * given, rel=0.05)
     assert len(planned) == (2 if until_share == 0.5 else 3)
     assert done[0] == planned[-1]
@@ -127,31 +126,33 @@ def test_it_takes_the_time_that_was_given(monkeypatch, given, growth, until_shar
 
 @pytest.fixture
 def short_rehearsals(monkeypatch):
-    monkeypatch.setattr(minutes, "FIRST", 10)
-    monkeypatch.setattr(minutes, "SHARE", 0.0)
+    monkeypatch.setattr(time_budget, "FIRST", 10)
+    monkeypatch.setattr(time_budget, "SHARE", 0.0)
     limit = Limit(1.0, math.inf, 1)
-    monkeypatch.setattr(minutes, "rehearsals_of", lambda *given: [minutes.rehearse(*given[:2], Fraction(1, 5), limit)])
+    monkeypatch.setattr(
+        time_budget, "rehearsals_of", lambda *given: [time_budget.rehearse(*given[:2], Fraction(1, 5), limit)]
+    )
 
 
 @pytest.mark.slow
 def test_run_in_minutes_has_the_bits_of_its_written_pipeline(tiny_scene, tmp_path, monkeypatch, short_rehearsals):
     """The steps are corrected while it trains, wherever the clock stands, and not again where it is stopped later and
     goes on; files of the rehearsal are gone."""
-    monkeypatch.setattr(minutes, "most_steps", lambda *given: 60)
+    monkeypatch.setattr(time_budget, "most_steps", lambda *given: 60)
 
-    def stop(checked: Pipeline, run: Run, start: str, show: minutes.Show) -> None:
+    def stop(checked: Pipeline, run: Run, start: str, show: time_budget.Show) -> None:
         def shown(progress: Progress) -> None:
             show(progress)
             run.interrupted |= start == "resume" and progress.step >= progress.steps - 10
 
         execute(checked, run, start, shown)
 
-    execute = single.runner.execute
-    monkeypatch.setattr(single.runner, "execute", stop)
+    execute = experiment.runner.execute
+    monkeypatch.setattr(experiment.runner, "execute", stop)
     out = tmp_path / "run"
     with pytest.raises(Interrupted):
         clsplat.run("smoke", tiny_scene, out, minutes=0.05)
-    monkeypatch.setattr(single.runner, "execute", execute)
+    monkeypatch.setattr(experiment.runner, "execute", execute)
     text = (out / "pipeline.yaml").read_text()
     steps, known = re.search(r"# --minutes 0.05: (.+) steps, of which ([\d,]+) had shown what one takes", text).groups()
     steps, known = (int(number.replace(",", "")) for number in (steps, known))
@@ -169,15 +170,15 @@ def test_run_in_minutes_has_the_bits_of_its_written_pipeline(tiny_scene, tmp_pat
 @pytest.mark.slow
 def test_run_that_dies_at_the_correction_keeps_what_was_chosen(tiny_scene, tmp_path, monkeypatch, short_rehearsals):
     """The pipeline is written before the checkpoint, which is of the corrected one."""
-    monkeypatch.setattr(minutes, "most_steps", lambda *given: 50)
+    monkeypatch.setattr(time_budget, "most_steps", lambda *given: 50)
 
-    def die(checked: Pipeline, run: Run, start: str, show: minutes.Show) -> None:
+    def die(checked: Pipeline, run: Run, start: str, show: time_budget.Show) -> None:
         if start == "resume":
             raise KeyboardInterrupt
         execute(checked, run, start, show)
 
-    execute = single.runner.execute
-    monkeypatch.setattr(single.runner, "execute", die)
+    execute = experiment.runner.execute
+    monkeypatch.setattr(experiment.runner, "execute", die)
     with pytest.raises(Interrupted):
         clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
     monkeypatch.undo()
@@ -201,9 +202,9 @@ def test_a_refused_beginning_leaves_a_run_that_is_done_done(tiny_scene, tmp_path
 @pytest.mark.slow
 def test_a_rehearsal_leaves_no_trace_in_the_run(tiny_scene, tmp_path, monkeypatch, short_rehearsals):
     """Of a training that ends before it can be corrected: the same bits as without a rehearsal."""
-    monkeypatch.setattr(minutes, "most_steps", lambda *given: 50)
-    monkeypatch.setattr(prediction, "EARLY", 1.0)
-    monkeypatch.setattr(prediction, "SOON", 1.0)
+    monkeypatch.setattr(time_budget, "most_steps", lambda *given: 50)
+    monkeypatch.setattr(time_budget, "EARLY", 1.0)
+    monkeypatch.setattr(time_budget, "SOON", 1.0)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
     plain = clsplat.run("smoke", tiny_scene, tmp_path / "plain")
     assert digest(out) == digest(plain)

@@ -9,7 +9,7 @@ import jsonschema
 import pytest
 
 import clsplat
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
 from clsplat.opencl import device
 from clsplat.runs.verify import verify
 from tests.support.commands import clsplat as command

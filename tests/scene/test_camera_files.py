@@ -12,18 +12,16 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat import cli
-from clsplat.cameras import inria
-from clsplat.cameras.nerfstudio import DISTORTION
-from clsplat.errors import ConfigError, DataError
-from clsplat.quaternions import rotation_matrix
-from clsplat.scene.exif import CameraExposure, write_exposures
-from clsplat.scene.exposures import camera_exposures
-from clsplat.scene.lens import MODELS, Lens
-from clsplat.scene.reprojection import with_cameras
-from clsplat.scene.scene import PointCloud, make_scene
-from clsplat.scene.tracks import Tracks
-from clsplat.scene.view import View
-from clsplat.stages.cameras import Cameras
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.quaternions import rotation_matrix
+from clsplat.scene import camera_files
+from clsplat.scene.camera import MODELS, Lens
+from clsplat.scene.camera_files import DISTORTION
+from clsplat.scene.images import CameraExposure, write_exposures
+from clsplat.scene.quality import with_cameras
+from clsplat.scene.scene import PointCloud, Tracks, make_scene
+from clsplat.scene.view import View, camera_exposures
+from clsplat.stages.export import Cameras
 from tests.support.commands import clsplat as command
 from tests.support.data_sets import data_set
 
@@ -152,7 +150,7 @@ def test_cameras_json_holds_the_undistorted_cameras(model, scene_of, tmp_path, c
     with caplog.at_level(logging.WARNING, "clsplat"):
         clsplat.write_cameras(scene, tmp_path, "inria")
     assert "the middle of the image for the principal point, which is up to" in caplog.text
-    found = inria.read(tmp_path / "cameras.json")
+    found = camera_files.read(tmp_path / "cameras.json")
     for a, b in zip(scene.views, found, strict=True):
         assert (b.name, b.camera) == (a.name, a.camera)
         np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-14)
@@ -187,7 +185,7 @@ def test_a_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
     file = tmp_path / "cameras.json"
     file.write_text(json.dumps(change(json.loads(file.read_text()))))
     with pytest.raises(DataError, match=message):
-        inria.read(file)
+        camera_files.read(file)
 
 
 @pytest.mark.parametrize(("form", "lines"), [("colmap", 1), ("inria", 1), ("nerfstudio", 0)])

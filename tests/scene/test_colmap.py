@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from clsplat.scene.colmap_files import read_cameras, read_images, read_point_table
-from clsplat.scene.colmap_records import MODELS, PARAMETERS
+from clsplat.scene.camera import Camera
+from clsplat.scene.colmap import MODELS, PARAMETERS, read_cameras, read_images, read_point_table
 from clsplat.scene.detect import read_scene
-from clsplat.scene.scene import Camera, Scene
+from clsplat.scene.scene import Scene
 from clsplat.scene.view import load_image
 from tests.support.colmap_writer import (
     PINHOLE,

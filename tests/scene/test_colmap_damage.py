@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
 from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.detect import read_scene
 from tests.support.colmap_writer import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clsplat.inspect.inspection import Inspection
+from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene import Reader
 from clsplat.scene.detect import holds_scene, read_scene
 from tests.support.orbit_scene import orbit, said, write

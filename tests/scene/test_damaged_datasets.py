@@ -262,7 +262,7 @@ def test_damaged_dataset(said, name):
 
 def main(base: Path, count: int) -> None:
     """Give every dataset to the command line, in this process."""
-    from clsplat import terminal
+    from clsplat.core import terminal
 
     terminal.ERRORS.width = 10_000
     cases = []
@@ -289,7 +289,8 @@ def peak_memory() -> int:
 
 def one_run(arguments: list[str]) -> dict[str, object]:
     """Run the command line; catch what it prints as errors, and how it ends."""
-    from clsplat import cli, terminal
+    from clsplat import cli
+    from clsplat.core import terminal
 
     code: object = 0
     sys.argv = ["clsplat", *arguments]

@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
+from clsplat.photos.exposure_estimate import noted
 from clsplat.prepare.gather import gather
 from clsplat.scene.camera import Camera
-from clsplat.scene.exif import BESIDE, CameraExposure, checked, exposure_of, read_exposures, write_exposures
-from clsplat.scene.exposures import camera_exposures
-from clsplat.scene.scene import View
-from clsplat.views.exposures import noted
+from clsplat.scene.images import BESIDE, CameraExposure, checked, exposure_of, read_exposures, write_exposures
+from clsplat.scene.view import View, camera_exposures
 
 CAMERA = Camera(4, 3, 4, 4, 2, 1.5)
 EXPOSURE = CameraExposure(seconds=0.01, aperture=2.0, iso=100.0)

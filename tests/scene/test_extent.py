@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from clsplat.scene.scene import Camera, View, camera_extent, strayed
+from clsplat.scene.camera import Camera
+from clsplat.scene.scene import camera_extent, strayed
+from clsplat.scene.view import View
 
 
 def views_at(centres):

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.scene import hull
-from clsplat.scene.hull import Silhouette, hull_points
-from clsplat.scene.scene import Camera, View
-from clsplat.scene.view import load_rgba
+from clsplat.scene import visual_hull
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View, load_rgba
+from clsplat.scene.visual_hull import Silhouette, hull_points
 from tests.support.silhouettes import RADIUS, SIZE, ball, ring
 
 
@@ -102,8 +102,8 @@ def test_an_alpha_that_ends_below_255_is_opaque():
 
 
 def test_photographs_are_read_small_and_not_all(monkeypatch):
-    monkeypatch.setattr(hull, "LONG_SIDE", 60)
-    monkeypatch.setattr(hull, "MAX_VIEWS", 20)
+    monkeypatch.setattr(visual_hull, "LONG_SIDE", 60)
+    monkeypatch.setattr(visual_hull, "MAX_VIEWS", 20)
     sizes = []
 
     def load(view: View) -> np.ndarray:

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clsplat.errors import DataError
-from clsplat.scene.image_headers import Header
-from clsplat.scene.images import image_size, read_header
+from clsplat.core.errors import DataError
+from clsplat.scene.images import Header, image_size, read_header
 from tests.support.data_sets import data_set
 from tests.support.pictures import with_exif
 

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clsplat.errors import OutputError
+from clsplat.core.errors import OutputError
+from clsplat.scene.camera import Camera
 from clsplat.scene.images import image_size, require_files, write_image
-from clsplat.scene.scene import Camera, View
-from clsplat.scene.view import load_image
+from clsplat.scene.view import View, load_image
 from tests.support.data_sets import data_set
 from tests.support.refusals import refusal
 

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError
-from clsplat.scene import lens as lens_room
-from clsplat.scene.lens import MAX_ROUNDS, MODELS, Lens, shared
+from clsplat.core.errors import DataError
+from clsplat.scene import camera as lens_room
+from clsplat.scene.camera import MAX_ROUNDS, MODELS, Lens, shared
 from tests.support.camera_rings import FISHEYE, STRONG
 from tests.support.data_sets import data_set
 

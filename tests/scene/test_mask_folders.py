@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.cluster.fingerprint import Scenes
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load
 from clsplat.runs.model_file import ModelFile
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import load_mask
+from clsplat.sweeps.cell import Scenes
 from tests.support.colmap_writer import tiny_model
 from tests.support.commands import clsplat as command
 from tests.support.orbit_scene import write

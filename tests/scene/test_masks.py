@@ -11,11 +11,10 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.metrics.images import psnr
 from clsplat.metrics.perceptual import ssim_map
+from clsplat.scene.camera import Camera, Lens
 from clsplat.scene.detect import read_scene
-from clsplat.scene.lens import Lens
 from clsplat.scene.photographs import load_photograph
-from clsplat.scene.scene import Camera, View
-from clsplat.scene.view import load_image, load_mask
+from clsplat.scene.view import View, load_image, load_mask
 from tests.support.data_sets import data_set
 from tests.support.pictures import masked_scene, store, with_orientation
 from tests.support.refusals import refusal

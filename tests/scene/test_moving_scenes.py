@@ -8,17 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.cameras.table import write_cameras
+from clsplat.core.errors import DataError
 from clsplat.data_tools.moments import write_moments
 from clsplat.data_tools.moving import STANDING, Moving, shapes_at
 from clsplat.data_tools.synthetic import write_dataset
-from clsplat.errors import DataError
-from clsplat.inspect.figures import figures
-from clsplat.inspect.inspection import Inspection
-from clsplat.prepare.colmap_writer import write_model
-from clsplat.prepare.undistort import undistort_scene
-from clsplat.scene.decoding import decode_all, require_whole
+from clsplat.prepare.inspect.findings import Inspection, figures
+from clsplat.prepare.undistort import undistort_scene, write_model
+from clsplat.scene.camera_files import write_cameras
 from clsplat.scene.detect import read_scene
+from clsplat.scene.identity import decode_all, require_whole
 from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.times import Clock, by_camera, moments_of

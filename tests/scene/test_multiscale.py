@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
+from clsplat.core.errors import DataError
+from clsplat.core.settings import variants
 from clsplat.data_tools.multiscale import pyramid, write_multiscale
-from clsplat.errors import DataError
+from clsplat.photos.sampling import Order, ViewPool
+from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
-from clsplat.scene.scene import Camera, View, make_scene
-from clsplat.scene.view import load_image
-from clsplat.settings import variants
-from clsplat.views.order import Order, ViewPool
+from clsplat.scene.scene import make_scene
+from clsplat.scene.view import View, load_image
 from tests.support.refusals import refusal
 
 

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from clsplat.core.errors import DataError
 from clsplat.data_tools.casting import camera_pose
 from clsplat.data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, STILL_LIFE, write_png
-from clsplat.errors import DataError
-from clsplat.scene.detail import MAX_SPACING, laplacian_chance, spacing
+from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
-from clsplat.scene.middle import centre_of
 from clsplat.scene.plane_sweep import MAX_DEPTH, MIN_DEPTH, PLANES, Surface, swept_points
-from clsplat.scene.scene import Camera, PointCloud, View
-from clsplat.scene.transparency import opaque_pixels
-from clsplat.scene.view import load_image
+from clsplat.scene.quality import MAX_SPACING, laplacian_chance, opaque_pixels, spacing
+from clsplat.scene.scene import PointCloud
+from clsplat.scene.view import View, load_image
+from clsplat.scene.viewpoint import centre_of
 from clsplat.stages.init import Init, from_points
 from tests.support.data_sets import data_set
 from tests.support.runs import train
@@ -224,7 +224,7 @@ def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, cap
     """more: than the scene's points are enough."""
     own, file = len(read_scene(tiny_scene).points), tmp_path / "start.yaml"
     cloud = PointCloud(np.random.default_rng(0).random((found, 3), np.float32), np.zeros((found, 3), np.float32))
-    monkeypatch.setattr("clsplat.stages.first_points.swept_points", lambda *arguments: cloud)
+    monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: cloud)
     monkeypatch.setattr("clsplat.stages.init.is_transparent", lambda scene: alpha)
     stages = f"[{{init: {{fewest: {own + more}}}}}, {{optimize: {{steps: 1, losses: [l1]}}}}, export]"
     file.write_text(f"name: start\nstages: {stages}\n")
@@ -250,7 +250,7 @@ def test_points_and_sweep(tiny_scene, tmp_path, caplog, detail):
 
 def test_a_sweep_that_adds_nothing_is_told(tiny_scene, tmp_path, monkeypatch, caplog):
     nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
-    monkeypatch.setattr("clsplat.stages.first_points.swept_points", lambda *arguments: nothing)
+    monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: nothing)
     run = train(tiny_scene, tmp_path / "run", "init.source=points+sweep", "optimize.steps=1")
     assert "agree on no points beside the scene's" in caplog.text
     assert run.model.gaussians.count == len(read_scene(tiny_scene).points)

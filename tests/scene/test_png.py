@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError
-from clsplat.scene.images import read_image
-from clsplat.scene.png import pixels_only
+from clsplat.core.errors import DataError
+from clsplat.scene.images import pixels_only, read_image
 
 RNG = np.random.default_rng(0)
 KINDS = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clsplat.quaternions import multiply, rotation_matrix, unit_quaternions
+from clsplat.core.quaternions import multiply, rotation_matrix, unit_quaternions
 from clsplat.scene.colmap import pose_matrix
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, DataError
-from clsplat.inspect.inspection import Inspection
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene import Camera, PointCloud, Reader, Scene, View, make_scene
 from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.detect import format_names, holds_scene, read_scene, readers

@@ -6,22 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, DataError
-from clsplat.inspect.findings import POSES, POSES_ERROR
-from clsplat.inspect.inspection import Inspection
-from clsplat.pipeline.choosing import choose
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.pipeline.choices import choose
 from clsplat.pipeline.loading import load
+from clsplat.prepare.inspect.findings import POSES, POSES_ERROR, Inspection
 from clsplat.prepare.undistort import undistort_scene
-from clsplat.runs.description import describe
-from clsplat.runs.single import run_pipeline
-from clsplat.scene.capture import measured
+from clsplat.runs.describe import describe
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
-from clsplat.scene.reprojection import misses, reprojection_errors, within
-from clsplat.scene.tracks import Tracks
+from clsplat.scene.quality import measured, misses, reprojection_errors, within
+from clsplat.scene.scene import Tracks
 from clsplat.scene.view import View
-from clsplat.views.colours import Auto
-from clsplat.views.poses import Poses
+from clsplat.sweeps.experiment import run_pipeline
+from clsplat.training.modules.camera_optimizer import Poses
+from clsplat.training.modules.exposure import Auto
 from tests.support.camera_rings import STRONG
 from tests.support.outdoor_scene import Yard, missing
 from tests.support.runs import FEW

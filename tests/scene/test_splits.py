@@ -8,17 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load
-from clsplat.runs.description import describe
-from clsplat.runs.scenes import RunScene
-from clsplat.scene.choice import Choice
+from clsplat.runs.describe import describe
+from clsplat.runs.opening import RunScene
 from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
-from clsplat.scene.scene import Scene
-from clsplat.scene.split import Split
-from clsplat.scene.tracks import Tracks
+from clsplat.scene.scene import Scene, Tracks
+from clsplat.scene.view_selection import Choice, Split
 from tests.support.transforms_scene import LENS, frames, write
 
 LETTERS = "abcdefghijklmnopqrstuvwx"

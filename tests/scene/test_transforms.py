@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
-from clsplat.scene.nerfstudio import NerfstudioReader
-from clsplat.scene.parts import Parts
-from clsplat.scene.scene import Camera
+from clsplat.scene.reader import Parts
+from clsplat.scene.transforms_json import NerfstudioReader
 from clsplat.scene.view import load_image
 from tests.support.data_sets import data_set
 from tests.support.refusals import refusal
@@ -188,7 +188,7 @@ def test_a_null_is_no_camera_model(tmp_path: Path) -> None:
 
 def test_too_many_frames_are_refused_before_they_are_read(tmp_path: Path, monkeypatch) -> None:
     write(tmp_path, **LENS, frames=frames("a.png", "b.png", "c.png"))
-    monkeypatch.setattr("clsplat.scene.transforms.MAX_FRAMES", 2)
+    monkeypatch.setattr("clsplat.scene.transforms_json.MAX_FRAMES", 2)
     assert "has 3 frames; expected at most 2: divide the scene" in refusal(read_scene, tmp_path)
 
 

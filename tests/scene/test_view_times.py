@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.errors import PoseError
+from clsplat.core.errors import PoseError
 from clsplat.scene.camera import Camera
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import make_scene
 from clsplat.scene.view import View
-from clsplat.video.camera_path import spread
-from clsplat.video.film import still
+from clsplat.viewer.video.camera_path import spread
+from clsplat.viewer.video.film import still
 
 CAMERA = Camera(40, 30, 50.0, 50.0, 20.0, 15.0)
 

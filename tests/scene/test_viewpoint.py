@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clsplat.inspect import space
-from clsplat.report import cameras
+from clsplat.prepare.inspect import page
 from clsplat.scene.camera import Camera
-from clsplat.scene.stand import Stand, across, closest_point, upward
 from clsplat.scene.view import View
-from clsplat.video.rig import Rig
+from clsplat.scene.viewpoint import Stand, across, closest_point, upward
+from clsplat.stages import report
+from clsplat.viewer.video.paths import Rig
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 UP = np.array([0.0, -0.8, 0.6])
@@ -67,8 +67,8 @@ def test_all_take_the_same_way_for_up(case):
     assert np.degrees(np.arccos(min(1, up @ expected))) < degrees
     np.testing.assert_allclose(Rig.of(views, points).up, up, atol=1e-12)
     np.testing.assert_allclose(Stand.of(points, views, views[0]).up, up, atol=1e-12)
-    np.testing.assert_allclose(space._axes(views)[2], up, atol=1e-12)
-    np.testing.assert_allclose(np.cross(*cameras._axes(views)), -up, atol=1e-12)
+    np.testing.assert_allclose(page._axes(views)[2], up, atol=1e-12)
+    np.testing.assert_allclose(np.cross(*report._axes(views)), -up, atol=1e-12)
 
 
 def test_all_on_their_side_have_the_mean_of_their_upward_axes():

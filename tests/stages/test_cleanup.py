@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.density.basic import PruneFaint
-from clsplat.density.importance import PruneUseless
-from clsplat.density.outliers import PruneFar, PruneWide
-from clsplat.density.thinning import MergeNeighbours
-from clsplat.errors import ConfigError, Interrupted, NumericError
+from clsplat.core.errors import ConfigError, Interrupted, NumericError
+from clsplat.core.progress import Progress
 from clsplat.gaussians.model import Model
+from clsplat.methods.adc import PruneFaint
+from clsplat.methods.micro_splatting import MergeNeighbours
+from clsplat.methods.mini_splatting import PruneUseless
+from clsplat.methods.outliers import PruneFar, PruneWide
 from clsplat.pipeline.loading import load
-from clsplat.progress import Progress
 from clsplat.runs import opening, runner
 from clsplat.scene.detect import read_scene
 from clsplat.stages.cleanup import Cleanup

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.density.contribution import best, sensitivities
-from clsplat.errors import ConfigError, Interrupted
+from clsplat.core.errors import ConfigError, Interrupted
+from clsplat.core.progress import Progress
+from clsplat.density.control import best, sensitivities
 from clsplat.formats.packing import morton_order
 from clsplat.formats.table import read
 from clsplat.gaussians.model import Model, load
 from clsplat.pipeline.loading import load as load_pipeline
-from clsplat.progress import Progress
 from clsplat.runs import opening, runner
-from clsplat.stages.reduction import PruneLeast, band_energy, columns_of, scores
+from clsplat.stages.cleanup import PruneLeast, band_energy, columns_of, scores
 from clsplat.training.run import Run
 from tests.support.runs import train
 

@@ -6,18 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, Interrupted, NumericError
+from clsplat.core.errors import ConfigError, Interrupted, NumericError
+from clsplat.core.progress import Progress
 from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
-from clsplat.progress import Progress
 from clsplat.runs import opening, runner
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.stages.reinit import ReinitFromDepth, drawn_of
 from clsplat.training import checkpoint
-from clsplat.training.poses import refined
+from clsplat.training.modules.camera_optimizer import SHIFTS, PhotographPoses, refined
 from clsplat.training.run import Run
-from clsplat.views.photograph_poses import SHIFTS, PhotographPoses
 from tests.support.runs import digest, train
 
 pytestmark = pytest.mark.slow

@@ -7,9 +7,9 @@ import pytest
 
 from clsplat.metrics.views import ViewMetrics
 from clsplat.render.backdrops import Auto, Directions
-from clsplat.report.advice import FEW, far_below, of_capture, of_sky, of_test_views, of_training_views, widest_gap
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
+from clsplat.stages.report import FEW, far_below, of_capture, of_sky, of_test_views, of_training_views, widest_gap
 
 CAMERA = Camera(40, 30, 40.0, 40.0, 20.0, 15.0)
 

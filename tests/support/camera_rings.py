@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from clsplat.scene.camera import Camera
-from clsplat.scene.lens import Lens
+from clsplat.scene.camera import Camera, Lens
 from clsplat.scene.view import View
-from clsplat.video.rig import Rig
+from clsplat.viewer.video.paths import Rig
 
 STRONG = Lens(200, 150, "OPENCV", (160.0, 165.0, 97.0, 80.0, -0.25, 0.06, 0.002, -0.001))
 

@@ -3,14 +3,12 @@
 import os
 from pathlib import Path
 
-from clsplat.cluster.cell import Cell
-from clsplat.cluster.child import FILE, OUT, PYTHON
-from clsplat.cluster.drive import Wanted
-from clsplat.cluster.engine import Lost
-from clsplat.cluster.fingerprint import Scenes
-from clsplat.cluster.probe import Place
-from clsplat.cluster.task import Outcome
 from clsplat.pipeline.loading import load
+from clsplat.sweeps.cell import Cell, Scenes
+from clsplat.sweeps.child import FILE, OUT, PYTHON
+from clsplat.sweeps.devices import Place
+from clsplat.sweeps.engines import Lost, Wanted
+from clsplat.sweeps.task import Outcome
 
 KILLS = int(os.environ.get("CLSPLAT_KILLS", "0"))
 

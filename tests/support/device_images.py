@@ -7,12 +7,12 @@ from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import Comparison, Loss
 from clsplat.opencl.device import Device
+from clsplat.photos.photographs import Photograph
+from clsplat.photos.transforms import Planes
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
-from clsplat.views.photographs import Photograph
-from clsplat.views.transforms import Planes
 
 
 def planes_of(device, image: np.ndarray, mask: np.ndarray | None = None) -> Planes:

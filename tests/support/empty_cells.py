@@ -10,23 +10,23 @@ from pathlib import Path
 
 import psutil
 
-from clsplat.cluster import scheduler
-from clsplat.cluster.cell import Cell
-from clsplat.cluster.child import OUT
-from clsplat.cluster.drive import Drive, Wanted
-from clsplat.cluster.probe import Place
-from clsplat.cluster.store import Store
-from clsplat.cluster.task import Terms
 from clsplat.pipeline.execution import Execution
+from clsplat.sweeps import dask
+from clsplat.sweeps.cell import Cell
+from clsplat.sweeps.child import OUT
+from clsplat.sweeps.devices import Place
+from clsplat.sweeps.engines import Drive, Wanted
+from clsplat.sweeps.store import Store
+from clsplat.sweeps.task import Terms
 from tests.support.cells import SPEC
 
 
 def measure(cells: int, workers: int, folder: Path) -> None:
     """Print the time a cell, the memory of the driver along the way, and the events."""
     places = [Place("local", f"device {number}", "b") for number in range(workers)]
-    scheduler.places = lambda worker, devices, packing: places
+    dask.places = lambda worker, devices, packing: places
     store, memory, process = Store(folder), [], psutil.Process()
-    engine = scheduler.engine(Execution(engine="local"), store, None)
+    engine = dask.engine(Execution(engine="local"), store, None)
     engine.command_of = lambda device: ["touch", OUT]
     wanted = [Wanted(Cell(f"cell {i}", {**SPEC, "scene": str(i)}, ""), 1) for i in range(cells)]
     drive = Drive(store, engine, True, Terms(store.now()))

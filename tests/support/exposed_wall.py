@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.prepare.colmap_writer import write_model
+from clsplat.photos.exposure_estimate import Exposures, measured
+from clsplat.prepare.undistort import write_model
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import write_image
-from clsplat.scene.scene import PointCloud, View
-from clsplat.scene.tracks import Tracks
-from clsplat.views.exposures import Exposures, measured
+from clsplat.scene.scene import PointCloud, Tracks
+from clsplat.scene.view import View
 
 SIZE, POINTS = 64, 400
 

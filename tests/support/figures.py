@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.comparison import Figure, relative_error
+from clsplat.conformance.check import Figure, relative_error
 from clsplat.opencl.device import Device
 
 

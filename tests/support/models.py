@@ -9,7 +9,7 @@ import pytest
 
 import clsplat
 from clsplat.conformance.scenes import Case
-from clsplat.formats.ksplat import HEADER, SECTION
+from clsplat.formats.splat import HEADER, SECTION
 from clsplat.formats.splats import PARAMETERS, Reading, SplatFile, Writing, opacities, unit
 from clsplat.formats.table import read, write
 from clsplat.gaussians.model import Model, Rendering

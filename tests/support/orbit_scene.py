@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from clsplat.inspect.inspection import Inspection
+from clsplat.prepare.inspect.findings import Inspection
 from tests.support.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry, write_scene
 
 COUNT = 24  # cameras on a circle of radius 4 that look at points in a ball of radius 1

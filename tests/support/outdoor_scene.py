@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.prepare.colmap_writer import write_model
+from clsplat.prepare.undistort import write_model
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import write_image
-from clsplat.scene.scene import PointCloud
-from clsplat.scene.tracks import Tracks
+from clsplat.scene.scene import PointCloud, Tracks
 from clsplat.scene.view import View
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 40.0

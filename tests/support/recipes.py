@@ -6,10 +6,10 @@ from pathlib import Path
 
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.stretching import stretched
-from clsplat.runs.single import run_pipeline
-from clsplat.stages.base import Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.optimize import Optimize
+from clsplat.sweeps.experiment import run_pipeline
+from clsplat.training.stage import Stage
 
 STEPS = 24
 

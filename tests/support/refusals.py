@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
 
 
 def refusal(read: Callable[..., Any], *args: Any) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.pipeline.loading import load
-from clsplat.runs import folders, opening, runner
+from clsplat.runs import opening, run_folder, runner
 from clsplat.runs.failures import failures_recorded
 from clsplat.training import archive
 from clsplat.training.run import Run
@@ -67,8 +67,8 @@ def records(out: Path) -> list[dict]:
 
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])
-    start: folders.Start = "resume" if resume else "new"
-    with folders.opened(out, start, step=0) as status, failures_recorded(status):
+    start: run_folder.Start = "resume" if resume else "new"
+    with run_folder.opened(out, start, step=0) as status, failures_recorded(status):
         run = opening.open_run(checked, out, None, start, status)
         runner.execute(checked, run, start, lambda progress: None)
     return run

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from clsplat.scene.scene import Camera, View
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
 
 SIZE, RADIUS = 120, 0.5
 

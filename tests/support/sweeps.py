@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.cluster.store import Store
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.runs import experiment
+from clsplat.sweeps import experiment
+from clsplat.sweeps.store import Store
 
 psutil = pytest.importorskip("psutil", exc_type=ImportError)  # of Dask
 

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from clsplat.formats.motion import fields_of
+from clsplat.formats.splats import fields_of
 from clsplat.gaussians.model import Model, Rendering
-from clsplat.scene.scene import Camera, Scene, View, make_scene
+from clsplat.scene.camera import Camera
+from clsplat.scene.scene import Scene, make_scene
+from clsplat.scene.view import View
 
 SIZE = 112, 80  # px
 PLAIN = Rendering(near=0.2, screen_variance=0.3, compensate=0.0, background="white")

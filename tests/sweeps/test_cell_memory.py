@@ -5,17 +5,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from clsplat.cluster.batch import wanted_cell
-from clsplat.cluster.drive import Drive
-from clsplat.cluster.fingerprint import Scenes
-from clsplat.cluster.need import Need
-from clsplat.cluster.probe import Place
-from clsplat.cluster.store import Store
-from clsplat.cluster.task import Outcome, run_cell
 from clsplat.pipeline import matrix
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
 from clsplat.stages.init import Init
+from clsplat.sweeps.batch import wanted_cell
+from clsplat.sweeps.cell import Scenes
+from clsplat.sweeps.devices import Place
+from clsplat.sweeps.engines import Drive
+from clsplat.sweeps.memory_need import Need
+from clsplat.sweeps.store import Store
+from clsplat.sweeps.task import Outcome, run_cell
 from clsplat.training.memory import plan
 from tests.support.cells import WRITES, Fake, command, wanted
 
@@ -48,7 +48,7 @@ def test_cell_runs_where_its_memory_is_and_others_go_on(store, terms):
 
 @pytest.mark.parametrize("joins", [True, False])
 def test_cell_waits_for_a_larger_device_that_may_join(store, terms, caplog, monkeypatch, joins):
-    monkeypatch.setattr("clsplat.cluster.drive.LOOK", 0.0)
+    monkeypatch.setattr("clsplat.sweeps.engines.LOOK", 0.0)
     engine, told, looks = Fake(Outcome("published"), places=(held(10, "small"),)), [], []
 
     def may_join(waited):

@@ -11,22 +11,18 @@ from dataclasses import replace
 
 import pytest
 
-from clsplat.cluster import child
-from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt
-from clsplat.cluster.drive import Drive, Wanted
-from clsplat.cluster.engine import Inline, Lost
-from clsplat.cluster.fingerprint import Scenes
-from clsplat.cluster.folder import ATTEMPTS, Different
-from clsplat.cluster.overview import overview_text, store_status
-from clsplat.cluster.page import store_page
-from clsplat.cluster.placing import place_copy
-from clsplat.cluster.probe import Place
-from clsplat.cluster.store import Store
-from clsplat.cluster.task import Outcome, Terms, run_cell
-from clsplat.errors import ConfigError, DeviceError, Interrupted, OutputError
-from clsplat.names import CHECKPOINTS
+from clsplat.core.errors import ConfigError, DeviceError, Interrupted, OutputError
+from clsplat.core.files import CHECKPOINTS
 from clsplat.pipeline.loading import load
 from clsplat.runs.opening import undistorted_folder
+from clsplat.sweeps import child
+from clsplat.sweeps.batch import place_copy
+from clsplat.sweeps.cell import Scenes
+from clsplat.sweeps.devices import Place
+from clsplat.sweeps.engines import Drive, Inline, Lost, Wanted
+from clsplat.sweeps.status import overview_text, store_page, store_status
+from clsplat.sweeps.store import ATTEMPTS, LEASE, MANIFEST, Attempt, Different, Store
+from clsplat.sweeps.task import Outcome, Terms, run_cell
 from tests.support.cells import CELL, SPEC, WRITES, Fake, command, keys, wanted
 from tests.support.html_page import HOSTILE, Page
 
@@ -144,7 +140,7 @@ def test_a_result_that_cannot_be_written_counts_as_a_failure(store, terms, monke
         if faults:
             raise faults.pop()
 
-    monkeypatch.setattr("clsplat.cluster.folder.sync_below", sync)
+    monkeypatch.setattr("clsplat.sweeps.store.sync_below", sync)
     outcome = run_cell(CELL, store, command(WRITES), terms)
     if times == 1:
         assert (outcome.state, told(store).count("start")) == ("published", 2)
@@ -237,7 +233,7 @@ def test_a_run_that_does_not_stop_is_killed(store, terms, monkeypatch):
 
 
 def test_an_attempt_that_was_removed_ends_its_run(store, terms, monkeypatch):
-    monkeypatch.setattr("clsplat.cluster.attempt.BEAT", 0.0)
+    monkeypatch.setattr("clsplat.sweeps.store.BEAT", 0.0)
     removes = "import shutil, sys, time; shutil.rmtree(sys.argv[2]); time.sleep(60)"
     outcome = run_cell(CELL, store, command(removes), terms)
     assert outcome.state == "failed"
@@ -245,7 +241,7 @@ def test_an_attempt_that_was_removed_ends_its_run(store, terms, monkeypatch):
 
 
 def test_process_frozen_until_its_attempt_is_gone_takes_a_result(store, terms, monkeypatch):
-    monkeypatch.setattr("clsplat.cluster.attempt.BEAT", 0.0)
+    monkeypatch.setattr("clsplat.sweeps.store.BEAT", 0.0)
     folder = store.add(CELL)
     other = folder.begin("other", terms.since)
     (other.path / "point_cloud.ply").write_bytes(b"bits")
@@ -266,7 +262,7 @@ def test_process_frozen_after_its_run_takes_the_result(store, terms, monkeypatch
         os.rename(other.path, folder.result)
         shutil.rmtree(attempt.path)
 
-    monkeypatch.setattr("clsplat.cluster.task._require_same_scene", sleeps)
+    monkeypatch.setattr("clsplat.sweeps.task._require_same_scene", sleeps)
     outcome = run_cell(CELL, store, command(WRITES), terms)
     assert (outcome.state, outcome.message) == ("published", "")
     assert told(store) == ["start", "end", "skip"]
@@ -367,7 +363,7 @@ def test_of_equal_classes_that_with_most_results_is_taken(store, terms, publishe
 
 
 def test_sweep_whose_class_has_no_device_left_names_the_others(store, terms, monkeypatch):
-    monkeypatch.setattr("clsplat.cluster.drive.ALONE", 0.2)
+    monkeypatch.setattr("clsplat.sweeps.engines.ALONE", 0.2)
     drive = Drive(store, Fake(places=PLACES), True, terms, bits="z")
     looks = iter(range(40))
     drive.is_stopped = lambda: next(looks) == 39
@@ -396,7 +392,7 @@ def test_a_device_that_suits_no_cell_is_asked_once(store, terms, monkeypatch):
     monkeypatch.setattr(
         Drive, "_suits", lambda drive, one, place, _: looks.append(place.bits) or suits(drive, one, place, _)
     )
-    monkeypatch.setattr("clsplat.cluster.drive.LOOK", 0.0)
+    monkeypatch.setattr("clsplat.sweeps.engines.LOOK", 0.0)
     engine, begun = Fake(places=PLACES[:2]), wanted(*range(5))
     for one in begun:
         store.add(one.on("x"))
@@ -416,7 +412,7 @@ def test_a_signal_stops_a_sweep(store, terms):
 
 
 def test_the_engine_of_this_process_runs_a_cell(store, terms, monkeypatch):
-    monkeypatch.setattr("clsplat.cluster.engine.run_command", lambda device, plugins: command(WRITES))
+    monkeypatch.setattr("clsplat.sweeps.engines.run_command", lambda device, plugins: command(WRITES))
     engine = Inline(store, PLACES[0], lambda: False)
     ticket = engine.start(CELL, PLACES[0], terms)
     assert ticket.outcome().state == "published"

@@ -12,18 +12,16 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.compare import crops
-from clsplat.compare.comparison import Comparison
-from clsplat.compare.differences import differing, flat
-from clsplat.compare.page import write_comparison
-from clsplat.compare.published import read_published
-from clsplat.compare.run_folder import RunFolder
-from clsplat.errors import ClsplatError, ConfigError, DataError
+from clsplat.core.errors import ClsplatError, ConfigError, DataError
 from clsplat.pipeline.loading import load
+from clsplat.runs.results import RunFolder
+from clsplat.scene.camera import Lens
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
-from clsplat.scene.lens import Lens
 from clsplat.scene.view import load_image
+from clsplat.sweeps.compare import crops
+from clsplat.sweeps.compare.comparison import Comparison, differing, flat, read_published
+from clsplat.sweeps.compare.page import write_comparison
 from tests.support.commands import clsplat
 from tests.support.html_page import HOSTILE, Page
 

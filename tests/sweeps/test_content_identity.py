@@ -7,16 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.cluster import fingerprint
-from clsplat.cluster.batch import wanted_cell
-from clsplat.cluster.cell import Cell
-from clsplat.cluster.fingerprint import Scenes
-from clsplat.cluster.task import run_cell
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.pipeline import matrix
+from clsplat.pipeline.input_files import content_of, contents
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.places import content_of, contents
 from clsplat.stages.video import Video
+from clsplat.sweeps import cell as fingerprint
+from clsplat.sweeps.batch import wanted_cell
+from clsplat.sweeps.cell import Cell, Scenes
+from clsplat.sweeps.task import run_cell
 from tests.support.cells import CELL, WRITES, command, keys
 from tests.support.runs import FEW, killed, train
 
@@ -53,7 +52,7 @@ def test_what_cannot_be_read_is_told(few_steps, tiny_scene, tmp_path, monkeypatc
     def refuse(path):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("clsplat.pipeline.places.model_at", refuse)
+    monkeypatch.setattr("clsplat.pipeline.input_files.model_at", refuse)
     with pytest.raises(DataError, match=r"few: cannot be read \(Permission denied\); give another file"):
         content_of(few_steps)
     assert contents(load("smoke", [f"scene.path={tiny_scene}", f"init.file='{few_steps}'"])) == {}

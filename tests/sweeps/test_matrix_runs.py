@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.errors import ClsplatError, ConfigError, DataError, InternalError, Interrupted, NumericError
+from clsplat.core.errors import ClsplatError, ConfigError, DataError, InternalError, Interrupted, NumericError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.runs import experiment, runner, scenes
+from clsplat.runs import opening, runner
+from clsplat.sweeps import experiment
 from tests.support.commands import clsplat
 from tests.support.pipelines import SMALL, STAGES, names
 
@@ -61,13 +62,13 @@ def test_the_folder_of_a_matrix_stands_for_its_cells(finished, tmp_path):
 
 
 def test_a_dry_run_reads_each_distinct_scene_once(tiny_scene, tmp_path, monkeypatch):
-    read, folders = scenes.read_scene, []
+    read, folders = opening.read_scene, []
 
     def counted(folder, holdout):
         folders.append(folder.name)
         return read(folder, holdout)
 
-    monkeypatch.setattr(scenes, "read_scene", counted)
+    monkeypatch.setattr(opening, "read_scene", counted)
     shutil.copytree(tiny_scene, tmp_path / "other")
     axes = f"scenes: ['{tiny_scene}', '{tmp_path / 'other'}'], seeds: [0, 1, 2], set: {{scene.downscale: [1, 2]}}"
     (tmp_path / "x.yaml").write_text(f"name: sweep\nmatrix: {{{axes}}}\n{STAGES}")

@@ -8,19 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from clsplat import cores, terminal
 from clsplat.api import tools
-from clsplat.bench import packing
-from clsplat.bench.packing import Packing, Packings, known_packing, measure_packings, task_of
 from clsplat.cli.tools import bench
-from clsplat.cluster import probe
-from clsplat.cluster.attempt import Attempt
-from clsplat.cluster.child import supervise
-from clsplat.cluster.packing import shares_of
-from clsplat.cluster.probe import places
+from clsplat.conformance.bench import packing
+from clsplat.conformance.bench.packing import Packing, Packings, known_packing, measure_packings, task_of
 from clsplat.conformance.host import code_variables
-from clsplat.errors import ConfigError, DeviceError, MemoryLimitError
+from clsplat.core import machine, terminal
+from clsplat.core.errors import ConfigError, DeviceError, MemoryLimitError
 from clsplat.opencl.discovery import DeviceInfo, choose
+from clsplat.sweeps import devices
+from clsplat.sweeps.child import supervise
+from clsplat.sweeps.devices import places, shares_of
+from clsplat.sweeps.store import Attempt
 
 CPU = DeviceInfo("a", "b", "CPU", "1", 4, 1 << 30, 1 << 29, 1 << 15, 64, 8, (0, 0))
 SIZE = (64, 48, 300)  # width, height, Gaussians
@@ -34,23 +33,23 @@ def caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_cores_are_shared_in_equal_parts_of_neighbours():
-    assert [cores.packings(count) for count in (1, 2, 6, 8)] == [[1], [1, 2], [1, 2, 4, 6], [1, 2, 4, 8]]
-    assert cores.shares((0, 1, 2, 5, 6, 7), 2) == [(0, 1, 2), (5, 6, 7)]
-    assert cores.shares(range(6), 4) == [(0,), (1,), (2,), (3,)], "all have as many"
+    assert [machine.packings(count) for count in (1, 2, 6, 8)] == [[1], [1, 2], [1, 2, 4, 6], [1, 2, 4, 8]]
+    assert machine.shares((0, 1, 2, 5, 6, 7), 2) == [(0, 1, 2), (5, 6, 7)]
+    assert machine.shares(range(6), 4) == [(0,), (1,), (2,), (3,)], "all have as many"
 
 
 def test_threads_match_cores_and_devices_need_no_second_check(monkeypatch):
-    found = cores.limited((3, 4), {"a": "b"})
-    assert found == {"a": "b", **dict.fromkeys(cores.LIMITS, "2")}
+    found = machine.limited((3, 4), {"a": "b"})
+    assert found == {"a": "b", **dict.fromkeys(machine.LIMITS, "2")}
     before = code_variables()
-    for name in cores.LIMITS:
+    for name in machine.LIMITS:
         monkeypatch.setenv(name, "1")
     assert code_variables() == before
 
 
 def measured(monkeypatch: pytest.MonkeyPatch, own: int, rates: dict[int, float | None]) -> Packings:
     """What is found on a machine of so many cores, with these steps per second by the number of processes."""
-    monkeypatch.setattr(cores, "usable", lambda: tuple(range(own)))
+    monkeypatch.setattr(machine, "usable", lambda: tuple(range(own)))
 
     def together(task, parts):
         if (rate := rates[len(parts)]) is None:
@@ -74,21 +73,21 @@ def test_sweep_takes_the_fewest_processes_of_about_equal_speed(rates, best, monk
     assert ("4 processes: it does not fit" in found.text()) == (rates[4] is None)
     caplog.set_level("INFO")
     (parts,) = shares_of([CPU], "auto")
-    assert parts == (cores.shares(range(4), best) if best > 1 else [()])
+    assert parts == (machine.shares(range(4), best) if best > 1 else [()])
     assert f"{packing.told(best)}; by `clsplat bench --packing`" in caplog.text
     assert shares_of([CPU, CPU], "auto") == [[()], [()]], "they have the same cores"
-    assert shares_of([CPU, GPU], 4) == [cores.shares(range(4), 4), [()]]
-    monkeypatch.setattr(cores, "usable", lambda: (0, 1))
+    assert shares_of([CPU, GPU], 4) == [machine.shares(range(4), 4), [()]]
+    monkeypatch.setattr(machine, "usable", lambda: (0, 1))
     assert known_packing(CPU) is None, "it was found with other cores"
     with pytest.raises(ConfigError, match=r"execution.packing: 4 runs cannot share 2 cores; expected fewer"):
         shares_of([CPU], 4)
 
 
 def test_each_run_that_shares_a_device_is_a_place_of_its_own(monkeypatch):
-    monkeypatch.setattr(cores, "usable", lambda: (0, 1, 2, 3))
-    monkeypatch.setattr(probe, "list_devices", lambda: [CPU])
-    monkeypatch.setattr(probe, "choose", lambda name: CPU)
-    monkeypatch.setattr(probe, "bits_class", lambda info, infos: "b")
+    monkeypatch.setattr(machine, "usable", lambda: (0, 1, 2, 3))
+    monkeypatch.setattr(devices, "list_devices", lambda: [CPU])
+    monkeypatch.setattr(devices, "choose", lambda name: CPU)
+    monkeypatch.setattr(devices, "bits_class", lambda info, infos: "b")
     found = places("local", ["a"], 2)
     assert [place.cores for place in found] == [(0, 1), (2, 3)]
     assert len({*found}) == 2
@@ -106,7 +105,7 @@ def test_processes_are_timed_together_on_the_device(monkeypatch):
     name = os.environ.get("CLSPLAT_TEST_DEVICES", "").split(";")[0]
     if (info := choose(name or None)).kind != "CPU":
         pytest.skip("a CPU is needed")
-    monkeypatch.setattr(cores, "usable", lambda: (0, 0))
+    monkeypatch.setattr(machine, "usable", lambda: (0, 0))
     found = measure_packings(info, task_of(info, SIZE, "smoke", 1, "auto"), numbers=[2])
     (one,) = found.tried
     assert (one.processes, one.cores, found.best) == (2, 1, 2)
@@ -115,14 +114,14 @@ def test_processes_are_timed_together_on_the_device(monkeypatch):
 
 
 def test_a_process_that_says_nothing_is_told(monkeypatch):
-    monkeypatch.setattr(packing, "MODULE", "clsplat.cores")
+    monkeypatch.setattr(packing, "MODULE", "clsplat.core.machine")
     with pytest.raises(DeviceError, match="a process of the packing ended with code 0, and no answer"):
         measure_packings(CPU, task_of(CPU, SIZE, "splat", 5, "auto"), numbers=[1])
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system keeps no process to cores")
 def test_the_run_of_a_cell_is_kept_to_its_cores(tmp_path):
-    attempt, own = Attempt(tmp_path / "attempt"), (cores.usable()[-1],)
+    attempt, own = Attempt(tmp_path / "attempt"), (machine.usable()[-1],)
     attempt.path.mkdir()
     attempt.take_lease("a", 0.0)
     code = "import os, sys, json, time; time.sleep(0.3)\n"

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.cluster.batch import wanted_cell
-from clsplat.cluster.child import FILE, OUT, PYTHON
-from clsplat.cluster.fingerprint import Scenes
-from clsplat.cluster.store import Store
-from clsplat.cluster.task import Terms, run_cell
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Cell
+from clsplat.sweeps.batch import wanted_cell
+from clsplat.sweeps.cell import Scenes
+from clsplat.sweeps.child import FILE, OUT, PYTHON
+from clsplat.sweeps.store import Store
+from clsplat.sweeps.task import Terms, run_cell
 from tests.support.runs import FEW
 
 pytestmark = pytest.mark.slow

@@ -11,19 +11,20 @@ from unittest.mock import ANY
 
 import pytest
 
-from clsplat.api import commands, sweeps
-from clsplat.cluster import batch, engine, single
-from clsplat.cluster.cell import Cell
-from clsplat.cluster.drive import Drive, Wanted
-from clsplat.cluster.fingerprint import code_digest
-from clsplat.cluster.overview import store_status
-from clsplat.cluster.probe import Place
-from clsplat.cluster.store import Store
-from clsplat.cluster.task import Terms
-from clsplat.errors import ClsplatError, ConfigError, DeviceError
+from clsplat.api import commands
+from clsplat.api import commands as sweeps
+from clsplat.core.errors import ClsplatError, ConfigError, DeviceError
 from clsplat.pipeline.execution import Execution, Tls, options, values_of
-from clsplat.pipeline.schema import json_schema
-from clsplat.runs.experiment import Job
+from clsplat.pipeline.recipes import json_schema
+from clsplat.sweeps import batch, engines
+from clsplat.sweeps import batch as single
+from clsplat.sweeps.cell import Cell, code_digest
+from clsplat.sweeps.devices import Place
+from clsplat.sweeps.engines import Drive, Wanted
+from clsplat.sweeps.experiment import Job
+from clsplat.sweeps.status import store_status
+from clsplat.sweeps.store import Store
+from clsplat.sweeps.task import Terms
 from tests.support.cells import SPEC, WRITES, command
 from tests.support.commands import clsplat
 from tests.support.pipelines import STAGES
@@ -53,7 +54,7 @@ def runs(few_steps: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
         code += "for seed, code in ends.items():\n    if seed in text: sys.exit(code)\n"
         return command(code + f"shutil.copytree({str(few_steps)!r}, sys.argv[2], dirs_exist_ok=True)")
 
-    monkeypatch.setattr(engine, "run_command", run_command)
+    monkeypatch.setattr(engines, "run_command", run_command)
     monkeypatch.setattr(single, "run_command", run_command)
     for module in (batch, single):
         monkeypatch.setattr(module, "places", lambda worker, devices=None: [PLACE])
@@ -254,7 +255,7 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Tls:
     ],
 )
 def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
-    library = pytest.importorskip("clsplat.cluster.library")
+    library = pytest.importorskip("clsplat.sweeps.dask")
     folder = Path(authority.ca).parent
     assert library.security(authority).require_encryption
     with pytest.raises(ConfigError, match=words):
@@ -262,8 +263,8 @@ def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
 
 
 def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeypatch):
-    pytest.importorskip("clsplat.cluster.library")
-    monkeypatch.setattr("clsplat.cluster.offer.places", lambda *words: pytest.fail("a device is proved"))
+    pytest.importorskip("clsplat.sweeps.dask")
+    monkeypatch.setattr("clsplat.sweeps.worker.places", lambda *words: pytest.fail("a device is proved"))
     with pytest.raises(ConfigError, match=r"tls.ca \(--tls-ca\): gone.pem"):
         sweeps.work_for("tls://127.0.0.1:1", tls=("gone.pem", authority.cert, authority.key))
 
@@ -301,7 +302,7 @@ class FakeClient:
 
 
 def test_workers_of_another_version_alone_end_a_sweep(tmp_path, monkeypatch):
-    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    scheduler = pytest.importorskip("clsplat.sweeps.dask")
     monkeypatch.setattr(scheduler, "ALONE", -1.0)
     with pytest.raises(DeviceError, match=r"no worker of this version for .* \(1 of another version get no cells\)"):
         scheduler.Cluster(FakeClient(old="another"), Store(tmp_path)).places()
@@ -309,7 +310,7 @@ def test_workers_of_another_version_alone_end_a_sweep(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("starter", ["nobody", "this machine"])
 def test_a_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, starter):
-    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    scheduler = pytest.importorskip("clsplat.sweeps.dask")
     client, sent = FakeClient(), []
     monkeypatch.setattr(client, "submit", lambda *words, **options: sent.append(options["workers"]))
     found, starts = [PLACE] if starter == "this machine" else None, starter != "nobody"
@@ -320,7 +321,7 @@ def test_a_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, start
 
 
 def test_a_worker_that_is_gone_gets_no_cell(tmp_path):
-    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    scheduler = pytest.importorskip("clsplat.sweeps.dask")
     client = FakeClient(one=code_digest())
     cluster = scheduler.Cluster(client, Store(tmp_path))
     assert [place.worker for place in cluster.places()] == ["one"]
@@ -330,7 +331,7 @@ def test_a_worker_that_is_gone_gets_no_cell(tmp_path):
 
 
 def test_a_scheduler_that_ended_is_told_with_what_to_do(tmp_path):
-    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    scheduler = pytest.importorskip("clsplat.sweeps.dask")
     client = FakeClient()
     cluster = scheduler.Cluster(client, Store(tmp_path))
     client.info, client.status = {}, "closed"
@@ -349,8 +350,8 @@ def listening() -> set[str]:
 
 
 def test_local_engine_runs_cells_in_parallel_on_loopback_alone(tmp_path, monkeypatch):
-    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
-    library = pytest.importorskip("clsplat.cluster.library")
+    scheduler = pytest.importorskip("clsplat.sweeps.dask")
+    library = pytest.importorskip("clsplat.sweeps.dask")
     places = [Place("local", "one", "b"), Place("local", "two", "b")]
     monkeypatch.setattr(scheduler, "places", lambda worker, devices, packing: places)
     store, ended, seen = Store(tmp_path / "store"), [], set()

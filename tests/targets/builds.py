@@ -7,12 +7,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from clsplat.core.resources import resource_dir
+from clsplat.core.settings import variants
 from clsplat.density.statistics import Statistic
+from clsplat.opencl.device import BUILD_OPTIONS, flatten, parse_kernels
 from clsplat.opencl.discovery import DeviceInfo, tuning_of
-from clsplat.opencl.program import BUILD_OPTIONS, flatten, parse_kernels
 from clsplat.render.rasterizer import PIXEL_SUMS
-from clsplat.settings import variants
-from clsplat.version import resource_dir
 
 Schedule = Literal["simt", "wide"]
 KERNELS = resource_dir("cl_kernels")

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+from clsplat.core.resources import __version__
 from clsplat.data_tools.synthetic import Options, write_dataset
-from clsplat.version import __version__
 from tests.torture.kills import kills
 
 ROOT = Path(__file__).parents[2]

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 import clsplat
-from clsplat import files
+from clsplat.core import files
 from tests.torture.kills import Attempt, identity
 
 TINY = {

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.conformance import uses
+from clsplat.conformance import quick
 from clsplat.data_tools.synthetic import Options, write_dataset
 from tests.torture import __main__ as torture
 from tests.torture import each_file, kills
@@ -40,7 +40,7 @@ def test_a_few_kills(tmp_path):
 def test_no_attempt_proves_the_device_again(kind, tmp_path):
     class Seen(kind):
         def _train(self, scene: Path, out: Path, recipe: str) -> None:
-            out.write_text(uses.forget_after_sudden_ends.__module__)
+            out.write_text(quick.forget_after_sudden_ends.__module__)
 
     out = tmp_path / "run"
     Seen(tmp_path, out, *(["smoke"] if kind is kills.Attempt else [])).wait()

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.averages import average_figures
 from clsplat.conformance.checks.projection import not_drawable
-from clsplat.conformance.checks.update import behind_each_fifth, seen_figures, step_figures
+from clsplat.conformance.checks.training import average_figures, behind_each_fifth, seen_figures, step_figures
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
-from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gradients, moment_tables
+from clsplat.formats.splats import PARAMETERS
+from clsplat.gaussians.gaussians import DeviceModel
+from clsplat.gaussians.structs import Gradients, moment_tables
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Frame, Rasterizer
-from clsplat.training import average
+from clsplat.training import adam as average
 from clsplat.training.adam import Adam, Rates, Rows
 from tests.support.figures import hold
 

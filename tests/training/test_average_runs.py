@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from clsplat import Trainer
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load

@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 
 from clsplat import Trainer
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
-from clsplat.report.charts import NAMES
-from clsplat.report.parting import is_by_heart, parting
-from clsplat.runs.experiment import Job
-from clsplat.runs.refitting import as_trained
-from clsplat.runs.summary import summary
-from clsplat.training import checkpoint, kept
+from clsplat.runs.runner import as_trained
+from clsplat.runs.status import summary
+from clsplat.stages.report import NAMES, is_by_heart, parting
+from clsplat.sweeps.experiment import Job
+from clsplat.training import best_model, checkpoint
 from clsplat.training.archive import split
-from clsplat.training.kept import Best, Measured
+from clsplat.training.best_model import Best, Measured
 from tests.support.runs import digest, train
 
 pytestmark = pytest.mark.slow
@@ -362,20 +361,20 @@ FOUND = Best(found=NOW, degree=0, metrics={}, evaluations=1, since=0, apart=None
 
 def test_a_checkpoint_without_its_best_model_is_damaged(best):
     state, tables = checkpoint.load(best / "checkpoints" / "step_000020.npz")
-    own, _ = split(tables, kept.FOLDER)
+    own, _ = split(tables, best_model.FOLDER)
     assert state.best is not None
     assert state.best.found.step == BEST
-    kept.check(state.best, own)
+    best_model.check(state.best, own)
     for wrong in (
         {name: table for name, table in own.items() if name != "means"},
         {**own, "means": own["means"][1:]},
         {**own, "quats": own["quats"] * np.float32(np.nan)},
     ):
         with pytest.raises(DataError, match="best model"):
-            kept.check(state.best, wrong)
+            best_model.check(state.best, wrong)
     with pytest.raises(DataError, match="says nothing of"):
-        kept.check(None, own)
-    assert split(checkpoint.load(best / "checkpoints" / "step_000002.npz")[1], kept.FOLDER)[0] == {}
+        best_model.check(None, own)
+    assert split(checkpoint.load(best / "checkpoints" / "step_000002.npz")[1], best_model.FOLDER)[0] == {}
 
 
 # ---- in words

@@ -5,7 +5,7 @@ import os
 import numpy as np
 import pytest
 
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
 from clsplat.training import archive
 from tests.support.runs import written
 

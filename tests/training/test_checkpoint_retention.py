@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import NotFiniteError
+from clsplat.core.errors import NotFiniteError
 from clsplat.training import checkpoint
 
 FEW = {"optimize.steps": 9, "init.count": 20, "checkpoint.every": 100, "optimize.log_every": 100}

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, DataError, MemoryLimitError, OutputError, as_clsplat_error
-from clsplat.names import CHECKSUMS
-from clsplat.runs import folders
+from clsplat.core.errors import ConfigError, DataError, MemoryLimitError, OutputError, as_clsplat_error
+from clsplat.core.files import CHECKSUMS
+from clsplat.runs import run_folder
 from tests.support.runs import FEW, crafted, digest, records, steps_saved, train
 
 pytestmark = pytest.mark.slow
@@ -135,7 +135,7 @@ def test_restoring_reads_no_other_run(tiny_scene, tmp_path):
     train(tiny_scene, tmp_path, *FEW)
     (tmp_path / "pipeline.yaml").unlink()
     with pytest.raises(ConfigError, match="already holds a run; give another folder, --resume or --restart"):
-        folders.check_run_folder(tmp_path, "new")
+        run_folder.check_run_folder(tmp_path, "new")
     assert CHECKSUMS in {path.name for path in tmp_path.iterdir()}
 
 

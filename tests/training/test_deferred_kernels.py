@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.deferred import deferred_figures, seen_rows, trained
-from clsplat.conformance.checks.update import behind_each_fifth
+from clsplat.conformance.checks.training import behind_each_fifth, deferred_figures, seen_rows, trained
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.gaussians.deferred import Deferred
-from clsplat.gaussians.tables import DeviceModel, Gradients
+from clsplat.gaussians.gaussians import DeviceModel
+from clsplat.gaussians.structs import Gradients
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
@@ -114,7 +114,7 @@ def test_the_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
     gradients = [rng.normal(size=(100, 45)).astype(np.float32) * mask[:, None] for mask in seen]
     found = []
     for longest in (1, 2, 7, 32):
-        monkeypatch.setattr("clsplat.conformance.checks.deferred.LONGEST", longest)
+        monkeypatch.setattr("clsplat.conformance.checks.training.LONGEST", longest)
         found.append(trained(device, case.model(device), seen, gradients, "deferred"))
     for name in Deferred.names:
         for tables in found[1:]:

@@ -9,20 +9,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, MemoryLimitError
+from clsplat.core.errors import ConfigError, MemoryLimitError
 from clsplat.formats.ply import write_ply
 from clsplat.formats.table import read as read_ply
 from clsplat.losses.base import LossValue, Penalty
 from clsplat.opencl.device import Device
+from clsplat.pipeline.checks import harmonics_of
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.on_host import harmonics_of
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.runs import folders, opening, runner
-from clsplat.runs.description import describe
-from clsplat.runs.single import run_pipeline
+from clsplat.runs import opening, run_folder, runner
+from clsplat.runs.describe import describe
+from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
 from clsplat.training.memory import last_place
-from clsplat.training.placing import most_gaussians
+from clsplat.training.sh_offload import most_gaussians
 from tests.support.runs import FEW, digest, train
 
 pytestmark = pytest.mark.slow
@@ -140,7 +140,7 @@ def test_a_run_that_sees_few_goes_on_from_every_checkpoint(few_steps, tiny_scene
     device, out = small(2050), tmp_path / "run"
     run_pipeline(load("smoke", own), out, Device(device), "new")
     expected = digest(out)
-    with folders.opened(out, "resume", step=0) as status:
+    with run_folder.opened(out, "resume", step=0) as status:
         run = opening.open_run(load("smoke", own), out, Device(device), "resume", status)
         checkpoint.restore(run)
     assert run.model.gaussians.on_host is not None
@@ -234,7 +234,7 @@ def test_a_penalty_on_harmonics_is_refused(few_steps, tiny_scene, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(few_steps, out)
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, DEFERRED])
-    with folders.opened(out, "restart", step=0) as status:
+    with run_folder.opened(out, "restart", step=0) as status:
         run = opening.open_run(checked, out, None, "restart", status)
         run.losses.append(OnHarmonics(weight=1.0))
         with pytest.raises(ConfigError, match="a penalty on sh_rest"):

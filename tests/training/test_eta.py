@@ -2,9 +2,9 @@
 
 import pytest
 
-from clsplat.progress import Progress
-from clsplat.terminal import line
-from clsplat.training.forecast import VIEWS, Forecast
+from clsplat.core.progress import Progress
+from clsplat.core.terminal import line
+from clsplat.training.records import VIEWS, Forecast
 
 LAST, GROWTH_END = 3000, 1600
 

@@ -3,8 +3,8 @@
 import pytest
 
 from clsplat.conformance.scenes import random_case
-from clsplat.errors import MemoryLimitError
-from clsplat.gaussians.tables import Gradients
+from clsplat.core.errors import MemoryLimitError
+from clsplat.gaussians.structs import Gradients
 from clsplat.training import memory
 from clsplat.training.memory import FRAME_GAUSSIAN, MemoryPlan
 from tests.support.commands import clsplat
@@ -89,7 +89,7 @@ def test_growth_stops_where_memory_ends(tiny_scene, tmp_path, monkeypatch):
 
 def test_photographs_read_again_and_again_train_to_the_same_bits(tiny_scene, tmp_path, monkeypatch):
     train(tiny_scene, tmp_path / "held")
-    monkeypatch.setattr("clsplat.views.photographs.BUDGET_SHARE", 1e-10)
+    monkeypatch.setattr("clsplat.photos.photographs.BUDGET_SHARE", 1e-10)
     assert train(tiny_scene, tmp_path / "tight").photographs.budget < 100
     held, tight = ((tmp_path / name / "point_cloud.ply").read_bytes() for name in ("held", "tight"))
     assert held == tight

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clsplat.core.errors import NumericError
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import NumericError
-from clsplat.training.advice import lower_rate
+from clsplat.training.checkpoint import lower_rate
 from clsplat.training.run import Run
 from tests.support.runs import FEW, digest, steps_saved, train
 
@@ -61,7 +61,7 @@ def test_a_state_that_is_not_finite_is_never_a_checkpoint(
 
 def test_a_loss_that_is_not_finite_leaves_no_newer_checkpoint(tiny_scene, tmp_path, monkeypatch):
     numbers = SimpleNamespace(isfinite=lambda value: False)
-    monkeypatch.setattr("clsplat.training.rescue.math", numbers)
+    monkeypatch.setattr("clsplat.training.checkpoint.math", numbers)
     with pytest.raises(NumericError, match=r"parameters not finite: none; .*goes on from step_000004.npz"):
         train(tiny_scene, tmp_path, *FEW)
     assert steps_saved(tmp_path) == ["failed_000005.npz", "step_000004.npz"]

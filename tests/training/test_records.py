@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.errors import DataError, Interrupted
+from clsplat.core.errors import DataError, Interrupted
 from clsplat.metrics import views
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner

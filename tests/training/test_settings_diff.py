@@ -4,14 +4,14 @@ from typing import ClassVar, Literal
 
 import pytest
 
+from clsplat.core.settings import rebuild, resumable, variants
 from clsplat.pipeline.loading import checked
-from clsplat.pipeline.settable import CADENCE
+from clsplat.pipeline.overrides import CADENCE
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.settings import rebuild, resumable, variants
-from clsplat.stages import base
-from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
-from clsplat.training.changes import differences, first_difference
+from clsplat.training import stage as base
+from clsplat.training.settings_diff import differences, first_difference
+from clsplat.training.stage import Scheduled, Stage
 
 
 def kinds(before, after) -> dict[str, str | None]:

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError
-from clsplat.gaussians.tables import moment_tables
+from clsplat.core.errors import ConfigError
+from clsplat.gaussians.structs import moment_tables
 from clsplat.losses.base import ViewGradients, ViewLosses
 from clsplat.opencl.device import Array
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import stretched
 from clsplat.runs import opening
+from clsplat.training.modules.skip_backward import Skip
 from clsplat.training.run import Run
-from clsplat.training.skipping import Skip
 from clsplat.training.trainer import Trainer
 from tests.support.runs import FEW, digest, train
 

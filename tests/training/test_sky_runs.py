@@ -10,26 +10,25 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import DataError
-from clsplat.gaussians.octahedral import sampled, texel_directions
-from clsplat.gaussians.sky import Sky, keep_sky, sky_beside
-from clsplat.gaussians.sky_splats import with_sky_splats
+from clsplat.core.errors import DataError
+from clsplat.core.reading import sha256
+from clsplat.gaussians.conversion import with_sky_splats
+from clsplat.gaussians.sky import Sky, keep_sky, sampled, sky_beside, texel_directions
 from clsplat.metrics.images import psnr
-from clsplat.pipeline.choices import without_choices
+from clsplat.photos.sky_detection import Seen, looked_at, panorama
+from clsplat.pipeline.capture_choice import without_choices
 from clsplat.pipeline.loading import load
-from clsplat.prepare.colmap_writer import write_model
-from clsplat.reading import sha256
+from clsplat.prepare.undistort import write_model
 from clsplat.render.backdrops import Auto
-from clsplat.runs.found import has_ended
 from clsplat.runs.model_file import evaluate
-from clsplat.runs.single import run_pipeline
+from clsplat.runs.state import has_ended
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import write_image
 from clsplat.scene.view import View
+from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
-from clsplat.training.sky import FOLDER, check_tables
-from clsplat.views.sky_share import Seen, looked_at, panorama
+from clsplat.training.modules.sky import FOLDER, check_tables
 from tests.support.outdoor_scene import Yard, painted
 from tests.support.runs import FEW, digest, train
 

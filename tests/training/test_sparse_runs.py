@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.scenes import random_case
+from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SEEN, SplatStats
-from clsplat.errors import ConfigError
 from clsplat.formats.table import read as read_ply
-from clsplat.gaussians.tables import Dropout
+from clsplat.gaussians.gaussians import Dropout
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import choose

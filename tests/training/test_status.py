@@ -10,12 +10,12 @@ import pytest
 from jsonschema import Draft202012Validator
 
 import clsplat
-from clsplat.errors import ClsplatError, OutputError
-from clsplat.files import write_text
-from clsplat.runs.experiment import Job
+from clsplat.core.errors import ClsplatError, OutputError
+from clsplat.core.files import write_text
+from clsplat.core.resources import full_version
+from clsplat.sweeps.experiment import Job
 from clsplat.training import status as writing
 from clsplat.training.status import StatusFile
-from clsplat.version import full_version
 from tests.support.runs import digest, train
 
 pytestmark = pytest.mark.slow

@@ -8,24 +8,24 @@ import pytest
 
 from clsplat.conformance.checks.images import comparison_of
 from clsplat.conformance.checks.images import pictures as images
+from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import ConfigError
-from clsplat.filters import FilterViews, measure_intervals
-from clsplat.gaussians.tables import INTERVAL2, DeviceModel, Gaussians
+from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, Gaussians
 from clsplat.losses.base import ImageLoss, Loss, returned
 from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
 from clsplat.opencl.device import Device
+from clsplat.photos.photographs import Photographs
+from clsplat.photos.sampling import Sampler
 from clsplat.pipeline.loading import load
+from clsplat.render.filters import FilterViews, measure_intervals
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs import opening
 from clsplat.scene.detect import read_scene
 from clsplat.stages.init import from_points
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
-from clsplat.views.photographs import Photographs
-from clsplat.views.sampling import Sampler
 from tests.support.device_images import gradient_of, trainer_of
 
 STEPS = 8  # of smoke, before its first edit

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, DataError, Interrupted, NumericError
+from clsplat.core.errors import ConfigError, DataError, Interrupted, NumericError
+from clsplat.core.progress import Progress
 from clsplat.formats.ply import write_ply
 from clsplat.formats.table import read as read_ply
+from clsplat.photos.sampling import Sampler
 from clsplat.pipeline.loading import load
-from clsplat.progress import Progress
 from clsplat.runs import opening, runner
 from clsplat.runs.failures import failures_recorded
 from clsplat.training import checkpoint
-from clsplat.views.sampling import Sampler
 from tests.support.onnx_writer import distance_network
 from tests.support.runs import ONE_CORE, digest, train
 

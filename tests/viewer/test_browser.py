@@ -12,10 +12,9 @@ import pytest
 
 import clsplat
 from clsplat.metrics.images import psnr, to_8_bits
-from clsplat.scene.stand import Stand
+from clsplat.scene.viewpoint import Stand
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import Page
-from clsplat.viewer.photographs import described
+from clsplat.viewer.page import Page, described
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.html_page import HOSTILE
 from tests.support.viewer_pages import MIP, PLAIN, cloud, scene

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from clsplat.pages.svg import HEIGHT, Line, curve, histogram
-from clsplat.report.charts import training_charts
-from clsplat.training.forecast import VIEWS, Forecast, over_views
+from clsplat.stages.report import training_charts
+from clsplat.training.records import VIEWS, Forecast, over_views
+from clsplat.viewer.charts import HEIGHT, Line, curve, histogram
 
 
 def rows(chart: str) -> list[str]:

@@ -10,13 +10,13 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat.cli import app
-from clsplat.errors import ConfigError, DataError, OutputError
+from clsplat.core.errors import ConfigError, DataError, OutputError
+from clsplat.core.progress import heard_by
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
-from clsplat.progress import heard_by
-from clsplat.runs.viewing import names
+from clsplat.runs.film import names
 from clsplat.scene.detect import read_scene
-from clsplat.stages.viewer import Viewer
+from clsplat.stages.export import Viewer
 from clsplat.viewer import page as module
 from tests.support.commands import process
 from tests.support.html_page import Page
@@ -47,7 +47,7 @@ def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
 
 
 def test_more_splats_than_a_page_shows_smoothly_come_with_advice(run, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("clsplat.runs.viewing.MANY", 10)
+    monkeypatch.setattr("clsplat.runs.film.MANY", 10)
     heard = []
     with heard_by(lambda *what, seconds_left: heard.append(what)):
         clsplat.view(run, out=tmp_path / "a.html")
@@ -66,7 +66,7 @@ def test_titles_name_the_folder_that_the_user_gave(run, tiny_scene, tmp_path, mo
     assert f"<title>castle_run · {tiny_scene.name}</title>" in clsplat.view(copy, out=tmp_path / "a.html").read_text()
     given = clsplat.view(copy, scene=prepared, out=tmp_path / "b.html").read_text()
     assert f"<title>castle_run · {prepared.name}</title>" in given, "what is given is what is named"
-    monkeypatch.setattr("clsplat.runs.scenes.read_scene", lambda folder, holdout: read_scene(prepared, holdout))
+    monkeypatch.setattr("clsplat.runs.opening.read_scene", lambda folder, holdout: read_scene(prepared, holdout))
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=SHORT)
     assert f"<title>smoke · {tiny_scene.name}</title>" in (out / "viewer.html").read_text()
     assert f"<title>{tiny_scene.name}</title>" in (out / "report.html").read_text()
@@ -119,7 +119,7 @@ def test_the_link_leads_from_another_folder(tiny_scene, tmp_path):
 
 def test_run_with_too_many_splats_shows_the_most_important(tiny_scene, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(module, "MAX_SIZE", 0.25)
-    monkeypatch.setattr("clsplat.stages.viewer.MAX_SIZE", 0.25)
+    monkeypatch.setattr("clsplat.stages.export.MAX_SIZE", 0.25)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set={**SHORT, "init.count": 8000})
     assert (out / "viewer.html").stat().st_size < 250_000
     assert any("most important of" in record.message for record in caplog.records)

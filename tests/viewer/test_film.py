@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, DataError, NumericError
+from clsplat.core.errors import ConfigError, DataError, NumericError
 from clsplat.scene.images import read_image
-from clsplat.video.pictures import Canvas, depth_picture, letterboxed
+from clsplat.viewer.video.pictures import Canvas, depth_picture, letterboxed
 from tests.support.commands import clsplat as command
 from tests.support.pictures import decoded
 

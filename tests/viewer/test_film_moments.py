@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.scene.camera import Camera
 from clsplat.scene.scene import make_scene
 from clsplat.scene.view import View
-from clsplat.video import camera_path
-from clsplat.video.film import Wish, plan
-from clsplat.video.moments import times_of
-from clsplat.video.paths import nearest
+from clsplat.viewer.video import camera_path
+from clsplat.viewer.video.film import Wish, plan, times_of
+from clsplat.viewer.video.paths import nearest
 from tests.support.refusals import refusal
 
 CAMERA = Camera(40, 30, 50.0, 50.0, 20.0, 15.0)

@@ -8,15 +8,23 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.scene.camera import Camera
 from clsplat.scene.scene import make_scene
 from clsplat.scene.view import View
-from clsplat.video.film import Wish, plan
-from clsplat.video.lenses import around, checked_frames, checked_rate, checked_size, even_size, like
-from clsplat.video.paths import PATHS, nearest
-from clsplat.video.rig import Rig
-from clsplat.video.walk import order
+from clsplat.viewer.video.film import Wish, plan
+from clsplat.viewer.video.paths import (
+    PATHS,
+    Rig,
+    around,
+    checked_frames,
+    checked_rate,
+    checked_size,
+    even_size,
+    like,
+    nearest,
+    order,
+)
 from tests.support.camera_rings import CAMERA, SIZE, UP, rig_of, ring
 from tests.support.data_sets import data_set
 

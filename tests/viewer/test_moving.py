@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.formats.motion import MOTION, fields_of, width_of
+from clsplat.formats.splats import MOTION, fields_of, width_of
 from clsplat.gaussians.motion import at_time
 from clsplat.metrics.images import psnr, to_8_bits
-from clsplat.scene.stand import Stand
+from clsplat.scene.viewpoint import Stand
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import Page
-from clsplat.viewer.photographs import described
+from clsplat.viewer.page import Page, described
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.viewer_data import unpacked
 from tests.support.viewer_pages import cloud, moving, scene

@@ -10,14 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import OutputError
-from clsplat.pages.page import inline, shrunk
-from clsplat.scene.stand import Stand
+from clsplat.core.errors import OutputError
+from clsplat.core.page import inline, shrunk
+from clsplat.scene.viewpoint import Stand
 from clsplat.viewer import page as module
-from clsplat.viewer.cameras import camera_data
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import FOLDER, SCRIPTS, Page, script
-from clsplat.viewer.photographs import described, left_out
+from clsplat.viewer.page import FOLDER, SCRIPTS, Page, camera_data, described, left_out, script
 from tests.support.html_page import HOSTILE
 from tests.support.html_page import Page as Parsed
 from tests.support.viewer_pages import cloud, scene, views

@@ -11,8 +11,8 @@ import pytest
 from jinja2 import UndefinedError
 
 import clsplat as package
-from clsplat.pages.page import TEMPLATES, charts, duration, embedded, render, require_end
-from clsplat.pages.svg import Line, curve
+from clsplat.core.page import TEMPLATES, charts, duration, embedded, render, require_end
+from clsplat.viewer.charts import Line, curve
 from tests.support.commands import clsplat
 from tests.support.html_page import HOSTILE, Page
 from tests.support.refusals import refusal
@@ -20,7 +20,7 @@ from tests.support.refusals import refusal
 SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
 PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "store", "viewer", "live")
 FOLDER = Path(package.__file__).parent / "pages" / "templates"
-DRAWINGS = {"clsplat/pages/svg.py", "clsplat/pages/plan.py", "clsplat/bench/table.py"}  # SVG, escaped there
+DRAWINGS = {"clsplat/viewer/charts.py", "clsplat/conformance/bench/measurement.py"}  # SVG, escaped there
 STATES = ("good", "warn", "bad", "note")  # colours of text with papers of their own
 WITHOUT_TEXT = {  # a background, or text on one that another rule or the page's data fix
     *("td.bar i", "button.grown", ".slider::after", ".space canvas", ".space button:hover", ".space output", ".chip"),

@@ -4,10 +4,10 @@ import shutil
 
 import pytest
 
-from clsplat.errors import ConfigError
+from clsplat.core.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.scene.images import image_size, read_image
-from clsplat.video.encoding import frames_of
+from clsplat.viewer.video.encoding import frames_of
 from tests.support.commands import clsplat as command
 from tests.support.runs import FEW, digest, train
 

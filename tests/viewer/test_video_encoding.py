@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, OutputError
-from clsplat.video import encoding, webm
+from clsplat.core.errors import ConfigError, OutputError
+from clsplat.viewer.video import encoding
+from clsplat.viewer.video import encoding as webm
 from tests.support.pictures import decoded
 
 SUFFIXES = [".webm", pytest.param(".mp4", marks=pytest.mark.skipif("not _has_av()", reason="PyAV is missing"))]

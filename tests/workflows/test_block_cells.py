@@ -5,13 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.blocks.cells import cells, owners, quantile
-from clsplat.blocks.views import Membership
-from clsplat.density.box import Box
-from clsplat.errors import DataError
-from clsplat.formats import ply_joining
-from clsplat.formats.ply import read_ply, write_ply
-from clsplat.formats.ply_joining import join_plys
+from clsplat.core.errors import DataError
+from clsplat.density.control import Box
+from clsplat.formats import ply
+from clsplat.formats.ply import join_plys, read_ply, write_ply
+from clsplat.workflows.partition import Membership, cells, owners, quantile
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 9])
@@ -80,7 +78,7 @@ def written(path: Path, rng: np.random.Generator, count: int, near: float = 0.2)
 
 
 def test_joined_models_are_their_rows_in_order(rng, tmp_path, monkeypatch):
-    monkeypatch.setattr(ply_joining, "ROWS", 7)  # several pieces
+    monkeypatch.setattr(ply, "PIECE_ROWS", 7)  # several pieces
     files = [tmp_path / f"{i}.ply" for i in range(3)]
     parts = [written(file, rng, count) for file, count in zip(files, (20, 1, 14), strict=True)]
     seen = []

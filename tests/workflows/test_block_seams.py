@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.blocks.cells import Cell
-from clsplat.blocks.seams import is_near, places
-from clsplat.compare.seams import find_seams
-from clsplat.density.box import Box
-from clsplat.errors import DataError
+from clsplat.core.errors import DataError
+from clsplat.density.control import Box
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
+from clsplat.sweeps.compare.crops import find_seams
+from clsplat.workflows.blocks import is_near, places
+from clsplat.workflows.partition import Cell
 
 SIZE = np.array([10.0, 10.0, 10.0])
 CELLS = [Cell(Box(high=[2.0, None, None]), SIZE), Cell(Box(low=[2.0, None, None]), SIZE)]

@@ -11,13 +11,13 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat.cli import app
+from clsplat.core.errors import ClsplatError, ConfigError, DataError, NoneInsideError
+from clsplat.core.schedule import values_of
 from clsplat.data_tools.multiscale import write_multiscale
-from clsplat.density.box import Box
-from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError
+from clsplat.density.control import Box
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
-from clsplat.schedule import values_of
-from clsplat.tuning import tuning
+from clsplat.workflows import finetune
 
 pytestmark = pytest.mark.slow
 
@@ -148,7 +148,7 @@ def test_a_folder_of_blocks_and_its_scene_can_move(trained, tiny_scene, few_step
 
 
 def test_what_is_done_is_left_alone(trained, tiny_scene, few_steps, monkeypatch):
-    monkeypatch.setattr("clsplat.tuning.tuning.run_pipeline", lambda *_: pytest.fail("a run begins"))
+    monkeypatch.setattr("clsplat.workflows.finetune.run_pipeline", lambda *_: pytest.fail("a run begins"))
     again = train(tiny_scene, few_steps, trained[0], blocks=COUNT, sight=NEVER)
     assert again == trained[1]
 
@@ -181,11 +181,11 @@ def test_a_block_without_gaussians_at_its_end_is_left_out(
     def empty(pipeline, folder, *options):
         if folder.name == "block_01":
             raise NoneInsideError("crop: none lies inside")
-        return tuning.trained(pipeline, folder, *options)
+        return finetune.trained(pipeline, folder, *options)
 
     out = tmp_path / "out"
     shutil.copytree(trained[0], out)
-    monkeypatch.setattr("clsplat.blocks.blocks.trained", empty)
+    monkeypatch.setattr("clsplat.workflows.blocks.trained", empty)
     train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
     assert "block_01: no Gaussian is left in its cell; the model goes on without it" in caplog.text
     parts = [clsplat.load(trained[0] / f"block_{i:02d}").means for i in (0, 2)]
@@ -202,8 +202,8 @@ def test_a_box_without_gaussians_is_told_apart(few_steps, tiny_scene, tmp_path):
 
 def test_blocks_trained_in_a_store_are_those_trained_here(trained, tiny_scene, few_steps, tmp_path, monkeypatch):
     on, out, here = tmp_path / "lab.yaml", tmp_path / "out", []
-    run = tuning.run_pipeline
-    monkeypatch.setattr(tuning, "run_pipeline", lambda *words: here.append(words[1].name) or run(*words))
+    run = finetune.run_pipeline
+    monkeypatch.setattr(finetune, "run_pipeline", lambda *words: here.append(words[1].name) or run(*words))
     on.write_text(f"engine: inline\nstore: '{tmp_path / 'store'}'\n")
     for _ in range(2):  # the second time all is done
         train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER, on=on)

@@ -11,22 +11,20 @@ import pytest
 from typer.testing import CliRunner
 
 import clsplat
-from clsplat import lock
 from clsplat.cli import app
-from clsplat.compress import search
-from clsplat.compress.page import page, table
-from clsplat.compress.rungs import FITTING, Ladder, checked_keeps
-from clsplat.compress.target import Point, Target
-from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
+from clsplat.core import lock
+from clsplat.core.errors import ConfigError, DataError, Interrupted, OutputError
+from clsplat.core.files import LOCK
 from clsplat.formats.table import detect, read
 from clsplat.gaussians.model import Rendering
 from clsplat.gaussians.sky import Sky
-from clsplat.names import LOCK
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs import loaded, runner
+from clsplat.runs import model_file, runner
 from clsplat.runs.model_file import Source, evaluate
 from clsplat.training.run import Run
-from clsplat.tuning.tuning import Tuning
+from clsplat.workflows import compress
+from clsplat.workflows.compress import FITTING, Ladder, Point, Target, checked_keeps, page, table
+from clsplat.workflows.finetune import Tuning
 from tests.support.html_page import Page
 from tests.support.runs import NO_PROCESS
 
@@ -76,7 +74,7 @@ def test_what_is_no_target_is_refused(text):
 def test_a_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
     sky = Sky(rng.random((64, 3), np.float32))
     replace(clsplat.load(few_steps), sky=sky).save(tmp_path / "rung.sog")
-    search._copy(tmp_path / "rung.sog", tmp_path / "compressed.sog")
+    compress._copy(tmp_path / "rung.sog", tmp_path / "compressed.sog")
     np.testing.assert_array_equal(clsplat.load(tmp_path / "compressed.sog").sky.texels, sky.texels)
 
 
@@ -172,8 +170,8 @@ def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatc
         opened.append(path)
         return clsplat.load(path)
 
-    monkeypatch.setattr(loaded, "load", load)
-    monkeypatch.setattr(search, "load", load)
+    monkeypatch.setattr(model_file, "load", load)
+    monkeypatch.setattr(compress, "load", load)
     (tmp_path / "own.txt").write_text("mine")
     with pytest.raises(ConfigError, match="holds something else"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
@@ -286,8 +284,8 @@ def test_the_command_prints_a_table(searched, few_steps):
 def test_a_loss_of_nothing_has_no_sign(monkeypatch):
     same = {"psnr": 30.0, "bytes": 10}
     found = {"chosen": {**same, "psnr": 29.999}, "source": same, "file": "a.sog", "page": "a.html"}
-    monkeypatch.setattr("clsplat.api.compression.compress_model", lambda *_, **__: found)
-    monkeypatch.setattr("clsplat.compress.page.table", lambda _: "")
+    monkeypatch.setattr("clsplat.api.commands.compress_model", lambda *_, **__: found)
+    monkeypatch.setattr("clsplat.workflows.compress.table", lambda _: "")
     told = CliRunner().invoke(app, ["compress", "a.ply"]).output
     assert "0.00 dB" in told
     assert "-0.00" not in told
@@ -327,7 +325,7 @@ def test_a_model_whose_size_cannot_be_told_leaves_no_folder(few_steps, tmp_path,
     def damaged(path):
         raise DataError("a level is missing")
 
-    monkeypatch.setattr(search, "bytes_of", damaged)
+    monkeypatch.setattr(compress, "bytes_of", damaged)
     with pytest.raises(DataError, match="a level is missing"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.density import mixture
 from clsplat.density.mixture import covariance_of, mass_of, merged, surface, volume
-from clsplat.errors import ConfigError, DataError
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.model import Model, Rendering
-from clsplat.lod import decimation
-from clsplat.lod.decimation import decimated, matched, pair_cost
+from clsplat.workflows import lod
+from clsplat.workflows.lod import decimated, matched, pair_cost
 from tests.support.models import splats
 
 
@@ -138,10 +138,10 @@ def test_work_grows_with_rows_and_pairs_not_with_their_product(rng, monkeypatch)
     monkeypatch.setattr(
         mixture, "mass_of", lambda tables, size: rows.append(len(tables["means"])) or mass_of(tables, size)
     )
-    monkeypatch.setattr(decimation, "mass_of", mixture.mass_of, raising=False)
+    monkeypatch.setattr(lod, "mass_of", mixture.mass_of, raising=False)
     source = wide(model(rng, 300))
     whole = matched(source)
-    monkeypatch.setattr(decimation, "BLOCK", 50)
+    monkeypatch.setattr(lod, "BLOCK", 50)
     for one, two in zip(matched(source), whole, strict=True):
         np.testing.assert_array_equal(one, two)
     assert rows == [300, 300]

@@ -11,16 +11,13 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat.cli import app
-from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
-from clsplat.formats.model_files import bytes_of
-from clsplat.formats.table import read
+from clsplat.core.errors import ConfigError, DataError, Interrupted, OutputError
+from clsplat.formats.table import bytes_of, read
 from clsplat.gaussians.sky import Sky
-from clsplat.lod import levels
-from clsplat.lod.decimation import decimated
-from clsplat.lod.table import table
-from clsplat.lod.training import Plan
 from clsplat.runs import runner
 from clsplat.runs.model_file import evaluate
+from clsplat.workflows import lod
+from clsplat.workflows.lod import Plan, decimated, table
 from tests.support.runs import NO_PROCESS
 
 pytestmark = pytest.mark.slow
@@ -58,8 +55,8 @@ def test_levels_are_trained_and_measured(trained, few_steps, tiny_scene):
 
 def test_numbers_are_told_as_elsewhere(monkeypatch, caplog):
     caplog.set_level("INFO")
-    monkeypatch.setattr(levels, "decimated", lambda model, keep: range(1200))
-    levels._levels(range(2400), Plan(levels=2), None)
+    monkeypatch.setattr(lod, "decimated", lambda model, keep: range(1200))
+    lod._levels(range(2400), Plan(levels=2), None)
     assert "level 1: 1,200 Gaussians" in caplog.text
 
 
@@ -182,7 +179,7 @@ def test_unwritable_path_is_refused_before_the_work(name, steps, few_steps, tmp_
     def works(*_):
         raise AssertionError("the work begins")
 
-    monkeypatch.setattr("clsplat.lod.levels.decimated", works)
+    monkeypatch.setattr("clsplat.workflows.lod.decimated", works)
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match="cannot be written"):
         clsplat.write_levels(few_steps, tmp_path / name, steps=steps)

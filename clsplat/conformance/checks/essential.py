@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from clsplat.conformance.check import Checks, Note
-from clsplat.conformance.checks import blending, images, large, projection, tiles, update
-from clsplat.conformance.comparison import Figure
+from clsplat.conformance.check import Checks, Figure, Note
+from clsplat.conformance.checks import blending, images, projection, tiles, training
+from clsplat.conformance.checks import tiles as large
 from clsplat.conformance.scenes import random_case, safe_case, with_world_filter
 from clsplat.opencl.device import Device
 
@@ -57,4 +57,4 @@ def learning(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note
     x, y = images.pictures(rng, 33, 17)
     for loss, oracle, kernel in images.LOSSES:
         yield from images.loss_figures(device, loss(weight=0.7), 0.7, oracle, kernel, x, y)
-    yield from update.fused_figures(device, rng, random_case(rng, 40), "40 Gaussians")
+    yield from training.fused_figures(device, rng, random_case(rng, 40), "40 Gaussians")

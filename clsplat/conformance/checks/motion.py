@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import Checks, Note
-from clsplat.conformance.comparison import CONIC, SUM, Figure, by_element, by_norm, equal, wrong
+from clsplat.conformance.check import CONIC, SUM, Checks, Figure, Note, by_element, by_norm, equal, wrong
 from clsplat.conformance.scenes import Case, random_case
-from clsplat.formats.motion import MOTION, STILL, WIDTHS, fields_of, width_of
-from clsplat.gaussians.tables import Gaussians, Gradients, moment_tables
+from clsplat.formats.splats import MOTION, STILL, WIDTHS, fields_of, width_of
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.structs import Gradients, moment_tables
 from clsplat.losses.base import PenaltyInputs
-from clsplat.losses.motion import Brevity, Travel
+from clsplat.methods.dynamic import Brevity, Travel
 from clsplat.opencl.device import Device
 from clsplat.render.motion import at_moment, to_centres
 from clsplat.render.rasterizer import Rasterizer

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.check import GRADIENT, Checks, Figure, Note, by_norm, equal
 from clsplat.conformance.checks.blending import (
     ALL_SUMS,
     BACKGROUND,
@@ -19,8 +19,7 @@ from clsplat.conformance.checks.blending import (
     sum_figures,
 )
 from clsplat.conformance.checks.projection import gradient_figures, record_figures
-from clsplat.conformance.checks.update import fused_figures
-from clsplat.conformance.comparison import GRADIENT, Figure, by_norm, equal
+from clsplat.conformance.checks.training import fused_figures
 from clsplat.conformance.scenes import Case, random_case, safe_case, with_world_filter
 from clsplat.density.survey import SQUARE
 from clsplat.opencl.device import Device

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.check import SUM, Checks, Figure, Note, by_element, by_norm, equal
 from clsplat.conformance.checks.images import outside, planes_of
-from clsplat.conformance.comparison import SUM, Figure, by_element, by_norm, equal
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.gaussians.sky import DeviceSky
 from clsplat.opencl.device import Array, Device

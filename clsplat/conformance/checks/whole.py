@@ -8,26 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.bench.cases import run_bench
-from clsplat.bench.peaks import Peaks, measure_peaks
-from clsplat.bench.scenes import case as bench_case
-from clsplat.conformance.check import Checks, Note
-from clsplat.conformance.comparison import Figure, by_element, equal
+from clsplat.conformance.bench.cases import Peaks, measure_peaks, run_bench
+from clsplat.conformance.bench.cases import case as bench_case
+from clsplat.conformance.check import Checks, Figure, Note, by_element, equal
 from clsplat.conformance.host import available_memory
 from clsplat.conformance.scenes import Case, random_case
-from clsplat.density.basic import Clone, PruneFaint, Split
+from clsplat.core.errors import MemoryLimitError
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
 from clsplat.density.thresholds import SceneScale
-from clsplat.errors import MemoryLimitError
 from clsplat.losses.image import L1, Dssim
+from clsplat.methods.adc import Clone, PruneFaint, Split
 from clsplat.opencl.device import Array, Device
+from clsplat.photos.photographs import Photograph
 from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
-from clsplat.views.photographs import Photograph
 
 CHECKS = Checks()
 SPEED = Checks()  # needed once for a device, not for each schedule

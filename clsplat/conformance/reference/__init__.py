@@ -6,8 +6,15 @@ Conventions: OpenCV camera (x right, y down, z forward); the centre of pixel (0,
 (w, x, y, z); `grad_x` is dL/dx.  Letters: N Gaussians, K harmonics, C = 3 channels, H, W image.
 """
 
-from clsplat.conformance.reference.adam import (
-    adam_step,
+from clsplat.conformance.reference.appearance import (
+    centred_grids,
+    coloured,
+    coloured_backward,
+    gain_gradient,
+    gain_matrix,
+    grid_smoothness,
+    gridded,
+    gridded_backward,
 )
 from clsplat.conformance.reference.blending import (
     blend,
@@ -16,41 +23,33 @@ from clsplat.conformance.reference.blending import (
     blend_weights,
     contribution,
     falloff_squares,
+    gradient_behind,
+    inverse_depth,
+    inverse_depth_backward,
+    inverse_depth_loss,
+    laid_over,
+    layer_cover,
     margin,
     render,
     render_backward,
     weight_entropy,
 )
-from clsplat.conformance.reference.blur import (
+from clsplat.conformance.reference.images import (
     blurred,
-)
-from clsplat.conformance.reference.clusters import member_sums, nearest_vectors, shared_means
-from clsplat.conformance.reference.colour_grid import centred_grids, grid_smoothness, gridded, gridded_backward
-from clsplat.conformance.reference.colours import coloured, coloured_backward, gain_gradient, gain_matrix
-from clsplat.conformance.reference.density import (
-    ABSGS,
-    CLONE,
-    KEEP,
-    PRUNE,
-    SPLIT,
-    adc_actions,
-    decayed_logit,
-    mean_gradient,
-    reset_logit,
-    screen_gain,
-    screen_gradient,
-    shared_logit,
-    split_children,
-)
-from clsplat.conformance.reference.haar import (
+    dssim,
     haar_filtered,
     haar_gradient,
+    l1,
+    l2,
+    ms_ssim,
+    psnr,
+    residual_numbers,
+    residuals,
+    ssim_map,
+    ssim_taps,
+    view_error,
+    without_transients,
 )
-from clsplat.conformance.reference.harmonics import (
-    sh_basis,
-    sh_basis_gradient,
-)
-from clsplat.conformance.reference.inverse_depth import inverse_depth, inverse_depth_backward, inverse_depth_loss
 from clsplat.conformance.reference.kinds import (
     SMOOTH,
     Camera,
@@ -58,43 +57,49 @@ from clsplat.conformance.reference.kinds import (
     Splats,
     Thresholds,
 )
-from clsplat.conformance.reference.layer import gradient_behind, laid_over, layer_cover
-from clsplat.conformance.reference.losses import (
-    dssim,
-    l1,
-    l2,
-    ms_ssim,
-    psnr,
-    ssim_map,
-    ssim_taps,
-    view_error,
-)
 from clsplat.conformance.reference.motion import brevity, moved, moved_backward, travel
-from clsplat.conformance.reference.penalties import (
-    anisotropy,
-    covariance_trace,
-    mean_opacity,
-    mean_scale,
-)
-from clsplat.conformance.reference.poses import moved_camera, pose_gradient
 from clsplat.conformance.reference.projection import (
     clamped_ray,
+    filtered,
     footprint,
+    moved_camera,
+    pose_gradient,
     project,
-    ray_limits,
-    rotation_matrix,
-)
-from clsplat.conformance.reference.projection_backward import (
     project_backward,
     ratio_gradient,
+    ray_limits,
+    rotation_matrix,
+    sampling_interval,
+    sh_basis,
+    sh_basis_gradient,
 )
 from clsplat.conformance.reference.random import dropped, normal3, philox
 from clsplat.conformance.reference.sky import rays, shows_sky, sky_cover, sky_gradient, sky_image, sky_update
-from clsplat.conformance.reference.splitting import mean_jacobian, screen_splitting, splitting
-from clsplat.conformance.reference.transients import residual_numbers, residuals, without_transients
-from clsplat.conformance.reference.world_filter import (
-    filtered,
-    sampling_interval,
+from clsplat.conformance.reference.training import (
+    ABSGS,
+    CLONE,
+    KEEP,
+    PRUNE,
+    SPLIT,
+    adam_step,
+    adc_actions,
+    anisotropy,
+    covariance_trace,
+    decayed_logit,
+    mean_gradient,
+    mean_jacobian,
+    mean_opacity,
+    mean_scale,
+    member_sums,
+    nearest_vectors,
+    reset_logit,
+    screen_gain,
+    screen_gradient,
+    screen_splitting,
+    shared_logit,
+    shared_means,
+    split_children,
+    splitting,
 )
 
 __all__ = [

@@ -6,8 +6,56 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.reference.harmonics import sh_basis
-from clsplat.conformance.reference.kinds import RADIUS_TILE, Camera, Gaussians, Splats, Thresholds
+from clsplat.conformance.reference.kinds import PARAMETERS, RADIUS_TILE, Camera, Gaussians, Splats, Thresholds
+
+# Spherical harmonics up to degree 3 in the sign convention of 3DGS, and their derivatives.
+
+
+def _harmonics(x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> list[tuple[Any, ...]]:
+    """The 16 rows (value, d/dx, d/dy, d/dz), treating x, y, z as free."""
+    c0, c1 = 0.28209479177387814, 0.4886025119029199
+    a, b, c = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
+    d, e, f = 0.5900435899266435, 2.890611442640554, 0.4570457994644658
+    g, h = 0.3731763325901154, 1.445305721320277
+    xx, yy, zz = x * x, y * y, z * z
+    return [
+        (c0, 0, 0, 0),
+        (-c1 * y, 0, -c1, 0),
+        (c1 * z, 0, 0, c1),
+        (-c1 * x, -c1, 0, 0),
+        (a * x * y, a * y, a * x, 0),
+        (-a * y * z, 0, -a * z, -a * y),
+        (b * (2 * zz - xx - yy), -2 * b * x, -2 * b * y, 4 * b * z),
+        (-a * x * z, -a * z, 0, -a * x),
+        (c * (xx - yy), 2 * c * x, -2 * c * y, 0),
+        (-d * y * (3 * xx - yy), -6 * d * x * y, -3 * d * (xx - yy), 0),
+        (e * x * y * z, e * y * z, e * x * z, e * x * y),
+        (-f * y * (4 * zz - xx - yy), 2 * f * x * y, -f * (4 * zz - xx - 3 * yy), -8 * f * y * z),
+        (g * z * (2 * zz - 3 * xx - 3 * yy), -6 * g * x * z, -6 * g * y * z, g * (6 * zz - 3 * xx - 3 * yy)),
+        (-f * x * (4 * zz - xx - yy), -f * (4 * zz - 3 * xx - yy), 2 * f * x * y, -8 * f * x * z),
+        (h * z * (xx - yy), 2 * h * x * z, -2 * h * y * z, h * (xx - yy)),
+        (-d * x * (xx - 3 * yy), -3 * d * (xx - yy), 6 * d * x * y, 0),
+    ]
+
+
+def _harmonic_table(directions: NDArray[Any], degree: int) -> NDArray[Any]:
+    """Value and gradient of the first (degree+1)² harmonics: [..., K, 4]."""
+    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    table = np.empty((*x.shape, (degree + 1) ** 2, 4))
+    for k, row in enumerate(_harmonics(x, y, z)[: (degree + 1) ** 2]):
+        for i, entry in enumerate(row):
+            table[..., k, i] = entry
+    return table
+
+
+def sh_basis(directions: NDArray[Any], degree: int) -> NDArray[Any]:
+    """Y_k of unit directions: [..., 3] -> [..., K]."""
+    return _harmonic_table(directions, degree)[..., 0]
+
+
+def sh_basis_gradient(directions: NDArray[Any], degree: int) -> NDArray[Any]:
+    """dY_k/d(x, y, z), as polynomials of free x, y, z: [..., 3] -> [..., K, 3]."""
+    return _harmonic_table(directions, degree)[..., 1:]
 
 
 def rotation_matrix(quat: NDArray[Any]) -> NDArray[Any]:
@@ -159,3 +207,221 @@ def project(
         splats.colour[n] = np.maximum(0, unclamped_colour(gaussians, n, camera, degree))
         splats.depth[n] = z
     return splats
+
+
+# Gradients of the projection, one Gaussian at a time.
+
+
+def quat_gradient(quat: NDArray[Any], h: NDArray[Any]) -> NDArray[Any]:
+    """dL/dq of the raw quaternion from H = dL/dR."""
+    norm = np.linalg.norm(quat)
+    unit = quat / norm
+    w, x, y, z = unit
+    gw = 2 * (z * (h[1, 0] - h[0, 1]) + y * (h[0, 2] - h[2, 0]) + x * (h[2, 1] - h[1, 2]))
+    gx = 2 * (y * (h[0, 1] + h[1, 0]) + z * (h[0, 2] + h[2, 0]) + w * (h[2, 1] - h[1, 2]) - 2 * x * (h[1, 1] + h[2, 2]))
+    gy = 2 * (x * (h[0, 1] + h[1, 0]) + z * (h[1, 2] + h[2, 1]) + w * (h[0, 2] - h[2, 0]) - 2 * y * (h[0, 0] + h[2, 2]))
+    gz = 2 * (x * (h[0, 2] + h[2, 0]) + y * (h[1, 2] + h[2, 1]) + w * (h[1, 0] - h[0, 1]) - 2 * z * (h[0, 0] + h[1, 1]))
+    grad_unit = np.array([gw, gx, gy, gz])
+    return (grad_unit - unit * (unit @ grad_unit)) / norm
+
+
+def point_gradient(camera: Camera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any]) -> NDArray[Any]:
+    """dL/d(camera-space point), through the screen position and through J with its clamped ray."""
+    x, y, z = foot.point
+    fx, fy = camera.fx, camera.fy
+    gu, gv = grad_mean2d
+    gx, gy = fx / z * gu, fy / z * gv
+    gz = -(fx * x * gu + fy * y * gv) / z**2 - fx / z**2 * grad_j[0, 0] - fy / z**2 * grad_j[1, 1]
+    tx, ty = clamped_ray(camera, foot.point)
+    (x_low, x_high), (y_low, y_high) = ray_limits(camera)
+    if x_low <= x / z <= x_high:
+        gx += -fx / z**2 * grad_j[0, 2]
+        gz += 2 * fx * x / z**3 * grad_j[0, 2]
+    else:  # tx = limit * z, so J02 goes like 1/z and x is not in it
+        gz += fx * tx / z**3 * grad_j[0, 2]
+    if y_low <= y / z <= y_high:
+        gy += -fy / z**2 * grad_j[1, 2]
+        gz += 2 * fy * y / z**3 * grad_j[1, 2]
+    else:
+        gz += fy * ty / z**3 * grad_j[1, 2]
+    return np.array([gx, gy, gz])
+
+
+def ratio_gradient(foot: Footprint) -> NDArray[Any]:
+    """d(det V / det V1)/dV, by the quotient rule; V1 = V + constant: [2,2]."""
+    det0, det1 = determinant(foot.sharp), determinant(foot.dilated)
+    return adjugate(foot.sharp) / det1 - det0 / det1**2 * adjugate(foot.dilated)
+
+
+def covariance_gradient(
+    splats: Splats, n: int, foot: Footprint, compensate: float, grad_conic: NDArray[Any], grad_kappa: float
+) -> NDArray[Any]:
+    """dL/dV, [2,2], from the conic and from κ = sqrt(1 + compensate (det V / det V1 - 1))."""
+    # Conic -> 2D covariance: G_V = -K G_K K (that of V itself for the pixel's box)
+    a, b, c = splats.conic[n]
+    conic = np.array([[a, b], [b, c]])
+    ga, gb, gc = grad_conic
+    grad_v = np.array([[ga, gb / 2], [gb / 2, gc]])
+    if not splats.pixel_box:
+        grad_v = -conic @ grad_v @ conic
+    if compensate != 0:
+        _, _, kappa = opacity_factors(0.0, foot, compensate)
+        grad_v += grad_kappa * compensate / (2 * kappa) * ratio_gradient(foot)
+    return grad_v
+
+
+def project_backward(
+    gaussians: Gaussians,
+    camera: Camera,
+    degree: int,
+    variance: float,
+    compensate: float,
+    splats: Splats,
+    grad_mean2d: NDArray[Any],
+    grad_conic: NDArray[Any],
+    grad_opacity: NDArray[Any],
+    grad_colour: NDArray[Any],
+) -> dict[str, NDArray[Any]]:
+    """Gradients of the parameters, named as in `PARAMETERS`; `filter_variance` is a constant.  Culled rows are zero."""
+    grad = {name: np.zeros_like(getattr(gaussians, name)) for name in PARAMETERS}
+    for n in np.flatnonzero(splats.visible).tolist():
+        foot = footprint(gaussians, n, camera, variance)
+
+        # Opacity o = sigmoid * ρ * κ, with the constant in ρ
+        sigmoid, rho, kappa = opacity_factors(gaussians.logit_opacity[n], foot, compensate)
+        rho = rho * gaussians.opacity_factor
+        grad["logit_opacity"][n] = grad_opacity[n] * rho * kappa * sigmoid * (1 - sigmoid)
+        grad_kappa = grad_opacity[n] * sigmoid * rho
+
+        grad_v = covariance_gradient(splats, n, foot, compensate, grad_conic[n], grad_kappa)
+
+        # 2D -> 3D covariance: V = M Σ Mᵀ, M = J W
+        m = foot.jacobian @ camera.rotation
+        grad_sigma = m.T @ grad_v @ m
+        grad_j = 2 * grad_v @ m @ foot.covariance @ camera.rotation.T
+        grad_point = point_gradient(camera, foot, grad_mean2d[n], grad_j)
+
+        # Colour: SH, its direction, max(0, .)
+        direction, distance = view_direction(camera, gaussians.means[n])
+        not_clamped = unclamped_colour(gaussians, n, camera, degree) > 0
+        grad_c = grad_colour[n] * not_clamped
+        basis, basis_gradient = sh_basis(direction, degree), sh_basis_gradient(direction, degree)
+        used = len(basis)
+        grad["sh"][n, :used] = np.outer(basis, grad_c)
+        grad_d = basis_gradient.T @ (gaussians.sh[n, :used] @ grad_c)
+        grad["means"][n] = camera.rotation.T @ grad_point + (grad_d - direction * (direction @ grad_d)) / distance
+
+        # Σ = L Lᵀ, L = R diag(s'); s' = sqrt(s² + f) also sits in ρ = Π s/s'
+        grad_l = 2 * grad_sigma @ foot.rotation @ np.diag(foot.filtered)
+        grad["quats"][n] = quat_gradient(gaussians.quats[n], grad_l @ np.diag(foot.filtered))
+        grad_filtered = np.sum(foot.rotation * grad_l, axis=0)
+        through_covariance = grad_filtered * foot.scale**2 / foot.filtered
+        through_rho = grad_opacity[n] * splats.opacity[n] * gaussians.filter_variance[n] / foot.filtered**2
+        grad["log_scales"][n] = through_covariance + through_rho
+    return grad
+
+
+# The world filter: how finely cameras sample each Gaussian (Yu et al. 2024, 5.1).
+
+
+def sampling_interval(
+    means: NDArray[Any], cameras: list[Camera], focal: list[float], near: float = 0.2, margin: float = 0.15
+) -> NDArray[Any]:
+    """Smallest depth / focal length over the cameras that see each mean; the largest of them where none does: [N]."""
+    intervals = np.full(len(means), np.inf)
+    for n, mean in enumerate(means):
+        for camera, f in zip(cameras, focal, strict=True):
+            x, y, z = camera.rotation @ mean + camera.translation
+            if not z > near:
+                continue
+            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+            if (
+                -margin * camera.width <= u <= (1 + margin) * camera.width
+                and -margin * camera.height <= v <= (1 + margin) * camera.height
+            ):
+                intervals[n] = min(intervals[n], z / f)
+    seen = np.isfinite(intervals)
+    intervals[~seen] = intervals[seen].max(initial=0)
+    return intervals
+
+
+def filtered(
+    log_scales: NDArray[Any], logit: NDArray[Any], variance: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Standard deviations and opacities as they are drawn: [N,3], [N] -> [N,3], [N]."""
+    scale = np.exp(log_scales)
+    drawn = np.sqrt(scale**2 + variance[:, None])
+    return drawn, np.prod(scale / drawn, axis=1) / (1 + np.exp(-logit))
+
+
+# Gradients by the place and the focal length of a camera, one Gaussian at a time, in the axes of the camera.
+
+
+def moved_camera(camera: Camera, shift: NDArray[Any], turn: NDArray[Any], zoom: float = 0.0) -> Camera:
+    """The camera after W' = exp([turn]x) W, t' = exp([turn]x) t + shift, and focal lengths times exp(zoom)."""
+    angle = np.linalg.norm(turn)
+    x, y, z = turn
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation = np.eye(3)
+    if angle > 0:
+        rotation = rotation + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
+    pose = rotation @ camera.world_to_camera
+    pose[:, 3] += shift
+    fx, fy = np.exp(zoom) * camera.fx, np.exp(zoom) * camera.fy
+    return Camera(pose, fx, fy, camera.cx, camera.cy, camera.width, camera.height)
+
+
+def pose_gradient(
+    gaussians: Gaussians,
+    camera: Camera,
+    degree: int,
+    variance: float,
+    compensate: float,
+    splats: Splats,
+    grad_mean2d: NDArray[Any],
+    grad_conic: NDArray[Any],
+    grad_opacity: NDArray[Any],
+    grad_colour: NDArray[Any],
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """dL/d(shift) and dL/d(turn), each [3], and dL/d(zoom), [1], of `moved_camera` at zero."""
+    shift, turn, zoom = np.zeros(3), np.zeros(3), np.zeros(1)
+    for n in np.flatnonzero(splats.visible).tolist():
+        foot = footprint(gaussians, n, camera, variance)
+        sigmoid, rho, _ = opacity_factors(gaussians.logit_opacity[n], foot, compensate)
+        grad_kappa = grad_opacity[n] * sigmoid * rho * gaussians.opacity_factor
+        grad_v = covariance_gradient(splats, n, foot, compensate, grad_conic[n], grad_kappa)
+        g = 2 * grad_v @ foot.jacobian @ camera.rotation @ foot.covariance @ camera.rotation.T
+        grad_point = point_gradient(camera, foot, grad_mean2d[n], g)
+
+        # x_c' = exp([turn]x) x_c + shift, and M = J W: dL/d(turn) = <G_J, J [turn]x>
+        j = foot.jacobian
+        turn += np.cross(foot.point, grad_point)
+        turn += [
+            j[0, 2] * g[0, 1] + j[1, 2] * g[1, 1] - j[1, 1] * g[1, 2],
+            j[0, 0] * g[0, 2] - j[0, 2] * g[0, 0] - j[1, 2] * g[1, 0],
+            j[1, 1] * g[1, 0] - j[0, 0] * g[0, 1],
+        ]
+
+        # The direction of view changes with the shift alone
+        direction, distance = view_direction(camera, gaussians.means[n])
+        grad_c = grad_colour[n] * (unclamped_colour(gaussians, n, camera, degree) > 0)
+        basis_gradient = sh_basis_gradient(direction, degree)
+        grad_d = basis_gradient.T @ (gaussians.sh[n, : len(basis_gradient)] @ grad_c)
+        shift += grad_point + camera.rotation @ (grad_d - direction * (direction @ grad_d)) / distance
+        zoom += camera.fx * focal_gradient(camera, foot, grad_mean2d[n], g, 0)
+        zoom += camera.fy * focal_gradient(camera, foot, grad_mean2d[n], g, 1)
+    return shift, turn, zoom
+
+
+def focal_gradient(
+    camera: Camera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any], axis: int
+) -> float:
+    """dL/dfx (axis 0) or dL/dfy (1), through the screen position and through J.
+
+    Limits of rays go like 1/f, so that J02 = -f limit/z of a clamped one does not change with f.
+    """
+    z = foot.point[2]
+    ray = foot.point[axis] / z
+    low, high = ray_limits(camera)[axis]
+    free = low <= ray <= high
+    return float(grad_mean2d[axis] * ray + grad_j[axis, axis] / z - (ray / z * grad_j[axis, 2] if free else 0.0))

@@ -1,1 +1,0 @@
-"""Cameras of a scene in the files of other programs."""

@@ -1,0 +1,1 @@
+"""Times of training steps next to the peaks of the device."""

@@ -1,0 +1,299 @@
+"""Whole training steps of several scenes in turns, so that a slow moment of the machine affects all; medians count."""
+
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.density.control import densify
+from clsplat.density.edit import Edit
+from clsplat.density.statistics import SplatStats
+from clsplat.density.thresholds import SceneScale
+from clsplat.formats.splats import PARAMETERS, SH_C0, Parameters
+from clsplat.formats.table import detect
+from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.model import load
+from clsplat.methods.adc import PruneLarge
+from clsplat.opencl.device import Device, constants
+from clsplat.photos.photographs import Photograph, Photographs
+from clsplat.pipeline.file import PipelineFile
+from clsplat.render.camera import upload_camera
+from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
+from clsplat.scene.camera import Camera
+from clsplat.scene.points import read_points_ply
+from clsplat.scene.view import View
+from clsplat.stages.init import from_points
+from clsplat.training.adam import Adam, Rates
+from clsplat.training.memory import plan
+from clsplat.training.motion import MotionRates
+from clsplat.training.records import stage_milliseconds
+from clsplat.training.trainer import Trainer
+
+# Peak rates of a device, from which the floors of stages are computed.
+
+LEAST = 2e-3  # s of a measurement: the first launch and the wait for the last take some 0.02 ms of it
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """Peak rates of the device."""
+
+    gflops: float  # multiply-adds count as two
+    gexp: float  # 10⁹ exponentials per second
+    gbytes: float  # 10⁹ bytes per second, read plus written, arrays larger than caches
+
+
+def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
+    """Measure the rates of multiply-adds, exponentials and copies: the best of `repeats`."""
+    program, lanes = device.program("peak.cl"), int(device.tuning["LANES"])
+    group = int(device.tuning["GROUP"])
+    is_cpu = device.info.kind == "CPU"
+    items = 64 * group * max(1, device.info.units // (8 if is_cpu else 2))  # a unit of a GPU runs some 2048 at once
+    result = device.empty(items * lanes)
+
+    def spent(launch: Callable[[], None], times: int) -> float:
+        device.finish()
+        start = time.perf_counter()
+        for _ in range(times):
+            launch()
+        device.finish()
+        return time.perf_counter() - start
+
+    def seconds(launch: Callable[[], None]) -> float:
+        times = 1
+        spent(launch, times)  # builds it
+        while (taken := spent(launch, times)) < LEAST:
+            times *= 4
+        return min([taken, *(spent(launch, times) for _ in range(repeats - 1))]) / times
+
+    piece, whole = max(lanes, 4), program.peak_copy.group[0]  # floats that an item copies, and items of a group
+    rounds = 40_000 if is_cpu else 4000  # long enough for the system to spread the threads
+    fma = seconds(lambda: program.peak_fma(items=items, result=result, factor=0.5, rounds=rounds))
+    exp = seconds(lambda: program.peak_exp(items=items, result=result, step=1e-3, rounds=rounds))
+    length = min(64 << 20, device.info.allocation // 16 // 4) // (piece * whole) * (piece * whole)  # floats
+    source, copied = device.zeros(length), device.zeros(length)
+    copy = seconds(lambda: program.peak_copy(items=length // piece, values=source, copied=copied))
+    work = items * lanes * rounds
+    return Peaks(16 * work / fma / 1e9, 2 * work / exp / 1e9, 8 * length / copy / 1e9)
+
+
+# The work of a step, and a lower bound of its time.
+
+
+@dataclass(frozen=True)
+class Work:
+    """The work of one step."""
+
+    gaussians: int
+    pairs: int
+    rows: int  # (pair, pixel row) combinations that blending computes, 16 pixels each
+    pixels: int
+
+
+def floors(work: Work, peaks: Peaks) -> dict[str, float]:
+    """Return the lower bound of each stage, ms.
+
+    Blending is counted in vector instructions of 16 lanes (31 a row forward; 80 a row and 60 a pair backward), which
+    issue at the rate of multiply-adds; the other stages in operations and bytes (473 operations and 236 bytes of
+    parameters a Gaussian, 59 parameters with gradient and two moments, 64 bytes a record, …).
+    """
+    n, pairs, pixels = work.gaussians, work.pairs, work.pixels
+
+    def floor(operations: float, moved: float) -> float:
+        return 1e3 * max(operations / (1e9 * peaks.gflops), moved / (1e9 * peaks.gbytes))
+
+    vector = 2 * 16  # operations of a multiply-add instruction
+    return {
+        "project": floor(380 * n, (236 + 64 + 8) * n),
+        "pairs": floor(80 * pairs, 2 * 64 * n + 12 * pairs),
+        "sort": floor(0, 64 * n + 24 * pairs),
+        "blend": floor(31 * vector * work.rows, 64 * pairs),
+        "loss": floor(1250 * pixels, 60 * pixels),
+        "blend backward": floor(vector * (80 * work.rows + 60 * pairs), 128 * pairs),
+        "sum records": floor(9 * pairs, 64 * pairs + 36 * n),
+        "update": floor((900 + 12 * 59) * n, (64 + 36 + 8 + 24 * 59) * n),
+        "statistics": floor(0, 20 * n),
+    }
+
+
+SPLAT_Y_MIN, SPLAT_Y_MAX = (int(constants("splat.h")[name]) for name in ("SPLAT_Y_MIN", "SPLAT_Y_MAX"))
+WARM_UP_STEPS = 3  # compile kernels and grow buffers
+LEAST_RATE = 1e-30  # changes nothing, so that every step does the same work; at a rate of 0 harmonics have no update
+
+
+@dataclass
+class Result:
+    """One scene's figures, in milliseconds."""
+
+    work: Work
+    stages: dict[str, float]
+    floors: dict[str, float]
+    step: float  # on the clock
+    densify: float
+    host: float  # time of the step minus that of the device's stages
+    memory: int  # bytes on the device, the peak
+    planned: int  # bytes, from the memory plan of training
+
+
+class Case:
+    """One scene for training steps with a pipeline's losses, statistics and rendering.
+
+    An exported model has the world filter in its scales, so the filter takes no time here.
+    """
+
+    def __init__(
+        self, device: Device, parameters: Parameters, photograph: Photograph, background: str, settings: PipelineFile
+    ) -> None:
+        self.device, self.photograph, optimize = device, photograph, settings.optimize
+        self._before = device.peak = device.allocated
+        gaussians = Gaussians(device, parameters)
+        for name in sorted(optimize.tables):
+            gaussians.add(name, 1)
+        colour = device.zeros(3)
+        colour.fill(1.0 if background == "white" else 0.0)
+        model = settings.model.model(gaussians, gaussians.sh_degree)
+        least: dict[str, Any] = dict.fromkeys(PARAMETERS, LEAST_RATE)
+        motion = MotionRates(**dict.fromkeys(MotionRates.model_fields, LEAST_RATE))
+        self.trainer = Trainer(
+            Rasterizer(device, "radix"),
+            model,
+            Adam(gaussians),
+            SplatStats(gaussians, optimize.statistics),
+            colour,
+            optimize.losses,
+            Rates(**least, motion=motion),
+            rows=optimize.update,
+        )
+        self.clock: list[float] = []
+        self.stages: dict[str, list[float]] = defaultdict(list)
+        self.densify: list[float] = []
+        self.frame: Frame | None = None
+        for _ in range(WARM_UP_STEPS):
+            self.step(record=False)
+        self.step(record=False, stale=PARAMETERS)  # as at a step with an edit: gradients are written to memory
+        self.edit()
+        self.memory = device.peak - self._before
+
+    def step(self, record: bool, stale: Collection[str] = ()) -> None:
+        """Do one training step; `record` keeps its times, parameters in `stale` are not updated."""
+        self.device.finish()
+        self.device.timings.sampling = record
+        start = time.perf_counter()
+        view = self.trainer.step(self.photograph, 1, stale=stale)
+        self.device.finish()
+        seconds = time.perf_counter() - start
+        self.device.timings.sampling = False
+        self.frame = view.frame
+        if record:
+            self.clock.append(1e3 * seconds)
+            for name, milliseconds in stage_milliseconds(self.device.timings).items():
+                self.stages[name].append(milliseconds)
+
+    def edit(self) -> None:
+        """Do one density edit that moves every table and changes nothing."""
+        self.device.finish()
+        start = time.perf_counter()
+        edit = Edit(self.trainer.model.gaussians, self.trainer.stats, SceneScale(1.0), step=1, seed=0)
+        densify(edit, [PruneLarge(size_above=1e30)], self.trainer.rasterizer.tiler)
+        self.device.finish()
+        self.densify.append(1e3 * (time.perf_counter() - start))
+
+    def result(self, peaks: Peaks) -> Result:
+        """Return the medians of all times, with the floors for `peaks`."""
+        work = self._work()
+        stages = {name: statistics.median(times) for name, times in self.stages.items()}
+        clock = statistics.median(self.clock)
+        host = clock - sum(stages.values())
+        densify_ms, planned = statistics.median(self.densify[1:]), self._planned()
+        return Result(work, stages, floors(work, peaks), clock, densify_ms, host, self.memory, planned)
+
+    def _planned(self) -> int:
+        camera = self.photograph.camera
+        gaussians = self.trainer.model.gaussians
+        pixels, pixel_sums = camera.stride * camera.rows, self.trainer.stats.pixel_sums
+        info, components = gaussians.device.info, gaussians.components
+        return plan(info, components, self.photograph.nbytes, pixels, pixel_sums).needed(gaussians.count)
+
+    def _work(self) -> Work:
+        assert self.frame is not None
+        lists, camera = self.frame.lists, self.frame.camera
+        records = self.frame.splats.get().reshape(-1, RECORD)[lists.pair_splat.get()[: lists.pairs]]
+        offsets = lists.tile_offset.get()[: camera.tiles + 1]
+        tiles = np.empty(lists.pairs, np.int64)
+        tiles[lists.tile_pairs.get()[: lists.pairs]] = np.repeat(np.arange(camera.tiles), np.diff(offsets))
+        top = tiles // camera.tiles_x * camera.tile + 0.5
+        first = np.maximum(np.ceil(records[:, SPLAT_Y_MIN] - top), 0)
+        last = np.minimum(np.floor(records[:, SPLAT_Y_MAX] - top), camera.tile - 1)
+        rows = int(np.maximum(last - first + 1, 0).sum()) * camera.tile // 16
+        return Work(self.trainer.model.gaussians.count, lists.pairs, rows, camera.width * camera.height)
+
+
+def run_bench(cases: dict[str, Case], peaks: Peaks, repeats: int) -> dict[str, Result]:
+    """Time every scene `repeats` times, one scene after the other; return the results by name."""
+    for _ in range(repeats):
+        for case in cases.values():
+            case.step(record=True)
+    for case in cases.values():
+        for _ in range(3):
+            case.edit()
+    return {name: case.result(peaks) for name, case in cases.items()}
+
+
+# The scenes of the benchmark: synthetic ones with a fixed seed, and real ones from files.
+
+FOCAL = 400.0  # px, of the synthetic scenes
+SIZE = 2.2  # px, standard deviation of their splats
+SIZES = {"A": (400, 400, 50_000), "B": (800, 800, 300_000), "C": (1920, 1080, 1_000_000)}
+GROWTH_COUNTS = (50_000, 100_000, 200_000, 400_000, 700_000, 1_000_000)
+
+
+def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[Parameters, View]:
+    """Return flat Gaussians that face the camera, of about `size` px, with log-normal sizes and random opacities."""
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(-8, width + 8, count), rng.uniform(-8, height + 8, count)
+    sizes = size * np.exp(rng.normal(0, 0.5, (count, 2)))
+    angle, depth = rng.uniform(0, np.pi, count), rng.uniform(1, 10, count)
+    means = np.stack([(u - width / 2) / FOCAL * depth, (v - height / 2) / FOCAL * depth, depth], axis=1)
+    scales = np.column_stack([sizes * depth[:, None] / FOCAL, np.full(count, 1e-4)])
+    zero = np.zeros(count)
+    tables: dict[str, NDArray[Any]] = {
+        "means": means,
+        "quats": np.stack([np.cos(angle / 2), zero, zero, np.sin(angle / 2)], axis=1),
+        "log_scales": np.log(scales),
+        "logit_opacity": rng.normal(-1, 1.5, (count, 1)),
+        "sh_base": (rng.uniform(0, 1, (count, 3)) - 0.5) / SH_C0,
+        "sh_rest": rng.normal(0, 0.02, (count, 45)),
+    }
+    camera = Camera(width, height, FOCAL, FOCAL, width / 2, height / 2)
+    parameters = {key: table.astype(np.float32) for key, table in tables.items()}
+    return parameters, View("bench", camera, np.eye(4)[:3], Path("bench"))
+
+
+def case(device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE) -> Case:
+    """Return a synthetic scene with a noise image as its photograph."""
+    parameters, view = synthetic(width, height, count, size)
+    camera = upload_camera(device, view)
+    shape = (3, height, width)
+    pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+    return Case(device, parameters, Photograph(camera, device.upload(pixels)), "black", settings)
+
+
+def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> Case:
+    """Return a splat PLY, or the Gaussians that `init` makes of a point cloud, at a scene's first training view."""
+    opened, background = settings.scene.read(scene)
+    photographs = Photographs(device, background)
+    parameters = load(model).tables() if detect(model) else from_points(read_points_ply(model), 0.1, 3)
+    return Case(device, parameters, photographs.get(opened.split("train")[0]), background, settings)
+
+
+def grown(device: Device, settings: PipelineFile) -> Iterator[Case]:
+    """Yield scenes of 50 000 to a million Gaussians over one image; their total area is constant."""
+    width, height, largest = SIZES["C"]
+    for count in GROWTH_COUNTS:
+        yield case(device, width, height, count, settings, SIZE * (largest / count) ** 0.5)

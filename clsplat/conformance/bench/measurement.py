@@ -1,0 +1,198 @@
+"""A benchmark: its cases, the device's peaks, the times, and their tables."""
+
+import statistics
+import textwrap
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from clsplat.conformance.bench.cases import SIZES, Peaks, Result, case, grown, measure_peaks, real_case, run_bench
+from clsplat.conformance.bench.packing import Packings, measure_packings, task_of
+from clsplat.core.errors import ConfigError, quoted
+from clsplat.core.files import write_text
+from clsplat.core.reading import read_json
+from clsplat.core.text_table import text_table
+from clsplat.opencl.device import Device, open_device
+from clsplat.opencl.discovery import Schedule, choose, resolve_schedule
+from clsplat.pipeline.loading import load
+from clsplat.viewer.charts import Line, curve
+
+# An earlier measurement: its file, and what it does not share with one of now.
+
+EXPECTED = "the JSON of an earlier `clsplat bench --json`"
+UNITS: dict[str, str] = {"gflops": "GFLOP/s", "gexp": "Gexp/s", "gbytes": "GB/s"}
+ALIKE = 1.1  # largest ratio of two peaks of a machine that has as much to give as before
+
+
+class _Peaks(BaseModel):
+    gflops: float
+    gexp: float
+    gbytes: float
+
+
+class _Times(BaseModel):
+    stages: dict[str, float]
+    host: float
+    step: float
+    densify: float
+
+
+class _Earlier(BaseModel):
+    """What a comparison reads of an earlier measurement."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    device: str
+    pipeline: str = "splat"
+    peaks: _Peaks
+    scenes: dict[str, _Times]
+
+
+def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
+    """Read the data of an earlier measurement of the same pipeline.  Raises ConfigError."""
+    name = load(pipeline).settings.name
+    data = read_json(path, EXPECTED, ConfigError)
+    try:
+        found = _Earlier.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the file"
+        raise ConfigError(f"{path}: {place}: {first['msg']}; expected {EXPECTED}: make it again") from error
+    if found.pipeline != name:
+        raise ConfigError(f"{path}: expected the pipeline '{name}', it has {quoted(found.pipeline)}")
+    return {key: value for key, value in data.items() if key != "against"}  # that of one still earlier
+
+
+def peaks_text(peaks: dict[str, float]) -> str:
+    """Return the peaks of a device, as the `data` of a measurement has them, in words."""
+    return f"{peaks['gflops']:.0f} GFLOP/s, {peaks['gexp']:.1f} Gexp/s, copy {peaks['gbytes']:.1f} GB/s"
+
+
+def beside(now: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
+    """Return lines about what the `data` of two measurements do not share, for whoever compares their times."""
+    lines = [f"earlier: {peaks_text(earlier['peaks'])}"]
+    if earlier["device"] != now["device"]:
+        lines.append(f"  of another device: {quoted(earlier['device'])}")
+    ratios = {unit: now["peaks"][key] / earlier["peaks"][key] for key, unit in UNITS.items() if earlier["peaks"][key]}
+    if any(not 1 / ALIKE <= ratio <= ALIKE for ratio in ratios.values()):
+        told = ", ".join(f"{ratio:.2f} of its {unit}" for unit, ratio in ratios.items())
+        lines.append(f"  the device gives {told}: compare ratios to the floors")
+    if missing := [name for name in now["scenes"] if name not in earlier["scenes"]]:
+        lines.append(f"  has not measured: {', '.join(missing)}; there are {', '.join(earlier['scenes']) or 'none'}")
+    return lines
+
+
+# The figures as text, and the time over the number of Gaussians as a chart.
+
+SVG_ATTRIBUTES = 'xmlns="http://www.w3.org/2000/svg" width="460" height="220"'
+STYLE = "<style>text{font:11px sans-serif;fill:#4a5568}.grid{stroke:#e2e8f0}</style>"
+
+
+def table(name: str, result: Result, earlier: dict[str, Any] | None) -> str:
+    """Return one scene as text; `earlier` is the same scene of an earlier run's JSON."""
+    work, mib = result.work, 2**20
+    counts = f"{work.gaussians:,} Gaussians, {work.pairs:,} pairs, {work.rows:,} rows, {work.pixels:,} pixels"
+    rows = [(stage, ms, result.floors.get(stage)) for stage, ms in result.stages.items()]
+    rows += [
+        ("host", result.host, None),
+        ("step", result.step, sum(result.floors.values())),
+        ("densify", result.densify, None),
+    ]
+    was = {**earlier["stages"], **{key: earlier[key] for key in ("host", "step", "densify")}} if earlier else {}
+    cells = [["stage", "ms", "floor", "ratio", *(("was", "now/was") if earlier else ())]]
+    for stage, ms, floor in rows:
+        ratio = (f"{floor:.2f}", f"{ms / floor:.2f}") if floor else ("", "")
+        compared = (f"{was[stage]:.2f}", f"{ms / was[stage]:.2f}") if was.get(stage, 0) > 0 else ()
+        cells.append([stage, f"{ms:.2f}", *ratio, *compared])
+    memory = f"memory {result.memory / mib:,.0f} MiB at most; training plans {result.planned / mib:,.0f} MiB"
+    return f"scene {name}: {counts}\n" + textwrap.indent(f"{text_table(cells, left=1)}\n{memory}", "  ")
+
+
+def growth_table(results: Sequence[Result]) -> str:
+    """Return the milliseconds of steps as text, for growing numbers of Gaussians and pairs, and ns for each."""
+    rows = [("Gaussians", "pairs", "ms", "ns each")]
+    for result in results:
+        work = result.work
+        each = 1e6 * result.step / (work.gaussians + work.pairs)
+        rows.append((f"{work.gaussians:,}", f"{work.pairs:,}", f"{result.step:.1f}", f"{each:.1f}"))
+    return text_table(rows)
+
+
+def growth_chart(results: Sequence[Result]) -> str:
+    """Return the milliseconds of a step over Gaussians + pairs, as SVG."""
+    points = [((r.work.gaussians + r.work.pairs) / 1e6, r.step) for r in results]
+    slope, x_max = statistics.median(y / x for x, y in points), max(x for x, _ in points)
+    lines = [Line(points, "measured"), Line([(0, 0), (x_max, slope * x_max)], "in proportion")]
+    drawing = curve("ms per step over millions of Gaussians + pairs", lines)
+    return drawing.replace("<svg", f"<svg {SVG_ATTRIBUTES}", 1).replace("</svg>", f"{STYLE}</svg>")
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Times of a training step, scene by scene."""
+
+    device: str
+    pipeline: str
+    peaks: Peaks
+    results: dict[str, Result]
+
+    def data(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        scenes = {name: asdict(result) for name, result in self.results.items()}
+        return {"device": self.device, "pipeline": self.pipeline, "peaks": asdict(self.peaks), "scenes": scenes}
+
+    def text(self, earlier: dict[str, Any]) -> str:
+        """Return tables of the times, beside the `data` of an earlier measurement unless that is empty."""
+        head = [f"device: {self.device}", f"peaks: {peaks_text(asdict(self.peaks))}"]
+        was = earlier.get("scenes", {})
+        tables = [table(name, result, was.get(name)) for name, result in self.results.items()]
+        return "\n".join([*head, *(beside(self.data(), earlier) if earlier else ()), *tables])
+
+
+def measure(
+    scenes: Sequence[str] = ("A",),
+    *,
+    model: Path | None = None,
+    scene: Path | None = None,
+    pipeline: str = "splat",
+    repeats: int = 20,
+    schedule: Schedule = "auto",
+    device: str | Device | None = None,
+) -> Measurement:
+    """Time a training step on fixed scenes, and of a model at the views of its scene.  Raises ClsplatError."""
+    if unknown := [name for name in scenes if name not in SIZES]:
+        raise ConfigError(f"--scenes: no scene named '{unknown[0]}'; there are {', '.join(SIZES)}")
+    if (model is None) != (scene is None):
+        raise ConfigError("bench: --model and --scene go together")
+    settings = load(pipeline).settings
+    opened = open_device(device, schedule)
+    peaks = measure_peaks(opened)
+    cases = {name: case(opened, *SIZES[name], settings) for name in scenes}
+    if model is not None and scene is not None:
+        cases[model.stem] = real_case(opened, model, scene, settings)
+    return Measurement(opened.text, settings.name, peaks, run_bench(cases, peaks, repeats))
+
+
+def measure_packing(
+    scenes: Sequence[str], *, pipeline: str, repeats: int, schedule: Schedule, device: str | Device | None
+) -> Packings:
+    """Time the packings of a CPU with a training step of one fixed scene.  Raises ClsplatError."""
+    if len(scenes) != 1 or scenes[0] not in SIZES:
+        raise ConfigError(f"--packing: expected one scene, of {', '.join(SIZES)}, got {quoted(','.join(scenes))}")
+    load(pipeline)
+    info = device.info if isinstance(device, Device) else choose(device)
+    resolve_schedule(info, schedule)
+    return measure_packings(info, task_of(info, SIZES[scenes[0]], pipeline, repeats, schedule), scenes[0])
+
+
+def measure_growth(chart: Path, *, pipeline: str, repeats: int, schedule: Schedule, device: str | Device | None) -> str:
+    """Time 50 000 to a million Gaussians; write an SVG, return a table.  Raises ClsplatError."""
+    settings = load(pipeline).settings
+    opened = open_device(device, schedule)
+    peaks = measure_peaks(opened)
+    sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened, settings)]
+    write_text(chart, growth_chart(sizes))
+    return f"device: {opened.text}\n{growth_table(sizes)}"

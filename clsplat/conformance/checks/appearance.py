@@ -1,0 +1,178 @@
+"""The colours of a photograph by place and luminance: a change of an image, its derivatives, and the tables."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import SUM, Checks, Figure, Note, by_element, equal
+from clsplat.conformance.checks.images import SIZES, camera_of, outside, planes_of
+from clsplat.conformance.reference.appearance import changed_by_grid
+from clsplat.opencl.device import Device
+from clsplat.photos.appearance import IDENTITY, LUMINANCE, GridTables, row_length
+from clsplat.render.workspace import Workspace
+from clsplat.training.modules.bilateral_grid import Grid, PhotographGrids
+from clsplat.training.modules.exposure import change_back, change_colours
+
+CHECKS = Checks()
+MARGIN = 1e-3  # from white, from black and between two levels, where a derivative is that of one side
+CASES = (  # width, height, nodes
+    (1, 1, (4, 4, 4)),
+    (17, 33, (4, 4, 4)),
+    (257, 9, (3, 5, 2)),
+    (33, 18, (16, 16, 8)),
+    (40, 21, (1, 1, 1)),
+    (40, 21, (1, 4, 3)),
+    (21, 40, (4, 1, 16)),
+)
+
+
+def grids_of(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> PhotographGrids:
+    """The second of three photographs has matrices about no change, and the others have others."""
+    model, tables = Grid(cells=list(nodes), weight=weight), GridTables(device, 3, nodes)
+    tables.set({"values": rng.normal(0, 0.2, tables.shape).astype(np.float32)})
+    return PhotographGrids(model, ("a", "b", "c"), 0.01, tables)
+
+
+def of_photograph(grids: PhotographGrids, values: NDArray[Any]) -> NDArray[Any]:
+    """The grid of a photograph, of so many values, as [3, 4, nz, ny, nx] in double."""
+    return values.reshape(3, 4, *grids.tables.shape[2:]).astype(np.float64)
+
+
+def picture_of(rng: np.random.Generator, grid: NDArray[Any], width: int, height: int, channels: int) -> NDArray[Any]:
+    """An image with values below black and beyond white, and none near a decision."""
+    image = rng.uniform(-0.2, 1.4, (channels, height, width)).astype(np.float32)
+    exact = image[:3].astype(np.float64)
+    luminance = np.einsum("a,ahw->hw", LUMINANCE, exact)
+    level = luminance * (grid.shape[2] - 1)
+    near = np.abs(level - np.rint(level)) < MARGIN
+    near |= (np.abs(luminance) < MARGIN) | (np.abs(luminance - 1) < MARGIN)
+    near |= (np.abs(changed_by_grid(exact, grid) - 1) < MARGIN).any(axis=0)
+    image[:, near] = 0.1 / max(grid.shape[2] - 1, 1)
+    return image
+
+
+def grid_figures(
+    device: Device, rng: np.random.Generator, width: int, height: int, nodes: tuple[int, ...], channels: int = 3
+) -> Iterator[Figure]:
+    """Compare an image, its gradient, and that by the grid."""
+    what = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
+    grids = grids_of(device, rng, nodes)
+    grid = of_photograph(grids, grids.tables.tables()["values"][1])
+    image = picture_of(rng, grid, width, height, channels)
+    gradient = rng.normal(size=image.shape).astype(np.float32)
+    camera, workspace = camera_of(device, width, height), Workspace(device)
+    for name in ("coloured", "grad_coloured"):
+        workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
+    planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
+    exact = image[:3].astype(np.float64)
+    found = grids.change(workspace, camera, planes, {}, 1)[0].get()
+    expected = ref.gridded(exact, grid)
+    yield by_element("colour_grid_forward", f"colours, {what}", found[:3, :height, :width], expected, 3e-6, floor=1.0)
+    yield equal("colour_grid_forward", f"pixels outside the image, {what}", outside(camera, found[:3]), 0.0)
+    passed, by_grid = grids.differentiated(workspace, camera, planes, uploaded, 1)
+    by_image, expected = ref.gridded_backward(exact, grid, gradient[:3].astype(np.float64))
+    largest = max(float(np.abs(by_image).max()), 1.0)
+    grad_image, grad_grid = passed.get(), by_grid.get()
+    yield by_element(
+        "colour_grid_backward", f"gradient, {what}", grad_image[:3, :height, :width], by_image, 1e-5, floor=largest
+    )
+    yield equal("colour_grid_backward", f"gradient outside the image, {what}", outside(camera, grad_image[:3]), 0.0)
+    floor = max(float(np.sqrt(gradient.size)) / 8, 1.0)
+    for kernel in ("colour_grid_row_sums", "colour_grid_gather"):
+        yield by_element(
+            kernel, f"gradient by the grid, {what}", of_photograph(grids, grad_grid), expected, SUM, floor=floor
+        )
+    if channels > 3:
+        yield equal("colour_grid_forward", f"fourth plane, {what}", found[3], planes.get()[3])
+        yield equal("colour_grid_backward", f"gradient of the fourth plane, {what}", grad_image[3], uploaded.get()[3])
+
+
+def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Iterator[Figure]:
+    """Compare the smoothness of a grid, three updates of it, and what they leave of the others."""
+    what, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
+    grids, workspace, numbers = grids_of(device, rng, nodes, weight), Workspace(device), dict[str, float]()
+    expected = grids.tables.tables()["values"].astype(np.float64).reshape(3, -1)
+    moment1, moment2 = np.zeros((2, row_length(nodes)))
+    camera = camera_of(device, 5, 3)
+    image = planes_of(device, camera, np.zeros((3, 3, 5)))
+    rate = 0.01
+    for step in range(1, 4):
+        _, value = grids.change(workspace, camera, image, numbers, 1)
+        by_smoothness = workspace.array("grid smoothness", row_length(nodes)).get()
+        smooth, slope = ref.grid_smoothness(of_photograph(grids, expected[1]))
+        found, wanted, kernel = np.array([value()]), np.array([weight * smooth]), "colour_grid_smoothness"
+        yield by_element(kernel, f"value, {what}", found, wanted, SUM, floor=1e-2)
+        found, wanted = of_photograph(grids, by_smoothness), weight * slope
+        largest = max(float(np.abs(wanted).max()), 1e-6)
+        yield by_element(kernel, f"derivatives, {what}", found, wanted, 2e-5, floor=largest)
+        gradient = rng.normal(0, 0.1, row_length(nodes)).astype(np.float32)
+        grids.learn(workspace, numbers, 1, device.upload(gradient), step)
+        whole = gradient.astype(np.float64) + by_smoothness
+        expected[1], moment1, moment2 = ref.adam_step(expected[1], whole, moment1, moment2, step, rate)
+        own = np.stack([of_photograph(grids, one) for one in expected])
+        expected = ref.centred_grids(own).reshape(expected.shape)
+    tables = {name: table.reshape(3, -1) for name, table in grids.tables.tables().items()}
+    for kernel in ("colour_grid_update", "colour_grid_centre"):
+        yield by_element(kernel, f"grids, {what}", tables["values"], expected, 2e-6, floor=1.0)
+    for name, moment, bound in (("moment1", moment1, SUM), ("moment2", moment2, 3 * SUM)):
+        floor = 0.1 * float(np.abs(moment).max())
+        yield by_element("colour_grid_update", f"{name}, {what}", tables[name][1], moment, bound, floor=floor)
+        yield equal("colour_grid_update", f"{name} of other photographs, {what}", tables[name][[0, 2]], 0.0)
+
+
+@CHECKS.add("colour_grid_forward", "colour_grid_backward", "colour_grid_row_sums", "colour_grid_gather")
+def colour_grids(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height, nodes in CASES:
+        yield from grid_figures(device, rng, width, height, nodes)
+    yield from grid_figures(device, rng, 33, 18, (4, 4, 4), channels=4)
+
+
+@CHECKS.add("colour_grid_smoothness", "colour_grid_update", "colour_grid_centre")
+def colour_grid_tables(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for nodes in ((4, 4, 4), (1, 1, 1), (5, 1, 3)):
+        yield from table_figures(device, rng, nodes)
+
+
+# The colours of a photograph: a change of an image and its derivatives.
+
+
+def colour_figures(
+    device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3
+) -> Iterator[Figure]:
+    """Compare an image with a third of its pixels beyond white, its gradient, and that by the matrix."""
+    what = f"{width} x {height} px"
+    matrix = (IDENTITY + rng.normal(0, 0.2, (3, 4))).astype(np.float32).astype(np.float64)
+    image = rng.uniform(-0.2, 1.6, (channels, height, width)).astype(np.float32)
+    near = np.abs(np.einsum("ab,bhw->ahw", matrix[:, :3], image[:3]) + matrix[:, 3, None, None] - 1).min(axis=0)
+    image[:, near < MARGIN] = 0
+    gradient = rng.normal(size=image.shape).astype(np.float32)
+    camera, workspace = camera_of(device, width, height), Workspace(device)
+    for name in ("coloured", "grad_coloured"):
+        workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
+    planes = planes_of(device, camera, image)
+    found = change_colours(workspace, camera, planes, matrix).get()
+    exact = image[:3].astype(np.float64)
+    expected = ref.coloured(exact, matrix)
+    yield by_element("colours_forward", f"colours, {what}", found[:3, :height, :width], expected, 2e-6, floor=1.0)
+    yield equal("colours_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)
+    uploaded = planes_of(device, camera, gradient)
+    grad_image, waiting = change_back(workspace, camera, planes, matrix, uploaded)
+    by_image, by_matrix = ref.coloured_backward(exact, matrix, gradient[:3].astype(np.float64))
+    passed = grad_image.get()
+    yield by_element("colours_backward", f"gradient, {what}", passed[:3, :height, :width], by_image, 2e-6, floor=1.0)
+    yield equal("colours_backward", f"gradient outside the image, {what}", outside(camera, passed), 0.0)
+    size = float(np.sqrt(gradient.size))
+    yield by_element("colours_backward", f"gradient by the matrix, {what}", waiting(), by_matrix, SUM, floor=size)
+    if channels > 3:
+        yield equal("colours_forward", f"fourth plane, {what}", found[3], planes.get()[3])
+        yield equal("colours_backward", f"gradient of the fourth plane, {what}", passed[3], uploaded.get()[3])
+
+
+@CHECKS.add("colours_forward", "colours_backward")
+def colours(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height in SIZES:
+        yield from colour_figures(device, rng, width, height)
+    yield from colour_figures(device, rng, 33, 18, channels=4)

@@ -1,0 +1,379 @@
+"""Cones of pixels, their samples, and the encodings of these, which a field reads."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance.check import GRADIENT, SUM, Checks, Figure, Note, by_element, by_norm, equal
+from clsplat.conformance.checks.images import planes_of
+from clsplat.conformance.reference import nerf as ref_cones
+from clsplat.conformance.reference import nerf as ref_field
+from clsplat.conformance.reference import nerf as ref_grid
+from clsplat.conformance.scenes import random_case
+from clsplat.nerf.field import Draw, Field, Level, Levels, Rays, Target
+from clsplat.nerf.network import PLACE_ROWS
+from clsplat.nerf.shape import FEATURES, SAMPLES, FieldShape
+from clsplat.nerf.training import AdamStep, LearnedField
+from clsplat.opencl.device import Array, Device
+
+CHECKS = Checks()
+RAYS = (1, 63, 64, 65)  # around a tile of samples, and a chunk of tiles
+SHAPE = FieldShape(
+    near=0.2,
+    depth=3,
+    width=16,
+    skip=1,
+    colour_width=12,
+    degrees=5,
+    direction_degrees=2,
+    coarse_samples=16,
+    fine_samples=32,
+)
+BACKGROUND = np.array([1.0, 0.7, 0.4], np.float32)
+WIDTH, HEIGHT = 19, 13
+ENCODING = 4e-5  # of a sine: 2^4 times a distance of about 6, rounded to 32 bits
+EDGES = 2e-6  # of the distances, in shares of the farthest
+
+
+@dataclass(frozen=True)
+class GridLevel:
+    """A level of a grid, and where its entries lie among the parameters."""
+
+    level: ref_grid.Level
+    first: int
+
+    def of(self, parameters: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Its entries, [entries, FEATURES]."""
+        own = parameters[self.first : self.first + FEATURES * self.level.entries]
+        return own.reshape(-1, FEATURES).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Random parameters, and a camera before a random photograph."""
+
+    shape: FieldShape
+    levels: Levels
+    parameters: NDArray[np.float32]
+    photograph: NDArray[np.float32]  # [3, HEIGHT, WIDTH]
+    planes: Array
+    rays: Rays
+    cones: NDArray[np.float64]  # with those that fill tiles
+
+    @classmethod
+    def of(cls, device: Device, rng: np.random.Generator, rays: int, draw: Draw, **keys: Any) -> "Case":
+        """Return a case of drawn rays."""
+        shape = FieldShape.model_validate({**SHAPE.model_dump(), **keys})
+        parameters = shape.first_parameters(int(rng.integers(100)))
+        for layer in shape.layers:
+            parameters[layer.first_bias : layer.first_bias + layer.outputs] = rng.normal(0, 0.3, layer.outputs)
+        if shape.grid:
+            own = parameters[shape.of_network : shape.of_network + shape.grid.learned]
+            own[:] = rng.normal(0, 0.5, len(own))
+        scene = random_case(rng, 1, WIDTH, HEIGHT)
+        camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)
+        field = Field(shape, device.upload(parameters), device.upload(BACKGROUND))
+        cast, levels = field.levels.drawn(camera, draw, rays), field.levels
+        pixels = ref_cones.drawn_pixels(WIDTH * HEIGHT, rays, draw.first, draw.seed, draw.step)
+        filled = np.concatenate([pixels, np.repeat(pixels[-1:], cast.count - rays)])
+        planes = planes_of(device, camera, photograph)
+        return cls(shape, levels, parameters, photograph, planes, cast, ref_cones.cones(scene.camera(), filled))
+
+    @property
+    def on_device(self) -> Array:
+        return self.levels.workspace.device.upload(self.parameters)
+
+    def units(self, samples: int, kind: int) -> NDArray[np.float64]:
+        """Random numbers of the edges of each ray."""
+        draw = self.rays.draw or Draw(0, 0, 0)
+        own = [ref_cones.units(draw.first + i, samples + 1, kind, draw.seed, draw.step) for i in range(self.rays.count)]
+        return np.stack(own)
+
+    def wanted(self) -> NDArray[np.float64]:
+        """The photograph's colours of the rays that count, [counted, 3]."""
+        pixels = self.rays.pixels.get()
+        return self.photograph[:, pixels // WIDTH, pixels % WIDTH].T.astype(np.float64)
+
+    def encoded(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Encoded positions and directions of samples, [S, features]."""
+        means, variances = ref_cones.frustums(self.cones, edges.astype(np.float64))
+        sines = ref_cones.encoded_frustums(means, variances, self.shape.degrees)
+        direction = ref_cones.encoded_directions(self.cones, self.shape.direction_degrees)
+        of_grid = [own.level.forward(own.of(self.parameters), *self.places(edges)) for own in self.grid_levels()]
+        position = np.concatenate([*of_grid, sines.reshape(sines.shape[0] * sines.shape[1], sines.shape[2])], axis=1)
+        return position, np.repeat(direction, edges.shape[1] - 1, axis=0)
+
+    def places(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places of samples in the grid's cube, [S, 3], and their variances, [S]."""
+        assert self.shape.grid is not None
+        means, variances = (one.reshape(-1, 3) for one in ref_cones.frustums(self.cones, edges.astype(np.float64)))
+        return ref_grid.places(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)
+
+    def grid_levels(self) -> list[GridLevel]:
+        """The levels of the grid; none without one."""
+        table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.of_network
+        return [
+            GridLevel(ref_grid.Level(cells, entries), first + FEATURES * before) for cells, before, entries, _ in table
+        ]
+
+
+def rows_of(table: Array, first: int, count: int) -> NDArray[Any]:
+    """[tiles, rows, SAMPLES] -> the features `first` to `first + count` of each sample, [S, count]."""
+    return np.asarray(table.get()[:, first : first + count].transpose(0, 2, 1).reshape(-1, count))
+
+
+@CHECKS.add("draw_pixels", "cast_rays", "spread_edges", "resample_edges")
+def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """Pixels, rays and where they are cut, drawn and even."""
+    for count in RAYS:
+        case = Case.of(device, rng, count, Draw(7, 11, 5))
+        pixels = ref_cones.drawn_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
+        yield equal("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
+        yield by_element("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
+        for rays in (case.rays, replace(case.rays, draw=None)):
+            yield from _edge_figures(replace(case, rays=rays), f"{count} rays, {'drawn' if rays.draw else 'even'}")
+
+
+def _edge_figures(case: Case, what: str) -> Iterator[Figure]:
+    coarse, fine = ((level.edges.get(), level.weights.get()) for level in case.levels.render(case.on_device, case.rays))
+    shape, (edges, weights) = case.shape, coarse
+    drawn, again = case.units(shape.coarse_samples, ref_cones.COARSE), case.units(shape.fine_samples, ref_cones.FINE)
+    is_drawn = case.rays.draw is not None
+    expected = [
+        ref_cones.coarse_edges(shape.near, shape.far, shape.coarse_samples, own if is_drawn else None) for own in drawn
+    ]
+    yield by_element("spread_edges", what, edges, np.stack(expected), EDGES, floor=shape.far)
+    pairs = zip(edges.astype(np.float64), weights.astype(np.float64), again, strict=True)
+    expected = [ref_cones.fine_edges(t, w, shape.fine_samples, own if is_drawn else None) for t, w, own in pairs]
+    yield by_element("resample_edges", what, fine[0], np.stack(expected), 10 * EDGES, floor=shape.far)
+
+
+@CHECKS.add("encode_frustums", "encode_directions")
+def encodings(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """What the network reads of a sample."""
+    for count in RAYS:
+        case = Case.of(device, rng, count, Draw(1, 2, 0))
+        level = next(case.levels.render(case.on_device, case.rays))
+        position, direction = case.encoded(level.edges.get())
+        (table, first), (seen, row) = (
+            place(level.raw_colours.shape[0]) for place in (case.levels.network.position, case.levels.network.seen)
+        )
+        found = rows_of(table, first, case.shape.position_rows)
+        yield by_element("encode_frustums", f"{count} rays", found[:, : position.shape[1]], position, ENCODING, 1.0)
+        yield equal("encode_frustums", f"what fills blocks, {count} rays", found[:, position.shape[1] :], 0.0)
+        found = rows_of(seen, row, case.shape.direction_rows)
+        yield by_element("encode_directions", f"{count} rays", found[:, : direction.shape[1]], direction, 2e-6, 1.0)
+        yield equal("encode_directions", f"what fills blocks, {count} rays", found[:, direction.shape[1] :], 0.0)
+
+
+# A grid of features: places of samples in it, features, and derivatives by its entries.
+
+GRID: dict[str, Any] = {
+    "levels": 3,
+    "coarsest": 4,
+    "finest": 19,
+    "entries": 512,
+    "corner": [-1.0, -1.1, -1.2],
+    "side": 2.5,
+}
+CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, places along an axis, keys of the grid
+    *((tiles, (-0.1, 1.1), {}) for tiles in (1, 2, 17)),
+    (2, (0.0, 1.0), {"levels": 1, "coarsest": 1, "finest": 1, "entries": 16}),  # one cell, all of its corners
+    (2, (-0.1, 1.1), {"entries": 16}),  # all levels share
+    (2, (-0.1, 1.1), {"entries": 8192}),  # none shares
+    (2, (1.1, 2.0), {}),  # no sample in the cube
+    (2, (0.0, 1.0), {"finest": 4096}),  # finer than most samples
+]
+
+
+@CHECKS.add("grid_places", "grid_forward", "grid_backward")
+def grids_of_features(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """Where samples are in a grid, what a network reads of it there, and derivatives by its numbers."""
+    for count in RAYS:
+        case = Case.of(device, rng, count, Draw(1, 2, 0), grid=GRID)
+        level = next(case.levels.render(case.on_device, case.rays))
+        at, variances = case.places(level.edges.get())
+        found = rows_of(case.levels.encoding.places(level.raw_colours.shape[0]), 0, PLACE_ROWS)
+        yield by_element("grid_places", f"means of {count} rays", found[:, :3], at, 1e-5, 1.0)
+        yield by_element("grid_places", f"variances of {count} rays", found[:, 3], variances, 1e-3)
+    for tiles, ends, keys in CASES:
+        case = Case.of(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
+        yield from _grid_figures(device, rng, case, _places(rng, tiles, ends))
+
+
+def _places(rng: np.random.Generator, tiles: int, ends: tuple[float, float]) -> NDArray[np.float32]:
+    """Random samples of all sizes, [tiles, PLACE_ROWS, SAMPLES]; a sixth of the means lie on faces of cells."""
+    at = rng.uniform(*ends, (tiles, 3, SAMPLES))
+    faces = np.where(rng.random(at.shape) < 1 / 6, np.rint(4 * at) / 4, at)
+    return np.concatenate([faces, 10.0 ** rng.uniform(-9, 0, (tiles, 1, SAMPLES))], axis=1).astype(np.float32)
+
+
+def _by_sample(table: NDArray[np.float32]) -> NDArray[np.float64]:
+    """[tiles, rows, SAMPLES] -> [S, rows]."""
+    return table.transpose(0, 2, 1).reshape(-1, table.shape[1]).astype(np.float64)
+
+
+def _grid_figures(
+    device: Device, rng: np.random.Generator, case: Case, places: NDArray[np.float32]
+) -> Iterator[Figure]:
+    shape, encoding, tiles = case.shape, case.levels.encoding, len(places)
+    assert shape.grid is not None
+    what = f"{tiles} tiles, {shape.grid.levels} levels to {shape.grid.finest} with {shape.grid.entries}"
+    encoding.places(tiles).set(places)
+    encoding.read_grid(case.on_device, tiles)
+    table, first = case.levels.network.position(tiles)
+    features = rows_of(table, first, shape.grid_rows)
+    by_features = rng.normal(size=(tiles, shape.grid_rows, SAMPLES)).astype(np.float32)
+    by_features[:, :, ::3] = 0  # samples without derivatives
+    gradients = list[NDArray[np.float32]]()
+    for parts in (encoding.parts, 1, 3):
+        encoding.parts, sums = parts, device.zeros(shape.parameters)
+        encoding.backward(device.upload(by_features), sums)
+        gradients.append(sums.get())
+    found, *others = gradients
+    for parts, gradient in zip((1, 3), others, strict=True):
+        yield equal("grid_backward", f"sums in {parts} of its parts, {what}", gradient, found)
+    by_sample = _by_sample(by_features)
+    at, variances = np.split(_by_sample(places), [3], axis=1)
+    variances = variances[:, 0]
+    for number, own in enumerate(case.grid_levels()):
+        rows = slice(FEATURES * number, FEATURES * (number + 1))
+        wanted = own.level.forward(own.of(case.parameters), at, variances)
+        yield by_element("grid_forward", f"level {number}, {what}", features[:, rows], wanted, 5e-5, 1.0)
+        wanted, by_entries = own.level.backward(by_sample[:, rows], at, variances), own.of(found)
+        yield by_norm("grid_backward", f"level {number}, {what}", by_entries, wanted, GRADIENT)
+        untouched = np.all(wanted == 0, axis=1)
+        yield equal("grid_backward", f"entries without samples, level {number}, {what}", by_entries[untouched], 0.0)
+    yield equal("grid_backward", f"parameters of the network, {what}", found[: shape.of_network], 0.0)
+
+
+# A field: its network, colours of rays, all derivatives, pictures and updates.
+
+FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
+    *((count, {}) for count in RAYS),
+    *((9, keys) for keys in ({"skip": None, "depth": 1}, {"degrees": 3}, {"skip": 0})),
+    *((9, {"grid": GRID, **keys}) for keys in ({}, {"skip": None, "depth": 1, "degrees": 0})),
+]
+
+
+@CHECKS.add(
+    *("dense_forward", "dense_backward", "dense_weights", "dense_biases", "dense_sums"),
+    *("composite_forward", "composite_backward"),
+)
+def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """Colours of rays and derivatives by all parameters, through both levels."""
+    for count, keys in FIELDS_CASES:
+        case = Case.of(device, rng, count, Draw(3, 4, 2), **keys)
+        gradient = device.zeros(case.shape.parameters)
+        errors, expected = device.zeros(2 + count), list[ref_field.Weights]()
+        by_entries = [np.zeros_like(own.of(case.parameters)) for own in case.grid_levels()]
+        parameters = case.on_device
+        for scale, level in zip((0.1, 1.0), case.levels.render(parameters, case.rays), strict=True):
+            comparison = _Comparison.of(case, level, scale)
+            yield from comparison.figures(f"{count} rays, {level.samples} samples")
+            case.levels.differentiate(parameters, level, Target(case.planes, scale, errors), gradient)
+            squares = (comparison.differences[:count] ** 2).sum(axis=1)
+            yield by_element("composite_backward", f"squares of {count} rays", errors.get()[2:], squares, SUM, 1e-3)
+            by_weights, by_position = comparison.backward(count)
+            expected.append(by_weights)
+            for number, own in enumerate(case.grid_levels()):
+                by_features = by_position[:, FEATURES * number : FEATURES * (number + 1)]
+                by_entries[number] += own.level.backward(by_features, *case.places(level.edges.get()))
+        for number, (own, wanted) in enumerate(zip(case.grid_levels(), by_entries, strict=True)):
+            what = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
+            for name in ("dense_backward", "grid_backward"):
+                yield by_norm(name, what, own.of(gradient.get()), wanted, GRADIENT)
+        yield from _gradient_figures(case.shape, gradient.get(), expected, f"{count} rays")
+
+
+def _gradient_figures(
+    shape: FieldShape, gradient: NDArray[Any], expected: list[ref_field.Weights], what: str
+) -> Iterator[Figure]:
+    gradient = gradient[: shape.of_network]
+    used = np.zeros(shape.of_network, bool)
+    for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
+        of_weights, of_biases = (sum(level[number][part] for level in expected) for part in (0, 1))
+        kernel = "composite_backward" if layer.name in ("density", "colour") else "dense_backward"
+        for name in (kernel, "dense_weights", "dense_sums"):
+            yield by_norm(name, f"weights of {layer.name}, {what}", weights, np.asarray(of_weights), GRADIENT)
+        yield by_norm("dense_biases", f"biases of {layer.name}, {what}", biases, np.asarray(of_biases), GRADIENT)
+        table = used[layer.first : layer.first_bias].reshape(layer.rows, layer.columns)
+        table[np.ix_(layer.inputs, range(layer.outputs))] = True
+        used[layer.first_bias : layer.first_bias + layer.outputs] = True
+    yield equal("dense_sums", f"what fills blocks, {what}", gradient[~used], 0.0)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """A level in double precision."""
+
+    level: Level
+    scale: float
+    network: ref_field.Network
+    weights: ref_field.Weights
+    raw: tuple[NDArray[np.float64], NDArray[np.float64]]
+    inputs: ref_field.Inputs
+    composite: ref_field.Composite
+    differences: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, case: Case, level: Level, scale: float) -> "_Comparison":
+        network, weights = ref_field.Network(case.shape.depth, case.shape.skip), case.shape.weights(case.parameters)
+        edges, samples = level.edges.get().astype(np.float64), level.samples
+        colours, densities, inputs = network.forward(weights, *case.encoded(edges))
+        lengths = np.diff(edges, axis=1) * case.cones[:, 7:8]
+        composite = ref_field.Composite(
+            colours.reshape(-1, samples, 3), densities.reshape(-1, samples), lengths, BACKGROUND.astype(np.float64)
+        )
+        differences = composite.colours()
+        differences[: case.rays.counted] -= case.wanted()
+        return cls(level, scale, network, weights, (colours, densities), inputs, composite, differences)
+
+    def figures(self, what: str) -> Iterator[Figure]:
+        colours, densities = (
+            rows_of(table, 0, count) for table, count in ((self.level.raw_colours, 3), (self.level.raw_densities, 1))
+        )
+        for name, found, expected in (("colours", colours, self.raw[0]), ("densities", densities, self.raw[1])):
+            yield by_element("dense_forward", f"raw {name}, {what}", found, expected, 1e-4, 1.0)
+        weights, left = self.composite.weights()
+        for name, table, wanted in (("weights", self.level.weights, weights), ("left", self.level.left, left)):
+            yield by_element("composite_forward", f"{name}, {what}", table.get(), wanted, 1e-4, 1.0)
+        yield by_element("composite_forward", what, self.level.colours.get(), self.composite.colours(), 1e-4, 1.0)
+
+    def backward(self, counted: int) -> tuple[ref_field.Weights, NDArray[np.float64]]:
+        by_colours = 2 * self.scale * self.differences
+        by_colours[counted:] = 0
+        by_raw, by_densities = self.composite.backward(by_colours)
+        return self.network.backward(self.weights, self.inputs, by_raw.reshape(-1, 3), by_densities.reshape(-1, 1))
+
+
+@CHECKS.add("place_colours")
+def pictures_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """A whole picture: the pixels in their places, zeros around them."""
+    case = Case.of(device, rng, 1, Draw(0, 1, 0))
+    field = Field(case.shape, case.on_device, device.upload(BACKGROUND))
+    pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)
+    *_, fine = case.levels.render(case.on_device, case.levels.cast(case.rays.camera, device.upload(pixels)))
+    expected = np.zeros((3, case.rays.camera.rows, case.rays.camera.stride), np.float32)
+    expected[:, :HEIGHT, :WIDTH] = fine.colours.get()[: len(pixels)].T.reshape(3, HEIGHT, WIDTH)
+    yield equal("place_colours", f"a picture of {WIDTH} x {HEIGHT}", field.paint(case.rays.camera).get(), expected)
+
+
+@CHECKS.add("dense_update")
+def updates_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """Adam, over some updates of gradients of all sizes."""
+    learned = LearnedField.first(SHAPE, 0, device.upload(BACKGROUND))
+    count = SHAPE.parameters
+    values, moment1, moment2 = SHAPE.first_parameters(0).astype(np.float64), np.zeros(count), np.zeros(count)
+    for number, epsilon in enumerate((1e-8, 1e-8, 1e-15), 1):
+        gradient = (rng.normal(size=count) * 10.0 ** rng.uniform(-10, 1, count)).astype(np.float32)
+        learned.update(device.upload(gradient), AdamStep(0.01, epsilon), number)
+        own = gradient.astype(np.float64)
+        values, moment1, moment2 = ref_field.update(values, moment1, moment2, own, 0.01, number, epsilon)
+    found = learned.tables()
+    yield by_element("dense_update", "parameters", found["parameters"][:, 0], values, 1e-4, 0.01)
+    yield by_element("dense_update", "first moments", found["moment1"][:, 0], moment1, 1e-4, 1e-12)
+    yield by_element("dense_update", "second moments", found["moment2"][:, 0], moment2, 1e-4, 1e-24)

@@ -1,0 +1,370 @@
+"""Adam, penalties, and the rows of tables."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import CONIC, SUM, Checks, Figure, Note, by_element, by_norm, equal
+from clsplat.conformance.checks.blending import BACKGROUND
+from clsplat.conformance.checks.projection import COUNTS as DROPOUT_COUNTS
+from clsplat.conformance.checks.projection import expected_gradients, gradient_figures, record_figures, splats_of
+from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.formats.splats import PARAMETERS
+from clsplat.gaussians.deferred import Deferred
+from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, Dropout, Gaussians, hide
+from clsplat.gaussians.structs import Gradients, moment_tables
+from clsplat.losses.base import Penalty, PenaltyInputs
+from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
+from clsplat.opencl.device import Array, Device, constants
+from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
+from clsplat.render.workspace import Workspace
+from clsplat.training import adam
+from clsplat.training.adam import Adam, Rates, Rows
+
+CHECKS = Checks()
+COUNTS = (1, 15, 17, 65)
+EXTENT = 2.5
+SPLAT_OPACITY = int(constants("splat.h")["SPLAT_OPACITY"])
+
+
+def step_figures(device: Device, rng: np.random.Generator, count: int) -> Iterator[Figure]:
+    """Three updates from gradients of very different sizes."""
+    case = random_case(rng, count)
+    model = case.model(device)
+    adam, rates = Adam(model.gaussians), Rates().at(3, extent=2.0)
+    frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.upload(BACKGROUND))
+    values = {name: case.parameters[name].astype(np.float64) for name in PARAMETERS}
+    moments = {name: [np.zeros_like(v), np.zeros_like(v)] for name, v in values.items()}
+    for step in range(1, 4):
+        gradients = Gradients(model.gaussians)
+        for name in PARAMETERS:
+            shape = values[name].shape
+            gradient = (rng.normal(size=shape) * rng.choice([1e-7, 1e-3, 1], shape)).astype(np.float32)
+            gradient[::3] = 0
+            planes = np.zeros(gradients[name].shape, np.float32)
+            planes[:, :count] = gradient.T
+            gradients[name].set(planes)
+            values[name], *moments[name] = ref.adam_step(
+                values[name], gradient.astype(np.float64), moments[name][0], moments[name][1], step, rates[name]
+            )
+        adam.step(model, frame, gradients, rates)
+    for name in PARAMETERS:
+        moved, what = float(np.abs(values[name] - case.parameters[name]).max()), f"{name}, {count} Gaussians"
+        found = model.gaussians.get(name)
+        # the value itself is rounded to float32, its change to 2e-5 of the largest
+        yield by_element("adam_step", what, found, values[name], 3e-7, floor=2e-5 * moved / 3e-7)
+        # 1 - 0.999f is off by 1.3e-5 in float32
+        for moment, expected, bound in zip(moment_tables(name), moments[name], (SUM, 3 * SUM), strict=True):
+            largest = float(np.abs(expected).max())
+            found = model.gaussians.get(moment)
+            yield by_element("adam_step", f"moments of {what}", found, expected, bound, floor=0.1 * largest)
+
+
+def _sums_of(
+    device: Device, rng: np.random.Generator, case: Case, rasterizer: Rasterizer, model: DeviceModel
+) -> tuple[Frame, Array]:
+    """The frame of a case, and its sums over pixels for a random gradient of the image."""
+    camera = case.device_camera(device)
+    frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
+    weights = np.zeros((3, camera.rows, camera.stride), np.float32)
+    weights[:, : camera.height, : camera.width] = rng.normal(size=(3, camera.height, camera.width))
+    return frame, rasterizer.pixel_sums(model, frame, device.upload(weights))
+
+
+def fused_figures(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Figure]:
+    """One update on the way: moments against the reference's gradients, values against the device's own moments."""
+    kernel, count = "update_gaussians", len(case.parameters["means"])
+    rasterizer, model = Rasterizer(device, "radix"), case.model(device)
+    gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
+    frame, pixel_sums = _sums_of(device, rng, case, rasterizer, model)
+    grad_mean2d = adam.update(model, frame, pixel_sums, rates).get()[:, :count].T
+    expected = expected_gradients(case, case.project(), pixel_sums.get()[:, :count].T.astype(np.float64))
+    yield by_norm(kernel, f"gradients of the projected means, {what}", grad_mean2d, expected["mean2d"], CONIC)
+    for name in PARAMETERS:
+        moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in moment_tables(name))
+        yield by_norm(kernel, f"first moment of {name}, {what}", moment1, 0.1 * expected[name], CONIC)
+        yield by_norm(kernel, f"second moment of {name}, {what}", moment2, 1e-3 * expected[name] ** 2, 2 * CONIC)
+        step = rates[name] * (moment1 / 0.1) / (np.sqrt(moment2 / 1e-3) + 1e-15)
+        before = case.parameters[name].astype(np.float64)
+        floor = 2e-5 * max(float(np.abs(step).max()), 1e-30) / 3e-7
+        yield by_element(kernel, f"{name}, {what}", gaussians.get(name), before - step, 3e-7, floor)
+
+
+def seen_figures(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Figure]:
+    """The fifth update, of seen rows alone, with moments from before, by each kernel from the same gradients."""
+    count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
+    moments = {
+        name: (rng.normal(size=values.shape), rng.uniform(0.5, 2, values.shape))
+        for name, values in parameters.items()
+        if name in PARAMETERS
+    }
+    for kernel in ("update_gaussians", "adam_step"):
+        rasterizer, model = Rasterizer(device, "radix"), case.model(device)
+        gaussians, adam = model.gaussians, Adam(model.gaussians)
+        frame, pixel_sums = _sums_of(device, rng, case, rasterizer, model)
+        gradients = rasterizer.gradients(model, frame, pixel_sums)
+        seen = frame.splats.get().reshape(-1, RECORD)[:count, SPLAT_OPACITY] > 0
+        adam.updates = dict.fromkeys(PARAMETERS, 4)
+        expected: dict[str, NDArray[Any]] = {}
+        for name in PARAMETERS:
+            for table, values in zip(moment_tables(name), moments[name], strict=True):
+                gaussians.set(table, values)
+            tables = name, *moment_tables(name)
+            before, moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in tables)
+            gradient = gradients[name].get()[:, :count].T.astype(np.float64)
+            after = ref.adam_step(before, gradient, moment1, moment2, 5, rates[name], seen=seen)
+            expected |= dict(zip(tables, after, strict=True))
+        if kernel == "adam_step":
+            adam.step(model, frame, gradients, rates, rows="seen")
+        else:
+            adam.update(model, frame, pixel_sums, rates, rows="seen")
+        for table, truth in expected.items():
+            found = gaussians.get(table)
+            yield equal(kernel, f"{table} of rows not seen, {what}", found[~seen], truth[~seen])
+            yield by_element(kernel, f"{table} of rows seen, {what}", found[seen], truth[seen], 3 * SUM, floor=0.1)
+
+
+def behind_each_fifth(case: Case) -> Case:
+    """Return the case with each fifth Gaussian behind the camera."""
+    case.parameters["means"][1::5] -= 20 * case.view.world_to_camera[2, :3]
+    return case
+
+
+@CHECKS.add("adam_step")
+def adam_figures(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        yield from step_figures(device, rng, count)
+
+
+@CHECKS.add("adam_step", "update_gaussians")
+def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        yield from seen_figures(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians")
+
+
+@CHECKS.add("update_gaussians")
+def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, degree in ((1, 3), (17, 0), (40, 2), (150, 3)):
+        case = with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
+        what = f"{count} Gaussians, degree {degree}"
+        yield from fused_figures(device, rng, behind_each_fifth(case), what)
+
+
+def penalty_figures(
+    device: Device,
+    rng: np.random.Generator,
+    count: int,
+    penalty: Penalty,
+    oracle: Any,
+    interval: NDArray[Any] | None = None,
+    parameter: str = "log_scales",
+) -> Iterator[Figure]:
+    """Compare value and gradient of a penalty of weight 3, for Gaussians of many sizes and forms."""
+    case = random_case(rng, count)
+    case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
+    gaussians = case.model(device).gaussians
+    if interval is not None:
+        gaussians.add(INTERVAL2, 1)
+        gaussians.set(INTERVAL2, interval[:, None] ** 2)
+    gradients = Gradients(gaussians)
+    gradients[parameter].fill(0.25)
+    inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
+    found = penalty.add(inputs).value()
+    value, gradient = oracle(case.parameters[parameter].astype(np.float64))
+    kernel, what = str(getattr(penalty, "type", "penalty")), f"{count} Gaussians"
+    yield by_element(kernel, f"value, {what}", np.array([found]), np.array([3 * value]), SUM, floor=1e-7)
+    added = gradients[parameter].get()[:, :count].T.astype(np.float64) - 0.25
+    floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
+    yield by_element(kernel, f"gradient, {what}", added, 3 * gradient, 1e-4, floor)
+
+
+@CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity")
+def penalties(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
+        trace = CovarianceTrace(weight=3.0, above=0.02)
+        yield from penalty_figures(
+            device, rng, count, trace, lambda s: ref.covariance_trace(s, 0.02 * EXTENT**2, EXTENT)
+        )
+        in_pixels = CovarianceTrace(weight=3.0, above=9.0, pixels=4.0)
+        bound = 3 * (4.0 * interval) ** 2
+        yield from penalty_figures(
+            device, rng, count, in_pixels, lambda s, bound=bound: ref.covariance_trace(s, bound, EXTENT), interval
+        )
+        shape = Anisotropy(weight=3.0, above=8.0)
+        yield from penalty_figures(device, rng, count, shape, lambda s: ref.anisotropy(s, 8.0))
+        yield from penalty_figures(device, rng, count, MeanScale(weight=3.0), lambda s: ref.mean_scale(s, EXTENT))
+        opacity = MeanOpacity(weight=3.0)
+        yield from penalty_figures(device, rng, count, opacity, ref.mean_opacity, parameter="logit_opacity")
+
+
+def _tables(gaussians: Gaussians) -> dict[str, NDArray[Any]]:
+    return {name: gaussians[name].get() for name in gaussians.tables}
+
+
+@CHECKS.add("set_rows", "zero_rows", "gather_rows", "count_not_finite", "fill_words")
+def rows_of_tables(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in (0, 1, 15, 17, 1025):
+        array = device.upload(np.full(count, 3, np.float32))
+        array.fill(-1.5)
+        yield equal("fill_words", f"{count} values", array.get(), -1.5)
+    gaussians = random_case(rng, 65).model(device).gaussians
+    before, rows, values = _tables(gaussians), rng.permutation(65)[:17], rng.normal(size=(17, 45))
+    gaussians.set_rows("sh_rest", rows, values)
+    before["sh_rest"][:, rows] = values.T.astype(np.float32)
+    gaussians.zero_rows(["quats"], rows)
+    before["quats"][:, rows] = 0
+    for name, kernel in (("sh_rest", "set_rows"), ("quats", "zero_rows"), ("means", "set_rows")):
+        yield equal(kernel, f"17 rows of {name}", gaussians[name].get(), before[name])
+    source, fresh = rng.integers(0, 65, 150).astype(np.uint32), rng.integers(0, 2, 150).astype(np.uint32)
+    gaussians.add("fresh", 2, zero_fresh=True)
+    gaussians.set("fresh", rng.normal(size=(65, 2)))
+    old = {name: gaussians.get(name) for name in gaussians.tables}
+    gaussians.rearrange(device.upload(source), device.upload(fresh), 150)
+    for name, table in old.items():
+        expected = table[source] * (1 if name != "fresh" else 1 - fresh[:, None])
+        yield equal("gather_rows", f"150 rows of {name}", gaussians.get(name), expected)
+    for value in (np.nan, np.inf, -np.inf):
+        case = random_case(rng, 65)
+        case.parameters["quats"][64, 2] = case.parameters["sh_rest"][0, 44] = value
+        found = case.model(device).gaussians.not_finite()
+        mistaken = {"quats", "sh_rest"} ^ set(found)
+        yield Figure("count_not_finite", f"tables with {value}", len(mistaken), 0, counts=True)
+
+
+# Updates of harmonics that wait until a view sees their Gaussians.
+
+DEFERRED_COUNTS = (1, 15, 17, 65, 150)
+CULLED = 0xFFFFFFFF
+LONGEST = 5  # below the number of steps, so that the list is full once
+STEPS = 8
+
+
+def seen_rows(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
+    """Return which rows a view sees: few, in few of the blocks of 16."""
+    blocks = rng.random(-(-count // 16)) < 0.4
+    return blocks.repeat(16)[:count] & (rng.random(count) < 0.5)
+
+
+def trained(
+    device: Device, model: DeviceModel, seen: list[NDArray[np.bool_]], gradients: list[NDArray[np.float32]], rows: Rows
+) -> dict[str, NDArray[np.float32]]:
+    """Update a model once for each view, and return the harmonics and their moments.
+
+    seen: [N] rows in the view; gradients: [N, components] of the harmonics.
+    """
+    gaussians, adam = model.gaussians, Adam(model.gaussians)
+    camera = random_case(np.random.default_rng(0), 1).device_camera(device)
+    frame = Rasterizer(device, "radix").forward(model, camera, device.upload(BACKGROUND))
+    deferred = gaussians.deferred = Deferred(gaussians, LONGEST) if rows == "deferred" else None
+    for step, (mask, gradient) in enumerate(zip(seen, gradients, strict=True), 1):
+        keys = np.full(gaussians.capacity, CULLED, np.uint32)
+        keys[: gaussians.count][mask] = 7
+        of_view = replace(frame, depth_key=device.upload(keys))
+        of_loss = Gradients(gaussians)
+        planes = np.zeros(of_loss["sh_rest"].shape, np.float32)
+        planes[:, : gaussians.count] = gradient.T
+        of_loss["sh_rest"].set(planes)
+        if deferred:
+            deferred.catch_up(of_view.depth_key)
+        others = set(gaussians.trained) - {"sh_rest"}
+        adam.step(model, of_view, of_loss, Rates().at(step, extent=2.0), others, rows)
+    return {name: gaussians.get(name) for name in Deferred.names}
+
+
+def deferred_figures(device: Device, rng: np.random.Generator, count: int) -> Iterator[Figure]:
+    """Compare waiting updates with the reference, and with the bits of updates at once."""
+    case = random_case(rng, count)
+    before = case.parameters["sh_rest"]
+    seen = [seen_rows(rng, count) for _ in range(STEPS)]
+    gradients = [rng.normal(size=before.shape).astype(np.float32) * mask[:, None] for mask in seen]
+    values, moment1, moment2 = before.astype(np.float64), np.zeros(before.shape), np.zeros(before.shape)
+    for step, gradient in enumerate(gradients, 1):
+        rate = Rates().at(step, extent=2.0)["sh_rest"]
+        values, moment1, moment2 = ref.adam_step(values, gradient.astype(np.float64), moment1, moment2, step, rate)
+    found = trained(device, case.model(device), seen, gradients, "deferred")
+    at_once = trained(device, case.model(device), seen, gradients, "all")
+    moved = max(float(np.abs(values - before).max(initial=0)), 1e-6)
+    yield by_element("replay_updates", f"{count} Gaussians", found["sh_rest"], values, 3e-7, 2e-5 * moved / 3e-7)
+    for name, expected, bound in zip(Deferred.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
+        floor = 0.1 * float(np.abs(expected).max(initial=0))
+        yield by_element("replay_updates", f"{name}, {count} Gaussians", found[name], expected, bound, floor)
+    for name in Deferred.names:
+        bits, expected_bits = found[name].view(np.uint32), at_once[name].view(np.uint32)
+        yield equal("note_update", f"bits of {name}, {count} Gaussians", bits, expected_bits)
+
+
+@CHECKS.add("replay_updates", "note_update", "adam_step")
+def updates_that_wait(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in DEFERRED_COUNTS:
+        yield from deferred_figures(device, rng, count)
+
+
+# Averages of the parameters over steps.
+
+
+@CHECKS.add("add_to_average", "count_step", "take_average")
+def averages(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        yield from average_figures(device, rng, count)
+
+
+def average_figures(device: Device, rng: np.random.Generator, count: int) -> Iterator[Figure]:
+    """The average of three steps, where the last row, if it is not the only one, is new after the first step."""
+    steps = [random_case(rng, count).parameters for _ in range(3)]
+    gaussians = random_case(rng, count).model(device).gaussians
+    adam.attach(gaussians)
+    for step, parameters in enumerate(steps):
+        for name in PARAMETERS:
+            gaussians.set(name, parameters[name])
+        adam.add(gaussians)
+        if step == 0 and count > 1:
+            source, fresh = np.arange(count, dtype=np.uint32), np.zeros(count, np.uint32)
+            fresh[-1] = 1
+            gaussians.rearrange(device.upload(source), device.upload(fresh), count)
+    for name in PARAMETERS:
+        gaussians.set(name, steps[0][name])
+    adam.take(gaussians)
+    for name in PARAMETERS:
+        values = np.stack([parameters[name].astype(np.float64) for parameters in steps])
+        expected = values.mean(axis=0)
+        expected[-1] = values[1 if count > 1 else 0 :, -1].mean(axis=0)
+        found = gaussians.get(name)
+        yield by_element("take_average", f"average of {name}, {count} Gaussians", found, expected, SUM, floor=1)
+
+
+# dropout.cl: what a step leaves out, and what projection makes of the others.
+
+SEED, STEP = 0x9E3779B9, 700
+DROPOUT = Dropout(0.3, SEED, STEP)
+
+
+def dropout_figures(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Figure]:
+    """Compare the records, and the gradients of the parameters, of a step that leaves Gaussians out."""
+    yield from record_figures(device, case, what)
+    yield from gradient_figures(device, case, rng, what)
+
+
+def hidden_figures(device: Device, case: Case, rng: np.random.Generator) -> Iterator[Figure]:
+    """Hide Gaussians in a view of which others are dropped; the records are those without both."""
+    model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
+    left_out = rng.random((2, count)) < 0.5
+    hide(model.gaussians, left_out)
+    found = Rasterizer(device, "radix").forward(model, replace(camera, view=1), device.zeros(3)).splats.get()
+    expected, _, _ = splats_of(device, case)
+    expected[left_out[1]] = 0
+    yield equal("draw_left_out", f"records of {count} Gaussians, some dropped and some hidden", found, expected)
+
+
+@CHECKS.add("draw_left_out", "project_forward", "project_backward")
+def dropout(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in DROPOUT_COUNTS:
+        case = replace(random_case(rng, count), dropout=DROPOUT)
+        yield from dropout_figures(device, case, rng, f"{count} Gaussians, some dropped")
+        yield from hidden_figures(device, case, rng)
+    filtered = with_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
+    yield from dropout_figures(device, replace(filtered, dropout=DROPOUT), rng, "30 filtered Gaussians, some dropped")

@@ -1,0 +1,116 @@
+"""The colours of one photograph by place and luminance: what a bilateral grid makes of an image; how smooth it is.
+
+Images are [3, H, W]; a grid is [3, 4, nz, ny, nx]: what matrices [E | b] differ from no change.
+"""
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+WEIGHTS = np.array([0.299, 0.587, 0.114])  # of the luminance, BT.601
+
+
+def gridded(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
+    """min(1, c + A [c; 1]) of every pixel, A the trilinear mean of the grid at its place and luminance."""
+    return np.minimum(changed_by_grid(image, grid), 1)
+
+
+def gridded_backward(
+    image: NDArray[Any], grid: NDArray[Any], gradient: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Derivatives of sum(gradient * gridded) by the image and by the grid; those of what is cut are 0."""
+    passed = np.where(changed_by_grid(image, grid) < 1, gradient, 0)
+    by_image, by_grid, with_one = passed.copy(), np.zeros(grid.shape), _with_one(image)
+    luminance = np.einsum("a,ahw->hw", WEIGHTS, image)
+    levels, inside = grid.shape[2] - 1, (luminance > 0) & (luminance < 1)
+    for (k, j, i), weight, slope in _corners(image, grid):
+        node = grid[:, :, k, j, i]  # [3, 4, H, W]
+        by_image += weight * np.einsum("abhw,ahw->bhw", node[:, :3], passed)
+        through = np.einsum("abhw,ahw,bhw->hw", node, passed, with_one)
+        by_image += WEIGHTS[:, None, None] * np.where(inside, levels * slope * through, 0)
+        for a, b in itertools.product(range(3), range(4)):
+            np.add.at(by_grid[a, b], (k, j, i), weight * passed[a] * with_one[b])
+    return by_image, by_grid
+
+
+def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
+    """The sum over the axes of the mean of the squared differences of neighbouring nodes, and its derivatives."""
+    value, derivatives = 0.0, np.zeros(grid.shape)
+    for axis in (2, 3, 4):
+        difference = np.diff(grid, axis=axis)
+        if difference.size:
+            value += float((difference**2).mean())
+            ends = [(0, 0)] * axis + [(1, 1)] + [(0, 0)] * (4 - axis)
+            derivatives -= 2 * np.diff(np.pad(difference, ends), axis=axis) / difference.size
+    return value, derivatives
+
+
+def centred_grids(grids: NDArray[Any]) -> NDArray[Any]:
+    """Grids [photographs, 3, 4, nz, ny, nx] less the mean, at each level, over the photographs and the places."""
+    return grids - grids.mean(axis=(0, 4, 5), keepdims=True)
+
+
+def _with_one(image: NDArray[Any]) -> NDArray[Any]:
+    return np.concatenate([image, np.ones((1, *image.shape[1:]))])
+
+
+def changed_by_grid(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
+    """c + A [c; 1] of every pixel, which is not cut."""
+    matrix = sum(weight * grid[:, :, k, j, i] for (k, j, i), weight, _ in _corners(image, grid))
+    return np.asarray(image + np.einsum("abhw,bhw->ahw", matrix, _with_one(image)))
+
+
+def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDArray[Any], NDArray[Any]]]:
+    """The nodes about each pixel, (k, j, i) each [H, W], their weights, and the derivatives of these by the level."""
+    _, _, nz, ny, nx = grid.shape
+    _, height, width = image.shape
+    y, x = np.mgrid[:height, :width]
+    luminance = np.clip(np.einsum("a,ahw->hw", WEIGHTS, image), 0, 1)
+    places = luminance * (nz - 1), (y + 0.5) / height * (ny - 1), (x + 0.5) / width * (nx - 1)
+    firsts = [
+        np.clip(np.floor(place), 0, max(n - 2, 0)).astype(int) for place, n in zip(places, (nz, ny, nx), strict=True)
+    ]
+    for corner in itertools.product((0, 1), repeat=3):
+        nodes = [np.minimum(f + step, n - 1) for f, step, n in zip(firsts, corner, (nz, ny, nx), strict=True)]
+        shares = [p - f if step else 1 - (p - f) for p, f, step in zip(places, firsts, corner, strict=True)]
+        slope = (1 if corner[0] else -1) * (nz > 1) * shares[1] * shares[2]
+        yield tuple(nodes), np.prod(shares, axis=0), slope
+
+
+# The colours of one photograph: an affine change of an image's colours, cut at white.
+
+
+def coloured(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
+    """min(1, E c + b) of every pixel."""
+    return np.minimum(_changed(image, matrix), 1)
+
+
+def coloured_backward(
+    image: NDArray[Any], matrix: NDArray[Any], gradient: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Derivatives of sum(gradient * coloured) by the image and by the matrix; those of what is cut are 0."""
+    passed = np.where(_changed(image, matrix) < 1, gradient, 0)
+    by_image = np.einsum("ab,ahw->bhw", matrix[:, :3], passed)
+    with_one = np.concatenate([image, np.ones((1, *image.shape[1:]))])
+    return by_image, np.einsum("ahw,bhw->ab", passed, with_one)
+
+
+def gain_matrix(exposure: float, red: float, blue: float) -> NDArray[Any]:
+    """The matrix of a gain and a white balance, [3, 4]: green is tied, so that the luminance follows `exposure`."""
+    luminance = np.array([0.299, 0.587, 0.114])  # BT.601
+    green = -(luminance[0] * red + luminance[2] * blue) / luminance[1]
+    return np.column_stack([np.diag(np.exp(exposure + np.array([red, green, blue]))), np.zeros(3)])
+
+
+def gain_gradient(exposure: float, red: float, blue: float, grad_matrix: NDArray[Any]) -> NDArray[Any]:
+    """Derivatives by exposure, red and blue, [3], from those by the matrix."""
+    q = np.diag(grad_matrix) * np.diag(gain_matrix(exposure, red, blue))
+    return np.array([q.sum(), q[0] - 0.299 / 0.587 * q[1], q[2] - 0.114 / 0.587 * q[1]])
+
+
+def _changed(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
+    """E c + b of every pixel."""
+    return np.asarray(np.einsum("ab,bhw->ahw", matrix[:, :3], image) + matrix[:, 3, None, None])

@@ -1,0 +1,210 @@
+"""Image losses and metrics, with gradients by x.
+
+Images are [C,H,W]: x is the render, y the target.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SSIM_RADIUS = 5
+SSIM_SIGMA = 1.5
+C1 = 0.01**2
+C2 = 0.03**2
+
+
+def l1(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
+    """Mean absolute difference, and its gradient."""
+    return np.mean(np.abs(x - y)), np.sign(x - y) / x.size
+
+
+def view_error(gradient: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> float:
+    """Sum of |gradient (x - y)|, the gradient by x of any losses."""
+    return float(np.abs(gradient * (x - y)).sum())
+
+
+def l2(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
+    """Mean squared difference, and its gradient."""
+    return np.mean((x - y) ** 2), 2 * (x - y) / x.size
+
+
+def psnr(x: NDArray[Any], y: NDArray[Any]) -> float:
+    """Peak signal-to-noise ratio of images in [0, 1], in dB."""
+    return 10 * np.log10(1 / np.mean((x - y) ** 2))
+
+
+def ssim_taps() -> NDArray[Any]:
+    """The 11 weights of the window, which sum to one."""
+    weights = np.exp(-(np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) ** 2) / (2 * SSIM_SIGMA**2))
+    return weights / weights.sum()
+
+
+def window_mean(image: NDArray[Any]) -> NDArray[Any]:
+    """Weighted mean over 11x11 pixels, zeros outside the image: one term per offset."""
+    taps = ssim_taps()
+    _, height, width = image.shape
+    padded = np.pad(image, ((0, 0), (SSIM_RADIUS, SSIM_RADIUS), (SSIM_RADIUS, SSIM_RADIUS)))
+    total = np.zeros(image.shape)
+    for row, weight_y in enumerate(taps):
+        for column, weight_x in enumerate(taps):
+            total += weight_y * weight_x * padded[:, row : row + height, column : column + width]
+    return total
+
+
+def _ssim_terms(x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """μ1, μ2, a1, a2, b1, b2."""
+    mu1, mu2 = window_mean(x), window_mean(y)
+    variance1 = window_mean(x * x) - mu1**2
+    variance2 = window_mean(y * y) - mu2**2
+    covariance = window_mean(x * y) - mu1 * mu2
+    a1, a2 = 2 * mu1 * mu2 + C1, 2 * covariance + C2
+    b1, b2 = mu1**2 + mu2**2 + C1, variance1 + variance2 + C2
+    return mu1, mu2, a1, a2, b1, b2
+
+
+def ssim_map(x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
+    """SSIM of every pixel and channel: [C,H,W]."""
+    _, _, a1, a2, b1, b2 = _ssim_terms(x, y)
+    return a1 * a2 / (b1 * b2)
+
+
+def dssim(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
+    """1 - mean SSIM, and its gradient."""
+    mu1, mu2, a1, a2, b1, b2 = _ssim_terms(x, y)
+    m = a1 * a2 / (b1 * b2)
+    d_mu = 2 * mu2 * (a2 - a1) / (b1 * b2) - 2 * mu1 * m * (1 / b1 - 1 / b2)
+    d_variance = -m / b2
+    d_covariance = 2 * a1 / (b1 * b2)
+    g = -1 / x.size
+    grad = window_mean(g * d_mu) + 2 * x * window_mean(g * d_variance) + y * window_mean(g * d_covariance)
+    return 1 - np.mean(m), grad
+
+
+def ms_ssim(x: NDArray[Any], y: NDArray[Any], scales: int) -> float:
+    """MS-SSIM (Wang et al. 2003) over whole windows only, weights divided by their sum: one window at a time."""
+    weights = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])[:scales]
+    window = np.outer(ssim_taps(), ssim_taps())
+    channels, products = len(x), np.ones(len(x))
+    for scale, weight in enumerate(weights / weights.sum()):
+        height, width = x.shape[1:]
+        luminance, structure = [], []
+        for row in range(height - 10):
+            for column in range(width - 10):
+                a, b = (image[:, row : row + 11, column : column + 11] for image in (x, y))
+                mu1, mu2 = (a * window).sum((1, 2)), (b * window).sum((1, 2))
+                d1, d2 = a - mu1[:, None, None], b - mu2[:, None, None]
+                variance1, variance2 = (d1 * d1 * window).sum((1, 2)), (d2 * d2 * window).sum((1, 2))
+                covariance = (d1 * d2 * window).sum((1, 2))
+                luminance.append((2 * mu1 * mu2 + C1) / (mu1**2 + mu2**2 + C1))
+                structure.append((2 * covariance + C2) / (variance1 + variance2 + C2))
+        terms = np.array(structure) * (np.array(luminance) if scale == scales - 1 else 1)
+        products *= np.maximum(terms.mean(axis=0), 0) ** weight
+        x, y = (
+            image[:, : height // 2 * 2, : width // 2 * 2].reshape(channels, height // 2, 2, width // 2, 2).mean((2, 4))
+            for image in (x, y)
+        )
+    return float(products.mean())
+
+
+# A Gaussian blur of the pixels that count, one place of the window at a time.
+
+
+def blurred(image: NDArray[Any], sigma: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
+    """Mean by the weights of a Gaussian, within 3 sigma along each axis.  image: [3, H, W]; mask: [H, W]; sigma: px."""
+    return averaged(image, math.ceil(3 * sigma), 1 / (2 * sigma * sigma), mask)
+
+
+def averaged(image: NDArray[Any], reach: int, falloff: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
+    """Mean, by weights exp(-falloff d²), of the pixels that count within `reach`; where none does, the pixel itself.
+
+    image: [3, H, W]; mask: [H, W] bool; reach: px along each axis; falloff: px⁻².
+    """
+    _, height, width = image.shape
+    counts = np.ones((height, width)) if mask is None else mask.astype(np.float64)
+    sums, weights = np.zeros((3, height, width)), np.zeros((height, width))
+    for y in range(-min(reach, height - 1), min(reach, height - 1) + 1):
+        for x in range(-min(reach, width - 1), min(reach, width - 1) + 1):
+            weight = math.exp(-falloff * (x * x + y * y))
+            to = np.s_[max(0, -y) : height - max(0, y), max(0, -x) : width - max(0, x)]
+            at = np.s_[max(0, y) : height - max(0, -y), max(0, x) : width - max(0, -x)]
+            sums[:, *to] += weight * counts[at] * image[:, *at]
+            weights[to] += weight * counts[at]
+    return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), image)
+
+
+# One level of the Haar transform and back, with a high-pass analysis filter of its own: matrices of whole lines.
+
+LOW, HIGH = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2)
+
+
+def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
+    """The matrix [length, length] of analysis with the high-pass filter `taps`, then synthesis with Haar's filters."""
+    there, back = np.zeros((length, length)), np.zeros((length, length))
+    for pair in range(length // 2):
+        at = slice(2 * pair, 2 * pair + 2)
+        there[pair, at], there[length // 2 + pair, at] = LOW, taps
+        back[at, pair], back[at, length // 2 + pair] = LOW, HIGH
+    return back @ there
+
+
+def haar_filtered(image: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None) -> NDArray[Any]:
+    """Analysis and synthesis along both axes; odd sizes repeat the last line, masked pixels are their block's mean.
+
+    image: [3, H, W]; taps: [2]; mask: [H, W] bool.
+    """
+    _, height, width = image.shape
+    odd = ((0, height % 2), (0, width % 2))
+    whole = np.pad(image, ((0, 0), *odd), mode="edge")
+    counts = np.pad(np.ones((height, width), bool) if mask is None else mask, odd, mode="edge")
+    for row in range(0, whole.shape[1], 2):
+        for column in range(0, whole.shape[2], 2):
+            at = np.s_[row : row + 2, column : column + 2]
+            if counts[at].any():
+                whole[:, *at][:, ~counts[at]] = whole[:, *at][:, counts[at]].mean(axis=1, keepdims=True)
+    down, across = (analysis_and_synthesis(length, taps) for length in whole.shape[1:])
+    return np.asarray(down @ whole @ across.T)[:, :height, :width]
+
+
+def haar_gradient(
+    image: NDArray[Any], gradient: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None
+) -> NDArray[Any]:
+    """Derivatives of sum(gradient * filtered image) by the taps, [2].
+
+    The image is a square in each tap, so that a difference about its middle is exact at any distance.
+    """
+    both = [(haar_filtered(image, taps + e, mask) - haar_filtered(image, taps - e, mask)) / 2 for e in np.eye(2)]
+    return np.array([(gradient * one).sum() for one in both])
+
+
+# Residuals of an image, how many there are of each size, and the pixels that count without the large ones.
+
+BINS, LEAST = 96, 2.0**-12  # eighths of octaves, up to 1
+
+
+def residuals(image: NDArray[Any], photograph: NDArray[Any]) -> NDArray[Any]:
+    """The mean over the channels of the absolute difference."""
+    return np.asarray(np.abs(image - photograph).mean(axis=0))
+
+
+def residual_numbers(values: NDArray[Any]) -> NDArray[np.int64]:
+    """The number of residuals by bin: an octave is cut in eight parts of one width."""
+    found = np.zeros(BINS, np.int64)
+    for value in values.ravel():
+        octave = math.floor(math.log2(value / LEAST)) if value > 0 else -1
+        part = math.floor((value / (LEAST * 2.0**octave) - 1) * 8)
+        found[min(max(8 * octave + part, 0), BINS - 1)] += 1
+    return found
+
+
+def without_transients(
+    values: NDArray[Any], counted: NDArray[np.bool_], threshold: float, reach: int
+) -> NDArray[np.bool_]:
+    """Which pixels count: those below the threshold, and those whose box has at least as many below it as not."""
+    found = counted & (values < threshold)
+    below = found.copy()
+    for y, x in zip(*np.nonzero(counted & ~below), strict=True):
+        box = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+        found[y, x] = 2 * below[box].sum() >= counted[box].sum()
+    return found

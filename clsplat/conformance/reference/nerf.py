@@ -1,0 +1,250 @@
+"""A field of densities and colours, as a network, and the colours of its rays, forward and backward in float64
+(Barron et al. 2021, "Mip-NeRF"; the network is that of Mildenhall et al. 2020)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance.reference.kinds import Camera
+from clsplat.conformance.reference.random import philox
+
+Floats = NDArray[np.float64]
+DENSITY_BIAS, COLOUR_PADDING = -1.0, 0.001
+Weights = list[tuple[Floats, Floats]]  # of each layer: [inputs, outputs], [outputs]
+Inputs = list[Floats]  # of each layer, [S, inputs]
+
+
+@dataclass(frozen=True)
+class Network:
+    """Layers in their order: `depth` of the trunk, of which the one after `skip` reads the position again, density,
+    bottleneck, condition, colour."""
+
+    depth: int
+    skip: int | None  # layer whose outputs the position joins
+
+    def forward(self, weights: Weights, position: Floats, direction: Floats) -> tuple[Floats, Floats, Inputs]:
+        """Raw colours [S, outputs], raw densities [S, outputs], and the inputs of each layer."""
+        inputs, x = [], position
+        for i in range(self.depth):
+            inputs.append(x)
+            x = np.maximum(x @ weights[i][0] + weights[i][1], 0)
+            if i == self.skip:
+                x = np.concatenate([x, position], axis=1)
+        density, bottleneck, condition, colour = weights[self.depth :]
+        seen = np.concatenate([x @ bottleneck[0] + bottleneck[1], direction], axis=1)
+        hidden = np.maximum(seen @ condition[0] + condition[1], 0)
+        inputs += [x, x, seen, hidden]
+        return hidden @ colour[0] + colour[1], x @ density[0] + density[1], inputs
+
+    def backward(
+        self, weights: Weights, inputs: Inputs, by_colours: Floats, by_densities: Floats
+    ) -> tuple[Weights, Floats]:
+        """Derivatives by the weights, and by the encoded position, [S, features], from those by the raw outputs."""
+        density, bottleneck, condition, colour = weights[self.depth :]
+        width = bottleneck[0].shape[1]
+        by_hidden = (by_colours @ colour[0].T) * (inputs[-1] > 0)
+        by_bottleneck = (by_hidden @ condition[0].T)[:, :width]
+        by_outputs = [by_densities, by_bottleneck, by_hidden, by_colours]
+        by_x = by_densities @ density[0].T + by_bottleneck @ bottleneck[0].T
+        by_position = np.zeros_like(inputs[0])
+        for i in reversed(range(self.depth)):
+            after = inputs[i + 1]  # with the position, where it joins
+            if i == self.skip:
+                by_position += by_x[:, weights[i][0].shape[1] :]
+            own = by_x[:, : weights[i][0].shape[1]] * (after[:, : weights[i][0].shape[1]] > 0)
+            by_outputs.insert(0, own)
+            by_x = own @ weights[i][0].T
+        return [(x.T @ y, y.sum(axis=0)) for x, y in zip(inputs, by_outputs, strict=True)], by_position + by_x
+
+
+@dataclass(frozen=True)
+class Composite:
+    """Rays of samples: raw colours [R, N, 3], raw densities [R, N], lengths of the samples [R, N]; background [3]."""
+
+    raw_colours: Floats
+    raw_densities: Floats
+    lengths: Floats
+    background: Floats
+
+    @property
+    def samples(self) -> tuple[Floats, Floats]:
+        """Colours [R, N, 3] and densities [R, N] of the samples."""
+        colours = (1 + 2 * COLOUR_PADDING) / (1 + np.exp(-self.raw_colours)) - COLOUR_PADDING
+        return colours, np.logaddexp(0, self.raw_densities + DENSITY_BIAS)
+
+    def weights(self) -> tuple[Floats, Floats]:
+        """Weights of the samples, and what is left behind each, [R, N]."""
+        left = np.exp(-np.cumsum(self.samples[1] * self.lengths, axis=1))
+        before = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], axis=1)
+        return before - left, left
+
+    def colours(self) -> Floats:
+        """Colours of the rays, [R, 3]."""
+        weights = self.weights()[0][..., None]
+        return np.asarray((weights * self.samples[0]).sum(axis=1) + (1 - weights.sum(axis=1)) * self.background)
+
+    def backward(self, by_colours: Floats) -> tuple[Floats, Floats]:
+        """Derivatives by the raw colours and densities, from those by the colours of the rays, [R, 3]."""
+        (colours, _), (weights, left) = self.samples, self.weights()
+        part = (colours + COLOUR_PADDING) / (1 + 2 * COLOUR_PADDING)
+        by_raw = by_colours[:, None] * weights[..., None] * (1 + 2 * COLOUR_PADDING) * part * (1 - part)
+        by_weights = (by_colours[:, None] * (colours - self.background)).sum(axis=-1)
+        behind = np.cumsum((weights * by_weights)[:, ::-1], axis=1)[:, ::-1] - weights * by_weights
+        slope = 1 / (1 + np.exp(-self.raw_densities - DENSITY_BIAS))
+        return by_raw, (left * by_weights - behind) * self.lengths * slope
+
+
+def update(
+    values: Floats,
+    moment1: Floats,
+    moment2: Floats,
+    gradient: Floats,
+    rate: float,
+    number: int,
+    epsilon: float = 1e-8,  # of Adam's paper
+) -> tuple[Floats, Floats, Floats]:
+    """Adam (Kingma and Ba 2015) at its update `number`: values and both moments."""
+    m, v = 0.9 * moment1 + 0.1 * gradient, 0.999 * moment2 + 0.001 * gradient**2
+    return values - rate * (m / (1 - 0.9**number)) / (np.sqrt(v / (1 - 0.999**number)) + epsilon), m, v
+
+
+# Cones of pixels, their samples, and the encodings of these, in float64 (Barron et al. 2021, "Mip-NeRF").
+
+BLUR_PADDING, WEIGHT_FLOOR = 0.01, 1e-5  # alpha of equation 18; the released code's least sum
+MOST = 1 - float(np.finfo(np.float32).eps)
+PIXELS, COARSE, FINE = 8, 9, 10  # which random numbers: cl_kernels/rays.cl
+
+
+def drawn_pixels(count: int, rays: int, first: int, seed: int, step: int) -> NDArray[np.int64]:
+    """A pixel of `count` for each ray of a step from `first` on, [rays]."""
+    return np.array([philox((first + i, step, PIXELS, 0), (seed, 0))[0] * count >> 32 for i in range(rays)], np.int64)
+
+
+def cones(camera: Camera, pixels: NDArray[np.int64]) -> Floats:
+    """Origin, direction with depth 1, radius at a distance of 1 and length of the direction, [R, 8]."""
+    x = (pixels % camera.width + 0.5 - camera.cx) / camera.fx
+    y = (pixels // camera.width + 0.5 - camera.cy) / camera.fy
+    rotation, translation = camera.world_to_camera[:, :3], camera.world_to_camera[:, 3]
+    directions = np.stack([x, y, np.ones_like(x)], axis=1) @ rotation
+    origins = np.broadcast_to(-rotation.T @ translation, directions.shape)
+    radii = np.full((len(pixels), 1), 2 / np.sqrt(12) / camera.fx)  # section 3.1
+    return np.concatenate([origins, directions, radii, np.linalg.norm(directions, axis=1, keepdims=True)], axis=1)
+
+
+def units(ray: int, count: int, kind: int, seed: int, step: int) -> Floats:
+    """Random numbers in (0, 1] of the edges of a ray, [count]."""
+    words = [word for four in range(-(-count // 4)) for word in philox((ray, step, kind, four), (seed, 0))]
+    return (np.array(words[:count], np.float64) // 256 + 1) / 2**24
+
+
+def coarse_edges(near: float, far: float, samples: int, drawn: Floats | None = None) -> Floats:
+    """Edges of a ray's coarse samples, [samples + 1]; drawn: [samples + 1] in (0, 1], for training."""
+    edges = np.linspace(near, far, samples + 1)
+    if drawn is None:
+        return edges
+    middles = (edges[1:] + edges[:-1]) / 2
+    low, high = np.concatenate([edges[:1], middles]), np.concatenate([middles, edges[-1:]])
+    return np.asarray(low + (high - low) * drawn)
+
+
+def fine_edges(edges: Floats, weights: Floats, samples: int, drawn: Floats | None = None) -> Floats:
+    """Edges of a ray's fine samples, [samples + 1], where the coarse weights are (equation 18)."""
+    padded = np.concatenate([weights[:1], weights, weights[-1:]])
+    largest = np.maximum(padded[:-1], padded[1:])
+    blurred = (largest[:-1] + largest[1:]) / 2 + BLUR_PADDING
+    blurred = blurred + max(0.0, WEIGHT_FLOOR - blurred.sum()) / len(blurred)
+    distribution = np.concatenate([[0.0], np.cumsum(blurred / blurred.sum())])
+    distribution[-1] = 1.0
+    if drawn is None:
+        wanted = np.linspace(0, MOST, samples + 1)
+    else:
+        wanted = np.minimum((np.arange(samples + 1) + drawn) / (samples + 1), MOST)
+    return np.interp(wanted, distribution, edges)
+
+
+def frustums(rays: Floats, edges: Floats) -> tuple[Floats, Floats]:
+    """Means and diagonals of the covariances of conical frustums, each [R, N, 3].
+
+    By integrals of powers of the distance over the frustum, and not by the stable form of the kernels (equation 7).
+    """
+    origins, directions, radii = rays[:, None, :3], rays[:, None, 3:6], rays[:, None, 6:7]
+    t0, t1 = edges[:, :-1, None], edges[:, 1:, None]
+
+    def power(n: int) -> Floats:
+        return np.asarray((t1 ** (n + 1) - t0 ** (n + 1)) / (n + 1))
+
+    volume = power(2)  # the area of a section grows with the square of the distance
+    mean = power(3) / volume
+    along = power(4) / volume - mean**2
+    across = radii**2 / 4 * power(4) / volume
+    squares = directions**2
+    diagonal = along * squares + across * (1 - squares / squares.sum(axis=-1, keepdims=True))
+    return origins + mean * directions, diagonal
+
+
+def encoded_frustums(means: Floats, variances: Floats, degrees: int) -> Floats:
+    """Means of sines, then of cosines, of 2^l x, [R, N, 6 degrees] (equations 13 and 14)."""
+    scales = 2.0 ** np.arange(degrees)[:, None]
+    angles = (means[..., None, :] * scales).reshape(*means.shape[:-1], -1)
+    falls = np.exp(-0.5 * (variances[..., None, :] * scales**2)).reshape(angles.shape)
+    return np.concatenate([falls * np.sin(angles), falls * np.cos(angles)], axis=-1)
+
+
+def encoded_directions(rays: Floats, degrees: int) -> Floats:
+    """Directions of length 1, with their sines and cosines, [R, 3 + 6 degrees]."""
+    directions = rays[:, 3:6] / rays[:, 7:8]
+    angles = (directions[:, None, :] * 2.0 ** np.arange(degrees)[:, None]).reshape(len(rays), -1)
+    return np.concatenate([directions, np.sin(angles), np.cos(angles)], axis=1)
+
+
+# A grid of features in several resolutions, and its derivatives, in float64.
+
+PRIMES = np.array([1, 2654435761, 805459861], np.uint64)  # equation 4 of Mueller et al. 2022
+CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)])
+
+
+def places(means: Floats, variances: Floats, corner: Floats, side: float) -> tuple[Floats, Floats]:
+    """Means of samples in the cube, [S, 3] in shares of its side, and the mean of their variances there, [S]."""
+    return (means - corner) / side, variances.mean(axis=-1) / side**2
+
+
+@dataclass(frozen=True)
+class Level:
+    """A cube of n^3 cells whose corners share `entries` where they are fewer."""
+
+    cells: int
+    entries: int
+
+    def weights(self, variances: Floats) -> Floats:
+        """How much of a level samples can tell, [S]: nearly erf(1 / sqrt(8 v n^2)) (Barron et al. 2023)."""
+        return np.sqrt(-np.expm1(-4 / np.pi / (8 * variances * self.cells**2)))
+
+    def corners(self, at: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """Entries of the corners around places in the cube, and their weights, both [S, 8]."""
+        cell = np.clip(np.floor(at * self.cells), 0, self.cells - 1)
+        within = at * self.cells - cell
+        sides = cell[:, None].astype(np.int64) + CORNERS
+        shares = np.where(CORNERS, within[:, None], 1 - within[:, None]).prod(axis=-1)
+        if (self.cells + 1) ** 3 <= self.entries:
+            return sides @ np.array([1, self.cells + 1, (self.cells + 1) ** 2]), shares
+        mixed = np.bitwise_xor.reduce(sides.astype(np.uint64) * PRIMES & np.uint64(0xFFFFFFFF), axis=-1)
+        return (mixed % np.uint64(self.entries)).astype(np.int64), shares
+
+    def forward(self, table: Floats, at: Floats, variances: Floats) -> Floats:
+        """Features of samples, [S, F], of a table of entries, [entries, F]; 0 outside of the cube."""
+        entries, shares = self._inside(at, variances)
+        return np.asarray((table[entries] * shares[..., None]).sum(axis=1))
+
+    def backward(self, by_features: Floats, at: Floats, variances: Floats) -> Floats:
+        """Derivatives by the table, [entries, F], from those by the features."""
+        entries, shares = self._inside(at, variances)
+        found = np.zeros((self.entries, by_features.shape[1]))
+        np.add.at(found, entries, shares[..., None] * by_features[:, None])
+        return found
+
+    def _inside(self, at: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """The corners, with the weight of the level; without any outside of the cube."""
+        inside = np.all((at >= 0) & (at <= 1), axis=1)
+        entries, shares = self.corners(np.where(inside[..., None], at, 0.5))
+        return entries, shares * (inside * self.weights(variances))[:, None]

@@ -1,0 +1,256 @@
+"""One step of Adam."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance.reference.blending import alpha_gradients
+from clsplat.conformance.reference.kinds import Camera, Gaussians, Splats, Thresholds
+from clsplat.conformance.reference.projection import rotation_matrix
+
+
+def adam_step(
+    parameter: NDArray[Any],
+    grad: NDArray[Any],
+    moment1: NDArray[Any],
+    moment2: NDArray[Any],
+    step: int,
+    rate: float | NDArray[Any],
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-15,
+    seen: NDArray[Any] | None = None,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """New parameter and moments; `step` counts from 1.  PyTorch's form: epsilon outside the root.
+
+    Rows that are not `seen`, [N], stay as they are.
+    """
+    first = beta1 * moment1 + (1 - beta1) * grad
+    second = beta2 * moment2 + (1 - beta2) * grad**2
+    mean = first / (1 - beta1**step)
+    square = second / (1 - beta2**step)
+    updated = parameter - rate * mean / (np.sqrt(square) + epsilon)
+    if seen is None:
+        return updated, first, second
+    rows = seen.reshape(-1, *[1] * (grad.ndim - 1))
+    return np.where(rows, updated, parameter), np.where(rows, first, moment1), np.where(rows, second, moment2)
+
+
+# Penalties on scales and opacities, with their gradients by log_scales and logit_opacity.
+
+
+def covariance_trace(
+    log_scales: NDArray[Any], above: NDArray[Any] | float, extent: float
+) -> tuple[float, NDArray[Any]]:
+    """Mean of max(sum of squared scales - above, 0) by extent².  log_scales: [N, 3]; above: scene units²."""
+    scale2 = np.exp(2 * log_scales)
+    excess = scale2.sum(axis=1) - above
+    penalised = (excess > 0)[:, None]
+    return np.maximum(excess, 0).mean() / extent**2, 2 * scale2 * penalised / len(scale2) / extent**2
+
+
+def anisotropy(log_scales: NDArray[Any], above: float) -> tuple[float, NDArray[Any]]:
+    """Mean of max(longest / shortest axis - above, 0)."""
+    rows = np.arange(len(log_scales))
+    longest, shortest = log_scales.argmax(axis=1), log_scales.argmin(axis=1)
+    ratio = np.exp(log_scales[rows, longest] - log_scales[rows, shortest])
+    slope = np.where(ratio > above, ratio, 0) / len(rows)
+    gradient = np.zeros_like(log_scales)
+    gradient[rows, longest] += slope
+    gradient[rows, shortest] -= slope
+    return np.maximum(ratio - above, 0).mean(), gradient
+
+
+def mean_scale(log_scales: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
+    """Mean of the scales by extent.  log_scales: [N, 3]."""
+    scales = np.exp(log_scales)
+    return scales.mean() / extent, scales / scales.size / extent
+
+
+def mean_opacity(logit_opacity: NDArray[Any]) -> tuple[float, NDArray[Any]]:
+    """Mean of the opacities.  logit_opacity: [N, 1]."""
+    opacities = 1 / (1 + np.exp(-logit_opacity))
+    return opacities.mean(), opacities * (1 - opacities) / opacities.size
+
+
+# Density control: which Gaussians are cloned, split and pruned, and their children.
+
+KEEP, CLONE, SPLIT, PRUNE = 0, 1, 2, 3  # rows left afterwards: itself; itself twice; two children; none
+
+
+@dataclass(frozen=True)
+class DensityRule:
+    """Constants; lengths are fractions of the scene extent."""
+
+    clone_gradient: float = 2e-4
+    split_gradient: float = 2e-4
+    dense: float = 0.01
+    min_opacity: float = 0.005
+    prune_scale: float = 0.1
+    split_factor: float = 1.6
+
+
+VANILLA = DensityRule()
+ABSGS = DensityRule(split_gradient=4e-4, dense=0.001)
+
+
+def screen_gradient(grad_mean2d: NDArray[Any], width: int, height: int) -> NDArray[Any]:
+    """‖g2d‖: pixels -> normalised device coordinates: [N,2] -> [N].  Also for `mean2d_abs`."""
+    return np.hypot(width / 2 * grad_mean2d[:, 0], height / 2 * grad_mean2d[:, 1])
+
+
+def screen_gain(grad_mean2d: NDArray[Any], conic: NDArray[Any]) -> NDArray[Any]:
+    """Largest change of the loss by a shift of one standard deviation, to first order: [N]; 0 for a culled splat.
+
+    grad_mean2d: [N,2] px^-1; conic: [N,3] px^-2.  It is the length of L^T g, with L L^T the covariance.
+    """
+    found = np.zeros(len(conic))
+    for i, (xx, xy, yy) in enumerate(conic):
+        if xx > 0:
+            lower = np.linalg.cholesky(np.linalg.inv([[xx, xy], [xy, yy]]))
+            found[i] = np.linalg.norm(lower.T @ grad_mean2d[i])
+    return found
+
+
+def mean_gradient(total: NDArray[Any], count: NDArray[Any]) -> NDArray[Any]:
+    """ḡ: [N]; 0 where the Gaussian was never visible."""
+    return np.where(count > 0, total / np.maximum(count, 1), 0)
+
+
+def adc_actions(
+    gradient: NDArray[Any],
+    max_scale: NDArray[Any],
+    opacity: NDArray[Any],
+    extent: float,
+    prune_large: bool,
+    rule: DensityRule = VANILLA,
+    split_gradient: NDArray[Any] | None = None,
+) -> NDArray[Any]:
+    """KEEP, CLONE, SPLIT or PRUNE per Gaussian: [N].
+
+    Pruning comes last and sees the new rows: copies and children have their parent's opacity, children its scale / 1.6.
+    `split_gradient` is the statistic of the split test where it is another one (ḡabs); `prune_large` is i > 3000.
+    """
+    split_gradient = gradient if split_gradient is None else split_gradient
+    actions = []
+    for g, g_split, scale, o in zip(gradient, split_gradient, max_scale, opacity, strict=True):
+        small = scale <= rule.dense * extent
+        action = KEEP
+        if small and g >= rule.clone_gradient:
+            action = CLONE
+        elif not small and g_split >= rule.split_gradient:
+            action = SPLIT
+        final_scale = scale / rule.split_factor if action == SPLIT else scale
+        too_large = prune_large and final_scale > rule.prune_scale * extent
+        actions.append(PRUNE if o < rule.min_opacity or too_large else action)
+    return np.array(actions, int)
+
+
+def split_children(
+    mean: NDArray[Any],
+    quat: NDArray[Any],
+    log_scale: NDArray[Any],
+    noise: NDArray[Any],
+    factor: float = VANILLA.split_factor,
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Means and log-scales of the children of one Gaussian; `noise` is N(0, 1): [2,3] -> [2,3], [2,3]."""
+    rotation, scale = rotation_matrix(quat), np.exp(log_scale)
+    means = np.array([mean + rotation @ (scale * sample) for sample in noise])
+    return means, np.array([log_scale - np.log(factor) for _ in noise])
+
+
+def shared_logit(logit: NDArray[Any], rows: int) -> NDArray[Any]:
+    """Logits of `rows` Gaussians in one place that together let through as much as one did: 1 - o' = (1 - o)^(1/n)."""
+    log_transmittance = -np.log1p(np.exp(logit)) / rows
+    return np.log(-np.expm1(log_transmittance)) - log_transmittance
+
+
+def decayed_logit(logit: NDArray[Any], factor: float) -> NDArray[Any]:
+    """The logit of `factor` times the opacity."""
+    opacity = factor / (1 + np.exp(-logit))
+    return np.log(opacity / (1 - opacity))
+
+
+def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, ceiling: float = 0.01) -> NDArray[Any]:
+    """Opacity reset (6; 8.3 with `filter_ratio` = ρ): the filtered opacity becomes at most `ceiling`: [N]."""
+    opacity = np.minimum(filter_ratio / (1 + np.exp(-logit)), ceiling) / filter_ratio
+    return np.log(opacity / (1 - opacity))
+
+
+# The splitting matrix (SteepGS, Wang et al. 2025): what becomes of the loss when a splat becomes two.
+
+
+def screen_splitting(
+    splats: Splats,
+    width: int,
+    height: int,
+    background: NDArray[Any],
+    grad_image: NDArray[Any],
+    thresholds: Thresholds = Thresholds(),
+) -> NDArray[Any]:
+    """Σ dL/dalpha · (Hessian of alpha by the splat's mean) over pixels, one after another: [N,2,2] px⁻²."""
+    found = np.zeros((len(splats.opacity), 2, 2))
+    for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
+        a, b, c = splats.conic[step.splat]
+        conic = np.array([[a, b], [b, c]])
+        for row, column in np.argwhere(grad_alpha != 0):
+            slope = conic @ [step.dx[row, column], step.dy[row, column]]
+            hessian = step.alpha[row, column] * (np.outer(slope, slope) - conic)
+            found[step.splat] += grad_alpha[row, column] * hessian
+    return found
+
+
+def mean_jacobian(camera: Camera, mean: NDArray[Any]) -> NDArray[Any]:
+    """d(projected mean)/d(mean): [2,3] px by scene unit."""
+    x, y, z = camera.rotation @ mean + camera.translation
+    perspective = np.array([[camera.fx / z, 0, -camera.fx * x / z**2], [0, camera.fy / z, -camera.fy * y / z**2]])
+    return perspective @ camera.rotation
+
+
+def splitting(gaussians: Gaussians, camera: Camera, on_screen: NDArray[Any]) -> NDArray[Any]:
+    """Lift matrices on the screen, [N,2,2], to the scene, with a form of the splat that stays: [N,3,3]."""
+    found = np.zeros((len(on_screen), 3, 3))
+    for n in np.flatnonzero(on_screen.any(axis=(1, 2))):
+        jacobian = mean_jacobian(camera, gaussians.means[n])
+        found[n] = jacobian.T @ on_screen[n] @ jacobian
+    return found
+
+
+# k-means (Lloyd 1982), one point at a time.
+
+
+def nearest_vectors(points: NDArray[Any], vectors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """The nearest vector of each point, the first of equally near ones, and half the squared distance, both [N].
+
+    points: [N,c], vectors: [E,c].  A point that is not a number has the label 0 and the distance inf.
+    """
+    labels, distances = np.zeros(len(points), int), np.full(len(points), np.inf)
+    for i, point in enumerate(points.astype(np.float64)):
+        for label, vector in enumerate(vectors.astype(np.float64)):
+            distance = np.sum((point - vector) ** 2) / 2
+            if distance < distances[i]:
+                labels[i], distances[i] = label, distance
+    return labels, distances
+
+
+def member_sums(points: NDArray[Any], labels: NDArray[Any], entries: int) -> NDArray[Any]:
+    """The sum of the points of each label, [entries,c]; what is not a number counts as 0."""
+    sums = np.zeros((entries, points.shape[1]))
+    for point, label in zip(points.astype(np.float64), labels, strict=True):
+        sums[label] += np.nan_to_num(point, nan=0)
+    return sums
+
+
+def shared_means(values: NDArray[Any], labels: NDArray[Any], weights: NDArray[Any]) -> NDArray[Any]:
+    """Each row replaced by the mean of the rows that have its label, by weight, [N,c].
+
+    values: [N,c], labels, weights: [N].  Where all weights of a label are zero it is the first of its rows.
+    """
+    shared = np.empty(values.shape)
+    for label in np.unique(labels):
+        members = np.flatnonzero(labels == label)
+        rows, weight = values[members].astype(np.float64), weights[members].astype(np.float64)
+        shared[members] = weight @ rows / weight.sum() if weight.any() else rows[0]
+    return shared

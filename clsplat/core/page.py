@@ -1,0 +1,105 @@
+"""Pages that open offline: one file of HTML with its style, charts and images inside.
+
+Templates, style and scripts lie in `templates/`.  They escape every value but the charts of `clsplat.viewer.charts` and
+the scripts and styles of the package.
+"""
+
+import base64
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError
+from clsplat.core.reading import read_file
+
+TEMPLATES = Environment(
+    loader=PackageLoader("clsplat.core"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+TEMPLATES.policies["json.dumps_kwargs"] = {"separators": (",", ":")}  # `tojson` escapes <, >, & and ' by itself
+JPEG_QUALITY = 92
+
+
+def render(template: str, **values: Any) -> str:
+    """Fill a template of `templates/`; return the page.  Invalid Unicode becomes `?`."""
+    text = TEMPLATES.get_template(template).render(**values)
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def require_end(path: Path) -> None:
+    """Raise DataError where the file of a page cannot be read, or has lost its end."""
+    if not read_file(path).rstrip().endswith(b"</html>"):
+        raise DataError(f"{path}: ends before its end")
+
+
+def charts(drawings: Iterable[str]) -> list[Markup]:
+    """Mark SVG drawings as safe and drop empty ones; templates escape all other values."""
+    return [_safe(drawing) for drawing in drawings if drawing]
+
+
+@dataclass(frozen=True)
+class Inline:
+    """A script or style of the package, and the hash with which a page's policy admits it and no other."""
+
+    text: Markup
+    hash: str
+
+
+def inline(text: str) -> Inline:
+    """Mark a script or style of the package as safe.  Raises ValueError where it would end its own element."""
+    if "</" in text:
+        raise ValueError("a script or style holds '</', which ends its element")
+    digest = hashlib.sha256(text.encode()).digest()
+    return Inline(_safe(text), f"sha256-{base64.b64encode(digest).decode()}")
+
+
+def _safe(text: str) -> Markup:
+    return Markup(text)
+
+
+def duration(seconds: float) -> str:
+    """Return a time in words: `1 h 2 min`, `3 min 4 s`, `5 s`."""
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes >= 60:
+        return f"{minutes // 60} h {minutes % 60} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def embedded(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
+    """Return an RGB image, [height, width, 3], as a data URL: .jpg, or .png, which keeps every bit."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix == ".jpg" else []
+    _, data = cv2.imencode(suffix, image[..., ::-1], options)
+    kind = "jpeg" if suffix == ".jpg" else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def shrunk(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """Return an image whose longer side is at most `longest` px, with its aspect."""
+    height, width = image.shape[:2]
+    factor = longest / max(width, height)
+    if factor >= 1:
+        return image
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+# How models and scenes show themselves in a notebook.
+
+THUMBNAIL = 160  # px, the larger side
+
+
+def summary(rows: Mapping[str, str], images: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> str:
+    """Return a table of names and values, and images, [height, width, 3], with their names, as a piece of HTML."""
+    thumbnails = [(name, embedded(shrunk(image, THUMBNAIL))) for name, image in images]
+    return render("notebook.html.j2", rows=rows, thumbnails=thumbnails)

@@ -1,0 +1,66 @@
+"""Where the files of this program are, and its version, with what tells it from other programs of the same version."""
+
+import hashlib
+import subprocess
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+from clsplat.core.reading import sha256
+
+__version__ = "0.2.0.dev0"
+PACKAGE = Path(__file__).resolve().parents[1]
+CODE = ("clsplat", "cl_kernels", "data_tools", "pipelines")  # folders of a checkout
+
+
+def resource_dir(name: str) -> Path:
+    """Return the folder `cl_kernels` or `pipelines`: a wheel carries it inside the package, a checkout beside it."""
+    for base in (PACKAGE, PACKAGE.parent):
+        if (base / name).is_dir():
+            return base / name
+    raise FileNotFoundError(f"{name}/ is missing beside {PACKAGE}")
+
+
+@cache
+def full_version() -> str:
+    """Return the version; that of a development version ends in the commit, or in a digest of the code.
+
+    `0.2.0.dev0+g1a2b3c4` is a checkout at that commit without changes; `0.2.0.dev0+d5e6f7a8b` is anything else.
+    """
+    if ".dev" not in __version__:
+        return __version__
+    commit = _commit(PACKAGE.parent)
+    return f"{__version__}+g{commit}" if commit else f"{__version__}+d{_digest(list_sources())}"
+
+
+def list_sources() -> list[str]:
+    """Return names and hashes of the files that decide what the program computes: Python and kernels."""
+    tools = PACKAGE / "data_tools"  # in a wheel; a checkout has it next to the package
+    python = [path for path in PACKAGE.rglob("*.py") if not path.is_relative_to(tools)]
+    kernels = resource_dir("cl_kernels")
+    texts = [path for pattern in ("*.cl", "*.h") for path in kernels.rglob(pattern)]
+    return [
+        f"{path.relative_to(root).as_posix()} {sha256(path)}"
+        for root, paths in ((PACKAGE, python), (kernels, texts))
+        for path in sorted(paths)
+    ]
+
+
+def _commit(root: Path) -> str:
+    """The commit of a checkout whose code has no changes, else ""."""
+    if not (root / ".git").exists() or _git(root, "status", "--porcelain", "--", *CODE) != "":
+        return ""
+    return _git(root, "rev-parse", "--short=7", "HEAD") or ""
+
+
+def _git(root: Path, *words: str) -> str | None:
+    """What git prints, None where it fails or is not installed."""
+    try:
+        found = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip()
+
+
+def _digest(lines: Sequence[str]) -> str:
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:8]

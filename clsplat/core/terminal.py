@@ -1,0 +1,240 @@
+"""Output to the terminal: a live line of progress, or plain lines when the output is not a terminal."""
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn
+
+from clsplat.core import signals
+from clsplat.core.errors import OutputError
+from clsplat.core.files import told_as
+from clsplat.core.progress import Progress as TrainingProgress
+from clsplat.core.progress import clock, counts_shown, heard_by
+from clsplat.core.resources import __version__
+
+LOG = logging.getLogger("clsplat")
+CONSOLE = Console(file=signals.STDOUT, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
+ERRORS = Console(file=signals.STDERR, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
+_bars: list[Live] = []  # that are drawn
+
+
+class WatchedStatus(Protocol):
+    """The status of a run: `now` holds stage, progress (done, total, unit), step and steps."""
+
+    @property
+    def now(self) -> Any: ...
+
+
+class _TerminalHandler(logging.Handler):
+    """A handler that prints remarks to `remarks`, warnings to stderr; above a progress bar where both are terminals."""
+
+    def __init__(self, remarks: Console) -> None:
+        super().__init__()
+        self.remarks = remarks
+
+    def emit(self, record: logging.LogRecord) -> None:
+        warning = record.levelno >= logging.WARNING
+        console = ERRORS if warning else self.remarks
+        if _bars and console.is_terminal:  # past the bar's console a line would be glued to it
+            console = CONSOLE
+        console.print(("warning: " if warning else "") + record.getMessage(), markup=False)
+
+
+def start_logging(debug: bool, remarks: Console = CONSOLE) -> None:
+    """Send the log to the terminal, with debug lines when `debug` is True."""
+    LOG.setLevel(logging.DEBUG)
+    LOG.handlers.clear()
+    handler = _TerminalHandler(remarks)
+    handler.setLevel(logging.DEBUG if debug else logging.INFO)
+    LOG.addHandler(handler)
+
+
+def keep_stdout_for_json() -> None:
+    """Send remarks of the log to stderr from here on: stdout holds JSON alone."""
+    for handler in LOG.handlers:
+        if isinstance(handler, _TerminalHandler):
+            handler.remarks = ERRORS
+
+
+def remark(text: str) -> None:
+    """Print what was done; where that cannot be written nothing is lost."""
+    CONSOLE.print(text, markup=False)
+
+
+def show(text: str) -> None:
+    """Print what the command is for, as it is.  Raises OutputError where it cannot be written."""
+    CONSOLE.print(text, markup=False)
+    signals.check_output()
+
+
+def show_json(data: Any) -> None:
+    """Print data as JSON.  Raises OutputError as `show` does."""
+    signals.STDOUT.write(json.dumps(data, indent=1) + "\n")
+    signals.check_output()
+
+
+class _LogFile(logging.FileHandler):
+    """A file of the log.  Where a line cannot be written, a warning says so once, and the work goes on."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, encoding="utf-8", errors="backslashreplace")
+        self.failed = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not self.failed:
+            self.failed = True
+            error = sys.exc_info()[1]
+            reason = getattr(error, "strerror", None) or error
+            LOG.warning("%s: cannot be written (%s); the work goes on without these lines", self.baseFilename, reason)
+
+    def close(self) -> None:
+        with suppress(OSError):  # lines that are held back; the warning was given
+            super().close()
+
+
+@contextmanager
+def logging_to(path: Path) -> Iterator[None]:
+    """Append the log to a file, with the time of every line, and the traceback of an error that ends the block.
+
+    The file has debug lines, whatever the level of the log was.  Raises OutputError where it cannot be written at the
+    beginning; later nothing ends for the log.
+    """
+    if path.exists() and not path.is_file():
+        raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or give another folder")
+    form = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
+    first = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (__version__,), None)
+    with told_as(path):
+        with path.open("a", encoding="utf-8") as file:
+            file.write(form.format(first) + "\n")
+        handler = _LogFile(path)
+    handler.setFormatter(form)
+    level = LOG.level
+    LOG.setLevel(logging.DEBUG)
+    LOG.addHandler(handler)
+    try:
+        yield
+    except BaseException as error:
+        LOG.debug("ended by %s", type(error).__name__, exc_info=error)
+        raise
+    finally:
+        for stream in (signals.STDOUT, signals.STDERR):
+            if stream.fault is not None:
+                LOG.debug("%s could not be written: %s", stream.name, stream.fault)
+        LOG.removeHandler(handler)
+        LOG.setLevel(level)
+        handler.close()
+
+
+def line(progress: TrainingProgress) -> str:
+    """Return the progress at a step as text."""
+    p = progress
+    least = "" if p.growth_known else "at least "
+    count = "" if p.gaussians is None else f"gaussians {p.gaussians:,}  "
+    return (
+        f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  {count}"
+        f"{p.milliseconds:.1f} ms/step  {least}{clock(p.seconds_left)} left"
+    )
+
+
+def device_text(device: dict[str, Any]) -> str:
+    """A device, as `clsplat.devices` lists it, and whether it works, as lines of text."""
+    d = device
+    sizes = f"{d['memory'] / 2**30:.1f} GiB of memory, buffers up to {d['allocation'] / 2**30:.1f} GiB"
+    limits = f"groups up to {d['group']}, {d['local_memory'] >> 10} KiB local, {d['float_width']} lanes"
+    return (
+        f"{d['name']} ({d['kind']}, {d['units']} units)\n"
+        f"  runtime   {d['platform']}\n"
+        f"  limits    {sizes}, {limits}\n"
+        f"  schedule  {d['schedule']}\n"
+        f"  state     {'does not work: ' + d['fault'] if d['fault'] else 'works'}"
+    )
+
+
+@contextmanager
+def progress_bar(status: WatchedStatus) -> Iterator[Callable[[TrainingProgress], None]]:
+    """Yield a function that shows reports; between them a terminal shows what `status` counts."""
+    if not CONSOLE.is_terminal:
+        yield lambda progress: LOG.info(line(progress))
+        return
+    bar = _RunBar(status)
+    with _drawn(bar):
+        yield bar.report
+
+
+@contextmanager
+def counted() -> Iterator[None]:
+    """Show how far the counted work of the block is, where the output is a terminal; a log has its lines."""
+    if not CONSOLE.is_terminal:
+        yield
+        return
+    bar = _new_bar()
+    task = bar.add_task("", total=None, visible=False)
+
+    def update(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        left = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
+        bar.update(task, total=total, completed=done, description=f"{what}: {done} of {total}{left}", visible=True)
+
+    with _drawn(bar), heard_by(update):
+        yield
+
+
+class _RunBar:
+    """The bar of a run, made of its status as often as it is drawn: the training waits for nothing."""
+
+    def __init__(self, status: WatchedStatus) -> None:
+        self.status, self.bar = status, _new_bar()
+        self.task = self.bar.add_task("", total=None)
+        self.last: tuple[float, TrainingProgress] | None = None  # report, and when
+        self.first: tuple[float, int, int] | None = None  # when, step and last step of a training, as first seen
+
+    def report(self, progress: TrainingProgress) -> None:
+        self.last = time.monotonic(), progress
+        LOG.debug(line(progress))
+
+    def __rich__(self) -> Progress:
+        now = self.status.now
+        stage, amount, done, total = now.stage or "", now.progress, now.step or 0, now.steps
+        if amount is None:
+            self.bar.update(self.task, total=None, completed=0, description=stage)
+        elif amount.unit == "steps" and total:
+            self.bar.update(self.task, total=total, completed=done, description=self._training(done, total))
+        else:
+            text = f"{stage}: {amount.done} of {amount.total} {amount.unit}"
+            self.bar.update(self.task, total=amount.total, completed=amount.done, description=text)
+        return self.bar
+
+    def _training(self, step: int, steps: int) -> str:
+        time_now = time.monotonic()
+        if self.last and self.last[1].steps == steps:
+            since, report = self.last
+            left = max(0.0, report.seconds_left - (time_now - since))
+            return line(replace(report, step=step, seconds_left=left))
+        if self.first is None or self.first[2] != steps:
+            self.first = time_now, step, steps
+        since, before, _ = self.first
+        seconds = (time_now - since) / (step - before) * (steps - step) if step > before else None
+        return f"step {step}/{steps}" + ("" if seconds is None else f"  about {clock(seconds)} left")
+
+
+def _new_bar() -> Progress:
+    return Progress(BarColumn(bar_width=24), TextColumn("{task.description}"), console=CONSOLE)
+
+
+@contextmanager
+def _drawn(bar: "Progress | _RunBar") -> Iterator[None]:
+    """Draw a bar in the block, several times a second; lines of the log stand above it."""
+    with Live(bar, console=CONSOLE, refresh_per_second=4, transient=True) as live, counts_shown():
+        _bars.append(live)
+        try:
+            yield
+        finally:
+            _bars.remove(live)

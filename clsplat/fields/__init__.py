@@ -1,1 +1,0 @@
-"""Fields of densities and colours: a network in the place of Gaussians."""

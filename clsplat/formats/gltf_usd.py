@@ -1,0 +1,400 @@
+"""glTF with KHR_gaussian_splatting, in its binary container: points with attributes, one accessor each.
+
+    POSITION 3 · ROTATION x y z w, unit · SCALE 3, linear · OPACITY in [0, 1] · SH_DEGREE_l_COEF_m 3, in the order and
+    with the signs of f_rest · COLOR_0 r g b a, linear, for viewers without the extension
+
+Axes of glTF are x right, y up, z back: y and z of the Gaussians are turned, not the node, for the extension leaves it
+to a viewer whether it turns harmonics with a node.
+"""
+
+import json
+import logging
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError, quoted
+from clsplat.core.reading import read_file
+from clsplat.formats.packing import Output, written
+from clsplat.formats.ply import checked_numbers
+from clsplat.formats.splats import (
+    MAX_DEGREE,
+    MAX_FILE,
+    SH_C0,
+    Parameters,
+    SplatFile,
+    Writing,
+    flipped,
+    logits,
+    logs,
+    opacities,
+    require_some,
+    unit,
+)
+
+# The parts of glTF that hold Gaussians: primitives, where their node stands, and accessors.
+
+LOG = logging.getLogger("clsplat")
+EXTENSION = "KHR_gaussian_splatting"
+PREFIX = f"{EXTENSION}:"
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+SHARED = 8  # times that a byte is read, on average: equal columns may be one accessor
+FLIP = np.diag([1.0, -1, -1, 1])  # between the axes of glTF and those of a PLY
+
+
+class NoIndex(ValueError):
+    """A value is no index, size or offset; the message tells it in words."""
+
+
+class Gltf:
+    """A file's primitives of Gaussians, all in the same place.
+
+    Raises DataError where there are none, or more than one place; for a tree that is damaged the errors of Python,
+    which `fault` tells in words.
+    """
+
+    def __init__(self, path: Path, tree: dict[str, Any], binary: bytes) -> None:
+        self.path, self.tree, self.binary = path, tree, binary
+        self.left = SHARED * len(binary)  # bytes that may still be read
+        self.primitives: list[dict[str, Any]] = []
+        self.placement: NDArray[np.float64] | None = None  # [4, 4] in the axes of a PLY
+        placements = []
+        for mesh, matrix in self._meshes():
+            for primitive in tree["meshes"][mesh]["primitives"]:
+                extension = primitive.get("extensions", {}).get(EXTENSION)
+                if extension is not None:
+                    self._check(extension)
+                    self.primitives.append(primitive)
+                    placements.append(matrix)
+        if not self.primitives:
+            raise DataError(
+                f"{path}: holds no Gaussians ({EXTENSION}); expected a primitive that has some: export it again"
+            )
+        if any(not np.allclose(one, placements[0]) for one in placements):
+            raise DataError(f"{path}: its Gaussians stand in several places; export them apart, then merge them")
+        if not np.allclose(placements[0], np.eye(4)):
+            self.placement = FLIP @ placements[0] @ FLIP
+
+    def accessor(self, number: Any, width: int) -> NDArray[np.float32]:
+        """Return the rows of an accessor, [count, width]; normalised whole numbers as those in [-1, 1]."""
+        one = self.tree["accessors"][_index(number)]
+        kind, count, start = COMPONENTS[one["componentType"]], _index(one["count"]), _index(one.get("byteOffset", 0))
+        view = self.tree["bufferViews"][_index(one["bufferView"])]
+        buffer = self.tree["buffers"][_index(view["buffer"])]
+        if WIDTHS.get(one["type"]) != width or "sparse" in one or view["buffer"] or "uri" in buffer:
+            raise DataError(
+                f"{self.path}: accessor {number} is a {quoted(one['type'])}, or lies elsewhere; expected {width} "
+                "numbers a row in the file itself: export it again"
+            )
+        size = width * np.dtype(kind).itemsize
+        stride = _index(view.get("byteStride", size))
+        length, offset = _index(view["byteLength"]), _index(view.get("byteOffset", 0))
+        if stride < size:
+            raise DataError(
+                f"{self.path}: the rows of accessor {number} are {stride} bytes apart; expected {size} at least: "
+                "export it again"
+            )
+        held = min(_index(buffer["byteLength"]), len(self.binary))
+        if offset + length > held or start + stride * max(count - 1, 0) + size * min(count, 1) > length:
+            raise DataError(
+                f"{self.path}: accessor {number} has {count} rows, more than its view of {length} bytes from {offset} "
+                f"on holds, or than the file, whose buffer has {held} bytes; copy or export it again"
+            )
+        start += offset
+        self.left -= count * size
+        if self.left < 0:
+            raise DataError(f"{self.path}: its accessors share their numbers too often; export it again")
+        rows = np.ndarray((count, width), kind, self.binary, start, (stride, np.dtype(kind).itemsize))
+        if not one.get("normalized") or kind == "<f4":
+            return rows.astype(np.float32)
+        return np.maximum(rows / np.float32(np.iinfo(kind).max), -1).astype(np.float32)
+
+    def _check(self, extension: dict[str, Any]) -> None:
+        kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
+        if kernel != "ellipse":
+            raise DataError(f"{self.path}: its kernel is {quoted(kernel)}; expected 'ellipse': export it again")
+        if space != "srgb_rec709_display":
+            LOG.warning("%s: its colours are %s; they are taken as they are", self.path, quoted(space))
+
+    def _meshes(self) -> list[tuple[int, NDArray[np.float64]]]:
+        """The meshes of the scene, each with the matrix of its node."""
+        nodes = self.tree["nodes"]
+        found: list[tuple[int, NDArray[np.float64]]] = []
+        seen: set[int] = set()
+        waiting = [(_index(root), np.eye(4)) for root in self._roots()]
+        while waiting:
+            number, above = waiting.pop()
+            if number in seen:
+                raise DataError(f"{self.path}: its nodes are no tree, node {number} occurs twice; export it again")
+            seen.add(number)
+            matrix = above @ self._matrix(number)
+            if not np.isfinite(matrix).all():
+                raise DataError(
+                    f"{self.path}: node {number} has no finite place; expected finite numbers: export it again"
+                )
+            if "mesh" in nodes[number]:
+                found.append((_index(nodes[number]["mesh"]), matrix))
+            waiting += [(_index(child), matrix) for child in nodes[number].get("children", [])]
+        return found
+
+    def _matrix(self, number: int) -> NDArray[np.float64]:
+        """Where a node stands in the one above, [4, 4].  Raises DataError for a quaternion without a direction."""
+        node = self.tree["nodes"][number]
+        if "matrix" in node:
+            return np.array(node["matrix"], np.float64).reshape(4, 4).T
+        quaternion = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
+        length = np.linalg.norm(quaternion)
+        if not 0 < length < np.inf:
+            raise DataError(
+                f"{self.path}: the rotation of node {number} is a quaternion of length {length:g}; expected 1: export "
+                "it again"
+            )
+        x, y, z, w = quaternion / length
+        matrix = np.eye(4)
+        matrix[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64)
+        matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64)
+        return matrix
+
+    def _roots(self) -> list[int]:
+        """The nodes of the scene; without one, those that are nobody's child."""
+        if "scenes" in self.tree and (roots := self.tree["scenes"][_index(self.tree.get("scene", 0))]["nodes"]):
+            return list(roots)
+        nodes = self.tree["nodes"]
+        return sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
+
+
+def fault(error: Exception) -> str:
+    """Return in words what an error of Python says about a tree."""
+    if isinstance(error, NoIndex):
+        return str(error)
+    if isinstance(error, json.JSONDecodeError):
+        return f"line {error.lineno}, column {error.colno}: {error.msg}"
+    if isinstance(error, UnicodeDecodeError):
+        return f"byte {error.start} is no UTF-8"
+    if isinstance(error, RecursionError):
+        return "nested too deeply"
+    if isinstance(error, KeyError):
+        return f"{quoted(error.args[0])} is missing or unknown"
+    if isinstance(error, IndexError):
+        return "an index is beyond the end of its list"
+    return "a value is of another kind, size or shape than in glTF 2.0"
+
+
+def _index(value: Any) -> int:
+    """A whole number from 0 on.  Raises NoIndex."""
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 40:
+        raise NoIndex(f"{quoted(value)} where a whole number from 0 on is expected")
+    return value
+
+
+MAGIC = b"glTF"
+JSON, BINARY = 0x4E4F534A, 0x004E4942  # kinds of chunks
+POINTS = 0  # mode of a primitive
+FLOAT, BYTE = 5126, 5121  # kinds of components
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+MAX_JSON = 1 << 26  # bytes
+
+
+def read_glb(path: Path) -> SplatFile:
+    """Read the Gaussians of a .glb file.  Raises DataError when it is missing, damaged or has none."""
+    data = read_file(path, "a .glb file", limit=MAX_FILE)
+    text, binary = _chunks(path, data)
+    try:
+        tree = json.loads(text)
+        found = Gltf(path, tree, binary)
+        parts = [_parameters(path, found, primitive) for primitive in found.primitives]
+        degrees = {part["sh_rest"].shape[1] for part in parts}
+        extras = tree.get("asset", {}).get("extras")
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise DataError(f"{path}: its JSON is damaged ({fault(error)}); copy or export the file again") from error
+    if len(degrees) > 1:
+        raise DataError(f"{path}: its parts have different SH degrees; expected one: export them apart")
+    parameters = flipped({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    ours = extras.get("clsplat") if isinstance(extras, dict) else None
+    rendering = checked_numbers(path, ours) if isinstance(ours, dict) else {}
+    return SplatFile(parameters, rendering, "mip" if rendering.get("compensate") else "default", found.placement)
+
+
+def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
+    """Write Gaussians as one primitive.  Raises OutputError."""
+    require_some(path, splats)
+    p = flipped(splats.parameters)
+    attributes = _attributes(p)
+    views: list[Any] = []
+    accessors: list[Any] = []
+    blocks, start = [], 0
+    for name, table in attributes.items():
+        kind = BYTE if table.dtype == np.uint8 else FLOAT
+        accessor = {"bufferView": len(views), "componentType": kind, "count": len(table), "type": TYPES[table.shape[1]]}
+        if kind == BYTE:
+            accessor["normalized"] = True
+        if name == "POSITION":
+            accessor |= {"min": table.min(axis=0).tolist(), "max": table.max(axis=0).tolist()}
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": table.nbytes})
+        accessors.append(accessor)
+        blocks.append(table.tobytes())
+        start += table.nbytes
+    primitive = {
+        "mode": POINTS,
+        "attributes": {name: i for i, name in enumerate(attributes)},
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
+    asset: dict[str, Any] = {"version": "2.0", "generator": "clsplat"}
+    if splats.rendering:
+        asset["extras"] = {"clsplat": splats.rendering}
+    tree = {
+        "asset": asset,
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": start}],
+    }
+    text = json.dumps(tree, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    with written(path) as file:
+        file.write(struct.pack("<4s2I", MAGIC, 2, 12 + 8 + len(text) + 8 + start))
+        file.write(struct.pack("<2I", len(text), JSON) + text + struct.pack("<2I", start, BINARY))
+        for block in blocks:
+            file.write(block)
+    return file.sha256
+
+
+def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
+    """What is written, by name: tables [N, c] of float32 or uint8."""
+    alpha = opacities(p["logit_opacity"])
+    colour = np.clip(SH_C0 * p["sh_base"].astype(np.float64) + 0.5, 0, 1)
+    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)  # sRGB, IEC 61966-2-1
+    with np.errstate(over="ignore"):
+        scale = np.minimum(np.exp(p["log_scales"].astype(np.float64)), np.finfo(np.float32).max)
+    tables: dict[str, NDArray[Any]] = {
+        "POSITION": p["means"],
+        f"{PREFIX}ROTATION": np.roll(unit(p["quats"]), -1, axis=1),
+        f"{PREFIX}SCALE": scale,
+        f"{PREFIX}OPACITY": alpha,
+        f"{PREFIX}SH_DEGREE_0_COEF_0": p["sh_base"],
+    }
+    first = 0
+    for degree in range(1, MAX_DEGREE + 1):
+        for order in range(2 * degree + 1):
+            if first < p["sh_rest"].shape[1]:
+                tables[f"{PREFIX}SH_DEGREE_{degree}_COEF_{order}"] = p["sh_rest"][:, first : first + 3]
+                first += 3
+    written = {name: np.ascontiguousarray(table, "<f4") for name, table in tables.items()}
+    written["COLOR_0"] = np.rint(255 * np.concatenate([linear, alpha], axis=1)).astype(np.uint8)
+    return written
+
+
+def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
+    """The JSON and the binary chunk."""
+    found: dict[int, bytes] = {}
+    start = 12
+    if data[:4] != MAGIC or len(data) < 20 or data[4:8] != b"\2\0\0\0":
+        raise DataError(f"{path}: not a .glb file of glTF 2.0; copy or export it again")
+    while start + 8 <= len(data):
+        length, kind = struct.unpack_from("<2I", data, start)
+        if length > len(data) - start - 8:
+            raise DataError(f"{path}: holds {len(data)} bytes; its chunks are longer: copy or export it again")
+        found.setdefault(kind, data[start + 8 : start + 8 + length])
+        start += 8 + length
+    text = found.get(JSON, b"")
+    if not text:
+        raise DataError(f"{path}: has no chunk of JSON; copy or export it again")
+    if len(text) > MAX_JSON:
+        raise DataError(
+            f"{path}: its JSON has {len(text)} bytes; expected {MAX_JSON} at most: export it with fewer primitives"
+        )
+    return text, found.get(BINARY, b"")
+
+
+def _parameters(path: Path, found: Gltf, primitive: dict[str, Any]) -> Parameters:
+    """The Gaussians of one primitive, in the axes of glTF."""
+    names = primitive["attributes"]
+
+    def table(name: str, width: int) -> NDArray[np.float32]:
+        if name not in names:
+            raise DataError(f"{path}: its Gaussians have no attribute {name}; export the file again")
+        return found.accessor(names[name], width)
+
+    degree = max((d for d in range(MAX_DEGREE + 1) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in names), default=0)
+    orders = [(d, m) for d in range(degree + 1) for m in range(2 * d + 1)]
+    bands = [table(f"{PREFIX}SH_DEGREE_{d}_COEF_{m}", 3) for d, m in orders]
+    means, scale = table("POSITION", 3), table(f"{PREFIX}SCALE", 3)
+    parameters = {
+        "means": means,
+        "quats": np.roll(table(f"{PREFIX}ROTATION", 4), 1, axis=1),
+        "log_scales": logs(np.abs(scale)),
+        "logit_opacity": logits(table(f"{PREFIX}OPACITY", 1)),
+        "sh_base": bands[0],
+        "sh_rest": np.concatenate(bands[1:], axis=1) if degree else np.zeros((len(means), 0), np.float32),
+    }
+    if len({len(one) for one in parameters.values()}) > 1:
+        raise DataError(f"{path}: the attributes of its Gaussians have different counts; export the file again")
+    return parameters
+
+
+# OpenUSD as text: a prim ParticleField3DGaussianSplat (UsdVol from 26.03 on), which is written only.
+
+BLOCK = 4096  # rows of text at a time
+EXTENT = 3.0  # standard deviations around the means
+START = """#usda 1.0
+(
+    defaultPrim = "Gaussians"
+    metersPerUnit = 1
+    upAxis = "Y"
+)
+
+def ParticleField3DGaussianSplat "Gaussians"
+{
+    uniform token projectionModeHint = "perspective"
+    uniform token sortingModeHint = "zDepth"
+"""
+
+
+def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
+    """Write a `.usda` file.  Raises OutputError."""
+    require_some(path, splats)
+    p = flipped(splats.parameters)
+    scales = np.exp(np.clip(p["log_scales"].astype(np.float64), -80, 80))
+    around = EXTENT * scales.max(axis=1, keepdims=True)
+    extent = np.stack([(p["means"] - around).min(axis=0), (p["means"] + around).max(axis=0)])
+    harmonics = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1).reshape(-1, 3)
+    tables = {
+        "float3[] extent": extent,
+        "point3f[] positions": p["means"],
+        "quatf[] orientations": unit(p["quats"]),
+        "float3[] scales": scales,
+        "float[] opacities": opacities(p["logit_opacity"]),
+        "float3[] radiance:sphericalHarmonicsCoefficients": harmonics,
+    }
+    with written(path) as file:
+        file.write(START.encode())
+        file.write(f"    uniform int radiance:sphericalHarmonicsDegree = {splats.sh_degree}\n".encode())
+        for name, table in tables.items():
+            _array(file, name, table)
+        file.write(b"}\n")
+    return file.sha256
+
+
+def _array(file: Output, name: str, table: NDArray[np.floating]) -> None:
+    """One attribute, with as many digits as float32 has."""
+    width = table.shape[1]
+    row = ", ".join(["%.9g"] * width) if width == 1 else f"({', '.join(['%.9g'] * width)})"
+    file.write(f"    {name} = [".encode())
+    for start in range(0, len(table), BLOCK):
+        block = table[start : start + BLOCK].astype(np.float32)
+        text = ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
+        file.write((", " if start else "").encode() + text.encode())
+    file.write(b"]\n")

@@ -1,0 +1,322 @@
+"""Streamed SOG of PlayCanvas, version 1: levels of detail, each in SOG files of its own, and a tree of boxes.
+
+    lod-meta.json   version 1, count of all levels, counts by level, lodLevels, filenames, tree, and an environment
+    a node          bound {min, max}, and two children, or as a leaf lods: by level a file, an offset and a count
+    L_i/meta.json   a SOG of level L as a folder, which holds runs of leaves one after the other; 0 is the finest
+
+A program that shows it takes of each leaf the level that its distance asks for.  Read is the finest level.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError, quoted
+from clsplat.core.files import fault_of_name, is_inside
+from clsplat.core.reading import read_json
+from clsplat.formats.packing import morton_order, written
+from clsplat.formats.sog import MAX_META, META, read_sog, with_images, write_as_ordered
+from clsplat.formats.sog_quantize import log_weights
+from clsplat.formats.splats import (
+    MAX_DEGREE,
+    Parameters,
+    SplatFile,
+    Writing,
+    require_moderate,
+    require_some,
+    unit,
+    with_degree,
+)
+
+LOD_META = "lod-meta.json"
+MOST_LEVELS = 64  # writers make about ten
+Run = tuple[int, int]  # offset and count of a leaf's splats in a file
+Runs = dict[int, list[Run]]  # of a level, ascending, by the number of their file
+
+
+def looks_like_lod(data: bytes) -> bool:
+    """Return whether bytes begin a lod-meta.json."""
+    return data.lstrip()[:1] == b"{" and b'"lodLevels"' in data
+
+
+def read_lod(path: Path) -> SplatFile:
+    """Read the finest level of a lod-meta.json, and its environment.  Raises DataError when it is damaged."""
+    meta = _meta(path)
+    runs = _runs(path, meta)[0]
+    if not runs:
+        raise DataError(f"{path}: its leaves name no file of level 0; export it again")
+    parts = [_part(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
+    _require_count(path, meta, 0, runs)
+    if "environment" in meta:
+        parts.append(read_sog(path.parent / _inside(path, meta["environment"])))
+    degree = min(MAX_DEGREE, max(part.sh_degree for part in parts))
+    tables = [with_degree(part.parameters, degree) for part in parts]
+    joined = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+    return SplatFile(joined, parts[0].rendering, parts[0].mode)
+
+
+def faults_of_levels(path: Path) -> list[str]:
+    """Return a sentence for each file of the coarser levels that is missing or damaged; `read_lod` reads the others."""
+    meta, faults = _meta(path), []
+    levels = _runs(path, meta)
+    spare: Runs = {file: [] for file in {*range(len(meta["filenames"]))}.difference(*levels)}
+    for level, runs in enumerate(levels):
+        try:
+            faults += _faults(path, meta, runs) if level else []
+            _require_count(path, meta, level, runs)
+        except DataError as error:
+            faults.append(str(error))
+    return faults + _faults(path, meta, spare)
+
+
+def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
+    """A sentence for each of some files that is missing or damaged."""
+    faults = []
+    for file, own in sorted(runs.items()):
+        try:
+            _part(path, meta["filenames"][file], own)
+        except DataError as error:
+            faults.append(str(error))
+    return faults
+
+
+def files_of_lod(path: Path) -> list[Path]:
+    """Return a lod-meta.json and all files of its levels."""
+    meta = _meta(path)
+    names = [*meta["filenames"], *([meta["environment"]] if "environment" in meta else [])]
+    places = [path.parent / _inside(path, name) for name in names]
+    return [path, *(file for place in places for file in with_images(place))]
+
+
+def _meta(path: Path) -> dict[str, Any]:
+    meta = read_json(path, "a lod-meta.json", limit=MAX_META)
+    if not isinstance(meta, dict) or meta.get("version") != 1:
+        version = quoted(meta.get("version") if isinstance(meta, dict) else meta)
+        raise DataError(f"{path}: streamed SOG of version {version}; expected 1: export it again")
+    names, counts = meta.get("filenames"), meta.get("counts")
+    if not isinstance(names, list) or len({_inside(path, name) for name in names}) < len(names):
+        raise DataError(f"{path}: filenames is {quoted(names)}; expected names of files, each once: export it again")
+    if not isinstance(counts, list) or not 1 <= len(counts) <= MOST_LEVELS:
+        raise DataError(
+            f"{path}: counts is {quoted(counts)}; expected a number for each of 1 to {MOST_LEVELS} levels: export it "
+            "again"
+        )
+    if (levels := meta.get("lodLevels")) != len(counts):
+        raise DataError(
+            f"{path}: lodLevels is {quoted(levels)}; expected {len(counts)}, as it has counts: export it again"
+        )
+    return meta
+
+
+def _inside(path: Path, name: Any) -> str:
+    """The name of a meta.json below the folder."""
+    if not isinstance(name, str) or not _is_meta_below(name):
+        raise DataError(f"{path}: names {quoted(name)}; expected a {META} in a folder below; export it again")
+    return name
+
+
+def _is_meta_below(name: str) -> bool:
+    path = PureWindowsPath(name)
+    return is_inside(name) and path.name == META and "\\" not in name and not any(map(fault_of_name, path.parts))
+
+
+def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
+    """The runs of each level."""
+    levels: list[Runs] = [{} for _ in meta["counts"]]
+    numbers = {str(level): level for level in range(len(levels))}
+    for leaf in _leaves(path, meta.get("tree")):
+        for name, run in leaf.items():
+            if name not in numbers:
+                raise DataError(
+                    f"{path}: a leaf names level {quoted(name)}; expected 0 to {len(levels) - 1}: export it again"
+                )
+            file, offset, count = (_whole(path, key, run) for key in ("file", "offset", "count"))
+            levels[numbers[name]].setdefault(file, []).append((offset, count))
+    for level, runs in enumerate(levels):
+        if max(runs, default=-1) >= len(meta["filenames"]):
+            raise DataError(f"{path}: its leaves name a file of level {level} that it has not; export it again")
+    return [{file: sorted(one) for file, one in runs.items()} for runs in levels]
+
+
+def _require_count(path: Path, meta: dict[str, Any], level: int, runs: Runs) -> None:
+    found, declared = sum(count for one in runs.values() for _, count in one), meta["counts"][level]
+    if found != declared:
+        raise DataError(
+            f"{path}: declares {quoted(declared)} splats of level {level}; its leaves have {found}: export it again"
+        )
+
+
+def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
+    """What each leaf holds by level."""
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop()
+        children, lods = (node.get("children"), node.get("lods")) if isinstance(node, dict) else (None, None)
+        if isinstance(lods, dict):
+            yield lods
+        elif isinstance(children, list):
+            waiting += children[::-1]
+        else:
+            raise DataError(f"{path}: a node of its tree is {quoted(node)}; expected children or lods: export it again")
+
+
+def _whole(path: Path, key: str, run: Any) -> int:
+    value = run.get(key) if isinstance(run, dict) else None
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise DataError(f"{path}: {key} of a leaf is {quoted(value)}; expected a whole number: export it again")
+    return value
+
+
+def _part(path: Path, name: str, runs: list[Run]) -> SplatFile:
+    """The splats of a file that are in leaves.  runs: ascending."""
+    part = read_sog(path.parent / name)
+    rows, end = [np.arange(0)], 0
+    for offset, count in runs:
+        if offset < end or offset + count > len(part):
+            raise DataError(
+                f"{path}: a leaf has {count} splats from {offset} on of {quoted(name)}, which holds {len(part)} and "
+                f"whose first {end} are in other leaves; export it again"
+            )
+        end = offset + count
+        rows.append(np.arange(offset, end))
+    return part.rows(np.concatenate(rows))
+
+
+# The tree of a streamed SOG: boxes that are halved until they are small, over the splats of all levels.
+
+MAX_LOG_SCALE = 80.0  # of a box: JSON has no infinity
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a leaf holds at most: numbers of PlayCanvas."""
+
+    splats: int = 512 * 1024  # of all levels; and a file no more than these and one leaf's
+    extent: float = 16.0  # scene units, of the longest side of its means' box
+    few: int = 1024  # splats, which are not divided for their extent
+
+
+@dataclass(frozen=True)
+class Node:
+    """A box, and two halves, or the rows of its splats by level, each along a Morton curve."""
+
+    low: Floats  # [3] scene units
+    high: Floats
+    children: tuple["Node", ...] = ()
+    rows: tuple[Rows, ...] = ()
+
+    def leaves(self) -> Iterator["Node"]:
+        """All leaves, from left to right."""
+        if not self.children:
+            yield self
+        for child in self.children:
+            yield from child.leaves()
+
+
+def tree(levels: Sequence[Parameters], limits: Limits) -> Node:
+    """Return the tree of levels, the finest first, none without splats."""
+    means = np.concatenate([level["means"] for level in levels]).astype(np.float64)
+    reach = np.concatenate([half_boxes(level) for level in levels])
+    starts = np.cumsum([0, *(len(level["means"]) for level in levels)])
+
+    def node(rows: Rows) -> Node:
+        span = np.ptp(means[rows], axis=0)
+        if len(rows) > limits.splats or (span.max() > limits.extent and len(rows) > limits.few):
+            ordered = rows[np.argsort(means[rows, int(span.argmax())], kind="stable")]
+            halves = node(ordered[: len(rows) // 2]), node(ordered[len(rows) // 2 :])
+            low = np.minimum(*(half.low for half in halves))
+            return Node(low, np.maximum(*(half.high for half in halves)), halves)
+        low, high = (means[rows] - reach[rows]).min(axis=0), (means[rows] + reach[rows]).max(axis=0)
+        return Node(low, high, rows=tuple(by_level(np.sort(rows))))
+
+    def by_level(rows: Rows) -> Iterator[Rows]:
+        for own, start in zip(np.split(rows, np.searchsorted(rows, starts[1:-1])), starts, strict=False):
+            yield own[morton_order(means[own])] - start
+
+    return node(np.arange(len(means)))
+
+
+def half_boxes(level: Parameters) -> Floats:
+    """Return half the sides of the boxes around turned boxes of one standard deviation, [N, 3] scene units."""
+    from scipy.spatial.transform import Rotation
+
+    turned = np.abs(Rotation.from_quat(np.roll(unit(level["quats"]), -1, axis=1)).as_matrix())
+    scales = np.exp(np.minimum(level["log_scales"].astype(np.float64), MAX_LOG_SCALE))
+    half: Floats = np.einsum("nij,nj->ni", turned, scales)
+    return half
+
+
+# Write streamed SOG, version 1 (layout: lod.py): the same levels give the same bytes.
+
+USUAL = Limits()
+
+
+def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None = None, limits: Limits = USUAL) -> str:
+    """Write levels, the finest first, into a folder; return the SHA-256 of its JSON, which is written last.
+
+    Raises DataError for a level without Gaussians, or one that SOG cannot hold, OutputError.
+    """
+    for level in levels:
+        require_some(folder / LOD_META, level)
+        require_moderate(folder / LOD_META, level, "SOG")
+    root = tree([level.parameters for level in levels], limits)
+    files = _Files(limits.splats)
+    shape = files.shape(root)
+    counts = [len(level) for level in levels]
+    meta = {
+        "version": 1,
+        "asset": {"generator": "clsplat"},
+        "count": sum(counts),
+        "counts": counts,
+        "lodLevels": len(levels),
+        "filenames": list(files.rows),
+        "tree": shape,
+    }
+    weights = [log_weights(level.parameters, level.has_sky) for level in levels]
+    for name, (number, parts) in files.rows.items():
+        rows = np.concatenate(parts)
+        write_as_ordered(folder / name, levels[number].rows(rows), weights[number][rows], options or Writing())
+    with written(folder / LOD_META) as file:
+        file.write(json.dumps(meta, separators=(",", ":"), allow_nan=False).encode())
+    return file.sha256
+
+
+@dataclass
+class _Files:
+    """The files of all levels: a file takes leaves until it holds more than so many splats."""
+
+    splats: int
+    rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by name: the level, and runs of its rows
+    held: dict[str, int] = field(default_factory=dict)
+    open: dict[int, int] = field(default_factory=dict)  # by level the number of the file that takes the next leaf
+
+    def shape(self, node: Node) -> dict[str, Any]:
+        """A node as JSON, whose leaves' rows get places in files."""
+        bound = {"bound": {"min": _short(node.low), "max": _short(node.high)}}
+        if node.children:
+            return {**bound, "children": [self.shape(child) for child in node.children]}
+        lods = {str(level): self._run(level, rows) for level, rows in enumerate(node.rows) if len(rows)}
+        return {**bound, "lods": lods}
+
+    def _run(self, level: int, rows: Rows) -> dict[str, int]:
+        number = self.open.setdefault(level, 0)
+        name = f"{level}_{number}/{META}"
+        runs = self.rows.setdefault(name, (level, []))[1]
+        offset = self.held.get(name, 0)
+        runs.append(rows)
+        self.held[name] = offset + len(rows)
+        if self.held[name] > self.splats:
+            self.open[level] += 1
+        return {"file": list(self.rows).index(name), "offset": offset, "count": len(rows)}
+
+
+def _short(numbers: NDArray[np.float64]) -> list[float]:
+    """Numbers in 7 digits, as float32 has them."""
+    return [float(f"{number:.7g}") for number in numbers]

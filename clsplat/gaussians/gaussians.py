@@ -1,0 +1,327 @@
+"""Gaussians on the device: a struct of arrays, and the one operation that changes their number.
+
+Every table is a set of planes [components, capacity] on the device, and [N, components] on the host.  Parameters,
+Adam's moments and statistics are all tables, so that their rows always move together.
+
+    means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
+    logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
+    filter_variance [1] scene units², the world filter; zero when there is none, never optimised
+    motion [W] of Gaussians that move (clsplat/formats/splats.py); absent where none does
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import ConfigError
+from clsplat.formats.splats import MOTION, PARAMETERS, degree_of, sh_coefficients
+from clsplat.gaussians.sh_offload import OnHost, defines_of
+from clsplat.gaussians.sky import DeviceSky
+from clsplat.gaussians.structs import HARMONICS, Struct, Waiting, checked_rows, moment_tables
+from clsplat.opencl.device import Array, Device
+
+# Which parameters of Gaussians are numbers.
+
+
+def not_finite(gaussians: Struct) -> list[str]:
+    """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
+    device, found = gaussians.device, set()
+    counters = {name: device.zeros(1, np.uint32) for name in gaussians.trained}
+    for name, counter in counters.items():
+        for table in gaussians.tables.keys() & {name, *moment_tables(name)}:
+            if gaussians.on_host and table in gaussians.on_host:
+                found |= set() if np.isfinite(gaussians.get(table)).all() else {name}
+                continue
+            device.program("check.cl").count_not_finite(
+                items=(gaussians.count, gaussians.tables[table].components),
+                values=gaussians[table],
+                counter=counter,
+                stride=gaussians.capacity,
+                count=gaussians.count,
+            )
+    return [name for name, counter in counters.items() if name in found or counter.get_item(0) > 0]
+
+
+# Gaussians that one step of a training leaves out.
+
+
+@dataclass(frozen=True)
+class Dropout:
+    """What one step leaves out: each Gaussian with a probability below 1, by (seed, step, row)."""
+
+    probability: float
+    seed: int
+    step: int  # global
+
+    @property
+    def opacity_factor(self) -> float:
+        """Factor of the opacities of the others, which keeps the mean opacity of a Gaussian (Park et al. 2025)."""
+        return 1 / (1 - self.probability)
+
+
+HIDDEN = "hidden"  # which training views leave a Gaussian out; see left_out.py
+INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
+ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
+GROWTH = 1.125  # of the capacity: every edit moves all tables in any case
+
+
+@dataclass
+class Table:
+    """One quantity of every Gaussian, [components, capacity]."""
+
+    array: Array
+    components: int
+    zero_fresh: bool  # rows of new Gaussians start at zero instead of copying their source
+
+
+class Gaussians:
+    """N Gaussians and their tables."""
+
+    def __init__(self, device: Device, parameters: Mapping[str, NDArray[np.float32]]) -> None:
+        """Upload `parameters`, each [N, components] by the names of PARAMETERS; also filter_variance and motion."""
+        self.device = device
+        self.count = len(parameters["means"])
+        self.capacity = _aligned(self.count)
+        self.sh_degree = degree_of(parameters["sh_rest"].shape[1])
+        self.tables: dict[str, Table] = {}
+        self.deferred: Waiting | None = None  # updates that rows wait for
+        self.on_host: OnHost | None = None  # tables that lie on the host
+        self.no_slot = device.zeros(1, np.uint32)
+        for name in PARAMETERS:
+            self.add(name, parameters[name].shape[1])
+            self.set(name, parameters[name])
+        self.add("filter_variance", 1)
+        for name in ("filter_variance", INTERVAL2, MOTION):
+            if name in parameters:
+                self.add(name, parameters[name].shape[1])
+                self.set(name, parameters[name])
+        self._rows = device.program("gather.cl")
+
+    def __getitem__(self, name: str) -> Array:
+        if self.on_host and name in self.on_host:
+            raise ConfigError(f"{name} lies in the memory of the host; expected `rasterizer.harmonics: device`")
+        return self._settled(name).array
+
+    def _settled(self, name: str) -> Table:
+        """A table whose rows wait for no update."""
+        if self.deferred and name in self.deferred.names:
+            self.deferred.flush()
+        return self.tables[name]
+
+    @property
+    def components(self) -> dict[str, int]:
+        """The number of components of each table, by name."""
+        return {name: table.components for name, table in self.tables.items()}
+
+    def add(self, name: str, components: int, zero_fresh: bool = False) -> None:
+        """Attach a table of zeros."""
+        if self.on_host and name in HARMONICS:
+            array = self.on_host.add(name, components)
+        else:
+            array = self.device.zeros((components, self.capacity))
+        self.tables[name] = Table(array, components, zero_fresh)
+
+    def move_to_host(self) -> None:
+        """Keep the harmonics above band 0 and their moments on the host; the device has those that a view sees."""
+        if self.on_host:
+            return
+        present = {name: self.get(name) for name in HARMONICS if name in self.tables}
+        self.on_host = OnHost(self)
+        for name, values in present.items():
+            self.add(name, values.shape[1], self.tables[name].zero_fresh)
+            self.set(name, values)
+
+    def get(self, name: str) -> NDArray[np.float32]:
+        """Copy a table to the host, [N, components]."""
+        table = self._settled(name)
+        if self.on_host and name in self.on_host:
+            return self.on_host.get(name)
+        planes = table.array.get()
+        return np.ascontiguousarray(planes[:, : self.count].T)
+
+    def set(self, name: str, values: NDArray[Any]) -> None:
+        """Copy [N, components] from the host into a table."""
+        table = self._settled(name)
+        if values.shape != (self.count, table.components):
+            raise ValueError(f"{name}: expected {(self.count, table.components)}, got {values.shape}")
+        if self.on_host and name in self.on_host:
+            self.on_host.set(name, values)
+            return
+        planes = np.zeros((table.components, self.capacity), np.float32)
+        planes[:, : self.count] = values.T
+        table.array.set(planes)
+
+    def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[Any]) -> None:
+        """Write [n, components] from the host into some rows of a table.
+
+        rows: [n] integers, as in `checked_rows`.  Raises ValueError for other rows and for values of another shape.
+        """
+        table, rows = self._settled(name), checked_rows(rows, self.count)
+        if values.shape != (len(rows), table.components):
+            raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
+        if self.on_host and name in self.on_host:
+            self.on_host.set_rows(name, rows, values)
+            return
+        self._rows.set_rows(
+            items=(len(rows), table.components),
+            rows=self.device.upload(rows),
+            values=self.device.upload(np.ascontiguousarray(values, np.float32)),
+            table=table.array,
+            components=table.components,
+            stride=self.capacity,
+            count=len(rows),
+        )
+
+    def zero_rows(self, names: Collection[str], rows: NDArray[np.integer]) -> None:
+        """Set some rows of tables to zero.
+
+        rows: [n] integers, as in `checked_rows`.  Raises ValueError for other rows.
+        """
+        uploaded = self.device.upload(checked_rows(rows, self.count))
+        for name in names:
+            table = self._settled(name)
+            if self.on_host and name in self.on_host:
+                self.on_host.set_rows(name, rows, np.zeros((len(rows), table.components), np.float32))
+                continue
+            self._rows.zero_rows(
+                items=(len(rows), table.components),
+                rows=uploaded,
+                table=table.array,
+                stride=self.capacity,
+                count=len(rows),
+            )
+
+    def lower_sh_degree(self, degree: int) -> None:
+        """Drop the bands of spherical harmonics above a degree, and their moments; a lower degree stays."""
+        if degree >= self.sh_degree:
+            return
+        self.sh_degree, components = degree, 3 * (sh_coefficients(degree) - 1)
+        for name in self.tables.keys() & set(HARMONICS):
+            kept = self.get(name)[:, :components]
+            self.add(name, components, self.tables[name].zero_fresh)
+            self.set(name, kept)
+
+    @property
+    def trained(self) -> tuple[str, ...]:
+        """The names of the tables that training changes: the parameters, and the motion where there is one."""
+        return (*PARAMETERS, *([MOTION] if self.moves else []))
+
+    @property
+    def moves(self) -> bool:
+        """Whether the Gaussians have a motion."""
+        return MOTION in self.tables
+
+    @property
+    def zero_fresh(self) -> list[str]:
+        """The names of the tables that are zero in fresh rows."""
+        return [name for name, table in self.tables.items() if table.zero_fresh]
+
+    def not_finite(self) -> list[str]:
+        """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
+        return not_finite(self)
+
+    def rearrange(self, source: Array, fresh: Array, count: int) -> None:
+        """Make row i of every table its row source[i]; set fresh rows of moments and statistics to zero.
+
+        source, fresh: [count] uint32.  The only operation that changes the number of Gaussians.
+        """
+        capacity = self.capacity
+        self._settled("sh_rest")
+        if count > capacity:
+            widest = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
+            roomy = min(int(self.capacity * GROWTH), self.device.info.allocation // widest - ALIGNMENT)
+            capacity = _aligned(max(count, roomy))
+        on_host = self.on_host.rearranged(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
+        for table in (table for name, table in self.tables.items() if name not in on_host):
+            moved = self.device.zeros((table.components, capacity))
+            self._rows.gather_rows(
+                items=(count, table.components),
+                table=table.array,
+                source=source,
+                fresh=fresh,
+                moved=moved,
+                zero_fresh=int(table.zero_fresh),
+                table_stride=self.capacity,
+                moved_stride=capacity,
+                count=count,
+            )
+            table.array = moved
+        self.count, self.capacity = count, capacity
+        for name, values in on_host.items():
+            self.set(name, values)
+
+
+@dataclass
+class DeviceModel:
+    """Gaussians and the numbers with which they are rendered."""
+
+    gaussians: Gaussians
+    degree: int  # active SH degree
+    near: float = 0.2  # scene units
+    screen_variance: float = 0.3  # px²
+    compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
+    pixel_box: float = 0.0  # 1: splats are integrated over the box of each pixel instead
+    dropout: Dropout | None = None  # of a step
+    sky: DeviceSky | None = None  # behind them, in place of a background of one colour
+
+    @property
+    def defines(self) -> dict[str, int]:
+        """What chooses the programs that project, list and blend these splats."""
+        return ({"PIXEL_BOX": 1} if self.pixel_box else {}) | defines_of(self.gaussians)
+
+
+def _aligned(count: int) -> int:
+    return max(ALIGNMENT, -(-count // ALIGNMENT) * ALIGNMENT)
+
+
+# Gaussians that a picture leaves out: those that a training view hides, and those that a step drops.
+
+HIDDEN_VIEWS = 22  # to a component, a whole number that to_VI of lanes.h converts
+
+
+def hide(gaussians: Gaussians, left_out: NDArray[np.bool_]) -> None:
+    """Write which Gaussians each training view leaves out, [V, N], into the table HIDDEN.
+
+    View v has bit v % HIDDEN_VIEWS of component v // HIDDEN_VIEWS.
+    """
+    views, count = left_out.shape
+    bits = np.zeros((count, -(-views // HIDDEN_VIEWS)), np.float32)  # whole numbers
+    for view in range(views):
+        plane, bit = divmod(view, HIDDEN_VIEWS)
+        bits[:, plane] += left_out[view] * np.float32(1 << bit)
+    if HIDDEN not in gaussians.tables:
+        gaussians.add(HIDDEN, bits.shape[1])
+    gaussians.set(HIDDEN, bits)
+
+
+def left_out_arguments(model: DeviceModel, view: int | None, drawn: Array) -> dict[str, Any]:
+    """Return the arguments of project_forward that leave Gaussians out.
+
+    view: the number of a training view, whose hidden ones are among them; drawn: [S], written where the model has a
+    dropout.
+    """
+    hidden = _hidden(model.gaussians, view)
+    if model.dropout is None:
+        return {**hidden, "opacity_factor": 1.0}
+    gaussians, dropout = model.gaussians, model.dropout
+    gaussians.device.program("dropout.cl").draw_left_out(
+        items=gaussians.count,
+        **hidden,
+        left_out=drawn,
+        below=round(dropout.probability * 2**32),
+        seed=dropout.seed,
+        step=dropout.step,
+        stride=gaussians.capacity,
+        count=gaussians.count,
+    )
+    return {"hidden": drawn, "hidden_plane": 0, "hidden_bit": 1, "opacity_factor": dropout.opacity_factor}
+
+
+def _hidden(gaussians: Gaussians, view: int | None) -> dict[str, Any]:
+    if view is None or HIDDEN not in gaussians.tables:
+        return {"hidden": gaussians["filter_variance"], "hidden_plane": 0, "hidden_bit": 0}  # any table: no bit counts
+    plane, bit = divmod(view, HIDDEN_VIEWS)
+    return {"hidden": gaussians[HIDDEN], "hidden_plane": plane, "hidden_bit": 1 << bit}

@@ -1,1 +1,0 @@
-"""A page that shows a run while it trains: served to this machine alone, drawn between steps."""

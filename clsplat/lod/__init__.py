@@ -1,1 +1,0 @@
-"""Levels of detail: a model with fewer and fewer Gaussians, trained where photographs are there, and streamed."""

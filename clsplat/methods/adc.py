@@ -1,0 +1,112 @@
+"""The rules of adaptive density control: clone, split and prune (Kerbl et al. 2023, section 5)."""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from clsplat.core.schedule import Positive
+from clsplat.core.settings import variants
+from clsplat.density.edit import Edit, Rule
+from clsplat.density.statistics import Statistic, StatisticName
+
+
+class Grow(Rule):
+    """Base of rules that make several Gaussians of one whose mean of a statistic is large.
+
+    With `as_many_as`, the rule chooses as many Gaussians by `statistic` as reach `gradient_above` in that other
+    statistic (Gaussian Opacity Fields, Yu et al. 2024).
+    """
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"gradient_above", "opacity"})
+
+    statistic: StatisticName = "screen_grad"
+    """Column whose mean is compared."""
+    gradient_above: Positive = 2.0e-4
+    """Lowest mean of the statistic, in its unit; by step."""
+    as_many_as: StatisticName | None = None
+    """Column in which Gaussians are counted at `gradient_above`; that number sets the threshold of `statistic`."""
+
+    opacity: Literal["copied", "shared"] = "copied"
+    """`shared`: what one becomes is together as opaque as it was, 1 − (1 − o)^(1/n) each (Rota Bulò et al. 2024)."""
+
+    @model_validator(mode="after")
+    def _with_a_threshold_of_its_unit(self) -> "Grow":
+        name = self.as_many_as or self.statistic
+        if variants(Statistic)[name].of_all_views and "gradient_above" not in self.model_fields_set:
+            raise ValueError(f"'gradient_above' is needed with '{name}', whose unit is another; try 200")
+        return self
+
+    @property
+    def statistics(self) -> set[str]:
+        return {self.statistic, self.as_many_as or self.statistic}
+
+    def condition(self, edit: Edit) -> dict[str, Any]:
+        """Return the arguments of Edit.mark that hold the rule's condition, and whether opacity is shared."""
+        above = edit.at(self.gradient_above)
+        if self.as_many_as:
+            above = edit.matching(self.statistic, self.as_many_as, above)
+        return {"statistic": self.statistic, "gradient_above": above, "shared": self.opacity == "shared"}
+
+
+class Clone(Grow):
+    """Copy small Gaussians whose statistic is large; the copy starts at the same place."""
+
+    type: Literal["clone"] = "clone"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"size_below"})
+
+    size_below: Positive = 0.01
+    """Largest size, the largest standard deviation as a share of the scene's extent; by step."""
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(copies=2, kept=1, size_below=edit.at(self.size_below), **self.condition(edit))
+
+
+class Split(Grow):
+    """Replace large Gaussians whose statistic is large by smaller ones, drawn from their own distribution."""
+
+    type: Literal["split"] = "split"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"size_above", "children", "shrink"})
+
+    size_above: Positive = 0.01
+    """Smallest size, the largest standard deviation as a share of the scene's extent; by step."""
+    children: Annotated[int, Field(ge=2, le=8)] = 2
+    """Number of Gaussians that replace one."""
+    shrink: Annotated[float, Field(ge=1)] = 1.6
+    """Divisor of the children's scales."""
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(
+            copies=self.children,
+            kept=0,
+            shrink=1.0 / self.shrink,
+            size_above=edit.at(self.size_above),
+            **self.condition(edit),
+        )
+
+
+class PruneFaint(Rule):
+    """Remove Gaussians that are almost transparent."""
+
+    type: Literal["prune_faint"] = "prune_faint"
+    grows: ClassVar[bool] = False
+    training_keys: ClassVar[frozenset[str]] = frozenset({"opacity_below"})
+
+    opacity_below: Positive = 0.005
+    """Opacity below which a Gaussian is removed; by step."""
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(copies=0, kept=0, opacity_below=edit.at(self.opacity_below))
+
+
+class PruneLarge(Rule):
+    """Remove Gaussians that are large in the scene."""
+
+    type: Literal["prune_large"] = "prune_large"
+    grows: ClassVar[bool] = False
+    training_keys: ClassVar[frozenset[str]] = frozenset({"size_above"})
+
+    size_above: Positive = 0.1
+    """Size above which a Gaussian is removed: largest standard deviation as a share of the extent; by step."""
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(copies=0, kept=0, size_above=edit.at(self.size_above))

@@ -1,0 +1,79 @@
+"""More Gaussians where those with a large gradient crowd (our reading of GDGS, Wang & Shan 2025)."""
+
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from clsplat.core.quaternions import rotation_matrix
+from clsplat.core.schedule import NonNegative, Positive
+from clsplat.density.edit import Edit, Rule
+
+Floats = NDArray[np.float64]
+CENTRAL = (0.01, 0.99)  # quantiles of the means between which the grid lies, along each axis
+
+
+class CloneCrowded(Rule):
+    """Copy small Gaussians with a large gradient twice where such Gaussians crowd: in place, and moved at random.
+
+    A grid of `cells`³ covers the central 98 % of the means.  The rule acts where the fullest `extremes` cells hold
+    `ratio_above` times as many Gaussians with a large gradient as the emptiest, and there in the fullest.  Put it
+    before `clone`, which then takes the others.
+    """
+
+    type: Literal["clone_crowded"] = "clone_crowded"
+    training_keys: ClassVar[frozenset[str]] = frozenset(
+        {"gradient_above", "size_below", "ratio_above", "jitter", "cells", "extremes"}
+    )
+
+    gradient_above: Positive = 2.0e-4
+    """Lowest mean of `screen_grad`; by step."""
+    size_below: Positive = 0.01
+    """Largest size, the largest standard deviation as a share of the scene's extent; by step."""
+    ratio_above: NonNegative = 400.0
+    """Smallest ratio of the numbers in the fullest and in the emptiest cells; by step."""
+    jitter: NonNegative = 0.5
+    """Deviation of the moved copies in standard deviations of the Gaussian along its axes; by step."""
+    cells: Annotated[int, Field(ge=1, le=256)] = 4
+    """Cells of the grid along each axis."""
+    extremes: Annotated[int, Field(ge=1)] = 20
+    """Number of the fullest cells, and of the emptiest."""
+
+    @property
+    def statistics(self) -> set[str]:
+        return {"screen_grad"}
+
+    def mark(self, edit: Edit) -> None:
+        gaussians = edit.gaussians
+        means, scales = (
+            gaussians.get("means").astype(np.float64),
+            np.exp(gaussians.get("log_scales").astype(np.float64)),
+        )
+        steep = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
+        cell = cells_of(means, self.cells)
+        counts = np.bincount(cell[steep & (cell >= 0)], minlength=self.cells**3)
+        order = np.argsort(-counts, kind="stable")
+        fullest, emptiest = order[: self.extremes], order[-self.extremes :]
+        if counts[fullest].sum() < edit.at(self.ratio_above) * max(counts[emptiest].sum(), 1):
+            return
+        small = scales.max(axis=1, initial=0) <= edit.at(self.size_below) * edit.scene_scale.extent
+        chosen = steep & small & np.isin(cell, fullest) & (edit.rows() == 1)
+        rows = np.flatnonzero(chosen)
+        quats = gaussians.get("quats")[rows].astype(np.float64)
+        axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T) * scales[rows, None, :]
+        way = edit.at(self.jitter) * np.einsum("nij,nj->ni", axes, edit.random().standard_normal((len(rows), 3)))
+        edit.choose(chosen, copies=3, kept=1)
+        edit.set_children("means", rows, np.stack([means[rows], means[rows], means[rows] + way], axis=1))
+
+
+def cells_of(means: Floats, cells: int) -> NDArray[np.int64]:
+    """Return the cell of each mean in a grid over the central ones, [N]; -1 outside it."""
+    finite = np.isfinite(means).all(axis=1)
+    if not finite.any():
+        return np.full(len(means), -1)
+    low, high = np.quantile(means[finite], CENTRAL, axis=0)
+    inside = finite & np.all((means >= low) & (means <= high), axis=1)
+    place = (np.where(inside[:, None], means, low) - low) / np.maximum(high - low, 1e-30) * cells
+    index = np.minimum(place.astype(np.int64), cells - 1)
+    return np.where(inside, np.ravel_multi_index(tuple(index.T), (cells,) * 3), -1)

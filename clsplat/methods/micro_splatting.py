@@ -1,0 +1,185 @@
+"""Rules that split Gaussians where the photographs have detail, or when they are too large (Lee et al. 2025).
+
+Both rules choose on the host, from tables and statistics: comparing Gaussians with each other is a line of NumPy there.
+"""
+
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from pydantic import Field
+
+from clsplat.core.schedule import NonNegative, Positive, explained
+from clsplat.density.control import largest
+from clsplat.density.edit import Edit, Rule
+from clsplat.density.mixture import mass_of, merged
+from clsplat.density.statistics import SEEN, StatisticName
+from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
+from clsplat.formats.splats import SH_C0, inverse_opacities
+from clsplat.gaussians.gaussians import INTERVAL2
+
+BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
+
+
+class Subdivide(Rule):
+    """Base of rules that replace Gaussians by smaller ones, a limited share of them at a time."""
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"children", "beta", "at_most", "radius_above"})
+
+    children: Annotated[int, Field(ge=2, le=8)] = 2
+    """Number of Gaussians that replace one."""
+    beta: Annotated[float, Field(gt=0, le=1)] = BETA
+    """A child's covariance divided by its parent's."""
+    at_most: Share = 0.05
+    """Largest share of all Gaussians that one edit splits; those with the largest score come first."""
+    radius_above: Annotated[float, Field(ge=0)] = 2.0
+    """Smallest mean radius on the screen, three standard deviations, px."""
+
+    @property
+    def statistics(self) -> set[str]:
+        return {"screen_radius"}
+
+    def subdivide(self, edit: Edit, candidates: NDArray[np.bool_], score: NDArray[np.float32]) -> None:
+        """Split the candidates, [N], with the largest scores; those of earlier rules and small ones are left out."""
+        candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
+        chosen = largest(candidates, score, int(self.at_most * len(candidates)))
+        edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
+
+
+class SplitTextured(Subdivide):
+    """Split Gaussians where the photographs are textured.
+
+    With `gradient_above` 0, texture alone decides.  Above 0, the mean of `screen_grad` must reach it too; choose a
+    threshold below that of the other rules.
+    """
+
+    type: Literal["split_textured"] = "split_textured"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"texture_above", "gradient_above"})
+
+    texture: StatisticName = "texture"
+    """Column whose mean is the texture."""
+    texture_above: Threshold = PixelQuantile(quantile=0.8, of="pixels")
+    """Lowest texture: a number by step, or a quantile."""
+    gradient_above: NonNegative = 1.0e-4
+    """Lowest mean of `screen_grad`; by step."""
+
+    @property
+    def statistics(self) -> set[str]:
+        return {*super().statistics, self.texture, "screen_grad"}
+
+    def mark(self, edit: Edit) -> None:
+        texture, gradient = edit.stats.mean(self.texture), edit.stats.mean("screen_grad")
+        above = edit.threshold(self.texture, self.texture_above)
+        seen = edit.gaussians.get(SEEN)[:, 0] > 0
+        candidates = seen & (texture >= above) & (gradient >= edit.at(self.gradient_above))
+        self.subdivide(edit, candidates, texture)
+
+
+class SplitOversized(Subdivide):
+    """Split Gaussians whose covariance trace is larger than τ = 3 s².
+
+    s is `rms_above` as a share of the extent, or a quantile of the rms scales, or, with `pixels`, the length of so many
+    pixels at the nearest training view.
+    """
+
+    type: Literal["split_oversized"] = "split_oversized"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rms_above"})
+
+    rms_above: Annotated[Quantile | Positive, explained(", or {quantile}")] = 0.01
+    """Smallest rms scale, a share of the scene's extent by step, or a quantile of all rms scales."""
+    pixels: Annotated[float, Field(gt=0)] | None = None
+    """Smallest rms scale in px of the nearest training view; replaces `rms_above`."""
+
+    @property
+    def tables(self) -> set[str]:
+        return {INTERVAL2} if self.pixels else set()
+
+    def mark(self, edit: Edit) -> None:
+        rms = np.sqrt(np.exp(2 * edit.gaussians.get("log_scales")).mean(axis=1))
+        if self.pixels:
+            bound = self.pixels * np.sqrt(edit.gaussians.get(INTERVAL2)[:, 0])
+        elif isinstance(self.rms_above, Quantile):
+            bound = np.full_like(rms, np.quantile(rms, self.rms_above.quantile) if len(rms) else 0.0)
+        else:
+            bound = np.full_like(rms, edit.at(self.rms_above) * edit.scene_scale.extent)
+        self.subdivide(edit, rms > bound, rms / np.maximum(bound, 1e-30))
+
+
+# Rules that reduce the number of Gaussians (the refinement of Micro-splatting's second version, Lee et al.
+
+Floats = NDArray[np.float64]
+
+
+class PruneUnimportant(Rule):
+    """Remove a share of all Gaussians: those with the smallest opacity times geometric mean scale."""
+
+    type: Literal["prune_unimportant"] = "prune_unimportant"
+    grows: ClassVar[bool] = False
+    training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
+
+    share: Share = 0.05
+    """Share of all Gaussians that is removed."""
+
+    def mark(self, edit: Edit) -> None:
+        gaussians = edit.gaussians
+        opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
+        score = opacity * np.exp(gaussians.get("log_scales").astype(np.float64).mean(axis=1))
+        chosen = np.zeros(len(score), bool)
+        chosen[np.argsort(score, kind="stable")[: int(self.share * len(score))]] = True
+        edit.choose(chosen, copies=0, kept=0)
+
+
+class MergeNeighbours(Rule):
+    """Replace two mutual nearest neighbours, close and of like colour, by one Gaussian.
+
+    It has the mean and covariance of their mixture and the mean of their colours, weighted by opacity times volume, and
+    the opacity that keeps the sum of these weights.  The row of the heavier one stays, with its statistics and Adam's
+    moments, except those of scales and rotation.
+    """
+
+    type: Literal["merge_neighbours"] = "merge_neighbours"
+    grows: ClassVar[bool] = False
+    rewrites: ClassVar[bool] = True
+    reads_means: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "colour_below"})
+
+    distance_below: Positive = 0.5
+    """Largest distance, a share of the sum of their mean scales; by step."""
+    colour_below: Positive = 0.05
+    """Largest difference of a channel of the base colours, in [0, 1]; by step."""
+
+    def mark(self, edit: Edit) -> None:
+        gaussians = edit.gaussians
+        names = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
+        tables = {name: gaussians.get(name).astype(np.float64) for name in names}
+        first, second = self._pairs(edit, tables)
+        alone = edit.rows() == 1
+        usable = alone[first] & alone[second]
+        first, second = first[usable], second[usable]
+        if not len(first):
+            return
+        for name, values in merged(tables, first, second).items():
+            edit.set_rows(name, first, values)
+        edit.zero_moments(first, ("log_scales", "quats"))  # which belong to other axes
+        absorbed = np.zeros(gaussians.count, bool)
+        absorbed[second] = True
+        edit.choose(absorbed, copies=0, kept=0)
+
+    def _pairs(self, edit: Edit, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of mutual nearest neighbours that may merge, the heavier one first."""
+        means, mass = tables["means"], mass_of(tables)
+        if len(means) < 2 or not np.isfinite(means).all():  # the next report ends the training
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        rows = np.arange(len(means))
+        distances, found = scipy.spatial.cKDTree(means).query(means, k=2)
+        other = np.where(found[:, 0] == rows, 1, 0)  # of two in one place, the row itself may come second
+        distance, nearest = distances[rows, other], found[rows, other]
+        mutual = (nearest[nearest] == rows) & (rows < nearest)
+        size = np.exp(tables["log_scales"].mean(axis=1))
+        close = distance < edit.at(self.distance_below) * (size + size[nearest])
+        colour = SH_C0 * np.abs(tables["sh_base"] - tables["sh_base"][nearest]).max(axis=1)
+        one = rows[mutual & close & (colour < edit.at(self.colour_below))]
+        two = nearest[one]
+        heavier = mass[one] >= mass[two]
+        return np.where(heavier, one, two), np.where(heavier, two, one)

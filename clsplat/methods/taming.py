@@ -1,0 +1,107 @@
+"""Growth within a budget and pruning, drawn by a score of what a Gaussian is and does in some views (Taming 3DGS,
+Mallick et al. 2024)."""
+
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from pydantic import Field
+
+from clsplat.density.control import SampledPruning, drawn_order
+from clsplat.density.edit import Edit, Rule
+from clsplat.density.survey import BLENDED, LOSSES, WEIGHT, Look, Survey, scaled
+from clsplat.formats.splats import inverse_opacities
+
+Floats = NDArray[np.float64]
+
+
+def by_median(values: NDArray[np.floating]) -> Floats:
+    """Return values over the median of the positive ones; 0 where there are none."""
+    positive = values[values > 0]
+    return np.asarray(values / np.median(positive), np.float64) if len(positive) else np.zeros(len(values))
+
+
+def pixel_weights(look: Look) -> Floats:
+    """Return the error of a view's pixels and the edges of its photograph, each from 0 to 1, added, [height, width]."""
+    counted = look.counted()
+    edges = np.abs(scipy.ndimage.laplace(look.photograph.image().mean(axis=2), mode="nearest"))
+    return scaled(look.error().astype(np.float64), counted) + scaled(edges, counted)
+
+
+def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
+    """Return for each Gaussian, [N], the sums of the losses of views that see it, and of its terms times the loss.
+
+    The terms: depth, radius, and over the pixels where it is blended their weights, their number and its own weight.
+    """
+    losses, terms = np.zeros(survey.count), np.zeros(survey.count)
+    drawn = survey.drawn(views)
+    for view, look in zip(drawn, survey.looks(drawn), strict=True):
+        radius = look.radius()
+        row = view.world_to_camera[2]
+        depth = (look.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # no BLAS: bits of any thread count
+        pixels = look.sum(BLENDED, pixel_weights(look)), look.sum(BLENDED, np.ones(look.counted().shape))
+        values = (5, depth), (10, radius), (10, pixels[0]), (0.1, pixels[1]), (50, look.sum(WEIGHT))
+        loss = look.loss(LOSSES) * (radius > 0)
+        losses += loss
+        terms += loss * sum(factor * by_median(np.where(radius > 0, value, 0)) for factor, value in values)
+    return losses, terms
+
+
+class ByScore(Rule):
+    """Base of rules that draw by score; rules with the same `views` share it."""
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"views"})
+
+    views: Annotated[int, Field(ge=1)] = 10
+    """Number of training views, drawn by seed and step; all where there are no more."""
+
+    @property
+    def statistics(self) -> set[str]:
+        return {"screen_grad"}
+
+    def score(self, edit: Edit) -> Floats:
+        """Return the scores, [N], 0 or more."""
+        gaussians, (losses, terms) = edit.gaussians, edit.survey.once(view_scores, self.views)
+        opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
+        volume = np.exp(gaussians.get("log_scales").astype(np.float64).sum(axis=1))
+        values = (25, edit.stats.mean("screen_grad")), (100, opacity), (25, volume)
+        found: Floats = terms + losses * sum(factor * by_median(value) for factor, value in values)
+        return found
+
+
+class GrowScored(ByScore):
+    """Of the Gaussians that the rules before this one make several of, grow as many as the limit of the edit allows
+    (`max_gaussians`, `budget`, memory).
+
+    They are drawn by score; those that are kept and those that are replaced have shares of the room by their numbers.
+    """
+
+    type: Literal["grow_scored"] = "grow_scored"
+
+    def mark(self, edit: Edit) -> None:
+        if edit.room is None or edit.room >= 0:
+            return
+        rows, kept = edit.rows().astype(np.int64), edit.kept.get() > 0
+        refused = rows > 1
+        if not refused.any():
+            return
+        room = edit.room + int(np.maximum(rows - 1, 0).sum())
+        score, random = self.score(edit), edit.random()
+        for kind, part in ((kept, (refused & kept).sum() / refused.sum()), (~kept, 1.0)):
+            order = drawn_order((rows > 1) & kind, score, random)
+            added = np.cumsum(rows[order] - 1)
+            grown = added <= round(part * room)
+            refused[order[grown]] = False
+            room -= int(added[grown][-1]) if grown.any() else 0
+        edit.undo_growth(refused)
+
+
+class PruneScored(SampledPruning, ByScore):
+    """Remove a share of the faint and the large Gaussians, drawn by 1 / score."""
+
+    type: Literal["prune_scored"] = "prune_scored"
+
+    def weights(self, edit: Edit) -> Floats:
+        with np.errstate(divide="ignore"):
+            return np.asarray(1 / self.score(edit))

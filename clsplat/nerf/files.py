@@ -1,0 +1,123 @@
+"""A field on the host, and its file: an .npz that notices damage (clsplat.training.archive), and holds no pickle.
+
+parameters.npy    [P, 1] float32, the network's parameters; clsplat.nerf.shape says where each layer's lie
+meta.npy          JSON: `format`, the `version` that wrote it, `shape` with the keys of `train_field.field`, the
+                  `background` and the `alpha` of the photographs
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from clsplat.core.errors import DataError, one_line, quoted, shortened
+from clsplat.core.files import atomic, is_there
+from clsplat.core.reading import sha256
+from clsplat.core.resources import __version__
+from clsplat.gaussians.model import Rendering, file_of_run
+from clsplat.nerf.field import Field
+from clsplat.nerf.shape import FieldShape, WrittenShape
+from clsplat.opencl.device import Device
+from clsplat.photos.photographs import BACKGROUNDS
+from clsplat.training import archive
+
+FORMAT: Final = 1
+ENDING, FILE, PARAMETERS = ".npz", "field.npz", "parameters"
+
+
+class Notes(BaseModel):
+    """What a file says beside its parameters."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    format: Literal[1]
+    version: str
+    shape: WrittenShape
+    background: Literal["black", "white"]
+    alpha: Literal["transparency", "mask"]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldModel:
+    """A field on the host, as `train_field` leaves it.
+
+    Raises ValueError where the parameters are not those of the shape.
+    """
+
+    shape: FieldShape
+    parameters: NDArray[np.float32]  # [P]
+    rendering: Rendering  # background, and what the fourth channel of its photographs was
+
+    def __post_init__(self) -> None:
+        if self.parameters.shape != (self.shape.parameters,):
+            raise ValueError(f"its parameters are {self.parameters.shape}; expected ({self.shape.parameters},)")
+
+    def upload(self, device: Device) -> Field:
+        """Copy the field to a device, before its background."""
+        background = device.upload(np.array(BACKGROUNDS[self.rendering.background or "black"], np.float32))
+        return Field(self.shape, device.upload(self.parameters), background)
+
+    def save(self, path: str | Path) -> str:
+        """Write the file; return its SHA-256.  Raises OutputError when it cannot be written."""
+        path, shown = Path(path), self.rendering
+        notes = Notes(
+            format=FORMAT,
+            version=__version__,
+            shape=self.shape,
+            background=shown.background or "black",
+            alpha=shown.alpha,
+        )
+        with atomic(path) as file:
+            archive.write(file, notes.model_dump(), [(PARAMETERS, self.parameters[:, None])])
+        return sha256(path)
+
+    def __repr__(self) -> str:
+        return f"FieldModel({self.shape.learned:,} parameters)"
+
+
+def is_field(path: Path) -> bool:
+    """Whether a path names a file of a field."""
+    return path.suffix.lower() == ENDING
+
+
+def field_of_run(folder: Path) -> Path:
+    """Return the file of the field of a run folder: the last that `export_field` has written."""
+    return file_of_run(folder, "export_field", FILE)
+
+
+def load_field(path: str | Path) -> FieldModel:
+    """Read the file of a field, or that of a run folder.
+
+    Raises DataError when it is missing, damaged or of something else.
+    """
+    path = field_of_run(Path(path)) if Path(path).is_dir() else Path(path)
+    if not is_there(path):
+        raise DataError(f"{path}: not found; expected a file of the stage export_field")
+    try:
+        return _checked(*archive.read(path))
+    except (DataError, ValueError) as error:
+        reason = shortened(one_line(error))
+        raise DataError(f"{path}: {reason}; expected a file of the stage export_field, whole") from error
+
+
+def _checked(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel:
+    """A field of what a file holds.  Raises DataError or ValueError."""
+    if notes.get("format") != FORMAT or "shape" not in notes:
+        raise DataError(f"is of format {quoted(str(notes.get('format')))}, or of something else than a field")
+    try:
+        found = Notes.model_validate(dict(notes))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise DataError(f"{'.'.join(map(str, first['loc']))} of its notes: {first['msg']}") from error
+    if arrays.keys() != {PARAMETERS}:
+        raise DataError(f"expected the array {PARAMETERS} alone")
+    table = arrays[PARAMETERS]
+    if table.dtype != np.float32 or table.shape != (found.shape.parameters, 1):
+        raise DataError(f"{PARAMETERS} are not [{found.shape.parameters}, 1] of float32")
+    if not np.isfinite(table).all():
+        raise DataError(f"{PARAMETERS} hold values that are not finite")
+    return FieldModel(found.shape, np.array(table[:, 0]), Rendering(background=found.background, alpha=found.alpha))

@@ -1,0 +1,343 @@
+"""A network on the device: the outputs of samples, and derivatives of a loss by its parameters.
+
+Arrays of features are in tiles of samples: cl_kernels/layers.h.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clsplat.nerf.shape import COLOUR_ROWS, GRID, LAYERS, SAMPLES, FieldShape, Layer, in_blocks
+from clsplat.opencl.device import Array, Device
+from clsplat.render.workspace import Workspace
+
+BLOCK, CHUNK = int(LAYERS["BLOCK"]), int(LAYERS["CHUNK"])
+NO_LIMIT = -float(np.finfo(np.float32).max)  # of outputs that are not cut
+RELU = 0.0
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Features of samples, [tiles, rows, SAMPLES], and the first row that a layer reads."""
+
+    array: Array
+    first: int = 0
+
+    @property
+    def rows(self) -> int:
+        return self.array.shape[1]
+
+
+class Network:
+    """The network of a shape, for a number of tiles of samples at a time."""
+
+    def __init__(self, workspace: Workspace, shape: FieldShape) -> None:
+        self.workspace, self.shape = workspace, shape
+        self._program = workspace.device.program("dense.cl")
+        self._columns = SAMPLES // (BLOCK * int(workspace.device.tuning["LANES"]))
+        self._layers = shape.layers
+        self._first, self._trunk = self._layers[0], self._layers[1 : shape.depth]
+        self._density, self._bottleneck, self._condition, self._colour = self._layers[shape.depth :]
+
+    def position(self, tiles: int) -> tuple[Array, int]:
+        """Return the table that the encoded position is in, [tiles, rows, SAMPLES], and its first row there."""
+        skip, width = self.shape.skip, self.shape.width
+        if skip is None:
+            return self._table("position", tiles, self.shape.position_rows), 0
+        return self._hidden(skip, tiles), width
+
+    def seen(self, tiles: int) -> tuple[Array, int]:
+        """Return the table that the encoded direction is in, as `position`."""
+        rows = self.shape.width + self.shape.direction_rows
+        return self._table("seen", tiles, rows), self.shape.width
+
+    def forward(self, parameters: Array, tiles: int) -> tuple[Array, Array]:
+        """Return raw colours and raw densities of samples whose encodings are in place, each [tiles, COLOUR_ROWS,
+        SAMPLES], valid until the next call."""
+        x = _Table(*self.position(tiles))
+        for i, layer in enumerate([self._first, *self._trunk]):
+            after = self._hidden(i, tiles)
+            self._apply(layer, parameters, x, after, RELU)
+            x = _Table(after)
+        densities = self._table("densities", tiles, COLOUR_ROWS)
+        colours = self._table("colours", tiles, COLOUR_ROWS)
+        seen, behind = self.seen(tiles)[0], self._table("conditioned", tiles, self.shape.colour_width)
+        self._apply(self._density, parameters, x, densities, NO_LIMIT)
+        self._apply(self._bottleneck, parameters, x, seen, NO_LIMIT)
+        self._apply(self._condition, parameters, _Table(seen), behind, RELU)
+        self._apply(self._colour, parameters, _Table(behind), colours, NO_LIMIT)
+        return colours, densities
+
+    def backward(self, parameters: Array, by_colours: Array, by_densities: Array, gradient: Array) -> Array:
+        """Add the derivatives by the parameters to `gradient`, [P], from those by the outputs of the last `forward`.
+
+        Returns those by the features of the grid, [tiles, grid_rows, SAMPLES], valid until the next call.
+        """
+        tiles, width = by_colours.shape[0], self.shape.width
+        last, seen = _Table(self._hidden(self.shape.depth - 1, tiles)), _Table(self.seen(tiles)[0])
+        behind = _Table(self._table("conditioned", tiles, self.shape.colour_width))
+        by_behind = self._table("by conditioned", tiles, self.shape.colour_width)
+        by_seen, by_x = self._table("by seen", tiles, width), self._table("by hidden", tiles, width)
+        self._sum(self._colour, behind, by_colours)
+        self._derive(self._colour, parameters, by_colours, behind, by_behind, RELU)
+        self._sum(self._condition, seen, by_behind)
+        self._derive(self._condition, parameters, by_behind, seen, by_seen, NO_LIMIT)
+        self._sum(self._density, last, by_densities)
+        self._sum(self._bottleneck, last, by_seen)
+        self._derive(self._density, parameters, by_densities, last, by_x, NO_LIMIT)
+        self._derive(self._bottleneck, parameters, by_seen, last, by_x, RELU, kept=1)
+        for i in range(len(self._trunk), 0, -1):
+            before, layer = _Table(self._hidden(i - 1, tiles)), self._trunk[i - 1]
+            self._sum(layer, before, by_x)
+            if i - 1 == self.shape.skip:
+                self._derive_grid(layer, parameters, by_x, self.shape.width, kept=0)
+            by_before = self._table(f"by hidden {i % 2}", tiles, width)
+            self._derive(layer, parameters, by_x, before, by_before, RELU)
+            by_x = by_before
+        self._sum(self._first, _Table(*self.position(tiles)), by_x)
+        by_grid = self._derive_grid(self._first, parameters, by_x, 0, kept=int(self.shape.skip is not None))
+        count = self.shape.of_network
+        self._program.dense_sums(
+            items=count // int(self.workspace.device.tuning["LANES"]),
+            partials=self._partials(tiles),
+            gradient=gradient,
+            chunks=-(-tiles // CHUNK),
+            count=count,
+        )
+        return by_grid
+
+    def _derive_grid(self, layer: Layer, parameters: Array, by_outputs: Array, row: int, kept: int) -> Array:
+        """Derive by the features of the grid, which a layer reads from a row on."""
+        tiles = by_outputs.shape[0]
+        position, by_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
+        self._derive(layer, parameters, by_outputs, position, by_grid, NO_LIMIT, kept, row)
+        return by_grid
+
+    def _hidden(self, i: int, tiles: int) -> Array:
+        """The outputs of layer i of the trunk, with room for the encoded position where that joins them."""
+        more = self.shape.position_rows if i == self.shape.skip else 0
+        return self._table(f"hidden {i}", tiles, self.shape.width + more)
+
+    def _table(self, name: str, tiles: int, rows: int) -> Array:
+        return self.workspace.array(f"field {name}", (tiles, rows, SAMPLES))
+
+    def _partials(self, tiles: int) -> Array:
+        """Sums of chunks, [chunks, of_network]; what no layer writes is zero, as new arrays are."""
+        return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.of_network))
+
+    def _apply(self, layer: Layer, parameters: Array, inputs: _Table, outputs: Array, lowest: float) -> None:
+        tiles = outputs.shape[0]
+        count = tiles * self._columns * (layer.columns // BLOCK)
+        self._program.dense_forward(
+            items=count,
+            inputs=inputs.array,
+            parameters=parameters,
+            outputs=outputs,
+            first_parameter=layer.first,
+            input_rows=inputs.rows,
+            first_input=inputs.first,
+            input_count=layer.rows,
+            output_rows=outputs.shape[1],
+            output_count=layer.columns,
+            lowest=lowest,
+            count=count,
+        )
+
+    def _derive(
+        self,
+        layer: Layer,
+        parameters: Array,
+        by_outputs: Array,
+        inputs: _Table,
+        by_inputs: Array,
+        lowest: float,
+        kept: int = 0,
+        row: int = 0,
+    ) -> None:
+        """Derive by inputs of a layer, whose weights begin at a row."""
+        tiles, derived, output_rows = *by_inputs.shape[:2], by_outputs.shape[1]
+        count = tiles * self._columns * (derived // BLOCK)
+        self._program.dense_backward(
+            items=count,
+            by_outputs=by_outputs,
+            parameters=parameters,
+            inputs=inputs.array,
+            by_inputs=by_inputs,
+            first_parameter=layer.first + row * layer.columns,
+            input_rows=inputs.rows,
+            first_input=inputs.first,
+            derived_count=derived,
+            output_rows=output_rows,
+            output_count=layer.columns,
+            lowest=lowest,
+            kept=kept,
+            count=count,
+        )
+
+    def _sum(self, layer: Layer, inputs: _Table, by_outputs: Array) -> None:
+        """Write the partial sums of the derivatives by a layer's parameters."""
+        tiles, output_rows = by_outputs.shape[:2]
+        chunks = -(-tiles // CHUNK)
+        count = chunks * (layer.rows // BLOCK) * (layer.columns // BLOCK)
+        shared: dict[str, Any] = {
+            "by_outputs": by_outputs,
+            "partials": self._partials(tiles),
+            "parameter_count": self.shape.of_network,
+            "output_rows": output_rows,
+            "output_count": layer.columns,
+            "tiles": tiles,
+        }
+        self._program.dense_weights(
+            items=count,
+            inputs=inputs.array,
+            first_parameter=layer.first,
+            input_rows=inputs.rows,
+            first_input=inputs.first,
+            input_count=layer.rows,
+            count=count,
+            **shared,
+        )
+        biases = chunks * layer.columns
+        self._program.dense_biases(items=biases, first_parameter=layer.first_bias, count=biases, **shared)
+
+
+# What the network of a field reads of samples, and derivatives by the numbers of its grid, on the device.
+
+PLACE_ROWS = int(GRID["PLACE_ROWS"])
+PARTS = 64  # of all levels together, for each unit of a GPU
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Rays, cut into samples."""
+
+    cones: Array  # [rays, RAY_VALUES]
+    edges: Array  # [rays, samples + 1]
+
+    @property
+    def of_ray(self) -> int:
+        return self.edges.shape[1] - 1
+
+    @property
+    def count(self) -> int:
+        return self.edges.shape[0] * self.of_ray
+
+    @property
+    def tiles(self) -> int:
+        return self.count // SAMPLES
+
+
+class Encoding:
+    """Puts the encodings of samples where the network reads them."""
+
+    def __init__(self, workspace: Workspace, shape: FieldShape, network: Network) -> None:
+        self.workspace, self.shape, self.network = workspace, shape, network
+        device = workspace.device
+        self._program, self._grid = device.program("encode.cl"), device.program("grid.cl")
+        self._lanes = int(device.tuning["LANES"])
+        self._levels = device.upload(shape.grid.table) if shape.grid else None
+        self.parts = parts_of_levels(device, shape.grid.levels) if shape.grid else 0
+
+    def forward(self, parameters: Array, samples: Samples) -> None:
+        """Write the encoded positions and directions."""
+        if self.shape.grid:
+            self._place(samples)
+            self.read_grid(parameters, samples.tiles)
+        shape, (features, first) = self.shape, self.network.position(samples.tiles)
+        shared: dict[str, Any] = {
+            "items": samples.count // self._lanes,
+            "cones": samples.cones,
+            "samples": samples.of_ray,
+            "count": samples.count,
+        }
+        if shape.degrees:
+            self._program.encode_frustums(
+                edges=samples.edges,
+                features=features,
+                rows=features.shape[1],
+                first_row=first + shape.grid_rows,
+                degrees=shape.degrees,
+                written=in_blocks(6 * shape.degrees),
+                **shared,
+            )
+        features, first = self.network.seen(samples.tiles)
+        self._program.encode_directions(
+            features=features,
+            rows=features.shape[1],
+            first_row=first,
+            degrees=shape.direction_degrees,
+            written=shape.direction_rows,
+            **shared,
+        )
+
+    def backward(self, by_position: Array, gradient: Array) -> None:
+        """Add the derivatives by the grid's numbers to `gradient`, [P].
+
+        by_position: those by its features of the samples of the last `forward`, [tiles, grid_rows, SAMPLES].
+        """
+        if not self.shape.grid:
+            return
+        tiles, rows = by_position.shape[:2]
+        count = self.shape.grid.levels * self.parts
+        self._grid.grid_backward(
+            groups=-(-count // int(self.workspace.device.tuning["TEAM"])),
+            places=self.places(tiles),
+            levels=self._levels,
+            by_features=by_position,
+            gradient=gradient,
+            first_parameter=self.shape.of_network,
+            rows=rows,
+            parts=self.parts,
+            samples=tiles * SAMPLES,
+            count=count,
+        )
+
+    def places(self, tiles: int) -> Array:
+        """Return the places of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES], until the next `forward`."""
+        return self.workspace.array("field places", (tiles, PLACE_ROWS, SAMPLES))
+
+    def read_grid(self, parameters: Array, tiles: int) -> None:
+        """Write the features of the grid at the places of samples."""
+        grid, (features, first) = self.shape.grid, self.network.position(tiles)
+        assert grid is not None
+        count = grid.levels * tiles * SAMPLES // self._lanes
+        self._grid.grid_forward(
+            items=count,
+            places=self.places(tiles),
+            levels=self._levels,
+            parameters=parameters,
+            features=features,
+            first_parameter=self.shape.of_network,
+            rows=features.shape[1],
+            first_row=first,
+            samples=tiles * SAMPLES,
+            count=count,
+        )
+
+    def _place(self, samples: Samples) -> None:
+        """Write the places of samples."""
+        grid = self.shape.grid
+        assert grid is not None
+        x, y, z = grid.corner
+        self._grid.grid_places(
+            items=samples.count // self._lanes,
+            cones=samples.cones,
+            edges=samples.edges,
+            places=self.places(samples.tiles),
+            corner_x=x,
+            corner_y=y,
+            corner_z=z,
+            side=grid.side,
+            samples=samples.of_ray,
+            count=samples.count,
+        )
+
+
+def parts_of_levels(device: Device, levels: int) -> int:
+    """Return in how many parts the entries of each level are summed: their sums do not depend on it.
+
+    Each part looks through all samples: so on a CPU they are as few as keep its cores busy.
+    """
+    wanted = 2 * device.info.units if int(device.tuning["TEAM"]) == 1 else PARTS * device.info.units
+    return max(1, wanted // levels)

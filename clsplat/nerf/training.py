@@ -1,0 +1,292 @@
+"""A field while it is trained: the losses of a step's rays, Adam, and its tables in a checkpoint."""
+
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
+from clsplat.nerf.field import Draw, Field, Target, rays_at_a_time
+from clsplat.nerf.network import CHUNK, PLACE_ROWS
+from clsplat.nerf.shape import COLOUR_ROWS, SAMPLES, FieldShape, GridShape, WrittenShape
+from clsplat.opencl.device import Array, constants
+from clsplat.photos.photographs import Photograph
+from clsplat.render.camera import DeviceCamera
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import View
+from clsplat.scene.viewpoint import centre_of
+from clsplat.training.field import Tables, TrainedField
+from clsplat.training.memory import Limits
+
+TABLES = ("parameters", "moment1", "moment2")
+CHANNELS = 3
+_WRITTEN: TypeAdapter[FieldShape] = TypeAdapter(WrittenShape)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A photograph of a step, on the device, and the rays that are drawn from it."""
+
+    camera: DeviceCamera
+    photograph: Photograph
+    rays: int
+    weight: float  # of each ray: the area of what it stands for, px^2 of the full size
+
+
+@dataclass(frozen=True)
+class AdamStep:
+    """How far an update by Adam goes."""
+
+    rate: float
+    epsilon: float = 1e-8  # added to the root of the second moment: the default of Adam's paper, which Mip-NeRF keeps
+
+
+class LearnedField(TrainedField):
+    """A field with Adam's moments, in tables that a checkpoint holds."""
+
+    kind = "nerf"
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+        device, count = field.parameters.device, field.shape.parameters
+        self._arrays = dict(zip(TABLES, (field.parameters, device.zeros(count), device.zeros(count)), strict=True))
+        self._gradient = device.zeros(count)
+        self._program = device.program("dense.cl")
+        self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
+        self.updates = 0  # which count for the bias of the moments
+        self.rate = 0.0  # of the last step
+        self._scales: list[tuple[int, float]] = []  # of the last step: rays, and what a squared difference counts
+
+    @classmethod
+    def first(cls, shape: FieldShape, seed: int, background: Array) -> "LearnedField":
+        """Return a field before its first step."""
+        return cls(Field.first(shape, seed, background))
+
+    @classmethod
+    def of_tables(cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array) -> Self:
+        """Return the field of a checkpoint, by what `tables` has returned."""
+        own = _shape_of(shape)
+        found = cls(Field(own, background.device.zeros(own.parameters), background))
+        for name, array in found._arrays.items():
+            array.set(tables[name][:, 0])
+        return found
+
+    @classmethod
+    def check_tables(cls, shape: Mapping[str, Any], tables: Tables, others: Tables) -> None:
+        """Raise DataError for tables that are not those of a field of a shape."""
+        if others:
+            raise DataError(f"it holds {next(iter(others))} beside a field")
+        if tables.keys() != set(TABLES):
+            raise DataError(f"its field has not the tables {', '.join(TABLES)}")
+        parameters = _shape_of(shape).parameters
+        for name, table in tables.items():
+            if table.dtype != np.float32 or table.shape != (parameters, 1):
+                raise DataError(f"{name} of its field is not [{parameters}, 1] of float32")
+            if not np.isfinite(table).all():
+                raise DataError(f"{name} of its field holds values that are not finite")
+
+    @property
+    def painter(self) -> Field:
+        """What renders views of it."""
+        return self.field
+
+    @property
+    def parameters(self) -> int:
+        """The number of parameters that are learned."""
+        return self.field.shape.learned
+
+    def shape_as_data(self) -> dict[str, Any]:
+        """Return its shape as JSON holds it."""
+        return self.field.shape.model_dump()
+
+    def tables(self) -> Tables:
+        """Copy its tables to the host, each [P, 1]."""
+        return {name: array.get()[:, None] for name, array in self._arrays.items()}
+
+    def not_finite(self) -> list[str]:
+        """Return the names of the tables that hold NaN or infinity."""
+        device, count = self._gradient.device, self.field.shape.parameters
+        counters = {name: device.zeros(1, np.uint32) for name in self._arrays}
+        for name, array in self._arrays.items():
+            device.program("check.cl").count_not_finite(
+                items=(count, 1), values=array, counter=counters[name], stride=count, count=count
+            )
+        return [name for name, counter in counters.items() if counter.get_item(0) > 0]
+
+    def step(self, shown: Sequence[Shown], coarse_weight: float, adam: AdamStep, seed: int, step: int) -> None:
+        """Do one update (Barron et al. 2021, section 3.3).
+
+        The loss is that of the fine level and `coarse_weight` of that of the coarse one; each is the mean squared
+        difference of the rays, weighted by what they stand for.
+        """
+        whole = CHANNELS * sum(one.rays * one.weight for one in shown)
+        self.rate = adam.rate
+        self._gradient.fill(0)
+        errors = self._errors(sum(one.rays for one in shown))
+        self._scales, first = [(one.rays, one.weight / whole) for one in shown], 0
+        for one in shown:
+            self._differentiate(one, one.weight / whole, coarse_weight, Draw(seed, step, first), errors)
+            first += one.rays
+        self.updates += 1
+        self.update(self._gradient, adam, self.updates)
+
+    def update(self, gradient: Array, adam: AdamStep, number: int) -> None:
+        """Change the parameters by Adam, for the update `number`, from a gradient, [P]."""
+        self._program.dense_update(
+            items=self.field.shape.parameters // int(self._gradient.device.tuning["LANES"]),
+            parameters=self.field.parameters,
+            moment1=self._arrays["moment1"],
+            moment2=self._arrays["moment2"],
+            gradient=gradient,
+            rate=adam.rate / (1 - self._beta1**number),
+            correction2=1 / (1 - self._beta2**number),
+            epsilon=adam.epsilon,
+            count=self.field.shape.parameters,
+        )
+
+    def loss(self, coarse_weight: float) -> tuple[float, float]:
+        """Read the loss of the last step, and the mean squared difference of its fine level."""
+        coarse, fine = (
+            sum(
+                scale * float(part.sum(dtype=np.float64))
+                for (_, scale), part in zip(self._scales, self._parts(array.get()), strict=True)
+            )
+            for array in self._errors(sum(rays for rays, _ in self._scales))
+        )
+        return fine + coarse_weight * coarse, fine
+
+    def _parts(self, errors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        return np.split(errors, np.cumsum([rays for rays, _ in self._scales])[:-1])
+
+    def _errors(self, rays: int) -> list[Array]:
+        """Squared differences of the rays of a step, coarse and fine."""
+        return [self.field.workspace.array(f"field {name} errors", rays) for name in ("coarse", "fine")]
+
+    def _differentiate(self, shown: Shown, scale: float, coarse_weight: float, draw: Draw, errors: list[Array]) -> None:
+        """Add the derivatives by the rays of one photograph, in passes."""
+        levels = self.field.levels
+        colours = shown.photograph.planes(self.field.workspace).colours
+        scales = coarse_weight * scale, scale
+        for first in range(0, shown.rays, levels.rays_at_a_time):
+            own = Draw(draw.seed, draw.step, draw.first + first)
+            rays = levels.drawn(shown.camera, own, min(levels.rays_at_a_time, shown.rays - first))
+            rendered = levels.render(self.field.parameters, rays)
+            for level, of_level, squares in zip(rendered, scales, errors, strict=True):
+                target = Target(colours, of_level, squares)
+                levels.differentiate(self.field.parameters, level, target, self._gradient)
+
+
+def _shape_of(written: Mapping[str, Any]) -> FieldShape:
+    """The shape of a field in a checkpoint.  Raises DataError where it is none."""
+    try:
+        return _WRITTEN.validate_json(json.dumps(written))
+    except ValidationError as error:
+        raise DataError(f"the shape of its field: {error.errors()[0]['msg']}") from None
+
+
+# The memory that the training of a field needs on the device, computed before it is allocated.
+
+TABLES_HELD = 4  # of the length of the parameters: these, Adam's moments, and the gradient
+MIB = 2**20
+
+
+@dataclass(frozen=True)
+class FieldPlan:
+    """Bytes on the device."""
+
+    parameters: int  # one table of them
+    features: int  # of the samples that are computed at a time, with derivatives
+    partials: int  # sums of chunks of samples, for each parameter of the network
+    photographs: int
+
+    @property
+    def needed(self) -> int:
+        """Bytes in all."""
+        return TABLES_HELD * self.parameters + self.features + self.partials + self.photographs
+
+    def text(self, limits: Limits) -> str:
+        """Return one line: the memory needed, and that of the device."""
+        return (
+            f"memory: {self.needed / MIB:,.0f} MiB for a field ({TABLES_HELD} tables of {self.parameters / MIB:,.0f} MiB, "
+            f"samples {(self.features + self.partials) / MIB:,.0f} MiB, photographs {self.photographs / MIB:,.0f} MiB) "
+            f"in {limits.memory / MIB:,.0f} MiB with buffers up to {limits.allocation / MIB:,.0f} MiB"
+        )
+
+    def check(self, limits: Limits) -> None:
+        """Raise MemoryLimitError where it does not fit."""
+        if self.needed > limits.memory or max(self.parameters, self.partials) > limits.allocation:
+            raise MemoryLimitError(
+                f"{self.text(limits)}: take fewer levels or entries of the grid (train_field.field.grid), a smaller "
+                "train_field.field.width, or fewer samples"
+            )
+
+
+def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
+    """Return the plan for a field.  photographs: their bytes on the device."""
+    samples = rays_at_a_time(shape) * max(shape.coarse_samples, shape.fine_samples)
+    hidden = (shape.depth + 3) * shape.width  # outputs of the trunk, and derivatives by three layers
+    encoded = shape.position_rows + shape.grid_rows + PLACE_ROWS + shape.direction_rows
+    rows = hidden + encoded + shape.width + 2 * shape.colour_width + 4 * COLOUR_ROWS
+    chunks = -(-samples // (SAMPLES * CHUNK))
+    return FieldPlan(4 * shape.parameters, 4 * rows * samples, 4 * chunks * shape.of_network, photographs)
+
+
+# Where the cube of a field's grid lies beside what photographs show: outside of that nothing is learned.
+
+Floats = NDArray[np.float64]
+UNIT = np.array(list(itertools.product((0.0, 1.0), repeat=3)))  # the corners of a cube, [8, 3]
+
+
+def require_seen(shape: FieldShape, scene: Scene) -> None:
+    """Raise ConfigError for a cube that no training view sees between near and far, or that holds no point of a scene
+    with points."""
+    cube, views, points = shape.grid, scene.split("train"), scene.points
+    if cube is None or not views:
+        return
+    corner, side = np.array(cube.corner), cube.side
+    if not any(_meet(corner + side * UNIT, _corners(view, shape.near, shape.far)) for view in views):
+        fault = f"no training view sees it at depths from {shape.near:g} to {shape.far:g}"
+    elif points and len(points) and not _inside(cube, np.asarray(points.positions, np.float64)).any():
+        fault = f"none of the scene's {len(points):,} points lies in it"
+    else:
+        return
+    least, most, seen = (_told(point) for point in (corner, corner + side, centre_of(views)))
+    raise ConfigError(
+        f"train_field.field.grid: its cube is from {least} to {most}, scene units, and {fault} ({scene.path}); "
+        f"expected one about what the cameras look at, near {seen}: set `corner` and `side`, and `near` and `far` "
+        "beside `grid`"
+    )
+
+
+def _inside(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
+    """Which points, [M, 3], lie in a cube."""
+    return np.asarray((np.abs(positions - (np.array(cube.corner) + cube.side / 2)) <= cube.side / 2).all(axis=1))
+
+
+def _corners(view: View, near: float, far: float) -> Floats:
+    """The corners of what a view sees between two depths, [8, 3]: UNIT over the columns, the rows and the depth."""
+    camera = view.camera
+    across = (UNIT[:, :2] * [camera.width, camera.height] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    places = np.column_stack([across, np.ones(8)]) * (near + UNIT[:, 2:] * (far - near))
+    rotation, translation = view.world_to_camera[:, :3], view.world_to_camera[:, 3]
+    return np.asarray((places - translation) @ rotation)
+
+
+def _meet(cube: Floats, frustum: Floats) -> bool:
+    """Whether two bodies, by their corners as UNIT has them, have a point in common: no axis parts them (Gottschalk,
+    Lin and Manocha 1996)."""
+    axes, edges = np.eye(3), frustum[[1, 5, 3, 7, 4, 2]] - frustum[[0, 4, 2, 6, 0, 0]]  # along the depth, row, column
+    faces = np.cross(edges[[4, 4, 4, 5, 5]], edges[[5, 0, 2, 0, 1]])
+    candidates = np.vstack([axes, faces, np.cross(axes[:, None], edges[None]).reshape(-1, 3)])
+    of_cube, of_frustum = cube @ candidates.T, frustum @ candidates.T
+    apart = (of_cube.max(axis=0) < of_frustum.min(axis=0)) | (of_frustum.max(axis=0) < of_cube.min(axis=0))
+    return not bool(apart.any())
+
+
+def _told(point: NDArray[np.floating]) -> str:
+    return f"({', '.join(f'{round(float(value), 6) + 0.0:.4g}' for value in point)})"

@@ -1,0 +1,5 @@
+"""What a training step compares with: photographs on the device, their sampling and transforms."""
+
+from clsplat.core.settings import import_modules
+
+import_modules(__name__, __path__)

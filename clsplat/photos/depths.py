@@ -1,0 +1,179 @@
+"""Depth maps that other programs have made of the photographs: one image each, fitted to the points of the scene.
+
+A value is the inverse depth, bright is near, up to a factor and an offset of each map, as networks for single images
+give it.  Both come from the points that the photograph shows, by least absolute differences: some points are wrong.
+"""
+
+import logging
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError
+from clsplat.opencl.device import Array, Device
+from clsplat.render.camera import DeviceCamera
+from clsplat.scene.images import read_image
+from clsplat.scene.scene import Tracks
+
+LOG = logging.getLogger("clsplat")
+Floats = NDArray[np.floating]
+FEWEST = 10  # points of a photograph that a map is fitted to
+MOST = 32_768  # pixels of a map that are compared
+ROUNDS = 20
+EXACT = 1e-3  # of the points' own spread: smaller differences weigh no more
+TINY = 1e-12  # scene units⁻¹: points that are all as far
+FITS = 0.5  # of the points' own spread: a map that leaves more of it does not show these depths
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """A folder of maps: `a.png`, of 8 or 16 bits and any size, for the photograph a.jpg; deeper ones likewise."""
+
+    folder: Path
+
+    def require(self, names: Iterable[str]) -> None:
+        """Raise DataError where one of the photographs has no map."""
+        for name in names:
+            if not self._file(name).is_file():
+                raise DataError(
+                    f"{self._file(name)}: no such file; expected the depth map of {name}, or --set another folder"
+                )
+
+    def _file(self, name: str) -> Path:
+        return (self.folder / name).with_suffix(".png")
+
+    def read(self, name: str, width: int, height: int) -> Floats:
+        """Return the map of a photograph by name, [height, width] in [0, 1].  Raises DataError without one."""
+        self.require([name])
+        pixels = read_image(self._file(name))[:, :, 0]
+        values: NDArray[Any] = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
+        if values.shape != (height, width):
+            values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(values)
+
+    def at(
+        self, name: str, size: tuple[int, int], rows: NDArray[np.intp], columns: NDArray[np.intp], inverse: Floats
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats] | None:
+        """Return rows, columns and inverse depths at an even grid of pixels of a photograph of size (width, height).
+
+        rows, columns: [K] pixels that points show, with their inverse depths [K].  None, with a warning, where the map
+        does not fit to these.  Raises DataError as `read`.
+        """
+        values = self.read(name, *size)
+        found = fitted(values[rows, columns], inverse)
+        if found is None:
+            LOG.warning("%s: its depth map does not fit to the points that it shows; it is left out", name)
+            return None
+        step = math.ceil(math.sqrt(values.size / MOST))
+        down, across = np.mgrid[step // 2 : size[1] : step, step // 2 : size[0] : step].reshape(2, -1)
+        depths = found[0] * values[down, across] + found[1]
+        near = depths > 0  # others lie beyond all that the map tells
+        return down[near], across[near], depths[near]
+
+
+def fitted(values: Floats, inverse: Floats) -> tuple[float, float] | None:
+    """Return factor and offset from values of a map to inverse depths, [K] each; None where they do not go together.
+
+    Least absolute differences, by least squares in turn with weights 1 / difference.
+    """
+    if len(values) < FEWEST:
+        return None
+    x, y = np.asarray(values, np.float64), np.asarray(inverse, np.float64)
+    spread = float(np.abs(y - np.median(y)).mean())
+    weights, factor, offset = np.ones(len(x)), 0.0, 0.0
+    for _ in range(ROUNDS):
+        total = weights.sum()
+        middle_x, middle_y = (weights * x).sum() / total, (weights * y).sum() / total
+        square = (weights * (x - middle_x) ** 2).sum()
+        factor = float((weights * (x - middle_x) * (y - middle_y)).sum() / square) if square > 0 else 0.0
+        offset = float(middle_y - factor * middle_x)
+        weights = 1 / np.maximum(np.abs(factor * x + offset - y), EXACT * spread + TINY)
+    left = float(np.median(np.abs(factor * x + offset - y)))
+    return (factor, offset) if factor > 0 and left <= FITS * spread else None
+
+
+# Depths that are known at some pixels of the training photographs: of the points that they show, or of depth maps.
+
+SURE = 4  # photographs that show a point whose depth counts whole; those of fewer count less
+
+
+@dataclass(frozen=True)
+class KnownDepths:
+    """Depths at pixels of one view, on the device."""
+
+    pixels: Array  # [K] places in a plane [rows, stride], each once
+    inverse: Array  # [K] 1 / depth, scene units⁻¹
+    weights: Array  # [K] in (0, 1]
+    extent: float  # of the scene, scene units: makes the loss free of units
+
+
+class PointDepths:
+    """The points that structure from motion has found in each training view, by the number of the view.
+
+    maps: are compared with in the place of the points, which they are fitted to.
+    """
+
+    def __init__(
+        self, device: Device, tracks: Tracks, names: Sequence[str], extent: float, maps: DepthMaps | None = None
+    ) -> None:
+        self.device, self.tracks, self.names, self.extent, self.maps = device, tracks, names, extent, maps
+        self._rows = [tracks.seen.get(name, np.empty(0, np.int64)) for name in names]
+        counts = np.bincount(np.concatenate([*tracks.seen.values(), np.empty(0, np.int64)]))
+        self._counts = np.pad(counts, (0, len(tracks.positions) - len(counts)))
+        self._held: dict[tuple[int, int, int], KnownDepths | None] = {}
+
+    def at(self, camera: DeviceCamera) -> KnownDepths | None:
+        """Return what is known at the size of a camera with a number; None where nothing is.
+
+        Raises DataError where a depth map cannot be read.
+        """
+        if camera.view is None:
+            return None
+        key = camera.view, camera.width, camera.height
+        if key not in self._held:
+            self._held[key] = self._uploaded(camera, self._rows[camera.view])
+        return self._held[key]
+
+    def _uploaded(self, camera: DeviceCamera, rows: NDArray[np.int64]) -> KnownDepths | None:
+        places, depths, kept = nearest_in_pixels(camera, self.tracks.positions[rows])
+        inverse: NDArray[np.floating] = 1 / depths
+        weights = np.minimum(1.0, self._counts[rows[kept]] / SURE)
+        if self.maps and camera.view is not None:
+            pixels = places // camera.stride, places % camera.stride
+            found = self.maps.at(self.names[camera.view], (camera.width, camera.height), *pixels, inverse)
+            if found is None:
+                return None
+            places, inverse, weights = found[0] * camera.stride + found[1], found[2], np.ones(len(found[2]))
+        if not len(places):
+            return None
+        upload, values = self.device.upload, (inverse.astype(np.float32), weights.astype(np.float32))
+        return KnownDepths(upload(places.astype(np.uint32)), upload(values[0]), upload(values[1]), self.extent)
+
+
+def nearest_in_pixels(
+    camera: DeviceCamera, positions: NDArray[np.floating]
+) -> tuple[NDArray[np.intp], NDArray[np.floating], NDArray[np.intp]]:
+    """Return the places in a plane that positions [M, 3] fall on, ascending [K], their depths and their rows.
+
+    Of those in one pixel the nearest one stays, the first of equal ones; those outside the image are left out.
+    """
+    values = camera.values
+    pose = np.asarray(values["world_to_camera"], np.float64).reshape(3, 4)
+    x, y, z = np.einsum("ij,nj->in", pose[:, :3], positions) + pose[:, 3:]  # no sum depends on threads
+    in_front = z > 0
+    depth = np.where(in_front, z, 1.0)
+    column = np.floor(float(values["fx"]) * x / depth + float(values["cx"]))
+    row = np.floor(float(values["fy"]) * y / depth + float(values["cy"]))
+    shown = in_front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    rows = np.flatnonzero(shown)
+    places = (row[rows] * camera.stride + column[rows]).astype(np.intp)
+    order = np.lexsort((rows, depth[rows], places))
+    _, first = np.unique(places[order], return_index=True)
+    kept = order[first]
+    return places[kept], depth[rows[kept]], rows[kept]

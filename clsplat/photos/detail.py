@@ -1,0 +1,130 @@
+"""The size at which photographs are worth training on, from how much of their detail each size shows.
+
+After DashGaussian (Chen et al. 2025).
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from pydantic import Field
+
+from clsplat.core.schedule import EverySteps, Points, acts, place
+from clsplat.core.settings import Settings
+
+Floats = NDArray[np.float64]
+LEVELS = 2048  # bounds of the frequency, from 0 to the highest of each direction
+KNOTS = 32  # published
+NO_DETAIL = 1e-3  # of the amplitudes: the rounding of an image of one colour
+LEAST = 0.25  # of the amplitudes, that the smallest size of any photograph shows: published
+
+
+class Spectrum:
+    """The amplitudes of images, summed over channels and all frequencies up to a bound."""
+
+    def __init__(self, within: Floats) -> None:
+        """within: sums at bounds of 0 to 1 times the highest frequency, at equal distances, [LEVELS + 1]."""
+        self.within = within
+
+    @classmethod
+    def of(cls, image: NDArray[np.uint8]) -> "Spectrum":
+        """Return the spectrum of an image, [height, width, 3]."""
+        height, width = image.shape[:2]
+        amplitudes = np.abs(scipy.fft.rfft2(image.astype(np.float32), axes=(1, 0))).sum(axis=2, dtype=np.float64)
+        down, right = (np.abs(scipy.fft.fftfreq(size)) * 2 for size in (height, width))
+        down = down[: height // 2 + 1]
+        twice = np.where((down == 0) | (down == 1), 1, 2)  # the transform of a real image has only one of a pair
+        bound = np.maximum(down[:, None], right[None, :])
+        level = np.ceil(bound * LEVELS).astype(np.int64)
+        sums = np.bincount(level.ravel(), (amplitudes * twice[:, None]).ravel(), LEVELS + 1)
+        return cls(np.cumsum(sums))
+
+    @property
+    def total(self) -> float:
+        """The sum over all frequencies."""
+        return float(self.within[-1])
+
+    def divisor(self, amplitude: float) -> float:
+        """Return the divisor of the size that keeps the frequencies whose amplitudes have a sum; inf where none is
+        needed for it."""
+        bounds = np.linspace(0, 1, LEVELS + 1)
+        bound = float(np.interp(amplitude, self.within, bounds))
+        return 1 / bound if bound else np.inf
+
+    def at(self, divisor: float) -> float:
+        """Return the sum of what an image of 1 / `divisor` of the size shows."""
+        return float(np.interp(1 / divisor, np.linspace(0, 1, LEVELS + 1), self.within))
+
+
+def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Floats, Floats]:
+    """Return steps, and the divisor of the photographs' size at each, falling from at most `largest` to 1 at `until`.
+
+    Equal shares of the amplitudes take times that fall as their sum grows.  Without detail to gain it is 1 from step 0.
+    """
+    first = min(largest, *(spectrum.divisor(LEAST * spectrum.total) for spectrum in spectra))
+    mean = Spectrum(np.mean([spectrum.within for spectrum in spectra], axis=0))
+    least = mean.at(first) if first > 1 else mean.total
+    if not 0 < least < (1 - NO_DETAIL) * mean.total:
+        return np.zeros(1), np.ones(1)
+    amplitudes = np.linspace(least, mean.total, KNOTS)
+    divisors = np.array([first, *(mean.divisor(amplitude) for amplitude in amplitudes[1:-1]), 1.0])
+    return until * np.log(amplitudes / least) / np.log(mean.total / least), divisors
+
+
+class DetailDivisor(Settings):
+    """The size grows as fast as the photographs' detail asks for (DashGaussian, Chen et al. 2025).
+
+    Small photographs first: those that show a quarter of the amplitudes of their spectrum.  The time that a share of
+    the amplitudes is waited for falls as their sum grows.  The divisor is a whole number, which changes with edits.
+    """
+
+    step_keys: ClassVar[frozenset[str]] = frozenset({"until", "every", "start"})
+
+    follows: Literal["detail"]
+    """`detail`: the mean spectrum of the training photographs."""
+    until: Annotated[int, Field(gt=0, le=10**6)]
+    """Global step at which the photographs have their full size, at the latest; up to a million."""
+    largest: Annotated[float, Field(ge=1)] = 8
+    """Largest divisor."""
+    every: EverySteps = 100
+    """Steps from one change to the next, as those between edits, which need not be whole; the size stays as it is up to
+    `start`."""
+    start: Annotated[int, Field(ge=0)] = 500
+    """Global step after which it changes."""
+
+    @property
+    def changes(self) -> list[int]:
+        """The steps before those at which the size may change; at the last one it is the full size."""
+        first, last = acts(self.every, self.start) + 1, acts(self.every, self.until - 1) + 1
+        return [place(self.every, number) for number in range(first, last + 1)]
+
+    def of(self, photographs: Iterable[NDArray[np.uint8]]) -> Points:
+        """Return the divisors of training photographs, each [height, width, 3], by step."""
+        steps, divisors = knots([Spectrum.of(image) for image in photographs], self.until, self.largest)
+
+        def at(places: Floats) -> Floats:
+            """Linear in the number of pixels."""
+            pixels = np.interp(places, steps, divisors**-2.0)
+            return np.where(places < self.until, np.floor(pixels**-0.5 + 1e-9), 1.0)
+
+        tried = np.array([1.0, *self.changes])
+        sizes = at(tried)
+        differs = np.flatnonzero(np.diff(sizes)) + 1
+        points = [[0.0, float(sizes[0])], *([float(tried[i]) + 1, float(sizes[i])] for i in differs)]
+        return Points(points=points, between="steps")
+
+
+def course(sizes: Points) -> str:
+    """Say in words at which sizes photographs are trained on."""
+    (_, first), *rest = sizes.points
+    if not rest and first == 1:
+        return "photographs are trained on in full size: smaller ones would show too little of their detail"
+    later = [f"{share(divisor)} from step {step:.0f}" for step, divisor in rest]
+    return f"photographs are trained on at {', '.join([f'{share(first)} of their size', *later])}"
+
+
+def share(divisor: float) -> str:
+    """A share of the size in words."""
+    return "full size" if divisor == 1 else f"1/{divisor:g}"

@@ -1,0 +1,257 @@
+"""Photographs on the device, 8 bits a channel, and the float planes that losses compare with."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError
+from clsplat.opencl.device import Array, Device
+from clsplat.photos.transforms import PhotographTransform, Planes
+from clsplat.render.camera import DeviceCamera, placed_camera, upload_camera
+from clsplat.render.workspace import Workspace
+from clsplat.scene.photographs import load_photograph
+from clsplat.scene.scene import Background
+from clsplat.scene.view import View, load_transparency
+
+Mask = NDArray[np.bool_]
+BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+BUDGET_SHARE = 0.25  # of the device's memory, when no budget is given
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One photograph on the device, and its camera."""
+
+    camera: DeviceCamera
+    colours: Array  # [3, height, width] uint8
+    mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None: all count
+    empty: bool = False  # whether the mask leaves out every pixel
+    transparency: Array | None = None  # [1, height, width] uint8, 255: the background alone; None: opaque, or not kept
+
+    @property
+    def nbytes(self) -> int:
+        return sum(array.nbytes for array in (self.colours, self.mask, self.transparency) if array)
+
+    def image(self) -> NDArray[np.uint8]:
+        """Return the colours on the host, [height, width, 3]."""
+        return np.asarray(self.colours.get().transpose(1, 2, 0))
+
+    def counted(self) -> Mask | None:
+        """Return which pixels count, [height, width], or None when all do."""
+        return np.asarray(self.mask.get()[0] > 0) if self.mask else None
+
+    def planes(
+        self,
+        workspace: Workspace,
+        transforms: Sequence[PhotographTransform] = (),
+        step: int = 0,
+        numbers: Mapping[str, float] | None = None,
+        backgrounds: tuple[Array, Array] | None = None,
+    ) -> Planes:
+        """Return the photograph as float planes of whole tiles, after the transforms of a global step.
+
+        numbers: those of a transform that learns; without them it has its first ones.  backgrounds: that of the
+        photographs, and what is behind transparent pixels in its place; each [3] in [0, 1].
+        """
+        colours = unpack(workspace, self.camera, self.colours, 1 / 255, "photograph")
+        if backgrounds and self.transparency:
+            change_background(workspace, self.camera, colours, self.transparency, *backgrounds)
+        mask = unpack(workspace, self.camera, self.mask, 1.0, "mask") if self.mask else None
+        planes = Planes(workspace, self.camera, colours, mask, numbers or {})
+        for transform in transforms:
+            planes = transform.apply(planes, step)
+        return planes
+
+
+class Pixels(NamedTuple):
+    """A photograph on the host: [height, width] uint8 of each channel."""
+
+    colours: NDArray[np.uint8]  # [3, height, width]
+    mask: NDArray[np.uint8]  # [0 or 1, height, width]
+    transparency: NDArray[np.uint8] | None
+
+
+Key = tuple[str, int, int]  # name, width and height of a view
+
+
+def _key(view: View) -> Key:
+    return view.name, view.camera.width, view.camera.height
+
+
+class Photographs:
+    """The photographs of a scene by view, up to `budget` bytes of them on the device; others are read again.
+
+    A thread reads views that are announced; the result is the same as without.
+    """
+
+    def __init__(
+        self, device: Device, background: Background, budget: int | None = None, undistorted: Path | None = None
+    ) -> None:
+        self.device = device
+        self.undistorted = undistorted  # folder that keeps undistorted photographs
+        self.background_name = background
+        self.background = device.upload(np.array(BACKGROUNDS[background], np.float32))  # [3]
+        self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
+        self._held: dict[Key, Photograph] = {}  # least recently used first
+        self._reading: dict[Key, Future[Pixels]] = {}
+        self._reader: ThreadPoolExecutor | None = None
+        self._transparency = False
+
+    def keep_transparency(self) -> None:
+        """Keep the transparency of photographs too, for drawn backgrounds."""
+        if not self._transparency:
+            self._transparency = True
+            self._held.clear()
+            self._reading.clear()
+
+    def fresh(self) -> "Photographs":
+        """Return an empty copy, for views that are used once."""
+        return Photographs(self.device, self.background_name, undistorted=self.undistorted)
+
+    def camera(self, view: View) -> DeviceCamera:
+        """Return the camera of a view."""
+        held = self._held.get(_key(view))
+        return placed_camera(held.camera, view) if held else upload_camera(self.device, view)
+
+    def get(self, view: View) -> Photograph:
+        """Return the photograph of a view, with the camera that the view has now.
+
+        Raises DataError when its file cannot be read.
+        """
+        key = _key(view)
+        photograph = self._held.pop(key, None)
+        if photograph is None:
+            reading = self._reading.pop(key, None)
+            colours, mask, shows = reading.result() if reading else self._read(view)
+            self._make_room(colours.nbytes + mask.nbytes + (0 if shows is None else shows.nbytes))
+            mask_on_device, empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
+            transparency = None if shows is None else self.device.upload(shows)
+            photograph = Photograph(self.camera(view), self.device.upload(colours), mask_on_device, empty, transparency)
+        elif (camera := placed_camera(photograph.camera, view)) is not photograph.camera:
+            photograph = replace(photograph, camera=camera)
+        self._held[key] = photograph
+        return photograph
+
+    def of_sizes(self, view: View, original: View, number: int | None = None) -> Photograph:
+        """Return the photograph of a view, or of the larger `original` where a mask leaves nothing of the smaller one.
+
+        number: of the view, see DeviceCamera.  Raises DataError when the mask leaves out every pixel at that size too.
+        """
+        photograph = self.get(view)
+        if photograph.empty and view is not original:
+            photograph = self.get(original)
+        if photograph.empty:
+            raise DataError(
+                f"{original.mask_path or original.image_path}: the mask leaves out every pixel of '{original.name}'; "
+                "expected some that count: remove the photograph from the dataset, or fix its mask"
+            )
+        return replace(photograph, camera=replace(photograph.camera, view=number))
+
+    def announce(self, views: Iterable[View]) -> None:
+        """Start to read the photographs of views that are used next, unless they are on the device."""
+        for view in views:
+            key = _key(view)
+            if key not in self._held and key not in self._reading:
+                self._reader = self._reader or ThreadPoolExecutor(1, "photographs")
+                self._reading[key] = self._reader.submit(self._read, view)
+
+    def _read(self, view: View) -> Pixels:
+        image = load_photograph(view, BACKGROUNDS[self.background_name], self.undistorted)
+        pixels = np.ascontiguousarray(image.transpose(2, 0, 1))
+        shows = load_transparency(view) if self._transparency else None
+        return Pixels(pixels[:3], pixels[3:], None if shows is None else shows[None])
+
+    def _make_room(self, size: int) -> None:
+        held = sum(photograph.nbytes for photograph in self._held.values())
+        while self._held and held + size > self.budget:
+            held -= self._held.pop(next(iter(self._held))).nbytes
+
+
+def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: float, name: str) -> Array:
+    """Return 8-bit pixels [C, height, width] times `factor` as float planes [C, rows, stride], zero outside."""
+    channels = pixels.shape[0]
+    planes = workspace.array(name, (channels, camera.rows, camera.stride))
+    lanes = int(workspace.device.tuning["LANES"])
+    workspace.device.program("loss.cl").unpack_pixels(
+        items=(-(-camera.stride // lanes), camera.rows, channels),
+        pixels=pixels,
+        planes=planes,
+        factor=factor,
+        width=camera.width,
+        height=camera.height,
+        stride=camera.stride,
+    )
+    return planes
+
+
+def change_background(
+    workspace: Workspace, camera: DeviceCamera, colours: Array, transparency: Array, background: Array, behind: Array
+) -> None:
+    """Put the colour `behind`, [3], in the place of the `background` of colours [3, rows, stride].
+
+    transparency: [1, height, width] uint8, 255 where the background alone is seen.
+    """
+    shown = unpack(workspace, camera, transparency, 1 / 255, "transparency")
+    pixels = camera.rows * camera.stride
+    workspace.device.program("loss.cl").change_background(
+        items=(pixels, 3), colours=colours, transparency=shown, background=background, behind=behind, pixels=pixels
+    )
+
+
+def apply_mask(workspace: Workspace, camera: DeviceCamera, planes: Array, mask: Array) -> None:
+    """Set `planes` [channels, rows, stride] to zero where the mask [1, rows, stride] is zero."""
+    assert planes.shape[1:] == mask.shape[1:] == (camera.rows, camera.stride)
+    pixels = camera.rows * camera.stride
+    workspace.device.program("loss.cl").apply_mask(
+        items=(pixels, planes.shape[0]), planes=planes, mask=mask, pixels=pixels
+    )
+
+
+# The texture of images: their gradient magnitude, |Sobel| / 8 of the luminance, per px.
+
+MAX_MAGNITUDE = 0.75  # per px: above the largest possible magnitude
+BINS = 3000
+
+
+def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, name: str = "texture") -> Array:
+    """Return the gradient magnitudes, [rows, stride] per px, of an image [3, rows, stride] in [0, 1]."""
+    magnitude = workspace.array(name, (camera.rows, camera.stride))
+    device = workspace.device
+    device.program("texture.cl").image_gradient(
+        items=(-(-camera.stride // int(device.tuning["LANES"])), camera.rows),
+        image=image,
+        magnitude=magnitude,
+        **camera.plane_arguments(),
+    )
+    return magnitude
+
+
+def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mask: Array | None) -> Array:
+    """Return gradient magnitudes, but -1 at pixels that the mask, [1, rows, stride], leaves out, and beside them."""
+    magnitude = image_gradient(workspace, camera, image)
+    if mask is not None:
+        workspace.device.program("texture.cl").hide_masked(
+            items=(camera.width, camera.height),
+            mask=mask,
+            magnitude=magnitude,
+            width=camera.width,
+            height=camera.height,
+            stride=camera.stride,
+        )
+    return magnitude
+
+
+def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], share: float) -> float:
+    """Return the magnitude, per px, to 1 / 4000, that `share` of all pixels that count stay below."""
+    counts = np.zeros(BINS, np.int64)
+    for photograph in photographs:
+        camera, planes = photograph.camera, photograph.planes(workspace)
+        inside = known_gradient(workspace, camera, planes.colours, planes.mask).get()[: camera.height, : camera.width]
+        counts += np.histogram(inside, BINS, (0, MAX_MAGNITUDE))[0]  # without values below 0
+    below = np.searchsorted(np.cumsum(counts), share * counts.sum())
+    return float(below + 1) * MAX_MAGNITUDE / BINS

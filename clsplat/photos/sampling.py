@@ -1,0 +1,165 @@
+"""The sample of a training step: a view, at a size, with transforms of its photograph."""
+
+import logging
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import AtLeastOne, Points, at_step, explained
+from clsplat.core.settings import OneOf, Settings
+from clsplat.photos.detail import DetailDivisor, course
+from clsplat.photos.transforms import PhotographTransform, learned_of
+from clsplat.scene.view import View
+
+# The view of each training step: it depends on the seed and the step alone, so a resumed run uses the same views.
+
+FINEST_SHARE = 0.3  # of the steps, which use a random view of the finest size (released code of Mip-Splatting)
+
+
+class ViewPool:
+    """The training views, which may come at several sizes, and permutations of them."""
+
+    def __init__(self, views: Sequence[View], seed: int) -> None:
+        finest = min(view.downscale for view in views)
+        self.views, self.seed = views, seed
+        self.finest = [i for i, view in enumerate(views) if view.downscale == finest]  # indices into `views`
+        self._epoch, self._permutation = (-1, -1), np.empty(0, np.int64)
+
+    def shuffled(self, entries: Sequence[int], step: int) -> View:
+        """Return the view of a step; each pass uses all `entries`, indices into `views`, in a new order."""
+        epoch, place = divmod(step - 1, len(entries))
+        return self.views[entries[int(self._shuffle(epoch, len(entries))[place])]]
+
+    def random(self, step: int) -> np.random.Generator:
+        """Return random numbers that depend on the seed and the step alone."""
+        return np.random.default_rng([self.seed, step, len(self.views)])
+
+    def _shuffle(self, epoch: int, count: int) -> NDArray[Any]:
+        if self._epoch != (epoch, count):
+            self._epoch = epoch, count
+            self._permutation = np.random.default_rng([self.seed, epoch]).permutation(count)
+        return self._permutation
+
+
+class Order(Settings):
+    """Which view a step trains on."""
+
+    @abstractmethod
+    def at(self, pool: ViewPool, step: int) -> View:
+        """Return the view of a step, counted from 1; it may depend on the pool, its seed and the step only."""
+
+
+class Uniform(Order):
+    """All views of every size, in a new random order in each pass."""
+
+    type: Literal["uniform"] = "uniform"
+
+    def at(self, pool: ViewPool, step: int) -> View:
+        return pool.shuffled(range(len(pool.views)), step)
+
+
+class Paper(Order):
+    """Views of the finest size twice as often as the others: 40, 20, 20, 20 % for four sizes (Barron et al. 2021, whose
+    protocol Mip-Splatting follows)."""
+
+    type: Literal["paper"] = "paper"
+
+    def at(self, pool: ViewPool, step: int) -> View:
+        return pool.shuffled([*range(len(pool.views)), *pool.finest], step)
+
+
+class Code(Order):
+    """A random view of the finest size in the place of 30 % of the steps: 47.5, 17.5, 17.5, 17.5 % for four sizes (the
+    released code of Mip-Splatting)."""
+
+    type: Literal["code"] = "code"
+
+    def at(self, pool: ViewPool, step: int) -> View:
+        rng = pool.random(step)
+        if rng.random() < FINEST_SHARE:
+            return pool.views[pool.finest[int(rng.integers(len(pool.finest)))]]
+        return pool.shuffled(range(len(pool.views)), step)
+
+
+LOG = logging.getLogger("clsplat")
+
+
+class ViewSettings(Settings):
+    """The sample of each step: a view, its size and transforms of its photograph."""
+
+    order: OneOf[Order] = Uniform()
+    """Which view a step trains on."""
+    resolution: Annotated[DetailDivisor | AtLeastOne, explained(", or {follows: detail, until, …}")] = 1.0
+    """Divisor of the photographs' size beside `scene.downscale`, at least 1: by step, or from their detail."""
+    transforms: list[OneOf[PhotographTransform]] = Field(default=[])
+    """Transforms of the photograph, in order; one that learns stands last."""
+
+    @field_validator("transforms")
+    @classmethod
+    def _learning_at_the_end(cls, transforms: list[PhotographTransform]) -> list[PhotographTransform]:
+        learned_of(transforms)
+        return transforms
+
+    def settled(self, photographs: Callable[[], Iterable[NDArray[np.uint8]]]) -> "ViewSettings":
+        """Return settings in which what follows from the training photographs, each [height, width, 3], is a number by
+        step."""
+        if not isinstance(self.resolution, DetailDivisor):
+            return self
+        found = self.resolution.of(photographs())
+        LOG.info(course(found))
+        return self.model_copy(update={"resolution": found})
+
+    def divisor(self, step: int) -> float:
+        """Return the divisor of the photographs' size at a global step.  Raises ConfigError before it is settled."""
+        if isinstance(self.resolution, DetailDivisor):
+            raise ConfigError("a resolution that follows detail needs photographs: expected what `settled` returns")
+        return at_step(self.resolution, step)
+
+    @property
+    def changes(self) -> list[float]:
+        """The global steps between which the size stays, or changes evenly; none where it does not change."""
+        resolution = self.resolution
+        if isinstance(resolution, DetailDivisor):
+            return [float(step) for step in resolution.changes]
+        points = resolution.points if isinstance(resolution, Points) else resolution
+        return [step for step, _ in points] if isinstance(points, list) else []
+
+    @property
+    def last_change(self) -> float:
+        """The global step of the last change of the size, at the latest; 0 where it does not change."""
+        return self.resolution.until if isinstance(self.resolution, DetailDivisor) else max([0.0, *self.changes])
+
+    def full_size(self, last: int) -> int:
+        """Return the first step up to `last` whose photographs are larger than 1/2 of their size."""
+        return next((step for step in range(1, last + 1) if self.divisor(step) < 2), last)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The sample of one step."""
+
+    view: View  # at the size of the step
+    original: View  # at the size that is trained on
+    number: int  # of it among the training views
+    transforms: Sequence[PhotographTransform]
+    step: int  # global
+
+
+class Sampler:
+    """Samples by step: they depend on the views, the seed and the step."""
+
+    def __init__(self, views: Sequence[View], settings: ViewSettings, seed: int) -> None:
+        self.settings, self._pool = settings, ViewPool(views, seed)
+        self._numbers = {id(view): number for number, view in enumerate(views)}
+
+    def at(self, step: int) -> Sample:
+        """Return the sample of a global step, counted from 1."""
+        view, divisor = self.settings.order.at(self._pool, step), self.settings.divisor(step)
+        small = view.resized(view.downscale * divisor)
+        return Sample(small, view, self._numbers[id(view)], self.settings.transforms, step)

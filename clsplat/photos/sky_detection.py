@@ -1,0 +1,154 @@
+"""Where photographs show the sky: bright or blue, even, far from all points, joined to the upper edge, and above the
+horizon (ours)."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians.sky import corners, neighbours, places, weights
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import View
+from clsplat.scene.viewpoint import upward
+
+SIDE = 160  # px of the longer side, at which photographs are looked at
+APART = 4  # px there, from the nearest point: 20 px of a photograph of 800
+BRIGHT = 0.6  # of the mean of the channels
+BLUE = 0.03  # by how much blue is above red
+DARKEST_BLUE = 0.3
+EVEN = 0.04  # standard deviation of the brightness in a square of 3 px
+UPPER = 1 / 3
+COUNTED = 1 / 3  # of the pixels of that third, at least, are what a share is of: masks may leave few
+SKYWARD = 0.75  # of such pixels are above the horizon: with fewer, they are a wall, or what an object lies on
+BEYOND = 2  # texels about those that photographs show as sky: its edge was left out, with what is near points
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one photograph shows of the sky."""
+
+    view: View
+    image: Image  # small, [height, width, 3]
+    mask: Mask  # pixels that show the sky, [height, width]
+    counted: Mask  # pixels that masks do not leave out, [height, width]
+    up: NDArray[np.float64]  # in the scene, [3]
+
+    @property
+    def share(self) -> float:
+        """The share of what counts of its upper third that shows the sky; 0 where that goes on below the horizon, as a
+        wall does."""
+        if not self.mask.any() or (self.directions[self.mask] @ self.up > 0).mean() < SKYWARD:
+            return 0.0
+        rows = slice(max(1, round(len(self.mask) * UPPER)))
+        return float(self.mask[rows].sum() / max(self.counted[rows].sum(), COUNTED * self.counted[rows].size))
+
+    @property
+    def upper(self) -> Image:
+        """The pixels of its upper third that count, [K, 3]."""
+        rows = slice(max(1, len(self.image) // 3))
+        return np.asarray(self.image[rows][self.counted[rows]])
+
+    @property
+    def directions(self) -> NDArray[np.float64]:
+        """Directions through its pixels in the scene, [height, width, 3], of any length."""
+        height, width = self.mask.shape
+        camera, turn = self.view.camera, self.view.world_to_camera[:, :3].astype(np.float64)
+        x = ((np.arange(width) + 0.5) * camera.width / width - camera.cx) / camera.fx
+        y = ((np.arange(height) + 0.5) * camera.height / height - camera.cy) / camera.fy
+        return np.asarray(x[None, :, None] * turn[0] + (y[:, None, None] * turn[1] + turn[2]))
+
+
+def looked_at(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -> Iterator[Seen]:
+    """Yield what photographs, [height, width, 3], show of the sky in pixels that count, [height, width]; None: all."""
+    up = upward(scene.split("train"))
+    for view, image, counted in views:
+        small = _small(image)
+        counts = np.ones(small.shape[:2], bool) if counted is None else _small(255 * counted.astype(np.uint8)) == 255
+        mask = sky_mask(small, _points_in(scene, view) * (small.shape[1] / view.camera.width), counts)
+        yield Seen(view, small, mask, counts, up)
+
+
+def panorama(seen: Sequence[Seen], side: int) -> tuple[NDArray[np.float32], Mask] | None:
+    """Return the first colours of a map of directions, [side * side, 3], and its texels that are sky, [side * side].
+
+    A texel is sky where a photograph shows it so, or one near it, or where none shows it at all.  It has the mean
+    colour of its pixels; the others have that of all pixels of sky.  None where no photograph shows any.
+    """
+    colours, of_sky, of_all = np.zeros((side**2, 3)), np.zeros(side**2), np.zeros(side**2)
+    for one in seen:
+        place = places(one.directions, side)
+        first = np.floor(place).astype(np.int64)
+        texels, weight = corners(first[..., 0], first[..., 1], side), weights(place - first)
+        of_all += np.bincount(texels[one.counted].ravel(), weight[one.counted].ravel(), side**2)
+        texels, weight = texels[one.mask], weight[one.mask]
+        of_sky += np.bincount(texels.ravel(), weight.ravel(), side**2)
+        values = one.image[one.mask].astype(np.float64) / 255
+        for channel in range(3):
+            shares = weight * values[:, channel, None]
+            colours[:, channel] += np.bincount(texels.ravel(), shares.ravel(), side**2)
+    if not of_sky.any():
+        return None
+    free = of_sky > 0
+    for _ in range(BEYOND):
+        free = np.asarray(free[neighbours(side)].any(axis=1))
+    mean = colours.sum(axis=0) / of_sky.sum()
+    found = np.where(of_sky[:, None] > 0, colours / np.maximum(of_sky, 1e-9)[:, None], mean)
+    return found.astype(np.float32), free | (of_all == 0)
+
+
+def sky_mask(image: Image, points: NDArray[np.floating], counted: Mask) -> Mask:
+    """Return which pixels of a small photograph show the sky, [height, width], of those that count.
+
+    points: [K, 2] px.  Below pixels that do not count, from the upper edge on, the sky begins where they end.
+    """
+    values = image.astype(np.float32) / 255
+    brightness = values.mean(axis=2)
+    mean = _blurred(brightness, counted)
+    spread = np.sqrt(np.maximum(_blurred(brightness**2, counted) - mean**2, 0))
+    blue = (values[..., 2] > values[..., 0] + BLUE) & (values[..., 2] > DARKEST_BLUE)
+    found = ((brightness > BRIGHT) | blue) & (spread < EVEN) & _apart(points, brightness.shape)
+    joined = (found & counted) | np.logical_and.accumulate(~counted, axis=0)
+    _, parts = cv2.connectedComponents(joined.astype(np.uint8), connectivity=4)
+    return np.asarray(found & counted & np.isin(parts, parts[0][joined[0]]))
+
+
+def _blurred(values: NDArray[np.float32], counted: Mask) -> NDArray[np.float32]:
+    """The means in squares of 3 px, of pixels that count."""
+    if counted.all():
+        return np.asarray(cv2.blur(values, (3, 3)))
+    shares = cv2.blur(counted.astype(np.float32), (3, 3))
+    return np.asarray(cv2.blur(values * counted, (3, 3)) / np.maximum(shares, 0.1), np.float32)
+
+
+def _apart(points: NDArray[np.floating], shape: tuple[int, ...]) -> Mask:
+    """Which pixels are far from all points."""
+    free = np.ones(shape, np.uint8)
+    column, row = np.floor(points).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])
+    free[row[inside], column[inside]] = 0
+    return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > APART)
+
+
+def _points_in(scene: Scene, view: View) -> NDArray[np.float64]:
+    """Where the dataset's points lie in a photograph, [K, 2] px: those that it shows, where that is known."""
+    if scene.tracks is not None and view.name in scene.tracks.seen:
+        positions = scene.tracks.positions[scene.tracks.seen[view.name]]
+    else:
+        positions = scene.points.positions if scene.points is not None else np.zeros((0, 3))
+    camera, pose = view.camera, view.world_to_camera.astype(np.float64)
+    x, y, z = pose[:, :3] @ positions.astype(np.float64).T + pose[:, 3:]
+    ahead = z > 0
+    found = camera.fx * x[ahead] / z[ahead] + camera.cx, camera.fy * y[ahead] / z[ahead] + camera.cy
+    return np.stack(found, axis=1)
+
+
+def _small(image: Image) -> Image:
+    factor = SIDE / max(image.shape[:2])
+    if factor >= 1:
+        return image
+    size = max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

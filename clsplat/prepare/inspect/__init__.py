@@ -1,0 +1,1 @@
+"""The inspection of a dataset: facts, findings with remedies, and their page."""

@@ -1,0 +1,460 @@
+"""The facts about a dataset that decide whether, and how well, it trains."""
+
+import logging
+import os
+from collections import Counter, defaultdict
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice, pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError
+from clsplat.core.progress import counted, kept, only
+from clsplat.prepare.gather import list_photographs, why_unreadable
+from clsplat.scene.camera import BORDER_POINTS, Lens
+from clsplat.scene.detect import read_scene, reader_of
+from clsplat.scene.identity import ImageFile, decode_all
+from clsplat.scene.images import CameraExposure, exposure_of, is_image, read_grey
+from clsplat.scene.points import MAX_VALUE
+from clsplat.scene.quality import SIDE, both_sharpnesses, is_blurred, reprojection_errors, require_ahead
+from clsplat.scene.reader import Parts
+from clsplat.scene.scene import camera_extent, strayed
+from clsplat.scene.times import by_camera, moments_of
+from clsplat.scene.view import NO_FILE, View, camera_exposures, fits
+
+# Edges of photographs that repeat the pixels beside them: what an undistortion fills.
+
+EDGES = ("left", "top", "right", "bottom")  # as np.rot90 turns them to the left
+EXAMPLES = 3  # photographs: all of a dataset are filled alike
+WIDEST = 32  # px
+REPEATED, DIFFERENT = 0.5, 2.0  # mean grey levels between neighbouring lines: without loss, and of a sharp photograph
+VARIED = 8.0  # grey levels: the standard deviation along a line that is more than plain
+FULL = 1 << 30  # px: no photograph is longer
+
+
+def padding(files: Iterable[Path]) -> dict[str, int]:
+    """Return how many px of an edge repeat the line beside them in each of the first photographs, by edge.
+
+    It is WIDEST at most.  Lines of one colour say nothing, nor do photographs that are alike or enlarged everywhere.
+    JPEG hides it.
+    """
+    found: list[list[int]] = []
+    with suppress(DataError):  # what cannot be read is another finding
+        found = [filled(read_grey(file, FULL)[0]) for file in islice(files, EXAMPLES)]
+    least = np.min(found, axis=0).tolist() if found else []
+    return {edge: px for edge, px in zip(EDGES, least, strict=False) if px}
+
+
+def filled(grey: NDArray[np.uint8]) -> list[int]:
+    """Return how many px of each edge of a photograph [H, W] repeat the line beside them, in the order of EDGES."""
+    return [_repeats(np.rot90(grey, turns)[:, : WIDEST + 3].astype(np.float32)) for turns in range(len(EDGES))]
+
+
+def _repeats(lines: NDArray[np.float32]) -> int:
+    """How many columns at the left repeat the next one."""
+    changes = np.abs(np.diff(lines, axis=1)).mean(axis=0)
+    count = int(np.argmax(np.append(changes, np.inf) >= REPEATED))
+    beyond = changes[count : count + 2]  # where a photograph is enlarged, lines repeat here too
+    ends = len(beyond) == 2 and beyond[0] >= DIFFERENT and beyond[1] >= REPEATED
+    return count if ends and lines[:, 0].std() > VARIED else 0
+
+
+# What photographs look like beside each other: blurred ones, the same one twice, exposures that jump, filled edges.
+
+THUMBNAIL = 32  # px, of each side
+SAME = 1.0  # grey levels between thumbnails: frames of a video are 9 apart, two codings of one photograph 0.3
+JUMP = 1.0  # stops from one photograph to the next
+STEP = 2.0  # brightness of a photograph by that of the one before: at most 1.4 in five captures with one exposure
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is measured of one photograph."""
+
+    sharpness: NDArray[np.float64]  # both
+    brightness: NDArray[np.float64]  # mean and median, grey levels
+    thumbnail: NDArray[np.float32]  # [THUMBNAIL²], grey levels
+
+
+@dataclass(frozen=True)
+class LookFacts:
+    """Names of photographs that stand out."""
+
+    blurred: list[str]  # much less sharp than the others
+    same: list[list[str]]  # photographs that look the same
+    jumps: list[tuple[str, str, float]]  # one and the next, and the stops between their exposures as EXIF tells them
+    steps: list[tuple[str, str, float]]  # one, the next, and its brightness by that of the first; where EXIF is silent
+    unreadable: dict[str, str]  # the reason why they cannot be decoded
+    padded: dict[str, int]  # px of an edge that repeat the line beside them, in the first photographs
+
+
+def looks_of(parts: Parts, missing: Container[Path]) -> LookFacts:
+    """Compare the photographs of the views of a dataset, or where it has no views, all of its folder."""
+    shown = [view for view in parts.views if view.image_path != NO_FILE and view.image_path not in missing]
+    if not shown:
+        return looks({os.path.relpath(file, parts.path).replace(os.sep, "/"): file for file in parts.on_disk})
+    exposures: list[CameraExposure | None] = [None] * len(shown)
+    with suppress(DataError):
+        exposures = camera_exposures(shown)
+    files = {view.name: view.image_path for view in shown}
+    return looks(files, {view.name: one for view, one in zip(shown, exposures, strict=True)})
+
+
+def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | None] | None = None) -> LookFacts:
+    """Compare photographs, by name; those that cannot be read are left out.  Without `exposures`, EXIF tells them."""
+    names = sorted(files)
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8), "looking") as pool:
+        read = counted(pool.map(_look, (files[name] for name in names)), "photographs looked at", len(names))
+        looked = dict(zip(names, read, strict=True))
+    found = {name: look for name, look in looked.items() if not isinstance(look, DataError)}
+    if exposures is None:
+        exposures = {name: exposure_of(files[name]) for name in found}
+    values = [(name, exposure.value) for name in names if (exposure := exposures.get(name))]
+    steps = [(a, b, round(abs(y - x), 2)) for (a, x), (b, y) in pairwise(values)]
+    middle = np.median([look.sharpness for look in found.values()], axis=0) if found else np.zeros(2)
+    return LookFacts(
+        blurred=[name for name, look in found.items() if is_blurred(look.sharpness, middle)],
+        same=_same(list(found), [look.thumbnail for look in found.values()]),
+        jumps=[step for step in steps if step[2] > JUMP],
+        steps=_steps({name: look.brightness for name, look in found.items()}, {name for name, _ in values}),
+        unreadable={
+            name: why_unreadable(files[name], error) for name, error in looked.items() if isinstance(error, DataError)
+        },
+        padded=padding(files[name] for name in found),
+    )
+
+
+def _look(file: Path) -> Look | DataError:
+    """Measure a photograph; or return why it cannot be read."""
+    try:
+        grey = read_grey(file, SIDE)[0]
+    except DataError as error:
+        return error
+    small = cv2.resize(grey, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
+    brightness = np.maximum([grey.mean(), np.median(grey)], 1.0)
+    return Look(both_sharpnesses(grey), brightness, small.astype(np.float32).ravel())
+
+
+def _steps(brightness: Mapping[str, NDArray[np.float64]], told: Container[str]) -> list[tuple[str, str, float]]:
+    """Neighbours of which mean and median both differ by more than STEP times: one of them follows what is shown.
+
+    told: photographs whose exposures are known; two of them make no step.
+    """
+    found = []
+    for (a, x), (b, y) in pairwise(brightness.items()):
+        ratios = y / x
+        if a in told and b in told:
+            continue
+        if min(ratios) > STEP or max(ratios) < 1 / STEP:
+            found.append((a, b, round(float(ratios[0]), 2)))
+    return found
+
+
+def _same(names: Sequence[str], thumbnails: Sequence[NDArray[np.float32]]) -> list[list[str]]:
+    """Groups of photographs whose thumbnails are the same; plain ones say nothing."""
+    groups: list[list[int]] = []
+    for i, one in enumerate(thumbnails):
+        if one.std() <= SAME:
+            continue
+        firsts = np.array([thumbnails[group[0]] for group in groups]).reshape(len(groups), len(one))
+        near = np.flatnonzero(((firsts - one) ** 2).mean(axis=1) < SAME**2)
+        groups[near[0]].append(i) if len(near) else groups.append([i])
+    return [[names[i] for i in group] for group in groups if len(group) > 1]
+
+
+# The facts about the sparse points of a dataset.
+
+SAMPLE_SIZE = 20_000  # points that coverage is measured on
+MAX_DISTANCE = 100.0  # camera extents from the middle of the cameras: photographs resolve nothing beyond
+
+
+@dataclass(frozen=True)
+class PointFacts:
+    """The sparse points.  Shares are of a sample of SAMPLE_SIZE points, evenly spaced in the file."""
+
+    count: int
+    not_finite: int
+    distant: int  # beyond MAX_DISTANCE camera extents
+    error_mean: float | None  # px
+    error_90: float | None  # px; 90 % of the points have less
+    in_two: float | None  # share that lies in the image of at least two views, hidden or not
+    behind: float | None  # share that lies behind all cameras
+
+
+def points_of(parts: Parts, extent: float | None, centres: NDArray[np.floating]) -> PointFacts:
+    """Measure the points of a dataset that has some.  extent: of its cameras; centres: of these, [N, 3]."""
+    assert parts.points is not None
+    positions = parts.points.positions
+    finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
+    known = _errors(parts, np.asarray(finite))
+    good = positions[finite].astype(np.float64)
+    distance = np.linalg.norm(good - np.median(centres, axis=0), axis=1) if len(centres) else np.empty(0)
+    sample = good[:: max(1, -(-len(good) // SAMPLE_SIZE))]
+    in_two, behind = _coverage(sample, parts.views) if len(sample) and parts.views else (None, None)
+    return PointFacts(
+        count=len(positions),
+        not_finite=int(np.count_nonzero(~finite)),
+        distant=int(np.count_nonzero(distance > MAX_DISTANCE * extent)) if extent else 0,
+        error_mean=float(known.mean()) if len(known) else None,
+        error_90=float(np.quantile(known, 0.9)) if len(known) else None,
+        in_two=in_two,
+        behind=behind,
+    )
+
+
+def _errors(parts: Parts, finite: NDArray[np.bool_]) -> NDArray[np.floating]:
+    """Reprojection errors of points, px at the full size: by where photographs show them, else as the file has them."""
+    found = reprojection_errors(parts.scene.tracks, parts.scene.views) if parts.scene else None
+    if found is not None:
+        return found
+    assert parts.points is not None
+    error = parts.points.error[finite] if len(parts.points.error) else np.empty(0)
+    known = error[np.isfinite(error) & (error > 0)]
+    return known if len(np.unique(known)) > 1 else np.empty(0)  # a placeholder
+
+
+def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float, float]:
+    """Shares of points [M, 3] that project into at least two views, and that lie behind all of them."""
+    inside, ahead = np.zeros(len(points), int), np.zeros(len(points), bool)
+    for view in views:
+        camera = view.camera
+        x, y, z = view.world_to_camera[:, :3] @ points.T + view.world_to_camera[:, 3:]
+        front = z > 0
+        depth = np.where(front, z, 1)
+        u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+        inside += front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+        ahead |= front
+    return float((inside >= min(2, len(views))).mean()), float((~ahead).mean())
+
+
+MIN_SEEN = 30  # points; COLMAP itself registers no image with fewer inliers
+
+
+@dataclass(frozen=True)
+class CameraFacts:
+    """Views of the same size, lens and focal length."""
+
+    views: int
+    model: str
+    width: int
+    height: int
+    focal: tuple[float, float]  # px
+    distortion: float | None  # px: the largest displacement by the lens at the border; None where it overflows
+    kept: float  # share of the photograph that is left when it is undistorted
+    centred: bool  # whether the principal point lies in the photograph
+
+
+@dataclass(frozen=True)
+class PhotographFacts:
+    """The image files and masks of the views, by name."""
+
+    unreadable: dict[str, str]  # the reason why they cannot be decoded
+    cut: list[str]  # the end of the file is missing; they cannot be decoded either
+    misfits: dict[str, str]  # the sizes of file and camera
+    on_side: list[str]  # misfits whose width and height are swapped
+    exif_turned: list[str]  # read as stored although their Exif data have a rotation
+    larger: list[str]  # reduced to their cameras' size when they are read
+    masks: int
+
+
+@dataclass(frozen=True)
+class Facts:
+    """All measurements of a dataset; names are those of the views, paths are relative to the dataset."""
+
+    path: str
+    kind: str
+    registered: int
+    train: int | None  # None when the dataset cannot be read
+    test: int | None
+    on_disk: int
+    missing: list[str]
+    unregistered: list[str]
+    folders: int  # that the registered images lie in
+    submodels: dict[str, int]  # images of each COLMAP model; the first is used
+    cameras: list[CameraFacts]
+    photos: PhotographFacts
+    looks: LookFacts
+    points: PointFacts | None
+    seen: dict[str, int]  # points seen by each view; empty where the dataset has no such counts
+    extent: float | None  # scene units
+    strayed: list[str]
+    moments: int  # different times of the views; 0 where the scene does not move
+    stations: int  # different cameras that took the views, where the scene moves
+    one_place: bool  # all cameras have the same centre
+    same_pose: list[list[str]]
+    same_but_case: list[list[str]]
+    same_base: int  # names that several folders hold
+    left_out: list[str]  # sentences about files that `prepare` does not read as photographs
+    faults: list[str]  # why pieces of it cannot be read
+    refusal: str  # why training does not start
+
+    @property
+    def few_seen(self) -> list[str]:
+        """Views that see fewer than MIN_SEEN points."""
+        return sorted((name for name, count in self.seen.items() if count < MIN_SEEN), key=lambda name: self.seen[name])
+
+
+def survey(parts: Parts) -> Facts:
+    """Measure a dataset that was read in pieces."""
+    views, expected = parts.views, parts.expected
+    missing = [file for file in expected if not os.path.exists(file)]  # never raises
+    known = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
+    names = [view.name for view in views]
+    centres = np.stack([view.position for view in views]) if views else np.empty((0, 3))
+    extent = parts.scene.extent if parts.scene else camera_extent(views) if views else None
+    return Facts(
+        path=str(parts.path),
+        kind=parts.kind,
+        registered=len(expected),
+        train=len(parts.scene.train) if parts.scene else None,
+        test=len(parts.scene.test) if parts.scene else None,
+        on_disk=len(parts.on_disk),
+        missing=[_relative(file, parts) for file in missing],
+        unregistered=[_relative(file, parts) for file in parts.on_disk if file not in known],
+        folders=len({file.parent for file in expected}),
+        submodels=parts.submodels,
+        cameras=_cameras(parts),
+        photos=_photographs(views, set(missing)),
+        looks=looks_of(parts, set(missing)),
+        points=points_of(parts, extent, centres) if parts.points else None,
+        seen=parts.observed if any(parts.observed.values()) else {},
+        extent=extent,
+        strayed=[view.name for view, far in zip(views, strayed(views), strict=True) if far] if views else [],
+        moments=len(moments_of(views)),
+        stations=len(by_camera(views)) if moments_of(views) else 0,
+        one_place=len(views) > 1 and bool(np.allclose(centres, centres[0], rtol=0, atol=1e-9)),
+        same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
+        same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
+        same_base=sum(count > 1 for count in Counter(file.name for file in set(expected)).values()),
+        left_out=parts.left_out,
+        faults=parts.faults,
+        refusal=parts.refusal,
+    )
+
+
+def distortion(lens: Lens) -> float | None:
+    """Return the largest displacement by the lens along the border, in pixels; None where it overflows."""
+    camera, along = lens.camera, np.linspace(0, 1, BORDER_POINTS)
+    zeros, ones = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
+    x = np.concatenate([along, along, zeros, ones]) * lens.width
+    y = np.concatenate([zeros, ones, along, along]) * lens.height
+    with np.errstate(all="ignore"):
+        moved_x, moved_y = lens.distort((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+        moved = float(np.hypot(moved_x - x, moved_y - y).max())
+    return moved if np.isfinite(moved) else None
+
+
+def _relative(file: Path, parts: Parts) -> str:
+    return os.path.relpath(file, parts.path).replace(os.sep, "/")
+
+
+def _repeated(names: Sequence[str], keys: Iterable[object]) -> list[list[str]]:
+    """Names whose keys are equal, in groups of two and more."""
+    groups = defaultdict(list)
+    for name, key in zip(names, keys, strict=True):
+        groups[key].append(name)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def _cameras(parts: Parts) -> list[CameraFacts]:
+    grouped: dict[object, list[View]] = defaultdict(list)
+    for view in parts.views:
+        grouped[(view.lens or view.camera, parts.models.get(view.name))].append(view)
+    found = []
+    for views in grouped.values():
+        lens, camera = views[0].lens, views[0].camera
+        original = lens.camera if lens else camera
+        model = parts.models.get(views[0].name) or (lens.model if lens else "PINHOLE")
+        kept = camera.width * camera.height / (original.width * original.height)
+        centred = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
+        size, focal = (original.width, original.height), (original.fx, original.fy)
+        found.append(CameraFacts(len(views), model, *size, focal, distortion(lens) if lens else 0.0, kept, centred))
+    return sorted(found, key=lambda facts: -facts.views)
+
+
+def _photographs(views: Sequence[View], missing: set[Path]) -> PhotographFacts:
+    facts = PhotographFacts({}, [], {}, [], [], [], sum(view.mask_path is not None for view in views))
+    decoded = decode_all(view for view in views if view.image_path not in missing)
+    for view in views:
+        files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
+        files[f"static mask of {view.name}"] = view.static_path
+        for name, file in files.items():
+            if file in decoded:
+                _photograph(facts, view, name, file, decoded[file])
+    return facts
+
+
+def _photograph(facts: PhotographFacts, view: View, name: str, path: Path, file: ImageFile) -> None:
+    """Note what there is to say about a view's photograph or mask."""
+    camera = view.lens or view.camera
+    if file.cut:
+        facts.cut.append(name)
+    elif file.size is None:
+        facts.unreadable[name] = file.fault.removeprefix(f"{path}: ")
+    elif file.fault and not fits(view, file.size):
+        facts.misfits[name] = f"{file.size[0]}x{file.size[1]}, its camera {camera.width}x{camera.height}"
+        if fits(view, file.size[::-1]):
+            facts.on_side.append(name)
+    else:
+        turned = not fits(view, file.size)  # the reader rotates it
+        if file.orientation > 1 and not turned:
+            facts.exif_turned.append(name)
+        if (file.size[::-1] if turned else file.size) != (camera.width, camera.height):
+            facts.larger.append(name)
+
+
+# Read a dataset in pieces: a damaged piece becomes a fault, and the other pieces are read.
+
+LOG = logging.getLogger("clsplat")
+
+
+def read_parts(path: Path) -> Parts:
+    """Read a dataset as read_scene does, but every piece on its own.  Raises DataError when there is no such folder."""
+    parts = Parts(path)
+    with only(logging.ERROR):
+        try:
+            parts.scene = read_scene(path)
+            if parts.scene.points:
+                require_ahead(parts.scene.points, parts.scene)
+        except DataError as error:
+            if not path.is_dir():
+                raise
+            parts.refusal = str(error)
+        if reader := reader_of(path):
+            parts.kind = reader.name
+            reader.list_parts(parts)
+    if parts.kind == "none":
+        _list_photographs(parts)
+    elif parts.image_folder or not parts.expected:
+        folder = parts.image_folder or path / "images"
+        parts.on_disk = list(image_files(folder if folder.is_dir() else path, deep=True))
+    else:
+        folders = sorted({file.parent for file in parts.expected})
+        parts.on_disk = [file for folder in folders for file in image_files(folder, deep=False)]
+    if parts.scene:  # some views may be on no split's list
+        parts.views = list(parts.scene.views)
+    return parts
+
+
+def _list_photographs(parts: Parts) -> None:
+    """List the photographs of a folder without cameras, and what their preparation would say of them."""
+    parts.on_disk = list(image_files(parts.path, deep=True))
+    with kept(logging.WARNING) as parts.left_out:
+        try:
+            list_photographs(parts.path)
+        except DataError as error:
+            if parts.on_disk or parts.left_out:
+                parts.refusal = str(error)
+
+
+def image_files(folder: Path, deep: bool) -> Iterator[Path]:
+    """Yield the image files in a folder, and with `deep` those in all below it, by name."""
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(f for f in folders if not f.startswith(".")) if deep else []
+        yield from (Path(place) / n for n in sorted(names) if is_image(Path(n)) and not n.startswith("."))

@@ -1,0 +1,382 @@
+"""Findings: what the facts about a dataset mean for training, each with its remedy."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from clsplat.core.errors import amount, in_shell, shortened
+from clsplat.prepare.gather import MIN_PHOTOGRAPHS, left_out
+from clsplat.prepare.gather import remedy as remedy_of
+from clsplat.prepare.inspect.facts import MAX_DISTANCE, MIN_SEEN, CameraFacts, Facts, PointFacts, read_parts, survey
+from clsplat.scene.reader import Parts
+
+# What is wrong with a dataset, and its remedy.
+
+Level = Literal["error", "warning", "note"]
+LEVELS: tuple[Level, ...] = ("error", "warning", "note")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A fault of a dataset and its remedy.  With an error, training does not start."""
+
+    level: Level
+    fault: str
+    remedy: str = ""
+
+    @property
+    def text(self) -> str:
+        """Fault and remedy in one sentence."""
+        return f"{self.fault}: {self.remedy}" if self.remedy else self.fault
+
+
+# What a preparation would say of a folder of photographs without cameras.
+
+
+def unprepared(facts: Facts) -> Iterator[Finding]:
+    """Yield that there are no cameras, and how to find them; then the files that a preparation leaves out."""
+    count, damaged = facts.on_disk, facts.looks.unreadable
+    if facts.kind != "none" or not (count or facts.left_out):
+        return
+    held = f"{amount(count, 'photograph')} but" if count else "no photographs that can be read, and"
+    readable = count - len(damaged)
+    if count < MIN_PHOTOGRAPHS:  # told with the files that are left out
+        remedy, texts = facts.refusal.removeprefix(f"{facts.path}: "), []
+    else:
+        remedy, texts = f"`clsplat run photos --scene {in_shell(facts.path)}` finds the cameras", facts.left_out
+        if readable < MIN_PHOTOGRAPHS:
+            remedy = f"only {readable} of {count} photographs can be read; {remedy_of(damaged)}"
+    yield Finding("error", f"{facts.path} holds {held} no camera poses", remedy)
+    for text in texts + left_out({"damaged": damaged, "photographs": readable}):
+        yield Finding("warning", text.removeprefix(f"{facts.path}: "))
+
+
+MAX_NAMES = 4  # names in a finding
+MIN_VIEWS = 10  # for training
+MIN_POINTS = 100
+MAX_SHARE_LEFT_OUT = 0.1  # share of the photographs that a model may leave out without a warning
+MAX_ERROR = 2.0  # px of mean reprojection error; COLMAP drops observations above 4
+POSES_ERROR, POSES = 1.0, "optimize.poses={start: 500}"  # px from which pipelines/photos.yaml learns poses
+MAX_SHARE_BEHIND, MIN_SHARE_IN_TWO = 0.1, 0.5  # shares of points
+MIN_SHARE_KEPT = 0.6  # share of a photograph
+FOCAL_RANGE = (0.2, 20.0)  # focal length by image width: 136 to 3 degrees
+
+
+def findings(facts: Facts) -> list[Finding]:
+    """Return the findings about a dataset, errors first, then warnings and notes."""
+    parts = (unprepared, _unreadable, _photographs, _looks, _cameras, _poses, _points)
+    found = [finding for part in parts for finding in part(facts)]
+    if facts.refusal and not any(finding.level == "error" for finding in found):
+        found.append(Finding("error", facts.refusal))
+    return sorted(found, key=lambda finding: LEVELS.index(finding.level))
+
+
+def few_views(train: int) -> Iterator[Finding]:
+    """Yield a warning where a scene has few training views."""
+    if train < MIN_VIEWS:
+        fault = f"there {_are(train, 'training view', 'only ')}"
+        yield Finding("warning", fault, "expect floaters and blur far from the photographs; take 30 or more")
+
+
+def trainable(found: Sequence[Finding]) -> bool:
+    """Return whether no finding is an error."""
+    return all(finding.level != "error" for finding in found)
+
+
+def verdict(found: Sequence[Finding]) -> str:
+    """Return the findings in one sentence: the first error or warning, and the number of the others."""
+    errors, warnings = ([f.fault for f in found if f.level == level] for level in ("error", "warning"))
+    worst, start = (errors, "cannot train: ") if errors else (warnings, "trains, but ")
+    if not worst:
+        return "ready to train"
+    more = f" (and {amount(len(worst) - 1, 'more ' + ('error' if errors else 'warning'))})" if len(worst) > 1 else ""
+    return f"{start}{worst[0]}{more}"
+
+
+def _unreadable(facts: Facts) -> Iterator[Finding]:
+    yield from (Finding("error", fault) for fault in facts.faults[:MAX_NAMES])
+    if len(facts.faults) > MAX_NAMES:
+        more = f"{amount(len(facts.faults) - MAX_NAMES, 'more part')} of the dataset cannot be read"
+        yield Finding("error", more, "fix the first ones and inspect again")
+
+
+def _photographs(facts: Facts) -> Iterator[Finding]:
+    photographs, colmap = facts.photos, facts.kind == "COLMAP"
+    if facts.missing:
+        fault = f"{len(facts.missing)} of {facts.registered} registered images are missing on disk"
+        remedy = "put the files back, or do without: --set scene.missing=skip"
+        yield Finding("error", f"{fault} ({_listed(facts.missing)})", remedy)
+    if photographs.unreadable:
+        unreadable, reason = _listed(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
+        fault = f"{amount(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
+        yield Finding("error", fault, f"{reason.partition(';')[0]}; copy or export them again")
+    if photographs.cut:
+        fault = f"the end is missing from {amount(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
+        yield Finding("error", fault, "copy them again")
+    if photographs.misfits:
+        sizes = [f"{name} is {size}" for name, size in photographs.misfits.items()]
+        fault = f"{_are(len(sizes), 'image file')} not of the camera's size ({_listed(sizes, 2)})"
+        remedy = "use the images that the cameras were made from"
+        if len(photographs.on_side) == len(sizes):
+            remedy = "width and height are swapped: " + remedy
+        yield Finding("error", fault, remedy)
+    if facts.unregistered:
+        share = len(facts.unregistered) / facts.on_disk
+        fault = (
+            f"{len(facts.unregistered)} of {facts.on_disk} images on disk have no pose ({_listed(facts.unregistered)})"
+        )
+        serious = colmap and facts.registered and share > MAX_SHARE_LEFT_OUT
+        remedy = "they are not trained on" + (
+            "; more overlapping photographs or colmap exhaustive_matcher may place them" if colmap else ""
+        )
+        if facts.registered:
+            yield Finding("warning" if serious else "note", fault, remedy)
+    if photographs.exif_turned:
+        fault = f"{_are(len(photographs.exif_turned), 'photograph')} rotated by the EXIF data"
+        yield Finding(
+            "note", fault, "clsplat reads the pixels as stored, as COLMAP does, so renders may be rotated too"
+        )
+    if photographs.larger:
+        fault = f"{_are(len(photographs.larger), 'image file')} larger than the camera"
+        yield Finding("note", fault, "clsplat reduces them when it reads them; smaller copies load faster")
+    for names in facts.same_but_case[:MAX_NAMES]:
+        fault = f"{' and '.join(map(shortened, names))} differ only in upper and lower case"
+        yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
+    if colmap and facts.same_base:
+        fault = f"{_are(facts.same_base, 'file name')} in several folders"
+        yield Finding("note", fault, "views keep the folder in their names; a tool that drops it confuses the files")
+
+
+def _looks(facts: Facts) -> Iterator[Finding]:
+    blurred, jumps = facts.looks.blurred, facts.looks.jumps
+    if blurred:
+        fault = f"{_are(len(blurred), 'photograph')} blurred ({_listed(blurred)})"
+        yield Finding("warning", fault, "leave them out, or take them again: the model learns the blur")
+    for names in facts.looks.same[:MAX_NAMES]:
+        yield Finding("note", f"{_listed(names)} look the same", "one of them is enough")
+    if jumps:
+        named = _listed([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
+        fault = f"the exposure jumps by more than a stop {amount(len(jumps), 'time')} ({named})"
+        yield Finding("note", fault, "--set optimize.colours=gain gives each photograph its own")
+    if steps := facts.looks.steps:
+        named = _listed([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
+        fault = f"{_are(len(steps), 'photograph')} more than twice as bright or dark as the one before ({named})"
+        remedy = "EXIF does not tell both exposures; if these changed, --set optimize.colours=gain gives each its own"
+        yield Finding("note", fault, remedy)
+    if (padded := facts.looks.padded) and not facts.photos.masks:
+        where = ", ".join(f"{px} px {edge}" for edge, px in padded.items())
+        fault = f"photographs repeat the pixels at an edge ({where}), as an undistortion fills it"
+        yield Finding("note", fault, "no model shows them; leave them out by scene.masks, or expect less PSNR")
+
+
+def _cameras(facts: Facts) -> Iterator[Finding]:
+    sizes = {(camera.width, camera.height) for camera in facts.cameras}
+    if len(sizes) > 1:
+        remedy = "this is allowed; a larger view takes more time in a step"
+        yield Finding("note", f"the photographs have {len(sizes)} sizes", remedy)
+    for camera in facts.cameras:
+        name = f"the {_camera_name(camera)} of {amount(camera.views, 'view')}"
+        if not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
+            fault = f"{name} has a focal length of {camera.focal[0]:.4g} px, which is not plausible"
+            yield Finding("warning", fault, "calibrate it again, or find the poses with the right focal length")
+        if not camera.centred:
+            yield Finding("warning", f"{name} has its principal point outside the image", "calibrate it again")
+        if camera.kept < MIN_SHARE_KEPT:
+            fault = f"undistorting {name} keeps only {100 * camera.kept:.0f} % of each photograph"
+            yield Finding("warning", fault, "use a narrower lens, or crop and undistort the images yourself")
+
+
+def _poses(facts: Facts) -> Iterator[Finding]:
+    used, *others = facts.submodels or {"": 0}
+    if others:
+        parts = ", ".join(f"{name} with {facts.submodels[name]} images" for name in others)
+        large = any(facts.submodels[name] > MAX_SHARE_LEFT_OUT * facts.submodels[used] for name in others)
+        fault = f"COLMAP made {len(facts.submodels)} models and only {used} ({facts.submodels[used]} images) is used"
+        remedy = f"left out is {parts}; colmap model_merger may join them where they share images"
+        yield Finding("warning" if large else "note", fault, remedy)
+    if facts.train is not None:
+        yield from few_views(facts.train)
+    if facts.test == 0:
+        yield Finding("note", "there are no test views", "clsplat measures quality on training views only")
+    if facts.one_place:
+        fault = "all cameras are at the same place"
+        yield Finding("warning", fault, "they show no depth; take photographs from different places")
+    if facts.strayed:
+        fault = f"{_are(len(facts.strayed), 'camera')} far away from all others ({_listed(facts.strayed)})"
+        yield Finding(
+            "warning", fault, "the pose is probably wrong; remove the image from the dataset or place it again"
+        )
+    for names in facts.same_pose[:MAX_NAMES] if not facts.one_place else ():
+        fault = f"{_listed(names)} have exactly the same pose"
+        yield Finding("note", fault, "training counts copies of a photograph twice; keep one of them")
+    if facts.few_seen:
+        counted = [f"{name}: {facts.seen[name]}" for name in facts.few_seen]
+        fault = f"fewer than {MIN_SEEN} points are seen by {amount(len(counted), 'view')} ({_listed(counted)})"
+        yield Finding("warning", fault, "their poses are unreliable; look at their renders, or remove these images")
+
+
+def _points(facts: Facts) -> Iterator[Finding]:
+    points = facts.points
+    if points is None or points.count == 0:
+        if facts.registered and not any("points3d" in fault.lower() for fault in facts.faults):
+            remedy = "training starts from a plane sweep, or from random points where photographs are transparent"
+            yield Finding("note", "there are no points", remedy)
+        return
+    if points.count < MIN_POINTS:
+        fault = f"there {_are(points.count, 'point', 'only ')}"
+        yield Finding("warning", fault, "try init: {source: random} as well")
+    if points.not_finite:
+        fault = f"{_are(points.not_finite, 'point')} not finite"
+        yield Finding("warning", fault, "clsplat leaves them out; the file may be damaged: export it again")
+    if points.distant:
+        fault = f"{_are(points.distant, 'point')} more than {MAX_DISTANCE:g} times the cameras' extent away"
+        yield Finding("note", fault, "usually sky or wrong matches; they become very large Gaussians")
+    if not facts.refusal:
+        yield from _coverage(points)
+    if points.error_mean is not None and points.error_mean >= POSES_ERROR:
+        fault = f"the mean reprojection error of the points is {points.error_mean:.2f} px at the full size"
+        remedy = (
+            "renders will be blurred; run bundle adjustment (colmap bundle_adjuster), or learn the cameras too: "
+            f'--set "{POSES}", as `photos` does by itself from {POSES_ERROR:g} px on at the size of training'
+        )
+        yield Finding("warning" if points.error_mean > MAX_ERROR else "note", fault, remedy)
+
+
+def _coverage(points: PointFacts) -> Iterator[Finding]:
+    axes = "the poses do not belong to these points, or their axes are flipped; export both together again"
+    if points.behind is not None and points.behind > MAX_SHARE_BEHIND:
+        yield Finding("warning", f"{100 * points.behind:.0f} % of the points lie behind all cameras", axes)
+    elif points.in_two is not None and points.in_two < MIN_SHARE_IN_TWO:
+        yield Finding(
+            "warning", f"only {100 * points.in_two:.0f} % of the points lie in the image of two views or more", axes
+        )
+
+
+def _camera_name(camera: CameraFacts) -> str:
+    return f"{camera.model} camera {camera.width}x{camera.height}"
+
+
+def _are(count: int, word: str, before: str = "") -> str:
+    """Return a count with its verb: `3 views are`, or with words before the count `are only 3 views`."""
+    verb = "is" if count == 1 else "are"
+    return f"{verb} {before}{amount(count, word)}" if before else f"{amount(count, word)} {verb}"
+
+
+def _listed(names: Sequence[str], limit: int = MAX_NAMES) -> str:
+    return ", ".join(map(shortened, names[:limit])) + (", …" if len(names) > limit else "")
+
+
+# One look at a dataset: pieces, facts, findings and the verdict.
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """The pieces of a dataset, the facts about them and the findings."""
+
+    parts: Parts
+    facts: Facts
+    findings: list[Finding]
+
+    @classmethod
+    def of(cls, path: Path) -> "Inspection":
+        """Inspect the dataset in a folder.  Raises DataError only where there is no such folder."""
+        parts = read_parts(path)
+        facts = survey(parts)
+        return cls(parts, facts, findings(facts))
+
+    @property
+    def trainable(self) -> bool:
+        return trainable(self.findings)
+
+    @property
+    def verdict(self) -> str:
+        return verdict(self.findings)
+
+    def data(self) -> dict[str, Any]:
+        """Return verdict, findings and facts as plain data for JSON."""
+        return {
+            "verdict": self.verdict,
+            "trainable": self.trainable,
+            "findings": [{"level": finding.level, "text": finding.text} for finding in self.findings],
+            "facts": asdict(self.facts),
+        }
+
+
+# The facts as short lines of text, for the terminal and the page.
+
+MAX_CAMERAS = 4  # cameras, by the number of their views
+
+
+def figures(facts: Facts) -> dict[str, str]:
+    """Return the figures that a dataset has, by name."""
+    lines = {"dataset": facts.kind if facts.kind != "none" else "none found", "images": _images(facts)}
+    if facts.train is not None:
+        lines["views"] = f"{facts.train} for training, {facts.test} for testing"
+    if facts.moments:
+        lines["times"] = f"{amount(facts.moments, 'moment')}, seen from {amount(facts.stations, 'place')}"
+    if len(facts.submodels) > 1:
+        lines["models"] = ", ".join(f"{name} ({amount(count, 'image')})" for name, count in facts.submodels.items())
+    for i, camera in enumerate(facts.cameras[:MAX_CAMERAS]):
+        lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_line(camera)
+    if facts.extent is not None:
+        lines["extent"] = f"{facts.extent:.4g} scene units around the cameras"
+        if facts.strayed:
+            lines["extent"] += f", without {len(facts.strayed)} that are far away from all others"
+    if points := facts.points:
+        lines["points"] = f"{points.count:,}"
+        if points.error_mean is not None:
+            lines["reprojection error"] = f"{points.error_mean:.2f} px on average, 90 % below {points.error_90:.2f} px"
+        if points.in_two is not None and points.behind is not None:
+            lines["coverage"] = f"{100 * points.in_two:.0f} % of the points in two views or more"
+            lines["coverage"] += f", {100 * points.behind:.0f} % behind all cameras" if points.behind else ""
+    elif facts.registered:
+        lines["points"] = "none"
+    if counts := list(facts.seen.values()):
+        lines["points per view"] = f"{min(counts):,} to {max(counts):,}, median {median(counts):,.0f}"
+    return lines
+
+
+def camera_line(camera: CameraFacts) -> str:
+    """Return a camera on one line."""
+    fx, fy = camera.focal
+    focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
+    bent = "without bounds" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
+    lens = f", distortion {bent}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
+    return (
+        f"{camera.model} {camera.width}x{camera.height}, focal length {focal} px{lens}; {amount(camera.views, 'view')}"
+    )
+
+
+def _images(facts: Facts) -> str:
+    if not facts.registered:
+        return f"{facts.on_disk} on disk"
+    parts = [f"{facts.registered} with a pose"]
+    parts += [f"{len(facts.missing)} of them missing on disk"] if facts.missing else []
+    parts += [f"{len(facts.unregistered)} more on disk without a pose"] if facts.unregistered else []
+    parts += [f"in {facts.folders} folders"] if facts.folders > 1 else []
+    parts += [f"{facts.photos.masks} with a mask"] if facts.photos.masks else []
+    return ", ".join(parts)
+
+
+# An inspection as a table for the terminal.
+
+STYLES = {"error": "bold red", "warning": "yellow", "note": "cyan"}
+
+
+def show(inspection: Inspection, console: Console) -> None:
+    """Print figures, findings and the verdict."""
+    table = Table.grid(padding=(0, 2))
+    for name, value in figures(inspection.facts).items():
+        table.add_row(Text(name, "bold"), Text(value))
+    for finding in inspection.findings:
+        table.add_row(Text(finding.level, STYLES[finding.level]), Text(finding.text))
+    console.print(table, soft_wrap=not console.is_terminal)
+    if inspection.trainable:
+        ready = inspection.verdict.startswith("ready")
+        console.print(Text(inspection.verdict, "bold green" if ready else "bold yellow"))

@@ -1,0 +1,192 @@
+"""The settings of `model:`: the degree of the colours and the two low-pass filters, as numbers.
+
+A world filter writes `filter_variance`, scene units², which is added to the squared scales of each Gaussian.  A screen
+filter is three numbers of the model.  Rendering reads these numbers and has no case for a filter.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
+
+from clsplat.core.settings import OneOf, Settings
+from clsplat.formats.ply import MAX_NUMBER
+from clsplat.formats.splats import MAX_DEGREE, width_of
+from clsplat.gaussians.gaussians import DeviceModel, Gaussians
+from clsplat.opencl.device import Array, Device
+from clsplat.render.backdrops import Backdrop
+from clsplat.render.camera import camera_values
+from clsplat.scene.view import View
+
+BOX_VARIANCE = 1 / 12  # px²
+
+
+class FilterViews:
+    """The views that sample the Gaussians: their cameras on the device, [V] camera_t, and focal lengths, [V] px."""
+
+    def __init__(self, device: Device, views: Sequence[View]) -> None:
+        tile = int(device.tuning["TILE"])
+        self.cameras: Array = device.upload(np.stack([camera_values(view, tile) for view in views]))
+        self.focal: NDArray[np.float32] = np.array([view.camera.fx for view in views], np.float32)
+
+
+class WorldFilter(Settings):
+    """A blur of Gaussians in the world."""
+
+    reads_means: ClassVar[bool] = False  # as the places of Gaussians, which those that move have at no view's time
+
+    @abstractmethod
+    def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
+        """Write `filter_variance`, [S] scene units², for the present means; `near`: smallest depth, scene units."""
+
+
+class NoWorldFilter(WorldFilter):
+    """No blur in the world."""
+
+    type: Literal["none"] = "none"
+
+    def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
+        pass
+
+
+class Smoothing(WorldFilter):
+    """Blur Gaussians to the training views' resolution (3D smoothing filter of Mip-Splatting, Yu et al. 2024).
+
+    A view of focal length f px samples a Gaussian at depth z every z/f scene units.  `per_camera` takes the smallest
+    such interval (eq. 6); `global_max` the smallest z by the largest f of all views, as the paper's code does.
+    """
+
+    reads_means: ClassVar[bool] = True
+    type: Literal["smoothing"] = "smoothing"
+    variance: Annotated[float, Field(ge=0)] = 0.2
+    """Variance added to the squared scales, in sampling intervals²."""
+    focal: Literal["per_camera", "global_max"] = "per_camera"
+    """Focal length of the interval: of each view, or the largest of all."""
+
+    def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
+        focal = np.full_like(views.focal, views.focal.max()) if self.focal == "global_max" else views.focal
+        measure_intervals(gaussians, views, focal, near, self.variance, gaussians["filter_variance"])
+
+
+def measure_intervals(
+    gaussians: Gaussians, views: FilterViews, focal: NDArray[np.float32], near: float, factor: float, squared: Array
+) -> None:
+    """Write `factor` times the squared sampling interval of each Gaussian, [S] scene units².  focal: [V] px."""
+    device, program = gaussians.device, gaussians.device.program("filter.cl")
+    largest = device.zeros(1, np.uint32)
+    items = -(-gaussians.count // int(device.tuning["LANES"]))
+    program.sampling_interval(
+        items=items,
+        means=gaussians["means"],
+        cameras=views.cameras,
+        focal=device.upload(focal),
+        interval=squared,
+        largest=largest,
+        near_plane=near,
+        views=len(focal),
+        stride=gaussians.capacity,
+        count=gaussians.count,
+    )
+    program.filter_variance(items=items, largest=largest, interval=squared, variance=factor, count=gaussians.count)
+
+
+class ScreenFilter(Settings):
+    """A blur of splats in the image."""
+
+    pixel_box: ClassVar[bool] = False  # splats are integrated over the pixel's box; the two numbers are for viewers
+    variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)]
+    """Added to the variance of every splat, px²."""
+    compensate: Literal[0, 1]
+    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
+
+
+class Dilation(ScreenFilter):
+    """Add a variance to every splat, so that each covers about a pixel or more (Kerbl et al. 2023)."""
+
+    type: Literal["dilation"] = "dilation"
+    variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)] = 0.3
+    """Added to the variance of every splat, px²."""
+    compensate: Literal[0, 1] = 0
+    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
+
+
+class Ewa(ScreenFilter):
+    """Add a variance to every splat and keep its energy (Zwicker et al. 2001; "3DGS + EWA" in Yu et al. 2024)."""
+
+    type: Literal["ewa"] = "ewa"
+    variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)] = 0.3
+    """Added to the variance of every splat, px²."""
+    compensate: Literal[0, 1] = 1
+    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
+
+
+class Mip(ScreenFilter):
+    """Blur every splat by about a pixel and keep its energy (2D Mip filter, Yu et al. 2024, eq. 11)."""
+
+    type: Literal["mip"] = "mip"
+    variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)] = 0.1
+    """Added to the variance of every splat, px²."""
+    compensate: Literal[0, 1] = 1
+    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
+
+
+def _of_a_box(variance: float) -> float:
+    if variance != BOX_VARIANCE:
+        raise ValueError(f"expected no variance beside the type 'box', or {BOX_VARIANCE}: write `screen_filter: box`")
+    return variance
+
+
+class Box(ScreenFilter):
+    """Integrate every splat over the box of each pixel, instead of taking its value at the pixel's centre.
+
+    Where a splat is larger than a pixel this differs little from a Gaussian blur of the box's variance, 1/12 px², which
+    programs that know no box draw instead.  The integral is that of `cl_kernels/pixel_box.h`.
+    """
+
+    pixel_box: ClassVar[bool] = True
+    type: Literal["box"] = "box"
+    variance: Annotated[float, AfterValidator(_of_a_box)] = BOX_VARIANCE
+    """Of the box, px²: for programs that draw a Gaussian blur instead.  Only this value."""
+    compensate: Literal[1] = 1
+    """As `variance`: a box keeps the energy of a splat."""
+
+
+class Motion(Settings):
+    """How Gaussians move and fade over the time of a scene: a polynomial, and a bell curve of their opacity."""
+
+    degree: Annotated[int, Field(ge=1, le=MAX_DEGREE)] = 1
+    """Degree of the polynomial in time that a mean follows: 1 in FreeTimeGS, 3 in Spacetime Gaussians."""
+    rotation: bool = False
+    """Whether Gaussians turn too, at a constant rate."""
+
+    @property
+    def width(self) -> int:
+        """Columns of the table of the motion."""
+        return width_of(self.degree, self.rotation)
+
+
+class ModelSettings(Settings):
+    """How Gaussians are rendered."""
+
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
+    """Highest degree of the spherical harmonics."""
+    near: Annotated[float, Field(gt=0, lt=MAX_NUMBER)] = 0.2
+    """Smallest depth in scene units that is drawn."""
+    world_filter: OneOf[WorldFilter] = NoWorldFilter()
+    """Blur of Gaussians in the world."""
+    screen_filter: OneOf[ScreenFilter] = Dilation()
+    """Blur of splats in the image."""
+    background: OneOf[Backdrop] | None = None
+    """What is behind the Gaussians: `directions`, a sky that is learned, or `auto`; without it, `scene.background`."""
+
+    time: Motion | None = None
+    """How Gaussians move, in a scene whose views have times; without it, they stand still."""
+
+    def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
+        """Return the Gaussians with the numbers of these settings; `degree` is the active one."""
+        screen = self.screen_filter
+        numbers = screen.variance, float(screen.compensate), float(screen.pixel_box)
+        return DeviceModel(gaussians, degree, self.near, *numbers)

@@ -1,1 +1,0 @@
-"""The parts of report.html: pictures, cameras, figures, curves, times."""

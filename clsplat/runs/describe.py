@@ -1,0 +1,130 @@
+"""What a run would do, before it does it."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from clsplat.core import lock
+from clsplat.core.errors import DataError, amount
+from clsplat.opencl.device import Device
+from clsplat.pipeline.choices import choose
+from clsplat.pipeline.loading import Pipeline
+from clsplat.runs.estimate import expected
+from clsplat.runs.opening import ReadScene, check_start, open_run, read_run_scene, settle
+from clsplat.runs.outputs import check_places
+from clsplat.runs.preflight import known, listed
+from clsplat.runs.run_folder import Start, check_run_folder, start_of
+from clsplat.runs.runner import check_in, restore
+from clsplat.scene.quality import Measures
+from clsplat.stages.evaluate import Evaluate
+from clsplat.stages.export import Render
+from clsplat.stages.init import Init
+from clsplat.training.memory import first_tables, last_place
+from clsplat.training.run import Run
+from clsplat.training.stage import Scheduled, Stage, Training
+
+LOG = logging.getLogger("clsplat")
+
+
+def describe(
+    pipeline: Pipeline,
+    out: Path,
+    device: str | Device | None,
+    start: Start,
+    read: ReadScene = read_run_scene,
+    with_time: bool = False,
+) -> str:
+    """Return a line for each stage of a run in `out`, which is left as it is.
+
+    read: reads the scene; with_time: whether lines follow that say how long a new run takes.
+    Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
+    """
+    planned = pipeline.preparation(out)
+    begun = start_of(pipeline, planned, out, start)
+    if begun is None:
+        return f"{out}: up to date"
+    start = begun
+    check_places(pipeline, out)
+    check_run_folder(out, start)
+    tell_of_waiting(out)
+    lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
+    run, verdict = None, "would run"
+    if any(one.why for one in planned):
+        opened, _ = check_start(pipeline, out, device, start)
+    else:
+        run = open_run(pipeline, out, device, start, read=read)
+        opened = run.device
+        pipeline = settle(pipeline, run, tell=LOG.debug)  # the description has them
+        if start == "resume":
+            resumed = restore(pipeline, run)
+            verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
+        check_in(pipeline, run)
+    names = listed(pipeline, planned, out) if run is None else []
+    measures, head = _known(pipeline, names)
+    choices = _choices(pipeline, measures)
+    lines += [*(head if choices or not measures else []), *choices]
+    lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages if _does(stage, run)]
+    lines += _on_host(pipeline, run) if run else []
+    if with_time and start != "resume":
+        lines += expected(pipeline, planned, names, measures, opened, run)
+    return f"{verdict} in {out}:\n" + "\n".join(lines)
+
+
+def _known(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures, list[str]]:
+    """What is known of named photographs that are to be prepared, and a line for it."""
+    head = f"  choices        if all {len(names)} photographs are placed"
+    try:
+        measures = known(pipeline, names)
+    except DataError as error:
+        return {}, [f"{head}, the run is refused: {error}"]
+    return measures, [f"{head}:"] if measures else []
+
+
+def _choices(pipeline: Pipeline, measures: Measures) -> list[str]:
+    """What was chosen; of photographs that are to be prepared, what follows from their measures, and what may."""
+    open_ones = pipeline.settings.choices
+    made = choose(pipeline.settings, measures).choices if measures else open_ones
+    pairs = zip(open_ones, made, strict=True)
+    told = [after.told if one.is_settled(measures) else one.possible(measures) for one, after in pairs]
+    return [f"  {one}" for one in told]
+
+
+def tell_of_waiting(out: Path) -> None:
+    """Raise OutputError where a run in `out` would be refused as it is in use; say where it would wait to know."""
+    if not lock.check_free(out):
+        LOG.info("%s: was in use elsewhere just now; the run would wait for its heartbeat, a minute at most", out)
+
+
+def _on_host(pipeline: Pipeline, run: Run) -> list[str]:
+    """The plan of memory, where the harmonics will lie on the host."""
+    first = next((stage for stage in pipeline.stages if isinstance(stage, Init)), None)
+    if first is None:
+        return []
+    motion, count = run.model_settings.time, first.expected_count(run.scene)
+    tables = first_tables(run.model_settings.sh_degree, motion.width if motion else 0)
+    if run.harmonics == "auto" and count <= run.memory_plan(tables, "device").limit:
+        return []
+    planned = run.memory_plan(tables, last_place(run.harmonics, run.device.info))
+    return [f"  {planned.text(count)}"] if planned.host else []
+
+
+def _does(stage: Stage, run: Run | None) -> bool:
+    """Whether a stage does something: those of the views of a split do not where there are none."""
+    return not (isinstance(stage, Evaluate | Render) and run) or bool(run.original.split(stage.split))
+
+
+def _detail(stage: Stage, run: Run | None) -> str:
+    if isinstance(stage, Training):
+        return f"{stage.steps} steps; " + ", ".join(map(_cadence, stage.during))
+    if isinstance(stage, Evaluate) and run:
+        views = run.original.downscaled(run.downscale).split(stage.split)
+        sizes = ", ".join(f"1/{downscale:g}" for downscale in stage.downscales or [run.downscale])
+        return f"{amount(len(views), f'{stage.split} view')} at {sizes}"
+    return ""
+
+
+def _cadence(stage: Scheduled) -> str:
+    """How often a stage acts, and what else must hold."""
+    limits = {name: getattr(stage, name, None) for name in ("start", "stop", "when_background")}
+    given = ", ".join(f"{name} {value}" for name, value in limits.items() if value)
+    return f"{stage.stage} every {stage.every}" + (f" ({given})" if given else "")

@@ -1,0 +1,276 @@
+"""Films of models: along a path, beside photographs or another model."""
+
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance.quick import open_correct
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.files import PIPELINE, check_no_file_of_a_run
+from clsplat.core.progress import counted
+from clsplat.gaussians.conversion import with_sky_splats
+from clsplat.gaussians.model import Model, load
+from clsplat.nerf.files import is_field
+from clsplat.opencl.device import Device
+from clsplat.photos.photographs import BACKGROUNDS
+from clsplat.pipeline.loading import load as load_pipeline
+from clsplat.runs.model_file import (
+    KINDS,
+    Loaded,
+    Source,
+    moves,
+    painter_of,
+    points_of,
+    read,
+    require_model,
+    run_of,
+    shown_of_run,
+    write_pictures,
+)
+from clsplat.runs.state import has_pipeline
+from clsplat.scene.camera_files import write_cameras
+from clsplat.scene.detect import read_scene
+from clsplat.scene.photographs import load_photograph
+from clsplat.scene.scene import HOLDOUT, Background, Scene
+from clsplat.scene.view import NO_FILE, View
+from clsplat.scene.viewpoint import Stand
+from clsplat.training.modules.camera_optimizer import poses_beside
+from clsplat.viewer.packing import pack
+from clsplat.viewer.page import BUDGET, Page, Which, described, is_viewer
+from clsplat.viewer.video import camera_path
+from clsplat.viewer.video.film import Film, Side, Wish, check_path_file, files, plan, shoot
+from clsplat.viewer.video.paths import nearest
+from clsplat.viewer.video.pictures import Canvas, Image, letterboxed
+
+LOG = logging.getLogger("clsplat")
+PHOTOGRAPH = "photograph"  # what can stand beside a picture; else a model
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a film goes: into a video, or as pictures into a folder."""
+
+    video: Path | None
+    out: Path = Path("renders")
+    kind: str = "png"
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What a film has beside its pictures."""
+
+    side: str | None = None  # PHOTOGRAPH, or a model file or run folder
+    layers: tuple[str, ...] = ("colour",)
+    save_path: Path | None = None  # a camera_path.json to write
+
+
+def film(
+    model: Path,
+    scene: Path | None,
+    place: Place,
+    wish: Wish,
+    extras: Extras,
+    *,
+    downscale: float | None = None,
+    device: str | Device | None = None,
+) -> dict[str, Any]:
+    """Film a model file or run folder; return `files`, `frames`, `fps`, `seconds`, `size`, and the time it `took`.
+
+    Raises ClsplatError.
+    """
+    begun = time.perf_counter()
+    videos = files(place.video, extras.layers) if place.video else {}
+    if place.kind not in KINDS:
+        raise ConfigError(f"no kind '{place.kind}'; there are {', '.join(KINDS)}")
+    if videos and place.kind != KINDS[0]:
+        raise ConfigError(f"--format {place.kind} is for pictures; a video has 8 bits: leave --video out")
+    if extras.save_path:
+        check_path_file(extras.save_path)
+    if extras.side and not videos:
+        raise ConfigError("--side needs --video: pictures of a folder stand alone")
+    loaded = _read(model)
+    found = _scene(model, scene, loaded, downscale, needed=not wish.of_a_file or extras.side == PHOTOGRAPH)
+    made = plan(wish, found, points_of(loaded, found), moves=moves(loaded))
+    if extras.save_path:
+        camera_path.write(extras.save_path, made.views, made.fps)
+    background = loaded.rendering.background or (found.background if found else "black")
+    opened = open_correct(device)
+    canvas = Canvas(painter_of(loaded, opened, background))
+    if not videos:
+        taken = [view.image_path for view in found.views] if found else []
+        written = write_pictures(canvas, made.views, place.out, place.kind, extras.layers, taken, film=True)
+    else:
+        side = _side(extras.side, made, found, background, opened)
+        shoot(canvas, made, videos, side, lambda views: counted(views, "frames rendered", len(views)))
+        written = list(videos.values())
+    return {
+        "files": [str(path) for path in written],
+        "frames": len(made.views),
+        "fps": made.fps,
+        "seconds": made.seconds,
+        "size": list(made.size),
+        "took": time.perf_counter() - begun,
+    }
+
+
+def _read(model: Path) -> Loaded:
+    """What a model file or a run folder holds, wherever its photographs are."""
+    file = shown_of_run(model) if has_pipeline(model) else model
+    return read(file if is_field(file) else model)
+
+
+def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | None, needed: bool) -> Scene | None:
+    """The scene of a model at the size of its run; None where none is known and none is needed."""
+    if not needed and scene is None and not has_pipeline(model):
+        return None
+    try:
+        source = Source.of(model, scene)
+    except DataError as error:
+        if needed or scene is not None:
+            raise
+        LOG.warning("%s; without it: the background and the size are those of the model and the path", error)
+        return None
+    return source.scene(loaded).downscaled(source.settings.downscale if downscale is None else downscale)
+
+
+def _side(name: str | None, made: Film, scene: Scene | None, background: Background, device: Device) -> Side | None:
+    """What stands beside a picture: the photograph whose camera is nearest, or another model."""
+    if name is None:
+        return None
+    if name != PHOTOGRAPH:
+        other = _read(Path(name))
+        return Canvas(painter_of(other, device, other.rendering.background or background)).picture
+    assert scene is not None
+    taken, reach = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
+    if not taken:
+        raise ConfigError(f"--side {PHOTOGRAPH}: the scene {scene.path} has no photographs; name a model instead")
+
+    @lru_cache(maxsize=4)
+    def photograph(place: int) -> Image:
+        return letterboxed(load_photograph(taken[place], BACKGROUNDS[background])[:, :, :3], made.size)
+
+    def side(view: View) -> Image:
+        return photograph(taken.index(nearest(view, taken, reach)))
+
+    return side
+
+
+# Models, of files or run folders, on one page to walk through.
+
+MOST = 2  # models beside each other
+MANY = 2_000_000  # splats: a page of more opens slowly
+
+
+def view(
+    models: Sequence[Path],
+    scene: Path | None = None,
+    out: Path = Path("viewer.html"),
+    *,
+    photographs: Which = "test",
+    photograph_budget: float = BUDGET,
+    splats: int | None = None,
+) -> Path:
+    """Write a page that shows one model, or two with one camera; return the page.  Raises ClsplatError.
+
+    scene: whose views and photographs are in the page; by default that of the first run folder among the models.
+    """
+    if not 1 <= len(models) <= MOST:
+        raise ConfigError(f"view: expected one model or two, got {len(models)}")
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise ConfigError(f"{out}: expected a name that ends in .html, as browsers open it")
+    if not (out.is_file() and is_viewer(out)):
+        check_no_file_of_a_run(out)
+    if splats is not None and splats < 1:
+        raise ConfigError(f"--splats {splats}: expected a number of at least 1")
+    if photographs not in ("none", "test", "all"):
+        raise ConfigError(f"no photographs '{photographs}'; there are none, test and all")
+    if not 0 <= photograph_budget < math.inf:
+        raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected MB, a finite number of at least 0")
+    for path in models:
+        require_model(path)
+    source = next((Source.of(path, scene) for path in models if scene is not None or run_of(path)), None)
+    if photographs == "all" and source is None:
+        raise ConfigError("--photographs all needs the photographs of a scene; give --scene, or a run folder")
+    _tell_of_scenes(models, source)
+    called = names(models)
+    loaded = dict(zip(called, map(load, counted(models, "models read", len(models))), strict=True))
+    _advise(loaded, splats)
+    first = next(iter(loaded.values()))
+    found = source.scene(first).downscaled(source.settings.downscale) if source else None
+    background = first.rendering.background or (found.background if found else "black")
+
+    def read(one: View) -> NDArray[np.uint8]:
+        return load_photograph(one, BACKGROUNDS[background])[:, :, :3]
+
+    views = described(found, read, photographs, photograph_budget) if found else []
+    start = (found.split("test") or found.views)[0] if found else None
+    stand = Stand.of(first.means, found.views if found else (), start)
+    title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
+    if found is None:
+        LOG.info("without a scene up is -y; give --scene where the picture stands on its head")
+    packed = counted(loaded.items(), "models packed", len(loaded))
+    shown = {name: pack(with_sky_splats(model), splats) for name, model in packed}
+    Page(title, shown, stand, background, views).write(out)
+    return out
+
+
+def _advise(loaded: Mapping[str, Model], splats: int | None) -> None:
+    """Warn of models with more splats than a page shows smoothly, before they are packed, which takes minutes."""
+    for name, model in loaded.items():
+        if min(len(model), splats or len(model)) > MANY:
+            LOG.warning(
+                "%s: has %s splats; they take a while to pack, and browsers show %s smoothly: --splats %d keeps the "
+                "most important",
+                *(name, f"{len(model):,}", f"{MANY:,}", MANY),
+            )
+
+
+def _tell_of_scenes(models: Sequence[Path], source: Source | None) -> None:
+    """Warn where models are of different scenes: the page has the cameras of one."""
+    scenes = {}
+    for name, run in zip(names(models), map(run_of, models), strict=True):
+        with suppress(ConfigError):  # of a plug-in that is missing: the model can be shown
+            if run and (path := load_pipeline(str(run / PIPELINE)).settings.scene.path):
+                scenes[name] = Path(path).resolve()
+    if source and len(set(scenes.values())) > 1:
+        told = [part for one in scenes.items() for part in one]
+        LOG.warning("%s is of %s, %s of %s: both stand before the cameras of %s", *told, source.scene_name)
+
+
+def names(models: Sequence[Path]) -> list[str]:
+    """Return a name for each model: its folder's or file's, with more of the path where two are the same."""
+    short = [path.resolve().name if path.is_dir() else path.stem for path in models]
+    parents = [path.resolve().parent.name for path in models]
+    if len(set(short)) < len(short):
+        short = [f"{parent}/{name}" for parent, name in zip(parents, short, strict=True)]
+    return short if len(set(short)) == len(short) else [f"{name} ({i})" for i, name in enumerate(short, 1)]
+
+
+# The cameras of a dataset, or of the dataset of a run, as files of other programs.
+
+
+def write(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:
+    """Write the cameras; return the files.  scene: a dataset, in a folder or as read, or a run folder, whose
+    cameras are those that it has learned.
+
+    Raises ClsplatError.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out}: expected a folder to write into")
+    return write_cameras(scene if isinstance(scene, Scene) else _cameras_read(scene), out, format_, images)
+
+
+def _cameras_read(folder: Path) -> Scene:
+    if not has_pipeline(folder):
+        return read_scene(folder, HOLDOUT)
+    source = Source.of(folder, None)
+    return poses_beside(source.file, read_scene(source.folder, source.settings.split))

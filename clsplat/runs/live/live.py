@@ -1,0 +1,167 @@
+"""The live preview of a run: what the thread that trains does for the pages that are open."""
+
+import logging
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from clsplat.core.errors import ClsplatError
+from clsplat.core.progress import Progress
+from clsplat.photos.photographs import BACKGROUNDS
+from clsplat.runs.live.preview import RESERVE, Curves, Desk, Order, Pictures, Preview, Shown
+from clsplat.runs.live.server import LOOPBACK, Answers, Server, scene_data
+from clsplat.scene.viewpoint import Stand
+from clsplat.training.run import Run
+from clsplat.training.status import StatusFile
+
+LOG = logging.getLogger("clsplat")
+LOOKING = 5.0  # s after its last question that a page counts as open: then the memory of pictures is given back
+ABSENT = 120.0  # s without a page that end a pause: browsers ask once a minute for a page in the background
+FAREWELL = 1.5  # s that the end of a run waits for a page to hear of it
+TOKEN = 16  # bytes
+
+
+class Live:
+    """Serves a page while runs train, one after the other.  A context manager: the server ends with the block."""
+
+    def __init__(self, port: int = 0) -> None:
+        """port: of the loopback address; 0: the usual one, or the next that is free.  Raises ConfigError."""
+        self.desk = Desk()
+        self._preview: Preview | None = None
+        self._server = Server(port, secrets.token_urlsafe(TOKEN), Answers(self.desk))
+
+    def __enter__(self) -> "Live":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def address(self) -> str:
+        return f"http://{LOOPBACK}:{self._server.port}/{self._server.token}/"
+
+    @property
+    def text(self) -> str:
+        """Where the page is, and how it is reached from another machine."""
+        port = self._server.port
+        return (
+            f"live preview: {self.address}\n"
+            f"  from another machine: `ssh -L {port}:{LOOPBACK}:{port} HOST`, then that address"
+        )
+
+    def close(self) -> None:
+        """End the server, once a page that is open has heard how the run has ended."""
+        desk = self.desk
+        desk.pause(False)
+        desk.ended = True
+        try:
+            end = time.monotonic() + FAREWELL
+            while desk.silent() < LOOKING and not desk.told and time.monotonic() < end:
+                self._leave()  # a page that waits for a picture asks for nothing else
+                time.sleep(0.05)
+        finally:
+            self._server.stop()
+            self._leave()
+
+    def follow(self, status: StatusFile) -> None:
+        """Show the state of a run that begins."""
+        self.desk.status = status
+
+    @contextmanager
+    def showing(self, run: Run) -> Iterator[None]:
+        """Show a run in the block: what it trains, and its reports."""
+        self._enter(run)
+        try:
+            yield
+        finally:
+            run.between = lambda: None
+            self._leave()
+
+    def reporting(self, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
+        """Return a function that shows a report as `show` does, and on the page."""
+
+        def both(progress: Progress) -> None:
+            show(progress)
+            if shown := self.desk.shown:
+                shown.curves.add(progress)
+
+        return both
+
+    def _enter(self, run: Run) -> None:
+        desk, scene = self.desk, run.scene.downscaled(run.downscale)
+        number = desk.shown.number + 1 if desk.shown else 1
+        title, test = f"{run.name} · {run.scene_name}", scene.split("test")
+        points = run.original.points.positions if run.original.points else np.zeros((0, 3), np.float32)
+        stand = Stand.of(points, scene.views, (test or scene.views)[0])
+        data = scene_data(number, title, scene.views, {view.name for view in test}, stand)
+        photographs = run.photographs
+        background = BACKGROUNDS[photographs.background_name]
+        pictures = Pictures(scene.views, background, photographs.undistorted, desk.budget)
+        desk.step, desk.fault = 0, ""
+        desk.shown = Shown(number, title, scene.views, data, pictures, Curves([]))
+        self._preview = Preview(run)
+        run.between = lambda: self._between(run)
+        desk.budget.skip()
+
+    def _leave(self) -> None:
+        """Let go of the run: its model may be large."""
+        self.desk.step, self._preview = 0, None
+        while order := self.desk.orders.first():
+            self.desk.orders.deliver(order, None)
+
+    def _between(self, run: Run) -> None:
+        """Draw what is asked for, if there is time for it; wait while the page says so."""
+        desk, preview = self.desk, self._preview
+        if preview is None or not (run.has_model and run.whole):
+            return
+        desk.step = max(run.step, 1)
+        if desk.orders:
+            self._draw(run, preview)
+        elif desk.silent() > LOOKING:
+            preview.release()
+        if desk.paused and not run.interrupted:
+            self._pause(run, preview)
+
+    def _draw(self, run: Run, preview: Preview, free: bool = False) -> None:
+        """Draw the first order; where the time does not allow it, it waits.  free: the training waits anyway."""
+        order = self.desk.orders.first()
+        if order is None:
+            return
+        kept = RESERVE if order.pace == "again" else 0.0
+        if not free and self.desk.budget.credit < preview.cost(order.pace) + kept:
+            return
+        started = time.perf_counter()
+        run.device.finish()
+        if run.device.info.kind == "CPU":  # it computes in that time; the host's lead over a GPU is lost with it
+            started = time.perf_counter()
+        self._deliver(order, preview)
+        if not free:
+            self.desk.budget.spend(time.perf_counter() - started)
+
+    def _deliver(self, order: Order, preview: Preview) -> None:
+        """Draw an order; what fails is told on the page, and the training goes on."""
+        try:
+            self.desk.orders.deliver(order, preview.draw(order))
+            self.desk.fault = ""
+        except ClsplatError as error:
+            self.desk.orders.deliver(order, None)
+            self.desk.fault = str(error)
+
+    def _pause(self, run: Run, preview: Preview) -> None:
+        """Wait until the page says to go on, nobody looks for a while, or the run is to stop."""
+        desk = self.desk
+        LOG.info("paused at step %d by the live page", run.step)
+        with run.status.stage("paused"):
+            while desk.paused and not run.interrupted:
+                if desk.silent() > ABSENT:
+                    LOG.info("no page has asked for %.0f s", ABSENT)
+                    desk.pause(False)
+                elif desk.orders:
+                    self._draw(run, preview, free=True)
+                else:
+                    desk.orders.wait(0.2)
+        desk.budget.skip()
+        LOG.info("going on" if not run.interrupted else "stopping")

@@ -1,0 +1,413 @@
+"""The server: threads that read bounded requests on the loopback address, and write answers."""
+
+import hmac
+import json
+import logging
+import math
+import os
+import socket
+import socketserver
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any, cast, get_args
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+import numpy as np
+
+from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.page import inline, render
+from clsplat.core.quaternions import rotation_matrix
+from clsplat.formats.splats import EXPECTED, is_moment
+from clsplat.runs.live.preview import Budget, Desk, Kind, Order, Pace, Shown
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
+from clsplat.scene.viewpoint import Stand
+from clsplat.viewer.page import camera_data, joined, stand_data, style
+
+# What a browser asks, and who may ask: GET alone, by a name of this machine, below a secret path.
+
+LONGEST = 8192  # bytes of a request: its line and its headers
+FIELDS = 8  # of a query
+NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})  # another one is a page elsewhere whose name leads here
+PHRASES = {200: "OK", 204: "No Content", 400: "Bad Request", 403: "Forbidden", 404: "Not Found"}
+PHRASES |= {405: "Method Not Allowed", 431: "Request Header Fields Too Large", 503: "Service Unavailable"}
+HEADERS = {  # where an answer has no others
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",  # the address holds the secret
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A status, a body and its kind."""
+
+    status: int
+    body: bytes = b""
+    kind: str = "text/plain; charset=utf-8"
+    headers: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def json(cls, value: Any) -> "Answer":
+        return cls(200, json.dumps(value, separators=(",", ":")).encode(), "application/json")
+
+    @classmethod
+    def refusal(cls, status: int, why: str) -> "Answer":
+        return cls(status, f"{why}\n".encode())
+
+    def bytes(self) -> bytes:
+        """Return the answer as it is sent."""
+        headers = {"Content-Type": self.kind, "Content-Length": len(self.body), **HEADERS, **self.headers}
+        lines = [f"HTTP/1.1 {self.status} {PHRASES[self.status]}"]
+        lines += [f"{name}: {value}" for name, value in headers.items()]
+        if self.status in (400, 405, 431):
+            lines.append("Connection: close")
+        return "\r\n".join([*lines, "", ""]).encode("latin-1") + self.body
+
+
+class Refused(Exception):
+    """A request that is not answered but for the reason; carries the answer."""
+
+    def __init__(self, status: int, why: str) -> None:
+        super().__init__(why)
+        self.answer = Answer.refusal(status, why)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for: the path behind the secret, and the fields of the query."""
+
+    path: str
+    query: dict[str, str]
+
+    def number(self, name: str, least: int, most: int) -> int:
+        """Return a field as a whole number.  Raises Refused."""
+        text = self.query.get(name, "")
+        if not (text.isascii() and text.isdecimal() and len(text) <= 12 and least <= int(text) <= most):
+            raise Refused(400, f"{name}: expected a whole number from {least} to {most}")
+        return int(text)
+
+
+def read(head: bytes, token: str) -> Request:
+    """Return what the lines of a request ask for.  Raises Refused: 400, 403, 404, 405."""
+    try:
+        first, *rest = head.decode("ascii").split("\r\n")
+        method, target, version = first.split(" ")
+        named = [line.partition(":") for line in rest if line]
+        hosts = [value.strip().lower() for name, _, value in named if name.lower() == "host"]
+        parts = urlsplit(target)
+        query = parse_qsl(parts.query, keep_blank_values=True, max_num_fields=FIELDS)
+    except ValueError:
+        raise Refused(400, "expected a request of HTTP/1.1") from None
+    if not version.startswith("HTTP/1.") or len(hosts) != 1 or not target.startswith("/"):
+        raise Refused(400, "expected a request of HTTP/1.1 with one Host")
+    if method != "GET":
+        raise Refused(405, "expected GET")
+    if host_name(hosts[0]) not in NAMES:
+        raise Refused(403, "this page answers to 127.0.0.1 and localhost alone")
+    secret, _, path = unquote(parts.path)[1:].partition("/")
+    if not hmac.compare_digest(secret.encode("utf-8", "replace"), token.encode()):
+        raise Refused(404, "not found")
+    return Request(path, dict(query))
+
+
+def host_name(host: str) -> str:
+    """Return a Host without its port: a tunnel may end at another one."""
+    name, colon, port = host.rpartition(":")
+    return name if colon and port.isdecimal() else host
+
+
+LOG = logging.getLogger("clsplat")
+LOOPBACK = "127.0.0.1"
+PORT, TRIED = 8710, 20  # the first port that is tried where none is given, and how many
+CONNECTIONS = 32  # at a time; browsers keep six
+IDLE = 15.0  # seconds until a connection that asks for nothing more is closed
+HEAD = 2.0  # seconds that the head of a request may take
+RATE, BURST = 30.0, 120.0  # answers a second, and at once after a rest: a page opens with many small pictures
+POLL = 0.1  # seconds until the server sees that it is to stop
+
+
+class Server(socketserver.ThreadingTCPServer):
+    """Answers requests below /TOKEN/ on the loopback address, in threads that end with the process."""
+
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = CONNECTIONS
+    allow_reuse_address = os.name == "posix"  # elsewhere it lets two programs share a port
+
+    def __init__(self, port: int, token: str, answer: Callable[[Request], Answer]) -> None:
+        """port: 0 takes the first one from PORT on that is free.  Raises ConfigError where it is in use."""
+        self.token, self.answer = token, answer
+        self._slots, self._rate = threading.Semaphore(CONNECTIONS), Budget(RATE, BURST)
+        self._rate.spend(-BURST)
+        self.ended, self._open, self._lock = False, set[Any](), threading.Lock()
+        super().__init__((LOOPBACK, 0), _Connection, bind_and_activate=False)
+        self.port = self._bind(port)
+        self._thread = threading.Thread(target=self.serve_forever, args=(POLL,), name="live", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Answer no more; a connection that is open ends after the answer that it is being given."""
+        self.ended = True
+        self.shutdown()
+        self.server_close()
+        with self._lock:
+            for one in self._open:
+                with suppress(OSError):  # the other side has closed it
+                    one.shutdown(socket.SHUT_RD)
+
+    def _bind(self, port: int) -> int:
+        """Listen; return the port."""
+        ports = [port] if port else range(PORT, PORT + TRIED)
+        for one in ports:
+            try:
+                self.server_address = LOOPBACK, one
+                self.server_bind()
+                self.server_activate()
+                return one
+            except OSError as error:
+                fault: OSError = error
+                self.socket.close()
+                self.socket = socket.socket(self.address_family, self.socket_type)
+        self.socket.close()
+        which = f"port {port}" if port else f"ports {PORT} to {PORT + TRIED - 1}"
+        raise ConfigError(
+            f"--live: {which} of {LOOPBACK} cannot be used ({fault.strerror}); give another one"
+            + ("" if not port else ", or none: the next that is free is taken")
+        )
+
+    def paced(self) -> None:
+        """Wait until another answer may be given."""
+        while self._rate.credit < 1:
+            sleep(1 / RATE)
+        self._rate.spend(1)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._slots.acquire(timeout=POLL):
+            with self._lock:
+                self._open.add(request)
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._slots.release()
+
+    def shutdown_request(self, request: Any) -> None:
+        with self._lock:
+            self._open.discard(request)
+            super().shutdown_request(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        LOG.debug("live: a request failed", exc_info=True)
+
+
+class _Connection(socketserver.StreamRequestHandler):
+    """One connection: requests one after the other."""
+
+    server: Server
+    timeout = IDLE
+    disable_nagle_algorithm = True
+
+    def handle(self) -> None:
+        try:
+            while (head := self._head()) is not None and not self.server.ended:
+                self.connection.settimeout(IDLE)
+                self.server.paced()
+                answer = self._answer(head)
+                self.wfile.write(answer.bytes())
+                if answer.status in (400, 405, 431):  # what follows may be a body
+                    return
+        except OSError:  # it was closed, or says nothing
+            return
+
+    def _answer(self, head: bytes) -> Answer:
+        if len(head) > LONGEST:
+            return Answer.refusal(431, f"expected at most {LONGEST} bytes")
+        try:
+            return self.server.answer(read(head, self.server.token))
+        except Refused as refused:
+            return refused.answer
+
+    def _head(self) -> bytes | None:
+        """The lines up to the empty one, or more than LONGEST bytes; None at the end."""
+        self.rfile.peek(1)  # type: ignore[attr-defined]
+        head, line, end = b"", b"", monotonic() + HEAD
+        while len(head + line) <= LONGEST:
+            self.connection.settimeout(max(end - monotonic(), 1e-3))  # one end for all: bytes may come one by one
+            if not (byte := self.rfile.read1(1)):
+                return None
+            line += byte
+            if line in (b"\r\n", b"\n"):
+                return head
+            if byte == b"\n":
+                head, line = head + line, b""
+        return head + line
+
+
+# The page of a live preview, with the style and the controls of the viewer.
+
+FOLDER = Path(__file__).parent
+SHARED = ("camera", "motion", "controls", "photographs", "frustums", "panel")  # of the viewer
+OWN = ("curves", "link", "live")
+
+
+def page() -> bytes:
+    """Return the page, which asks for all else."""
+    own = [(FOLDER / f"{name}.js").read_text("utf-8") for name in OWN]
+    text = render(
+        "live.html.j2",
+        style=inline(style() + (FOLDER / "live.css").read_text("utf-8")),
+        script=inline(joined(SHARED, own)),
+    )
+    return text.encode()
+
+
+def scene_data(number: int, title: str, views: Sequence[View], test: set[str], stand: Stand) -> dict[str, Any]:
+    """Return what live.js reads of a run: its views and the frame of motion."""
+
+    def described(index: int, view: View) -> dict[str, Any]:
+        of = f"view={index}&scene={number}"
+        pictures = {kind: f"{kind}.jpg?{of}" for kind in ("thumbnail", "photograph")}
+        split = "test" if view.name in test else "train"
+        return {"name": view.name, "split": split, **pictures, **camera_data(view)}
+
+    first = next((i for i, view in enumerate(views) if view is stand.start), -1)
+    described_views = [described(i, view) for i, view in enumerate(views)]
+    return {"number": number, "title": title, **stand_data(stand), "views": described_views, "first": first}
+
+
+# The answers of the server: the page, the scene, the state, pictures, and the two buttons.
+
+WAIT = 4.0  # s until a page that waits for a picture asks again
+LARGEST = 1e9  # of a number of a camera
+MAX_SIDE, MAX_ASPECT = 16384, 8.0  # of a picture that is asked for
+STATUS_KEYS = {"state", "stage", "progress", "step", "steps", "gaussians", "seconds_left", "message", "device", "host"}
+
+
+class Answers:
+    """Answers requests, in any thread."""
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk = desk
+        self._page = page()
+        self._routes: dict[str, Callable[[Request], Answer]] = {
+            "": lambda request: Answer(200, self._page, "text/html; charset=utf-8"),
+            "state.json": self._state,
+            "scene.json": self._scene,
+            "frame.jpg": self._frame,
+            "thumbnail.jpg": lambda request: self._picture(request, "thumbnail"),
+            "photograph.jpg": lambda request: self._picture(request, "photograph"),
+            "pause": lambda request: self._pause(True),
+            "resume": lambda request: self._pause(False),
+        }
+
+    def __call__(self, request: Request) -> Answer:
+        """Return the answer.  Raises Refused."""
+        if (route := self._routes.get(request.path)) is None:
+            raise Refused(404, "not found")
+        self.desk.hear()
+        return route(request)
+
+    def _state(self, request: Request) -> Answer:
+        desk, shown = self.desk, self.desk.shown
+        ended = desk.ended  # at one time, before the rest: who hears of the end hears how it was
+        status = desk.status.now.model_dump(include=STATUS_KEYS, exclude_none=True) if desk.status else {}
+        state: dict[str, Any] = {**status, "scene": shown.number if shown else 0, "drawn": desk.step}
+        state |= {"paused": desk.paused, "ended": ended, "fault": desk.fault}
+        if shown:
+            state["points"] = shown.curves.after(request.number("after", 0, 1 << 40))
+        desk.told = desk.told or ended
+        return Answer.json(state)
+
+    def _scene(self, request: Request) -> Answer:
+        return Answer.json(self._shown().scene)
+
+    def _frame(self, request: Request) -> Answer:
+        """A picture through a camera: of `view`, or `camera` as written by camera.js, at a `time` where one is given.
+
+        204 when it is not ready yet.
+        """
+        desk, shown = self.desk, self._shown()
+        pace = request.query.get("pace", "")
+        if pace not in get_args(Pace):
+            raise Refused(400, f"pace: expected one of {', '.join(get_args(Pace))}")
+        if "view" in request.query:
+            view = shown.views[request.number("view", 0, len(shown.views) - 1)]
+        else:
+            view = camera(request.query.get("camera", ""))
+            if "time" in request.query:
+                view = replace(view, time=moment(request.query["time"]))
+        order = Order(request.number("page", 0, 1 << 40), view, cast(Pace, pace))
+        if not desk.orders.ask(order, WAIT):
+            raise Refused(503, "too many pictures are waited for")
+        if order.picture is None:
+            return Answer(204)
+        return Answer(200, order.picture.jpeg, "image/jpeg", {"X-Step": str(order.picture.step)})
+
+    def _picture(self, request: Request, kind: Kind) -> Answer:
+        shown = self._shown()
+        index = request.number("view", 0, len(shown.views) - 1)
+        if request.query.get("scene") != str(shown.number):  # of an earlier run of a matrix
+            raise Refused(404, "not found")
+        try:
+            data = shown.pictures.get(kind, index)
+        except DataError as error:
+            raise Refused(404, str(error)) from None
+        if data is None:
+            raise Refused(503, "no time for it; ask again")
+        return Answer(200, data, "image/jpeg", {"Cache-Control": "private, max-age=3600"})
+
+    def _pause(self, paused: bool) -> Answer:
+        if not self.desk.ended:
+            self.desk.pause(paused)
+        return Answer.json({"paused": self.desk.paused})
+
+    def _shown(self) -> Shown:
+        if self.desk.shown is None:
+            raise Refused(503, "no scene yet")
+        return self.desk.shown
+
+
+def moment(text: str) -> float:
+    """Return a moment of the scene.  Raises Refused."""
+    try:
+        found = float(text)
+    except ValueError:
+        found = math.nan
+    if not is_moment(found):
+        raise Refused(400, f"time: {EXPECTED}")
+    return found
+
+
+def camera(text: str) -> View:
+    """Return the view that camera.js has written: eye; quaternion x, y, z, w; fx, fy, cx, cy, width, height.
+
+    Raises Refused.
+    """
+    try:
+        eye, turn, lens = ([float(value) for value in part.split(",")] for part in text.split(";"))
+    except ValueError:
+        raise Refused(400, "camera: expected eye;quaternion;lens") from None
+    if (len(eye), len(turn), len(lens)) != (3, 4, 6) or not all(abs(v) <= LARGEST for v in [*eye, *turn, *lens]):
+        raise Refused(400, "camera: expected 3, 4 and 6 finite numbers")
+    fx, fy, cx, cy, width, height = lens
+    sides = sorted((width, height))
+    if not (math.hypot(*turn) > 1e-6 and min(fx, fy) > 1e-3 and sides[0] >= 1 and sides[1] <= MAX_SIDE):
+        raise Refused(400, "camera: expected a rotation, focal lengths and a size")
+    if sides[1] > MAX_ASPECT * sides[0]:
+        raise Refused(400, f"camera: expected a picture at most {MAX_ASPECT:.0f} times as long as wide")
+    x, y, z, w = (part / math.hypot(*turn) for part in turn)
+    rotation = rotation_matrix(w, x, y, z)
+    pose = np.column_stack([rotation, -rotation @ np.array(eye)])
+    return View("live", Camera(round(width), round(height), fx, fy, cx, cy), pose)

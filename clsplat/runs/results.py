@@ -1,0 +1,165 @@
+"""A finished run, read from its folder: settings, metrics, records, renders."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from clsplat.core.errors import ConfigError, DataError, shortened
+from clsplat.core.files import METRICS, PIPELINE, STATUS
+from clsplat.core.reading import read_file, read_json
+from clsplat.pipeline import plugins
+from clsplat.pipeline.explanation import explain
+from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.yaml_file import read_yaml
+from clsplat.prepare.cache import noted
+from clsplat.training.records import Records
+
+Points = list[tuple[float, float]]
+
+
+class Averages(BaseModel):
+    """Metrics of a split at one size; perceptual metrics and remarks on them are extra fields."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+    views: int
+    psnr_colour_views: int | None = None  # None: all of them
+
+    @property
+    def colour_views(self) -> int:
+        """The number of views that `psnr_colour` is the mean of."""
+        return self.views if self.psnr_colour_views is None else self.psnr_colour_views
+
+    def figure(self, metric: str) -> float | None:
+        """Return a metric by name; None when it was not measured."""
+        value = getattr(self, metric, None)
+        return float(value) if isinstance(value, int | float) else None
+
+
+AveragesByDownscale = dict[Annotated[str, Field(pattern=r"^\d+(\.\d+)?$")], Averages]
+
+
+class RunMetrics(BaseModel):
+    """The contents of metrics.json; figures of stages and of photographs are extra fields."""
+
+    model_config = ConfigDict(extra="allow")
+
+    test: AveragesByDownscale
+    train: AveragesByDownscale
+    gaussians: int | None  # None: a field was trained
+    parameters: int | None = None  # of a field
+    steps: int
+    train_seconds: float
+    cpu_seconds: float | None = None  # of all threads, in the training
+    device_memory: int | None = None  # bytes, the peak
+    seed: int
+    device: str
+    pipeline: str
+    files: dict[str, str] = {}  # of the last stage of each name, in the run folder
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """One finished run."""
+
+    path: Path
+    settings: dict[str, Any]  # the resolved pipeline, in the shape of a file
+    scene: SceneSettings
+    metrics: RunMetrics
+
+    @classmethod
+    def read(cls, path: Path) -> "RunFolder":
+        """Read a run folder.
+
+        Raises DataError when it is missing, unfinished or damaged, ConfigError when its pipeline.yaml cannot be read.
+        """
+        if not path.is_dir():
+            raise DataError(f"{path}: no such folder; expected the folder of a finished run")
+        if not (path / PIPELINE).is_file():
+            raise DataError(f"{path}: has no pipeline.yaml; expected the folder of a finished run")
+        if not (path / METRICS).is_file():
+            raise DataError(f"{path}: has no metrics.json, so the run {_state(path)}; finish it with --resume")
+        settings = read_settings(path)
+        return cls(path, settings, _scene(path, settings), read_metrics(path / METRICS))
+
+    @property
+    def missing_plugins(self) -> list[str]:
+        """A sentence for each plug-in of the run that is not loaded, or has other content now."""
+        recorded = self.settings.get("plugins")
+        faults = plugins.differences(recorded) if isinstance(recorded, dict) else []
+        return [f"{self.path}: {fault}" for fault in faults]
+
+    @property
+    def photographs(self) -> Path:
+        """The folder with the photographs that the run trained on.  Raises ConfigError when no scene is named."""
+        prepared = noted(self.path)
+        return Path(prepared["folder"]) if prepared else self.scene.folder
+
+    @cached_property
+    def records(self) -> list[dict[str, Any]]:
+        """The lines of metrics.jsonl; none where it is missing.  Raises DataError when it is damaged."""
+        return Records(self.path).read()
+
+    def points(self, kind: str, figure: str, **where: Any) -> Points:
+        """Return (step, figure) of all records of a kind, such as `train`, whose values are those of `where`."""
+        lines = (line for line in self.records if line["kind"] == kind)
+        chosen = (line for line in lines if all(line.get(key) == value for key, value in where.items()))
+        return [(line["step"], line[figure]) for line in chosen if isinstance(line.get(figure), int | float)]
+
+    def by_cpu_seconds(self, points: Points) -> Points:
+        """Return points (step, figure) by the CPU seconds of training at their step; none where no record has them."""
+        spent = [(0.0, 0.0), *self.points("train", "cpu_seconds")]
+        if len(spent) == 1:
+            return []
+        steps, seconds = zip(*spent, strict=True)
+        return [(float(np.interp(step, steps, seconds)), figure) for step, figure in points]
+
+    @property
+    def renders(self) -> Path:
+        """The folder of the images that the run's last `render` stage wrote."""
+        stages = [stage["render"] for stage in self.settings["stages"] if isinstance(stage, dict) and "render" in stage]
+        return self.path / (stages[-1] or {}).get("folder", "renders") if stages else self.path / "renders"
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return a run folder's pipeline.yaml as plain data.  Raises ConfigError when it holds anything else."""
+    data = read_yaml(path / PIPELINE).data
+    if not isinstance(data, dict) or not isinstance(data.get("stages", []), list):
+        raise ConfigError(f"{path / PIPELINE}: damaged; expected keys such as name and stages")
+    return {"stages": [], **data}
+
+
+def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
+    try:
+        return SceneSettings.model_validate(settings.get("scene", {}))
+    except ValidationError as error:
+        file = path / PIPELINE
+        raise ConfigError(explain(error, SceneSettings, file, read_yaml(file))) from error
+
+
+def read_metrics(path: Path) -> RunMetrics:
+    """Return the contents of a metrics.json.  Raises DataError with the file and the place when it is damaged."""
+    try:
+        return RunMetrics.model_validate_json(read_file(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = shortened(".".join(str(part) for part in first["loc"]))
+        message = shortened(first["msg"].removeprefix("Invalid JSON: "), 200)
+        raise DataError(
+            f"{path}: {place + ': ' if place else ''}{message}; the file is damaged: run the pipeline again"
+        ) from error
+
+
+def _state(path: Path) -> str:
+    try:
+        state = read_json(path / STATUS).get("state")
+    except (DataError, AttributeError):
+        state = None
+    return {"failed": "failed", "interrupted": "was interrupted"}.get(str(state), "is not finished")

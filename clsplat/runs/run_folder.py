@@ -1,0 +1,179 @@
+"""The run folder: made and held, cleared, left as it was by a run that has not begun."""
+
+import shutil
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from clsplat.core import lock
+from clsplat.core.errors import ClsplatError, ConfigError, InternalError, OutputError, as_clsplat_error
+from clsplat.core.files import (
+    BEFORE_A_RUN,
+    CHECKPOINTS,
+    CHECKSUMS,
+    INPUTS,
+    LOCK,
+    METRICS,
+    NOTE,
+    OF_A_RUN,
+    PIPELINE,
+    RECORDS,
+    STATUS,
+    TRIAL,
+    make_folder,
+    sweep,
+    told_as,
+    write_text,
+)
+from clsplat.core.reading import read_text
+from clsplat.pipeline.loading import Pipeline
+from clsplat.pipeline.matrix import load_experiment
+from clsplat.prepare.cache import Planned, note, noted
+from clsplat.runs.recovery import is_complete
+from clsplat.runs.state import has_begun, has_pipeline, is_done, is_done_with, restart
+from clsplat.training import checkpoint
+from clsplat.training.status import StatusFile, read_status
+
+RESOLVED = "# resolved from "  # the beginning of a pipeline.yaml that a single run has written
+Start = Literal["new", "resume", "restart"]
+
+
+@contextmanager
+def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
+    """Make the run folder, swept of what killed runs have left, and its status with `values`; hold it in the block.
+
+    A run that ends before its first step, without a checkpoint, leaves no new folder and no run in one that was there;
+    one that was done before, and is refused before it goes on, stays done.
+    Raises ConfigError when it holds another run, OutputError when it is in use or cannot be written.
+    """
+    check_run_folder(out, start)
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    is_new = not (out / PIPELINE).exists()
+    with told_as(out):
+        make_folder(out)
+    try:
+        with lock.held(out) as require_held:
+            check_run_folder(out, start)  # again: another run may have ended since
+            sweep(out, border=PIPELINE)
+            before = read_text(out / STATUS) if start != "new" and is_done(out) else None
+            status = StatusFile(out, require_held, **values)
+            status.begin()
+            try:
+                with closing(status):  # the next holder writes its own
+                    yield status
+            except BaseException as error:
+                if before is not None and not status.has_run:
+                    with suppress(OutputError):
+                        status.require_held()
+                        write_text(out / STATUS, before)
+                is_defect = isinstance(as_clsplat_error(error), InternalError)  # its log has the traceback
+                if is_new and not status.now.step and not is_defect:
+                    written = BEFORE_A_RUN if status.now.cells else OF_A_RUN - {CHECKPOINTS}
+                    with suppress(OutputError):
+                        status.require_held()
+                        _remove_unused(out, written, kept={LOCK} if made else BEFORE_A_RUN)
+                raise
+    except BaseException:
+        with suppress(OSError):  # where a folder holds anything, it stays
+            for folder in made:
+                folder.rmdir()
+        raise
+
+
+def _remove_unused(out: Path, written: Collection[str], kept: Collection[str]) -> None:
+    """Remove what a run has written that ended before its first step, but for the names to keep.
+
+    Where anything else is there, a checkpoint or a file of others, nothing is removed.
+    """
+    with suppress(OSError):
+        files = list(out.iterdir())
+        if all(file.name in written for file in files):
+            for file in files:
+                if file.name not in kept:
+                    shutil.rmtree(file) if file.is_dir() else file.unlink()
+
+
+def clear(status: StatusFile) -> None:
+    """Remove what a run would go on from.  Raises OutputError."""
+    status.note(checkpoint=None)
+    status.write()
+    out = status.out
+    checkpoints = out / CHECKPOINTS
+    files = [*checkpoint.saved(out), *checkpoints.glob("failed_*.npz"), *checkpoints.glob("damaged_*.npz")]
+    files += [out / name for name in (CHECKSUMS, METRICS, RECORDS, TRIAL, INPUTS, NOTE)]
+    for file in files:
+        with told_as(file):
+            file.unlink(missing_ok=True)
+
+
+def _is_of_a_run(out: Path) -> bool:
+    """Whether a folder's pipeline.yaml, where there is one, was written by a run, or by that of a matrix."""
+    if not has_pipeline(out) or (out / STATUS).exists() or checkpoint.saved(out):
+        return True
+    with suppress(ClsplatError):
+        if read_text(out / PIPELINE).startswith(RESOLVED):
+            return True
+        found = load_experiment(str(out / PIPELINE))
+        cells = found.cells if found else ()
+        return any(read_text(out / cell.name / PIPELINE).startswith(RESOLVED) for cell in cells)
+    return False
+
+
+def check_run_folder(out: Path, start: Start) -> None:
+    """Raise ConfigError when a new run finds another one in its folder, or any finds a pipeline.yaml of the user's.
+
+    Raises OutputError when a run that is to go on has lost its state.
+    """
+    if start not in get_args(Start):
+        raise ConfigError(f"no start '{start}'; there are {', '.join(get_args(Start))}")
+    if not _is_of_a_run(out):
+        raise ConfigError(
+            f"{out / PIPELINE}: is not that of a run, which would write its own in its place; give another folder"
+        )
+    if start == "new" and has_begun(out):
+        raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
+    status = read_status(out) if start == "resume" else {}
+    if status.get("state") == "done" and "cells" not in status and not checkpoint.saved(out):
+        raise ConfigError(f"{out}: is done, and has no checkpoint to go on from; {restart(out)} trains it again")
+    if start == "resume" and not status and (out / INPUTS).exists() and not checkpoint.saved(out):
+        raise OutputError(
+            f"{out}: has neither a readable {STATUS} nor a checkpoint, though a run has begun there; put them back, or "
+            f"give {restart(out)}, which begins it again"
+        )
+
+
+# The folder of a run that was given none, and whether a folder has what a run would make.
+
+
+def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
+    """Return the default run folder: a new run beside one that is not up to date gets the next free number."""
+    number, free = 1, folder
+    planned = pipeline.preparation(folder) if pipeline else []
+
+    def taken() -> bool:
+        if (free / LOCK).exists():
+            try:
+                if not lock.check_free(free):
+                    return True
+            except OutputError:  # by a run that may not have begun yet
+                return True
+        return (free / PIPELINE).exists() and not (pipeline and is_same(pipeline, planned, free))
+
+    while start == "new" and taken():
+        number += 1
+        free = folder.with_name(f"{folder.name}-{number}")
+    return free
+
+
+def start_of(pipeline: Pipeline, planned: Sequence[Planned], out: Path, start: Start) -> Start | None:
+    """How a run begins in `out`; None: it is up to date.  One that is done goes on where files of it were lost."""
+    if start == "restart" or not is_same(pipeline, planned, out):
+        return start
+    return None if is_complete(out) else "resume"
+
+
+def is_same(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:
+    """Whether a run of this pipeline and the same photographs has come to its end in `out`; never where nothing is
+    prepared."""
+    return bool(planned) and noted(out) == note(planned) and is_done_with(pipeline, out)

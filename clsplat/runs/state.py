@@ -1,0 +1,108 @@
+"""What a folder holds of a run."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from clsplat.core.errors import ConfigError, DataError, in_shell
+from clsplat.core.files import CHECKSUMS, METRICS, PIPELINE, STATUS, is_inside
+from clsplat.core.reading import read_json, sha256
+from clsplat.pipeline.capture_choice import without_choices
+from clsplat.pipeline.choices import undone
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.runs.results import read_metrics
+from clsplat.training import checkpoint
+from clsplat.training.settings_diff import first_difference
+from clsplat.training.status import read_status
+
+
+def has_pipeline(folder: Path) -> bool:
+    """Whether a folder holds the pipeline of a run, or of a matrix."""
+    return (folder / PIPELINE).is_file()
+
+
+def has_begun(out: Path) -> bool:
+    """Whether a run has begun in a folder, whatever is left of it."""
+    is_listed = bool(read_status(out)) and read_sums(out) is not None
+    return (out / PIPELINE).exists() or bool(checkpoint.saved(out)) or is_listed
+
+
+def has_state(folder: Path) -> bool:
+    """Whether a folder holds a run or a matrix, or what one has said before it began."""
+    return has_pipeline(folder) or (folder / STATUS).is_file()
+
+
+def is_done(out: Path) -> bool:
+    """Whether a run has come to its end in a folder, whose files may have been lost since."""
+    return read_status(out).get("state") == "done"
+
+
+def is_done_with(pipeline: Pipeline, out: Path) -> bool:
+    """Whether that was a run of this pipeline."""
+    with suppress(ConfigError):  # a damaged file
+        return is_done(out) and _asked(load(str(out / PIPELINE))) == _asked(pipeline)
+    return False
+
+
+def has_ended(pipeline: Pipeline, out: Path) -> bool:
+    """Whether a run of this pipeline has come to its end.  Raises ConfigError when that was with other settings."""
+    if not is_done(out) or not has_pipeline(out):
+        return False
+    try:
+        before = _asked(load(str(out / PIPELINE)))
+    except ConfigError:
+        if out / PIPELINE in changed(out):  # the run writes it again, or says that it cannot go on
+            return False
+        raise
+    if difference := first_difference(before, _asked(pipeline)):
+        raise ConfigError(f"{out}: was run with other settings: {difference}; use another folder, or those settings")
+    return True
+
+
+def _asked(pipeline: Pipeline) -> Any:
+    """The resolved pipeline without what a run chose."""
+    return without_choices(replace(pipeline, settings=undone(pipeline.settings)).resolved())
+
+
+def restart(out: Path) -> str:
+    """The command that begins a run again."""
+    pipeline = "…"
+    with suppress(ConfigError):  # where it is lost
+        load(str(out / PIPELINE))
+        pipeline = in_shell(out / PIPELINE)
+    return f"`clsplat run {pipeline} --out {in_shell(out)} --restart`"
+
+
+def read_sums(out: Path) -> dict[str, str] | None:
+    """The list of checksums; None where it is missing or damaged."""
+    try:
+        sums = read_json(out / CHECKSUMS)
+    except DataError:
+        return None
+    return {name: str(value) for name, value in sums.items() if is_inside(name)} if isinstance(sums, dict) else None
+
+
+def changed(out: Path) -> list[Path]:
+    """The files of a finished run that are missing or not as they were written; the list of them where that is lost."""
+    sums = read_sums(out)
+    if sums is not None:
+        return not_whole(out, sums)
+    try:
+        read_metrics(out / METRICS)
+    except DataError:
+        return [out / CHECKSUMS, out / METRICS]
+    return [out / CHECKSUMS]
+
+
+def not_whole(out: Path, sums: Mapping[str, str]) -> list[Path]:
+    """The files of a list of checksums that are missing or changed."""
+    return [out / name for name, expected in sums.items() if sum_of(out / name) != expected]
+
+
+def sum_of(file: Path) -> str | None:
+    """The SHA-256 of a file; None where it cannot be read."""
+    with suppress(DataError):
+        return sha256(file)
+    return None

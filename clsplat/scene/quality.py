@@ -1,0 +1,246 @@
+"""What is measured of a capture before training, for the choices that follow from it."""
+
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError, amount
+from clsplat.scene.images import read_grey
+from clsplat.scene.scene import PointCloud, Scene, Tracks
+from clsplat.scene.view import View, lens_of, load_mask, load_transparency, some_of
+
+# How far the points of a dataset are from where its photographs show them.
+
+Floats = NDArray[np.float64]
+NEAR = 1.0  # px at the size of training, ours: beyond it a pixel does not show the point
+EXACT = 1e-3  # px: below it places were computed from the cameras, and tell nothing of them
+
+
+def misses(view: View, positions: NDArray[np.floating], places: Floats) -> Floats:
+    """Return the vectors, [K, 2] px, from where a view at its full size shows positions, [K, 3], to places, [K, 2] px
+    of the photograph as it was taken; NaN behind the camera, and for places far outside the photograph."""
+    taken = view.lens or view.camera
+    size = np.array([taken.width, taken.height])
+    # a place of a damaged file says nothing of cameras
+    near = np.all(np.abs(places - size / 2) <= size, axis=1, keepdims=True)
+    return np.where(near, places - projected(view, positions), np.nan)
+
+
+def projected(view: View, positions: NDArray[np.floating]) -> Floats:
+    """Return where a view at its full size shows positions, [K, 3]: [K, 2] px of the photograph as it was taken, NaN
+    behind the camera."""
+    points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
+    points[~(points[:, 2] > 0)] = np.nan
+    with np.errstate(all="ignore"):
+        if view.lens is not None:
+            return lens_of(view).project(points)
+        camera = view.camera
+        return np.asarray(points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
+
+
+def with_cameras(scene: Scene, views: Sequence[View]) -> Scene:
+    """Return a scene, at its full size, whose views have other cameras; photographs show its points where they did."""
+    tracks, missed = scene.tracks, dict[str, Floats]()
+    if tracks is not None:
+        for old, new in zip(scene.views, views, strict=True):
+            if old.name in tracks.misses:
+                positions = tracks.positions[tracks.seen[old.name]]
+                moved = projected(old, positions) - projected(new, positions)
+                missed[old.name] = tracks.misses[old.name] + moved
+        tracks = replace(tracks, misses={**tracks.misses, **missed})
+    return replace(scene, views=tuple(views), tracks=tracks)
+
+
+def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats | None:
+    """Return the mean distance for each point that views show, px at their sizes; None where the dataset does not tell
+    it."""
+    if tracks is None or not tracks.misses:
+        return None
+    sums, counts = np.zeros(len(tracks.positions)), np.zeros(len(tracks.positions))
+    for view in views:
+        distances = np.linalg.norm(tracks.misses.get(view.name, np.empty((0, 2))), axis=1) / view.downscale
+        known = np.isfinite(distances)
+        if known.any():
+            np.add.at(sums, tracks.seen[view.name][known], distances[known])
+            np.add.at(counts, tracks.seen[view.name][known], 1)
+    errors = sums[counts > 0] / counts[counts > 0]
+    return errors if len(errors) and errors.mean() > EXACT else None
+
+
+def within(tracks: Tracks, views: Iterable[View], limit: float = NEAR) -> Tracks:
+    """Return the tracks without the points that views show `limit` px or more, at their sizes, from where the cameras
+    do; a view without known places keeps all of its points, and so do other views than these."""
+    seen, missed = dict(tracks.seen), dict(tracks.misses)
+    for view in sorted(views, key=lambda view: -view.downscale):  # of a photograph in several sizes the largest one
+        if view.name in tracks.misses:
+            found = tracks.misses[view.name]
+            kept = ~(np.linalg.norm(found, axis=1) / view.downscale >= limit)  # NaN: not known
+            seen[view.name], missed[view.name] = tracks.seen[view.name][kept], found[kept]
+    return Tracks(tracks.positions, seen, missed)
+
+
+def require_ahead(points: PointCloud, scene: Scene) -> None:
+    """Raise DataError when every point lies behind every training camera."""
+    poses = np.stack([view.world_to_camera for view in scene.split("train")])
+    if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):
+        raise DataError(
+            f"{scene.path}: all {len(points):,} points lie behind all training cameras; poses and points follow "
+            "different conventions: export both again, or use init: {source: sweep}"
+        )
+
+
+Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "reprojection_error", "sky"]
+Measures = dict[Measure, float]
+NEAREST = 0.01  # share of the points that photographs show which may lie nearer: some of them are mistaken
+TOLD: dict[Measure, str] = {
+    "photographs_per_point": "{:,.4g} training photographs show a point, in the mean",
+    "pixels": "{:,.4g} pixels has a training photograph, in the median",
+    "points": "{:,.4g} points",
+    "reprojection_error": "{:,.4g} px are between a point and where photographs show it, in the mean at the size of "
+    "training",
+    "sky": "{:.0%} of the training photographs show a sky",
+}
+
+
+def told(measure: Measure, value: float) -> str:
+    """Return a measure in words."""
+    return amount(round(value), "training photograph") if measure == "photographs" else TOLD[measure].format(value)
+
+
+def measured(scene: Scene) -> Measures:
+    """Return the measures that a scene, as it is trained on, has; views for validation count as training views.
+
+    `sky` is not among them: it needs the photographs.
+    """
+    views = {view.name: view for view in reversed(scene.with_fold().split("train"))}  # the largest size of each
+    errors = reprojection_errors(scene.tracks, views.values())
+    found: dict[Measure, float | None] = {
+        "photographs": len(views),
+        "photographs_per_point": _photographs_per_point(scene, views),
+        "pixels": float(np.median([view.camera.width * view.camera.height for view in views.values()])),
+        "points": len(scene.points) if scene.points else None,
+        "reprojection_error": None if errors is None else float(errors.mean()),
+    }
+    return {measure: value for measure, value in found.items() if value is not None}
+
+
+def nearest_points(scene: Scene) -> float | None:
+    """Return the depth, scene units, that a hundredth of all points that training views show are nearer than.
+
+    Views for validation count as training views.  None where the dataset does not tell which points views show.
+    """
+    if scene.tracks is None:
+        return None
+    shown = [
+        (view, scene.tracks.positions[scene.tracks.seen.get(view.name, [])])
+        for view in scene.with_fold().split("train")
+    ]
+    with np.errstate(all="ignore"):  # points of a damaged file
+        depths = [points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3] for view, points in shown]
+    ahead = [one[(one > 0) & (one < np.inf)] for one in depths]
+    return float(np.quantile(np.concatenate(ahead), NEAREST)) if any(map(len, ahead)) else None
+
+
+def _photographs_per_point(scene: Scene, names: Container[str]) -> float | None:
+    if scene.tracks is None:
+        return None
+    rows = [scene.tracks.seen[name] for name in scene.tracks.seen if name in names]
+    counts = np.bincount(np.concatenate(rows)) if rows else np.zeros(0)
+    return float(counts[counts > 0].mean()) if counts.any() else None
+
+
+# How sharp a photograph is, by its small details.
+
+BLURRED = 0.25  # share of the middle of a set: six captures have 0.4 and more, a blur of 1 px leaves 0.05 to 0.09
+SIDE = 480  # px: sharpness is measured at this size: at full size, noise counts as detail
+
+
+def sharpness(grey: NDArray[np.uint8]) -> float:
+    """Return the variance of the Laplacian of an image [H, W], grey levels²."""
+    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
+
+
+def both_sharpnesses(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return the sharpness of an image [H, W], and it by the square of its mean, which a darker copy has too, [2]."""
+    found = sharpness(grey)
+    return np.array([found, found / max(float(grey.mean()), 1.0) ** 2])
+
+
+def sharpness_of(path: Path) -> NDArray[np.float64]:
+    """Return both sharpnesses of a photograph, reduced to SIDE px.  Raises DataError when it cannot be read."""
+    return both_sharpnesses(read_grey(path, SIDE)[0])
+
+
+def is_blurred(own: NDArray[np.float64], middle: NDArray[np.float64]) -> bool:
+    """Return whether both sharpnesses of a photograph are far below the medians of a set, [2].
+
+    The first alone is small of a dark photograph, the second of a bright one among dark ones.
+    """
+    return bool((own < BLURRED * middle).all())
+
+
+# How much detail photographs show at each pixel: there Gaussians are to lie densely.
+
+DetailFloats = NDArray[np.floating]
+MAX_SPACING = 0.1  # by the width of the photograph (Meuleman et al. 2025)
+
+
+def laplacian_chance(image: DetailFloats) -> DetailFloats:
+    """Return the chance, [H, W], with which a pixel of a photograph, [H, W, 3] in [0, 1], becomes a point.
+
+    It is min(1, ‖∇²I‖₁) with the Laplacian of five points, summed over the colours (Meuleman et al. 2025).  There it is
+    averaged over a disc of weight 1; here photographs are so small that each pixel is an average already, and the
+    factor stays 1.  A pixel that differs from the mean of its neighbours by a twelfth of the range in each colour has
+    the chance 1.
+    """
+    framed = np.pad(image.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")
+    middle, around = framed[1:-1, 1:-1], (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
+    chance: DetailFloats = np.minimum(np.abs(sum(around) - 4 * middle).sum(axis=2), 1)
+    return chance
+
+
+def spacing(chance: DetailFloats, width: int) -> DetailFloats:
+    """Return the distance in pixels between points that are taken with some chances above 0: 1/√chance.
+
+    It is at most MAX_SPACING by the width of the photograph, px.
+    """
+    distance: DetailFloats = np.minimum(1 / np.sqrt(chance), MAX_SPACING * width)
+    return distance
+
+
+# Whether photographs show a background behind them.
+
+LOOKED_AT = 3  # training photographs: what is shown may fill one of them
+
+
+def is_transparent(scene: Scene) -> bool:
+    """Return whether one of some training photographs has transparent pixels that count.  Raises DataError."""
+    return any(map(_is_transparent, some_of(scene.split("train"), LOOKED_AT)))
+
+
+def background_shows(scene: Scene) -> bool:
+    """Return whether another background can be put behind one of some training photographs.
+
+    It cannot behind those with masks.  Raises DataError.
+    """
+    return any(load_transparency(view) is not None for view in some_of(scene.split("train"), LOOKED_AT))
+
+
+def opaque_pixels(view: View) -> NDArray[np.bool_] | None:
+    """Return which pixels of a photograph count and show no background, [H, W], or None when all do.
+
+    Raises DataError.
+    """
+    shows, counted = load_transparency(replace(view, mask_path=None)), load_mask(view)
+    masks = [mask for mask in (None if shows is None else shows == 0, counted) if mask is not None]
+    return np.logical_and.reduce(masks) if masks else None
+
+
+def _is_transparent(view: View) -> bool:
+    shows, counted = load_transparency(replace(view, mask_path=None)), load_mask(view)
+    return shows is not None and bool((shows if counted is None else shows[counted]).any())

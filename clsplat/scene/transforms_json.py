@@ -1,0 +1,371 @@
+"""Read a `transforms*.json`: the frames and points that Blender (NeRF) and nerfstudio datasets share."""
+
+import logging
+import math
+import os
+from dataclasses import replace
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import numpy as np
+
+from clsplat.core.errors import DataError, quoted
+from clsplat.core.reading import read_json
+from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, shared
+from clsplat.scene.images import Missing, image_size, inside, present, read_header, require_files
+from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
+from clsplat.scene.reader import Parts, Reader
+from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
+from clsplat.scene.times import Clock, clock_of
+from clsplat.scene.view import Floats, View
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+LENSES = {  # the parameters of each camera_model, in COLMAP's order
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), DISTORTION[:4]),
+    "FULL_OPENCV": DISTORTION,
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+COLMAP = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
+MAX_FRAMES = 100_000  # ten times the largest captures that are trained as one scene; they take some 15 s
+MAX_BYTES = 1 << 27  # exporters write at most 1.3 KB for a frame
+
+
+class Frame:
+    """One image of the file, with values of its own, or else those of the whole file; `where` is for messages."""
+
+    def __init__(self, folder: Path, where: str, own: dict[str, Any], common: dict[str, Any] | None = None) -> None:
+        self.folder, self.where = folder, where
+        self._own, self._common = own, common or {}
+
+    def value(self, key: str) -> Any:
+        """Return a value as the file holds it, or None."""
+        return self._own[key] if key in self._own else self._common.get(key)
+
+    def number(self, key: str) -> float | None:
+        """Return a number below MAX_VALUE in size, or None where there is none.  Raises DataError for anything else."""
+        value = self.value(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
+            raise DataError(f"{self.where}: {key} is {quoted(value)}; expected {BELOW_MAX}: export the file again")
+        return float(value)
+
+    def file(self, key: str, suffix: str = "") -> Path | None:
+        """Return a path below the folder of the JSON file, with `suffix` where it has none, or None."""
+        value = self.value(key)
+        if value is None:
+            return None
+        if not isinstance(value, str):
+            raise DataError(f"{self.where}: {key} is {quoted(value)}; expected a path below {self.folder}")
+        path = inside(self.folder, view_name(value), self.where)
+        return path if path.suffix else path.with_name(path.name + suffix)
+
+
+class Transforms:
+    """A `transforms*.json`.  Raises DataError when it is not JSON, or not a table with a list `frames`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.table = read_json(path, "cameras in JSON", limit=MAX_BYTES)
+        frames = self.table.get("frames") if isinstance(self.table, dict) else None
+        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+            raise DataError(f"{path}: expected a table with a list of tables called `frames`; export it again")
+        if len(frames) > MAX_FRAMES:
+            raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: divide the scene")
+        self.frames = [Frame(path.parent, f"{path}: frames[{i}]", own, self.table) for i, own in enumerate(frames)]
+
+    def moments(self) -> list[tuple[str, float | None]]:
+        """Return the place and the `time` of every frame, as the file has it.  Raises DataError for another value."""
+        return [(frame.where, frame.number("time")) for frame in self.frames]
+
+    def views(self, missing: Missing = "refuse", clock: Clock | None = None) -> list[View]:
+        """Return one view per frame, in the order of the file; of those whose image is missing as `missing` says.
+
+        An image without a size in the file has the size of the first one.  Photographs of lenses with distortion are
+        undistorted when they are read.
+        Raises DataError for damaged numbers, missing files and paths that leave the folder.
+        """
+        images = [image_path_of(frame) for frame in self.frames]
+        there = present(self.path, images, missing)
+        frames = [frame for frame, found in zip(self.frames, there, strict=True) if found]
+        lost = [frame for frame, found in zip(self.frames, there, strict=True) if not found]
+        self.skipped = tuple(view_name(str(frame.value("file_path"))) for frame in lost)
+        require_files(self.path, filter(None, (frame.file("mask_path") for frame in frames)))
+        has_sizes = all(frame.number("w") and frame.number("h") for frame in frames)
+        size = None if has_sizes else image_size(images[there.index(True)])
+        require_files(self.path, filter(None, (frame.file("static_path") for frame in frames)))
+        return [view_of(frame, size, clock) for frame in frames]
+
+    def points(self, clock: Clock | None = None) -> PointCloud | None:
+        """Read the points; None when there are none."""
+        path = self.points_path()
+        points = read_points_ply(path, clock) if path else None
+        return points if points and len(points) else None
+
+    def points_path(self) -> Path | None:
+        """Return `ply_file_path`, or else `points3d.ply` where that exists."""
+        given = Frame(self.path.parent, str(self.path), self.table).file("ply_file_path")
+        beside = self.path.parent / "points3d.ply"
+        return given or (beside if beside.is_file() else None)
+
+
+def list_frames(parts: Parts, *names: str) -> None:
+    """Add the frames of those of the files `names` that exist to `parts`, and the points of the first file."""
+    files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
+    moments = [moment for file in filter(None, files) for moment in parts.attempt(file.moments) or []]
+    clock = parts.attempt(clock_of, parts.path, moments)
+    for transforms in filter(None, files):
+        frames = [(frame, parts.attempt(image_path_of, frame)) for frame in transforms.frames]
+        paths = [path for _, path in frames if path]
+        parts.expected += paths
+        if parts.scene is None:
+            first = next((path for path in paths if os.path.isfile(path)), None)
+            header = parts.attempt(read_header, first) if first else None
+            size = (header.width, header.height) if header else None
+            views = [parts.attempt(view_of, frame, size, clock) for frame, path in frames if path]
+            parts.views += [view for view in views if view]
+    if files and files[0]:
+        place = parts.attempt(files[0].points_path)
+        parts.points = parts.attempt(read_ply_table, place) if place else None
+        if parts.points and clock and len(parts.points.times):
+            parts.attempt(clock.of_points, place, parts.points.times[parts.points.kept()])
+
+
+def view_name(file_path: str) -> str:
+    """Return the name of a view: its `file_path` with forward slashes and without a leading `./`."""
+    return PureWindowsPath(file_path).as_posix()
+
+
+def view_of(frame: Frame, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
+    """Return the view of a frame; `size` is the image's where the frame has none.
+
+    clock: of the scene, where it moves.  Raises DataError.
+    """
+    image, mask = image_path_of(frame), frame.file("mask_path")
+    lens = shared(lens_of(frame, camera_of(frame, size)))
+    camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+    moment, still = frame.number("time"), frame.file("static_path")
+    time = None if clock is None or moment is None else float(clock(moment))
+    name, pose = view_name(frame.value("file_path")), pose_of(frame)
+    return View(name, camera, pose, image, mask, lens=distortion, time=time, static_path=still)
+
+
+def image_path_of(frame: Frame) -> Path:
+    """Return the path of a frame's image.  Raises DataError when the frame has none."""
+    path = frame.file("file_path", suffix=".png")  # Blender's exporter omits the suffix
+    if path is None:
+        raise DataError(f"{frame.where}: it has no `file_path`; expected the path of an image: export the file again")
+    return path
+
+
+def camera_of(frame: Frame, size: tuple[int, int] | None) -> Camera:
+    """Return the camera of a frame without its distortion.  Raises DataError when it has no focal length."""
+    default_width, default_height = size or (0, 0)
+    width, height = int(frame.number("w") or default_width), int(frame.number("h") or default_height)
+    fx, fy = _focal(frame, "fl_x", "camera_angle_x", width), _focal(frame, "fl_y", "camera_angle_y", height)
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None or min(width, height) <= 0 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
+        raise DataError(
+            f"{frame.where}: the camera is {width}x{height} with focal lengths {fx}, {fy}; expected positive numbers "
+            f"from w, h (at most {MAX_SIDE}) and fl_x, fl_y or camera_angle_x: export the file again"
+        )
+    cx, cy = frame.number("cx"), frame.number("cy")
+    return Camera(width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+
+
+def _focal(frame: Frame, length_key: str, angle_key: str, pixels: int) -> float | None:
+    """Return a focal length in pixels, given as such or as the angle (rad) that `pixels` span."""
+    length, angle = frame.number(length_key), frame.number(angle_key)
+    if length is not None or angle is None:
+        return length
+    if not 0 < angle < math.pi:
+        raise DataError(f"{frame.where}: {angle_key} is {angle}; expected an angle in (0, pi): export the file again")
+    return pixels / 2 / math.tan(angle / 2)
+
+
+def lens_of(frame: Frame, camera: Camera) -> Lens:
+    """Return the lens of a frame: OpenCV's polynomial, rational or fisheye one.  Raises DataError for others."""
+    named = frame.value("camera_model")
+    model = "OPENCV_FISHEYE" if frame.value("is_fisheye") else "OPENCV" if named is None else named
+    used = LENSES.get(model) if isinstance(model, str) else None
+    given = {key: frame.number(key) or 0.0 for key in DISTORTION}
+    surplus = [key for key, value in given.items() if value and key not in (used or DISTORTION)]
+    if used is None or surplus:
+        fault = f"camera_model {quoted(model)}" + (f" with {', '.join(surplus)}" if surplus else "")
+        raise DataError(
+            f"{frame.where}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
+            "undistort the images first, for example with `colmap image_undistorter`"
+        )
+    params = (camera.fx, camera.fy, camera.cx, camera.cy, *(given[key] for key in used))
+    return Lens(camera.width, camera.height, "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)], params)
+
+
+def pose_of(frame: Frame) -> Floats:
+    """Return [3, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
+    try:
+        matrix = np.array(frame.value("transform_matrix"), np.float64)
+    except (ValueError, TypeError, OverflowError):
+        matrix = np.empty(0)
+    finite = (np.abs(matrix) < MAX_VALUE).all()
+    if matrix.shape not in ((4, 4), (3, 4)) or not finite or not _is_rotation(matrix[:3, :3]):
+        raise DataError(
+            f"{frame.where}: transform_matrix is not 4x4 numbers with a rotation in its corner; "
+            "remove that frame or export the file again"
+        )
+    camera_to_world = np.eye(4)
+    camera_to_world[:3] = matrix[:3]
+    camera_to_world[:3, 1:3] *= -1
+    return np.linalg.inv(camera_to_world)[:3]
+
+
+def opengl_matrix(pose: Floats) -> Floats:
+    """Return the camera-to-world matrix with OpenGL axes, [4, 4], from [3, 4]: the inverse of `pose_of`."""
+    matrix: Floats = np.linalg.inv(np.vstack([pose, [0, 0, 0, 1]])) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    matrix[3] = 0, 0, 0, 1
+    return matrix
+
+
+def _is_rotation(matrix: Floats) -> bool:
+    """Return whether [3, 3] is a rotation, to 1e-3: some exporters write few digits."""
+    return np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0
+
+
+# Read the Blender datasets of NeRF and D-NeRF: transforms_train.json and transforms_test.json.
+
+TRAIN_FILE, TEST_FILE = "transforms_train.json", "transforms_test.json"
+
+
+class BlenderReader(Reader):
+    """A Blender scene; the test views are those of transforms_test.json, none where that is missing.
+
+    With a `time` in every frame of both files it moves (D-NeRF): the first moment of all frames is 0, the last 1.
+    """
+
+    name = "Blender"
+    expects = TRAIN_FILE
+
+    def matches(self, path: Path) -> bool:
+        return (path / TRAIN_FILE).is_file()
+
+    def read(self, path: Path, holdout: int) -> Scene:
+        transforms = Transforms(path / TRAIN_FILE)
+        held = Transforms(path / TEST_FILE) if (path / TEST_FILE).is_file() else None
+        clock = clock_of(path, transforms.moments() + (held.moments() if held else []))
+        train = transforms.views(self.missing, clock)
+        test = held.views(self.missing, clock) if held else []
+        held_out = set(range(len(train), len(train) + len(test)))
+        # NeRF and later papers render these scenes on white.
+        scene = make_scene(path, train + test, held_out, transforms.points(clock), background="white")
+        return replace(scene, skipped=transforms.skipped + (held.skipped if held else ()))
+
+    def list_parts(self, parts: Parts) -> None:
+        list_frames(parts, TRAIN_FILE, TEST_FILE)
+
+
+# Read nerfstudio and instant-ngp datasets: one transforms.json.
+
+TRANSFORMS_FILE = "transforms.json"
+logger = logging.getLogger("clsplat")
+
+
+class NerfstudioReader(Reader):
+    """A nerfstudio scene; views are in order of name.
+
+    The lists `train_filenames` and `test_filenames` are the split where the file has one of them; images on neither
+    list are left out.  Otherwise every `holdout`-th view is for testing.  With a `time` in every frame the scene moves.
+    """
+
+    name = "nerfstudio"
+    expects = TRANSFORMS_FILE
+
+    def matches(self, path: Path) -> bool:
+        return (path / TRANSFORMS_FILE).is_file()
+
+    def read(self, path: Path, holdout: int) -> Scene:
+        transforms = Transforms(path / TRANSFORMS_FILE)
+        clock = clock_of(transforms.path, transforms.moments())
+        views = sorted(transforms.views(self.missing, clock), key=lambda view: view.name)
+        train, test = (_listed(transforms, key) for key in ("train_filenames", "test_filenames"))
+        if train is None and test is None:
+            scene = make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points(clock))
+            return replace(scene, skipped=transforms.skipped)
+        test = test or set()
+        kept = views if train is None else [view for view in views if view.name in train | test]
+        if len(kept) < len(views):
+            logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(kept))
+        held_out = {i for i, view in enumerate(kept) if view.name in test}
+        return replace(make_scene(path, kept, held_out, transforms.points(clock)), skipped=transforms.skipped)
+
+    def list_parts(self, parts: Parts) -> None:
+        list_frames(parts, TRANSFORMS_FILE)
+
+
+def _listed(transforms: Transforms, key: str) -> set[str] | None:
+    """Return the view names of a list of file paths, or None where there is none.  Raises DataError."""
+    entries = transforms.table.get(key)
+    if entries is None:
+        return None
+    if not isinstance(entries, list) or not all(isinstance(entry, str) for entry in entries):
+        raise DataError(f"{transforms.path}: {key} is not a list of file paths; export the file again")
+    names = {view_name(entry) for entry in entries}
+    unknown = sorted(names - {view_name(path) for frame in transforms.frames if (path := frame.value("file_path"))})
+    if unknown:
+        raise DataError(
+            f"{transforms.path}: {key} lists {quoted(unknown[0])}, which no frame has; remove it from the list"
+        )
+    return names
+
+
+# Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, every photograph at several sizes.
+
+METADATA_FILE, POINTS = "metadata.json", "points3d.ply"
+COLUMNS = ("file_path", "cam2world", "width", "height", "focal", "label")  # one value for each image
+
+
+class MultiscaleReader(Reader):
+    """A multi-scale Blender scene; an image of label j shows 1/2^j of the full size."""
+
+    name = "multi-scale Blender"
+    expects = METADATA_FILE
+
+    def matches(self, path: Path) -> bool:
+        return (path / METADATA_FILE).is_file()
+
+    def read(self, path: Path, holdout: int) -> Scene:
+        splits = read_json(path / METADATA_FILE, limit=MAX_BYTES)
+        train, test = (_views(path / METADATA_FILE, splits, name) for name in ("train", "test"))
+        there = present(path, [view.image_path for view in train + test], self.missing)
+        skipped = tuple(view.name for view, found in zip(train + test, there, strict=True) if not found)
+        test = [view for view, found in zip(test, there[len(train) :], strict=True) if found]
+        train = [view for view, found in zip(train, there[: len(train)], strict=True) if found]
+        points = path / POINTS
+        held_out = set(range(len(train), len(train) + len(test)))
+        cloud = read_points_ply(points) if points.is_file() else None
+        return replace(make_scene(path, train + test, held_out, cloud, background="white"), skipped=skipped)
+
+    def list_parts(self, parts: Parts) -> None:
+        super().list_parts(parts)
+        points = parts.path / POINTS
+        parts.points = parts.attempt(read_ply_table, points) if points.is_file() else None
+
+
+def _views(path: Path, splits: Any, name: str) -> list[View]:
+    table = splits.get(name) if isinstance(splits, dict) else None
+    columns: list[Any] = [table.get(column) for column in COLUMNS] if isinstance(table, dict) else [None]
+    if not all(isinstance(column, list) for column in columns) or len(set(map(len, columns))) > 1:
+        raise DataError(f"{path}: '{name}' lacks lists of one length called {', '.join(COLUMNS)}; make it again")
+    if len(columns[0]) > MAX_FRAMES:
+        raise DataError(f"{path}: '{name}' has {len(columns[0])} images; expected at most {MAX_FRAMES}")
+    views = []
+    for i, (file, pose, width, height, focal, label) in enumerate(zip(*columns, strict=True)):
+        values = {"file_path": file, "transform_matrix": pose, "w": width, "h": height, "fl_x": focal, "label": label}
+        frame = Frame(path.parent, f"{path}: {name}[{i}]", values)
+        level = frame.number("label")
+        if level is None or not 0 <= level <= 8 or level % 1:
+            raise DataError(
+                f"{frame.where}: label is {quoted(label)}; expected the number of its halvings, 0 to 8: make it again"
+            )
+        image = image_path_of(frame)
+        view = View(view_name(file), camera_of(frame, None), pose_of(frame), image, downscale=2**level)
+        views.append(view)
+    return views

@@ -1,0 +1,355 @@
+"""A choice of a scene's views by their names: every n-th, a list, or the lines of a file."""
+
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from clsplat.core.errors import DataError, amount, quoted
+from clsplat.core.reading import read_text
+from clsplat.core.settings import ReadPath, Settings, in_one_sentence
+from clsplat.scene.images import Missing, is_image
+from clsplat.scene.scene import HOLDOUT, Scene, every_nth, make_scene
+
+LOG = logging.getLogger("clsplat")
+LARGEST = 1 << 24  # bytes of a list of names
+TakenBy = Literal["holdout", "train", "missing"]
+Taken = Mapping[TakenBy, Sequence[str]]  # names that are no training views, by the key that says so, or their files
+NONE: Taken = {}
+NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
+
+
+def _text(value: Any) -> Any:
+    if not isinstance(value, str):
+        raise ValueError("expected names of photographs as text: put numbers in quotes, as in '0042'")
+    if not value.strip():
+        raise ValueError("expected names of photographs that are not empty")
+    return value
+
+
+class OfPlaced(DataError):
+    """A fault of a choice that follows from which photographs are there: fewer of them may not have it."""
+
+
+class Choice(Settings):
+    """Views by name: every n-th from one on, or those of a list, or of a file with a name a line.
+
+    A listed name is that of the view, or its end: `0042`, `0042.jpg` and `images/0042.jpg` name the same photograph.
+    It has this name, too, where it was prepared as `0042.png`.
+    """
+
+    every: Annotated[int, Field(gt=0)] | None = None
+    """Every n-th view, in order of name."""
+    offset: Annotated[int, Field(ge=0)] = 0
+    """Place of the first of them, counted from 0."""
+    names: Annotated[list[Annotated[str, BeforeValidator(_text)]], Field(min_length=1)] | None = None
+    """Names of the views."""
+    file: ReadPath | None = None
+    """Text file with a name a line; a relative path is one in the folder of the dataset."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_meant(cls, value: Any) -> Any:
+        """Say what is wrong with tables that are nearly right."""
+        if not isinstance(value, dict):
+            return value
+        if any(isinstance(key, str) and ":" in key and given is None for key, given in value.items()):
+            raise ValueError(f"{NOTATIONS} (YAML needs a blank after each colon)")
+        offset = value.get("offset")
+        if isinstance(offset, int) and offset < 0:
+            raise ValueError(f"expected an offset of 0 or more, not {quoted(offset)}")
+        if "offset" in value and len(value) == 1:
+            raise ValueError("expected every beside offset, as in {every: 8, offset: 4}")
+        return value
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> "Choice":
+        given = [self.every, self.names, self.file]
+        if sum(value is not None for value in given) != 1 or (self.offset and self.every is None):
+            raise ValueError(NOTATIONS)
+        if self.every is not None and self.offset >= self.every:
+            raise ValueError(f"expected an offset below every, {self.every}")
+        return self
+
+    def place_of(self, key: str, scene: str | None) -> Path | None:
+        place = super().place_of(key, scene)
+        return place and Path(scene or "") / place
+
+    def of(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
+        """Return the indices of the chosen ones of `names`.
+
+        folders: where a relative file is looked for, in order; others: names that may not be chosen, and those whose
+        photographs are missing, which are skipped.  Raises DataError for a name that no view has, or several have.
+        """
+        if self.every is not None:
+            return every_nth(names, self.every, self.offset)
+        place, listed = self._listed(folders)
+        own, of_others = _Ends(names), {key: _Ends(taken) for key, taken in others.items()}
+        found_at = {name: own.indices_of(name) for name in listed}
+        for name in [name for name, found in found_at.items() if not found]:
+            for key in (key for key, taken in of_others.items() if taken.indices_of(name)):
+                if key != "missing":
+                    raise _taken(place, name, key)
+                del found_at[name]
+        if lost := len({*listed}) - len(found_at):
+            LOG.info("%s: skipped %s whose photograph is missing", place, amount(lost, "name"))
+        chosen = {name: _only(name, found, names, place) for name, found in found_at.items()}
+        for name, i in chosen.items():
+            _tell_of_another(name, names[i], place)
+        return set(chosen.values())
+
+    def check(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> list[str]:
+        """Return those of `names` that are listed, some of which may be left out later; none of every n-th.
+
+        others: names that may not be chosen.  Raises DataError for a name that means none, or only such.
+        """
+        if self.every is not None:
+            return []
+        place, listed = self._listed(folders)
+        own, of_others = _Ends(names), {key: {*taken} for key, taken in others.items()}
+        found = {name: own.indices_of(name) for name in listed}
+        for name, indices in found.items():
+            if not indices:
+                raise _unknown(name, names, place)
+            for key in (key for key, taken in of_others.items() if {names[i] for i in indices} <= taken):
+                raise _taken(place, name, key)
+        return [names[i] for indices in found.values() for i in indices]
+
+    def _listed(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
+        """Where the names are listed, and these.  Raises DataError where the file cannot be read, or has none."""
+        if self.file is None:
+            return "the list of names", self.names or []
+        files = [folder / self.file for folder in folders]
+        found = next((file for file in files if file.is_file()), files[-1])
+        lines = (line.strip() for line in read_text(found, limit=LARGEST).splitlines())
+        if listed := [line for line in lines if line and not line.startswith("#")]:
+            return str(found), listed
+        raise DataError(f"{found}: is empty; expected the name of a photograph in each line")
+
+
+Number = Annotated[int, Field(ge=0)]
+Chosen = Annotated[Number | Choice, in_one_sentence(NOTATIONS)]
+ChosenOrAuto = Annotated[Number | Choice | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
+
+
+def _taken(place: str, name: str, key: TakenBy) -> DataError:
+    """The error of a name that cannot be chosen, since a key of the scene's settings leaves it to another use."""
+    why, remedy = {
+        "holdout": ("is held out for testing", "out of scene.holdout"),
+        "train": ("is left out by scene.train", "put it into scene.train"),
+    }[key]
+    told = f"{quoted(name)} {why}; expected training photographs: take it out of this list, or {remedy}"
+    return OfPlaced(f"{place}: {told}")
+
+
+def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
+    """Return the indices of the chosen names; a number chooses every n-th from the first on, 0 none.
+
+    Raises DataError as Choice.of does.
+    """
+    return choice.of(names, folders, others) if isinstance(choice, Choice) else every_nth(names, choice)
+
+
+class _Ends:
+    """Names of views by their ends: `a/b.png`, `b.png` and `b` mean the same one."""
+
+    def __init__(self, names: Sequence[str]):
+        paths = [PurePosixPath(name) for name in names]
+        stems = [path.with_suffix("") for path in paths]
+        self._at = {name: i for i, name in reversed([*enumerate(names)])}
+        self._ends, self._stems = _grouped(_ends_of(paths)), _grouped(_ends_of(stems))
+        self._whole = _grouped((stem.parts, i) for i, stem in enumerate(stems))
+
+    def indices_of(self, listed: str) -> list[int]:
+        """Return the indices of names that a listed one means, whole or as an end, with or without its suffix.
+
+        Where that means none, the suffix of an image may be another: what is prepared is PNG.
+        """
+        if listed in self._at:
+            return [self._at[listed]]
+        wanted = PurePosixPath(listed.replace("\\", "/"))
+        stem = (wanted.with_suffix("") if is_image(wanted) else wanted).parts
+        return self._ends.get(wanted.parts) or self._whole.get(stem) or self._stems.get(stem, [])
+
+
+def _ends_of(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
+    """Each end of each path, the whole one too, with its index."""
+    return ((path.parts[first:], i) for i, path in enumerate(paths) for first in range(len(path.parts)))
+
+
+def _grouped(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ...], list[int]]:
+    """The indices of each of these."""
+    found: dict[tuple[str, ...], list[int]] = {}
+    for parts, i in indexed:
+        found.setdefault(parts, []).append(i)
+    return found
+
+
+def _tell_of_another(listed: str, found: str, place: str) -> None:
+    """Log that a name in another folder, of another kind of image, is meant."""
+    wanted, path = PurePosixPath(listed), PurePosixPath(found)
+    if is_image(wanted) and wanted.suffix != path.suffix and wanted.with_suffix("") != path.with_suffix(""):
+        LOG.info("%s: %s means %s", place, quoted(listed), quoted(found))
+
+
+def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -> int:
+    """The index that was found.  Raises DataError for none, and for several."""
+    if len(found) == 1:
+        return found[0]
+    if found:
+        both = " and ".join(quoted(names[i]) for i in found[:2])
+        raise OfPlaced(f"{place}: {quoted(listed)} means {both}; give more of the path")
+    raise _unknown(listed, names, place)
+
+
+def _unknown(listed: str, names: Sequence[str], place: str) -> DataError:
+    near = get_close_matches(listed, [*names, *(PurePosixPath(name).name for name in names)], 1)
+    more = (
+        f"did you mean {quoted(near[0])}?" if near else f"the first is {quoted(names[0])}: correct or remove the name"
+    )
+    return OfPlaced(f"{place}: no photograph is called {quoted(listed)}; {more}")
+
+
+# Which views of a scene are for training, for validation and for testing, and which are left out.
+
+FOLD, FOLD_OFFSET = 8, 4  # of the training views, in order of name: not the first, the end of many a path
+LEAST = 4  # training views that can be divided
+
+
+@dataclass(frozen=True)
+class Split:
+    """What of a dataset a run trains on, chooses by and is tested on; fields as in the table `scene` of a pipeline."""
+
+    holdout: int | Choice = HOLDOUT
+    train: Choice | None = None
+    validation: int | Choice | Literal["auto"] = 0
+    missing: Missing = "refuse"
+    folder: Path | None = None  # where lists of names are that the dataset's own folder does not have
+
+    @property
+    def of_reader(self) -> int:
+        """The holdout that a reader is asked for, where the dataset has no split."""
+        return self.holdout if isinstance(self.holdout, int) else 0
+
+    def applied(self, scene: Scene) -> Scene:
+        """Return the scene, read with `of_reader`, with this split.
+
+        Raises DataError where names are wrong, or a split takes every view.
+        """
+        folders = [scene.path, *([self.folder] if self.folder else [])]
+        if isinstance(self.holdout, Choice) and not (self.holdout.every and scene.test):  # the dataset says which
+            names = [view.name for view in scene.views]
+            test = _chosen(scene, "holdout", self.holdout, names, folders, {"missing": scene.skipped})
+            if len(test) == len(names):
+                raise DataError(
+                    f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; expected some to "
+                    "train with: name fewer of them, or raise `every`"
+                )
+            if not test:
+                remedy = "lower its offset" if self.holdout.every else "name others, whose photographs are there"
+                raise DataError(
+                    f"{scene.path}: scene.holdout takes 0 of {len(names)} photographs for testing; expected some: "
+                    f"{remedy}, or set scene.holdout to 0 for none"
+                )
+            scene = _with_test(scene, test)
+        left_out: list[str] = []
+        if self.train is not None:
+            kept = _of(scene, "train", self.train, folders) | set(scene.test)
+            if kept == set(scene.test):
+                raise DataError(f"{scene.path}: scene.train leaves no photograph to train with; expected some of them")
+            LOG.info("scene.train leaves out %s", amount(len(scene.views) - len(kept), "photograph"))
+            views = [view for i, view in enumerate(scene.views) if i in kept]
+            left_out = [view.name for i, view in enumerate(scene.views) if i not in kept]
+            tested = {scene.views[i].name for i in scene.test}
+            smaller = replace(scene, views=tuple(views))
+            scene = _with_test(smaller, {i for i, view in enumerate(views) if view.name in tested})
+        return self.with_validation(scene, left_out)
+
+    def check(self, folder: Path, names: Sequence[str]) -> None:
+        """Raise DataError for lists with names of none of the photographs in a folder, however many are placed, or with
+        one photograph for testing and not, or for validation and not for training."""
+        others: dict[TakenBy, list[str]] = {}
+        for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
+            if isinstance(choice, Choice):
+                try:
+                    listed = {*choice.check(names, [folder], others)}
+                except DataError as error:
+                    raise DataError(f"{folder}: scene.{key}: {error}") from error
+                if listed and key == "holdout":
+                    others["holdout"] = [*listed]
+                if listed and key == "train":
+                    free = listed | self._counted_out(names)
+                    others["train"] = [name for name in names if name not in free]
+
+    def _counted_out(self, names: Sequence[str]) -> set[str]:
+        """Names that a number holds out for testing, where all are placed."""
+        every, offset = self.of_reader, 0
+        if isinstance(self.holdout, Choice):
+            every, offset = self.holdout.every or 0, self.holdout.offset
+        return {sorted(names)[i] for i in every_nth(sorted(names), every, offset)}
+
+    def with_validation(self, scene: Scene, left_out: Sequence[str] = ()) -> Scene:
+        """Return a scene that has all training views, some of them for validation.
+
+        left_out: names of views that were left out of it.  Raises DataError as `applied`.
+        """
+        folders = [scene.path, *([self.folder] if self.folder else [])]
+        if self.validation == 0:
+            return scene
+        chosen = self.validation
+        fold = _auto(scene) if chosen == "auto" else _of(scene, "validation", chosen, folders, left_out)
+        train = tuple(i for i in scene.train if i not in fold)
+        if not fold or not train:
+            raise DataError(
+                f"{scene.path}: scene.validation takes {len(fold)} of {len(scene.train)} training photographs; "
+                "expected some of them, not all"
+            )
+        return replace(scene, train=train, validation=tuple(sorted(fold)))
+
+
+def _with_test(scene: Scene, test: set[int]) -> Scene:
+    """The views of a scene, with its extent, where these are for testing."""
+    made = make_scene(scene.path, list(scene.views), test, scene.points, scene.background)
+    return replace(scene, train=made.train, test=made.test, extent=made.extent)
+
+
+def _of(
+    scene: Scene, key: str, choice: int | Choice, folders: Sequence[Path], left_out: Sequence[str] = ()
+) -> set[int]:
+    """The indices of the chosen ones of the training views; key: the setting that chooses."""
+    names = [scene.views[i].name for i in scene.train]
+    tested = [scene.views[i].name for i in scene.test]
+    others: Taken = {"holdout": tested, "train": left_out, "missing": scene.skipped}
+    return {scene.train[i] for i in _chosen(scene, key, choice, names, folders, others)}
+
+
+def _chosen(
+    scene: Scene,
+    key: str,
+    choice: int | Choice,
+    names: Sequence[str],
+    folders: Sequence[Path],
+    others: Taken = NONE,
+) -> set[int]:
+    """The indices of the chosen names.  Raises DataError, with the place of the choice."""
+    try:
+        return choose(choice, names, folders, others)
+    except DataError as error:
+        raise type(error)(f"{scene.path}: scene.{key}: {error}") from error
+
+
+def _auto(scene: Scene) -> set[int]:
+    """Every 8th of the training views, and at least two of them."""
+    count = len(scene.train)
+    if count < LEAST:
+        raise DataError(
+            f"{scene.path}: has {amount(count, 'training photograph')}; expected {LEAST} or more to keep some for "
+            "validation: take more, or set scene.validation to 0"
+        )
+    order = sorted(scene.train, key=lambda i: scene.views[i].name)
+    fold = order[FOLD_OFFSET::FOLD]
+    return set(fold if len(fold) > 1 else [order[count // 4], order[3 * count // 4]])

@@ -1,0 +1,118 @@
+"""Where a scene is looked at: which way is up, what the cameras look at, and where one who looks begins."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.scene.camera import Camera
+from clsplat.scene.scene import PointCloud, Scene
+from clsplat.scene.view import View
+
+TURNED = 0.1  # of the squares of rightward axes, along their second direction: cameras turn by 18 degrees
+ROLLED = 0.15  # of that, along their third: with more, cameras are rolled, or lie on their sides
+TOLD = 0.2  # of upward axes along what is up, in the mean: less of them do not say which way it is
+AGREED, FURTHEST = 0.5, 75.0  # a mean of upward axes of this length is less than so many degrees away from what is up
+PRIOR = 1e-3  # weight of the splats' middle, beside the axes: where all are parallel, nothing else says how far
+START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # where there is no view
+SHARES = 0.05, 0.95  # of the splats, along each axis, are before and behind the sides of the box that is looked at
+DISTANCE = 2.2  # of that start from its middle, in halves of its diagonal
+
+
+@dataclass(frozen=True)
+class Stand:
+    """The frame of all motion of one who looks, in scene units."""
+
+    pivot: NDArray[np.floating]  # [3]
+    up: NDArray[np.floating]  # [3], unit
+    radius: float
+    focal: float  # px, the median of the views: what a screen filter without compensation belongs to
+    start: View
+
+    @classmethod
+    def of(cls, points: NDArray[np.floating], views: Sequence[View], first: View | None) -> "Stand":
+        """Look from `first`, else at most of the points from outside.  points: [N, 3], what is to be seen."""
+        means = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        low, high = np.quantile(means, SHARES, axis=0) if len(means) else np.zeros((2, 3))
+        middle, spread = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        if first is None or not views:
+            up = np.array([0.0, -1.0, 0.0])  # as cameras of COLMAP stand
+            radius = spread or 1.0
+            eye = middle + DISTANCE * radius * np.array([0.35, -0.25, -0.9])
+            return cls(middle, up, radius, START.fx, View.looking_at(eye, middle, up, START, "start"))
+        poses = np.stack([view.world_to_camera for view in views])
+        centres = np.stack([view.position for view in views])
+        pivot = closest_point(centres, poses[:, 2, :3], middle)
+        radius = float(np.median(np.linalg.norm(centres - pivot, axis=1))) or spread or 1.0
+        return cls(pivot, upward(views), radius, float(np.median([view.camera.fx for view in views])), first)
+
+
+def upward(views: Sequence[View]) -> NDArray[np.float64]:
+    """Return what is up, unit, [3].
+
+    Where cameras turn, and are held level, it is what their rightward axes are across; else the mean of their upward
+    axes, which leans where all look down from one side.  Where these cancel out, what most look away from.
+    """
+    poses = np.stack([view.world_to_camera for view in views]).astype(np.float64)
+    right, mean, ahead = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
+    squares, axes = np.linalg.eigh(right.T @ right / len(right))
+    axis, length = axes[:, 0], np.linalg.norm(mean)
+    leans = length > AGREED and abs(axis @ mean) < length * np.cos(np.radians(FURTHEST))
+    if squares[1] >= TURNED and squares[0] <= ROLLED * squares[1] and not leans:
+        way = axis @ mean if abs(axis @ mean) > TOLD else -axis @ ahead  # looking down is more usual than up
+        return np.asarray(axis if way > 0 else -axis)
+    axis = mean if length > np.linalg.norm(ahead) / 2 else -ahead
+    axis = axis if np.linalg.norm(axis) > np.finfo(np.float32).eps else -poses[0, 1, :3]
+    return np.asarray(axis / np.linalg.norm(axis), np.float64)
+
+
+def across(up: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return a unit direction across a unit one, both [3]."""
+    found = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    return np.asarray(found / np.linalg.norm(found), np.float64)
+
+
+def closest_point(
+    centres: NDArray[np.floating], axes: NDArray[np.floating], prior: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Return the point, [3], with the least squared distances to lines; weakly drawn to `prior`.
+
+    centres, axes: [V, 3], a point of each line and its unit direction.
+    """
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    weight = PRIOR * len(centres)
+    matrix = across.sum(axis=0) + weight * np.eye(3)
+    return np.asarray(np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centres) + weight * prior))
+
+
+# What the cameras of a scene look at: a point, a box around it, and random points in the box.
+
+RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: the value of 3DGS for the Blender scenes
+
+
+def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
+    """Return grey points, uniform in a box around the point that the training cameras look at."""
+    centre, half_side = looked_at_box(scene)
+    rng = np.random.default_rng([seed, count])
+    spread = rng.uniform(-half_side, half_side, (count, 3))
+    return PointCloud((centre + spread).astype(np.float32), np.full((count, 3), 127 / 255, np.float32))
+
+
+def looked_at_box(scene: Scene) -> tuple[NDArray[np.floating], float]:
+    """Return the centre, [3], and half the side of a box around the point that the training cameras look at."""
+    views = scene.split("train")
+    positions, centre = np.stack([view.position for view in views]), centre_of(views)
+    return centre, RANDOM_BOX * float(np.median(np.linalg.norm(positions - centre, axis=1)))
+
+
+def centre_of(views: Sequence[View]) -> NDArray[np.floating]:
+    """Return the point that the cameras look at, [3] scene units."""
+    return looked_at(np.stack([v.position for v in views]), np.stack([v.world_to_camera[2, :3] for v in views]))
+
+
+def looked_at(positions: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the point nearest to all optical axes, in least squares, [3] scene units."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    point, *_ = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, positions), rcond=None)
+    return np.asarray(point)

@@ -1,0 +1,167 @@
+"""Points for photographs with transparency: the visual hull of their silhouettes (Laurentini 1994).
+
+A box is split into cells, as an octree (Szeliski 1993).  A cell that lies outside the silhouette of one view is empty;
+one that lies inside all silhouettes is full; the others are split.  The last of them are full where their centre is.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from clsplat.scene.scene import PointCloud
+from clsplat.scene.view import View
+
+Floats = NDArray[np.floating]
+Bools = NDArray[np.bool_]
+Cells = NDArray[np.integer]  # [M, 3], places in a grid
+LONG_SIDE = 400  # px, of the photographs that are read
+MAX_VIEWS = 64  # that are read
+COARSEST, FINEST = 16, 256  # cells along a side of the box
+HALF, OPAQUE = 127, 250  # alpha from which a pixel belongs to the silhouette, and shows its colour alone
+LEAST_VIEWS, LEAST_SHARE = 2, 0.25  # that see a cell, in number and of all
+HALF_DIAGONAL = 0.75**0.5  # of a cube of side 1
+BEHIND = 2.0  # sides of a cell that a point may lie behind the first one of its place in the image, and be visible
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """A photograph with transparency, and its camera."""
+
+    view: View
+    rgba: NDArray[np.uint8]  # [H, W, 4]
+
+    @property
+    def alpha(self) -> NDArray[np.uint8]:
+        """[H, W]."""
+        return np.ascontiguousarray(self.rgba[:, :, 3])
+
+    def project(self, points: NDArray[np.float32]) -> "Projection":
+        """Return where points [M, 3] lie in the image."""
+        c, pose = self.view.camera, self.view.world_to_camera
+        matrix = (np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]]) @ pose).astype(np.float32)
+        # not a matrix product: the libraries that compute those sum in an order that follows the number of threads
+        x, y, depth = (sum(row[k] * points[:, k] for k in range(3)) + row[3] for row in matrix)
+        ahead = depth > 0
+        safe = np.where(ahead, depth, 1)
+        row = np.floor(y / safe).clip(-1, c.height).astype(int)
+        column = np.floor(x / safe).clip(-1, c.width).astype(int)
+        inside = ahead & (row >= 0) & (row < c.height) & (column >= 0) & (column < c.width)
+        return Projection(inside, row[inside], column[inside], depth[inside])
+
+    def radius(self, size: float, depth: Floats) -> int:
+        """Return the radius in pixels that nothing of a ball exceeds, at the nearest of some depths."""
+        c = self.view.camera
+        slant = math.hypot(1, max(c.cx, c.width - c.cx) / c.fx, max(c.cy, c.height - c.cy) / c.fy)
+        return min(math.ceil(slant * size * max(c.fx, c.fy) / float(depth.min())), max(c.width, c.height))
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Points in an image; K of M lie in it."""
+
+    inside: Bools  # [M]
+    row: NDArray[np.integer]  # [K] px
+    column: NDArray[np.integer]  # [K] px
+    depth: Floats  # [K] scene units
+
+
+def hull_points(
+    views: Sequence[View],
+    centre: Floats,
+    half_side: float,
+    load: Callable[[View], NDArray[np.uint8] | None],
+    count: int,
+    seed: int,
+) -> PointCloud:
+    """Return at most `count` coloured points on the hull, in a box of 2 `half_side` around `centre` [3], perhaps none.
+
+    `load` returns a photograph with its alpha, [H, W, 4], or None without transparency.  The last cells are those of
+    which there are `count` or more on the surface, about, unless they would be smaller than the box by FINEST.
+    """
+    silhouettes = list(_silhouettes(views, load))
+    full, number = np.zeros((COARSEST,) * 3, bool), COARSEST
+    cells: Cells = np.argwhere(~full)
+    while True:
+        centres, side = _centres(cells, centre, half_side, number)
+        inside, cut = _within(silhouettes, centres, HALF_DIAGONAL * side)
+        full[tuple(cells[inside].T)] = True
+        cells, number = _split(cells[cut]), 2 * number
+        full = full.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
+        if cut.sum() >= count or number == FINEST:
+            break
+    inside, _ = _within(silhouettes, _centres(cells, centre, half_side, number)[0], 0)
+    full[tuple(cells[inside].T)] = True
+    points, side = _centres(
+        np.argwhere(full & ~scipy.ndimage.binary_erosion(full, border_value=1)), centre, half_side, number
+    )
+    colours, seen = _colours(silhouettes, points, side)
+    points, colours = points[seen], colours[seen]
+    chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(points))[:count])
+    return PointCloud(points[chosen], colours[chosen])
+
+
+def _silhouettes(views: Sequence[View], load: Callable[[View], NDArray[np.uint8] | None]) -> Iterator[Silhouette]:
+    for place in np.unique(np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)):
+        view = views[place]
+        small = view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
+        rgba = load(small)
+        if rgba is not None:
+            yield Silhouette(small, rgba)
+
+
+def _split(cells: Cells) -> Cells:
+    """The eight parts of each cell, [8 M, 3]."""
+    return (2 * cells[:, None] + np.indices((2, 2, 2)).reshape(3, -1).T).reshape(-1, 3)
+
+
+def _centres(cells: Cells, centre: Floats, half_side: float, number: int) -> tuple[NDArray[np.float32], float]:
+    """The centres of cells of a box that has `number` along a side, [M, 3], and their side."""
+    side = 2 * half_side / number
+    return (centre - half_side + side * (cells + 0.5)).astype(np.float32), side
+
+
+def _within(silhouettes: Sequence[Silhouette], centres: NDArray[np.float32], radius: float) -> tuple[Bools, Bools]:
+    """Which balls around points, [M], lie inside all silhouettes in whose images they are, and which on the edge of one
+    and outside none.  Neither are those that few views see: nobody knows what is there."""
+    full, left, seen = np.ones(len(centres), bool), np.arange(len(centres)), np.zeros(len(centres), int)
+    for silhouette in silhouettes:
+        place = silhouette.project(centres[left])
+        if not len(place.depth):
+            continue
+        around = np.ones((2 * silhouette.radius(radius, place.depth) + 1,) * 2, np.uint8)
+        here = left[place.inside]
+        seen[here] += 1
+        full[here[cv2.erode(silhouette.alpha, around)[place.row, place.column] <= HALF]] = False
+        stays = ~place.inside
+        stays[place.inside] = cv2.dilate(silhouette.alpha, around)[place.row, place.column] > HALF
+        left = left[stays]
+    touched = np.zeros(len(centres), bool)
+    touched[left] = True
+    touched &= seen >= max(LEAST_VIEWS, LEAST_SHARE * len(silhouettes))
+    return touched & full, touched & ~full
+
+
+def _colours(
+    silhouettes: Sequence[Silhouette], points: NDArray[np.float32], side: float
+) -> tuple[NDArray[np.float32], Bools]:
+    """The mean colours of points, [M, 3] in [0, 1], in the views that show them, and which are shown."""
+    total, number = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
+    for silhouette in silhouettes:
+        place, camera = silhouette.project(points), silhouette.view.camera
+        if not len(place.depth):
+            continue
+        cell = max(1, math.ceil(side * max(camera.fx, camera.fy) / float(np.median(place.depth))))  # px
+        first = np.full((camera.height // cell + 1, camera.width // cell + 1), np.inf, np.float32)
+        np.minimum.at(first, (place.row // cell, place.column // cell), place.depth)
+        shown = place.depth <= first[place.row // cell, place.column // cell] + BEHIND * side
+        rgba = silhouette.rgba[place.row, place.column]
+        shown &= rgba[:, 3] >= OPAQUE
+        here = np.flatnonzero(place.inside)[shown]
+        total[here] += rgba[shown, :3]
+        number[here] += 1
+    return np.asarray(total / np.maximum(255 * number, 1)[:, None], np.float32), number > 0

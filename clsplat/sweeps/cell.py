@@ -1,0 +1,185 @@
+"""A cell: one run of a sweep, named by the content of all that decides its bits, and by no place."""
+
+import hashlib
+import json
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from clsplat.core.errors import ClsplatError, DataError
+from clsplat.core.files import PREPARED, write_text
+from clsplat.core.reading import read_json, sha256
+from clsplat.core.resources import __version__, list_sources
+from clsplat.pipeline.input_files import content_of, contents, in_place, placeless
+from clsplat.pipeline.loading import Pipeline
+from clsplat.prepare.cache import plan
+from clsplat.scene.detect import read_scene
+from clsplat.scene.identity import Identity, ImageFile
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import NO_FILE
+
+# Fingerprints of what a cell depends on: the content of its scene, and the program.
+
+KEPT = 16  # hexadecimal digits of a hash
+# decode photographs, place Gaussians, and compress models: OpenCV has libwebp
+LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "zstandard", "deflate")
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of a scene before any run."""
+
+    digest: str
+    pixels: float  # of all training photographs, for the order of cells
+    scene: Scene | None = None  # as its files have it; None where `prepare` makes it
+
+
+@cache
+def code_digest() -> str:
+    """Return a hash of the program: the package, its kernels, and the libraries that decide over bits."""
+    libraries = [*_versions(*LIBRARIES), f"zlib {zlib.ZLIB_RUNTIME_VERSION}", _builtin_zstd()]
+    return _digest([__version__, *list_sources(), *libraries])
+
+
+@cache
+def tools_digest() -> str:
+    """Return a hash of what else decides over the bits of scenes that `prepare` makes."""
+    return _digest(_versions("pycolmap"))
+
+
+def _versions(*names: str) -> Iterator[str]:
+    for name in names:
+        with suppress(PackageNotFoundError):
+            yield f"{name} {version(name)}"
+
+
+def _builtin_zstd() -> str:
+    """The Zstandard of Python itself, from 3.14 on."""
+    with suppress(ImportError):
+        from compression import zstd
+
+        return f"zstd {zstd.zstd_version}"
+    return ""
+
+
+def _digest(parts: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:KEPT]
+
+
+class Scenes:
+    """Fingerprints of scenes.  Hashes of photographs are kept by size and time of change, in a file a scene folder."""
+
+    def __init__(self, folder: Path) -> None:
+        """folder: of those files, which may be lost."""
+        self._folder = folder
+        self._known: dict[str, Known] = {}
+
+    def known(self, pipeline: Pipeline) -> Known:
+        """Return what is known of a pipeline's scene.
+
+        It is the identity that a run writes into inputs.json; where `prepare` makes the scene, that of prepared.json.
+        Raises DataError when the scene cannot be read, ConfigError when none is named.
+        """
+        settings = pipeline.settings
+        steps = [step.model_dump(mode="json") for step in settings.prepare]
+        key = json.dumps([settings.scene.model_dump(mode="json"), steps])
+        if key not in self._known:
+            self._known[key] = self._prepared(pipeline) if settings.prepare else self._read(pipeline)
+        return self._known[key]
+
+    def _prepared(self, pipeline: Pipeline) -> Known:
+        folder = pipeline.settings.scene.folder
+        return Known(plan(pipeline.settings.prepare, folder, self._folder / PREPARED)[-1].key, 0.0)
+
+    def _read(self, pipeline: Pipeline) -> Known:
+        settings = pipeline.settings.scene
+        original, _ = settings.applied(read_scene(settings.folder, settings.split))
+        paths = [path for view in original.views for path in (view.image_path, view.mask_path)]
+        files = {}
+        with self._digests(settings.folder) as digest_of:
+            for path in paths:
+                if path is not None and path != NO_FILE and path not in files:
+                    files[path] = ImageFile(digest=digest_of(path))
+        pixels = sum(view.camera.width * view.camera.height for view in original.split("train")) / settings.downscale**2
+        return Known(Identity.of(original, files).digest, float(pixels), original)
+
+    @contextmanager
+    def _digests(self, scene: Path) -> Iterator[Any]:
+        """Yield a function that hashes a file below a scene, or knows its hash from before."""
+        place = hashlib.sha256(str(scene.resolve()).encode()).hexdigest()[:KEPT]
+        note = self._folder / f"{place}.json"
+        before: dict[str, Any] = {}
+        with suppress(DataError):
+            found = read_json(note)
+            before = found if isinstance(found, dict) else {}
+        after = dict(before)
+
+        def digest_of(path: Path) -> str:
+            try:
+                state = path.stat()
+                stamp = [state.st_size, state.st_mtime_ns]
+                match before.get(str(path)):
+                    case [size, time, str(digest)] if [size, time] == stamp:
+                        return digest
+                after[str(path)] = [*stamp, sha256(path)]
+            except (DataError, OSError):  # the run will say what is wrong with it
+                return ""
+            return str(after[str(path)][2])
+
+        yield digest_of
+        if after != before:
+            with suppress(ClsplatError):
+                write_text(note, json.dumps(after) + "\n")
+
+
+KEY = 20  # hexadecimal digits of the hash that names a cell
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run, and the pipeline file that runs it on this machine."""
+
+    name: str  # in its sweep
+    spec: dict[str, Any]  # what its key is made of: pipeline, scene, code, bits
+    text: str  # the resolved pipeline, with absolute paths
+    files: dict[str, str] = field(default_factory=dict)  # hashes of the files that it names, by path
+
+    @classmethod
+    def of(cls, name: str, pipeline: Pipeline, scene: str, bits: str) -> "Cell":
+        """Return the cell of a pipeline.  scene: the fingerprint of its scene; bits: the bits class of its device.
+
+        Raises DataError when a file that it names cannot be read.
+        """
+        placed = in_place(pipeline)
+        spec = {"pipeline": placeless(placed), "scene": scene, "code": code_digest(), "bits": bits}
+        if pipeline.settings.prepare:
+            spec["tools"] = tools_digest()
+        return cls(name, spec, placed.text(), contents(placed))
+
+    @classmethod
+    def from_json(cls, text: str) -> "Cell":
+        """Return what `json` returned."""
+        return cls(**json.loads(text))
+
+    def json(self) -> str:
+        """Return the cell as text, for another process."""
+        return json.dumps(asdict(self))
+
+    def require_files(self) -> None:
+        """Raise DataError where a file that it names does not hold here what its key was made of."""
+        for path, digest in self.files.items():
+            if content_of(Path(path)) != digest:
+                raise DataError(
+                    f"cell {self.name}: {path} is not what it was where the sweep began; put that file there, or run "
+                    "the sweep again"
+                )
+
+    @property
+    def key(self) -> str:
+        """The name of its folder in a store."""
+        return hashlib.sha256(json.dumps(self.spec, sort_keys=True).encode()).hexdigest()[:KEY]

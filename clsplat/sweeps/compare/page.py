@@ -1,0 +1,428 @@
+"""Runs side by side, as one page that opens offline: metrics, curves, crops, differing settings."""
+
+import logging
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean, stdev
+from urllib.parse import quote
+
+from markupsafe import Markup
+
+from clsplat.core.errors import ConfigError, DataError, amount
+from clsplat.core.files import write_text
+from clsplat.core.page import charts, duration, embedded, render
+from clsplat.pipeline.file import SceneSettings
+from clsplat.runs.results import Points, RunFolder, RunMetrics
+from clsplat.sweeps.compare.comparison import Comparison, PublishedTable, Row, Variant, differing
+from clsplat.sweeps.compare.crops import Crop, Seams, find_crops, find_seams
+from clsplat.training.records import VIEWS, over_views
+from clsplat.viewer.charts import COLOURS, Line, curve
+
+# The tables of a comparison: metrics and costs, means over scenes, differing settings.
+
+METRICS = {  # name -> heading, digits, function that returns the better one
+    "psnr": ("PSNR ↑", 2, max),
+    "psnr_colour": ("PSNR in the photographs' colours ↑", 2, max),
+    "psnr_affine": ("PSNR, colours fitted ↑", 2, max),
+    "psnr_held_out_moments": ("PSNR, held-out moments ↑", 2, max),
+    "psnr_other_moments": ("PSNR, other moments ↑", 2, max),
+    "psnr_static": ("PSNR, static pixels ↑", 2, max),
+    "flicker": ("flicker of static pixels, levels ↓", 2, min),
+    "ssim": ("SSIM ↑", 4, max),
+    "ms_ssim": ("MS-SSIM ↑", 4, max),
+    "flip": ("FLIP ↓", 4, min),
+    "lpips": ("LPIPS ↓", 4, min),
+}
+CONDITIONS = {"lpips_input": "input range of LPIPS", "lpips_model": "LPIPS network"}
+MAX_SEEDS = 3  # named one by one
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A mean as text, with the standard deviation where there are several runs."""
+
+    text: str
+    deviation: str = ""
+    best: bool = False
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure of each row."""
+
+    heading: str
+    cells: list[Cell]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Columns under a common title."""
+
+    title: str
+    columns: list[Column]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A row for each variant."""
+
+    variants: list[Variant]
+    groups: list[Group]
+    seeds: list[str] = field(default_factory=list)  # by row; empty: not shown
+
+
+def main_table(rows: Sequence[Row]) -> Table:
+    """Return test metrics at the training size, and the costs."""
+    costs = [
+        *_cost(rows, "Gaussians", lambda metrics: metrics.gaussians),
+        *_cost(rows, "parameters", lambda metrics: metrics.parameters),
+        Column("steps", _cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
+        Column("training", [Cell(duration(fmean(run.metrics.train_seconds for run in row.runs))) for row in rows]),
+        *_cost(rows, "CPU seconds", lambda metrics: metrics.cpu_seconds),
+        *_cost(rows, "device memory, MB", lambda metrics: metrics.device_memory and metrics.device_memory / 1e6),
+    ]
+    return _table(rows, [*_trained_on(rows), Group("", costs)])
+
+
+def _cost(rows: Sequence[Row], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
+    """A column of what not all runs note; none where no run does."""
+    found = [[cost(run.metrics) for run in row.runs] for row in rows]
+    values = [[value for value in row if value is not None] for row in found]
+    return [Column(heading, _cells(values, 0))] if any(values) else []
+
+
+def other_table(rows: Sequence[Row]) -> Table | None:
+    """Return the metrics of all other sizes and views; None when there are none."""
+    groups = [_group(rows, *one) for one in _measured(rows) if one != ("test", rows[0].downscale)]
+    return _table(rows, groups) if groups else None
+
+
+def downscales(rows: Sequence[Row], split: str) -> list[str]:
+    """Return the divisors of the image sizes that any row was measured at, from full size down."""
+    found = {downscale for row in rows for downscale in row.downscales(split)}
+    return sorted(found, key=lambda text: (float(text), text))
+
+
+def means_over_scenes(comparison: Comparison) -> Table | None:
+    """Return means over the scenes, for variants that ran on all of them; None when there is no such figure."""
+    scenes = list(comparison.scenes.values())
+    everywhere = [[row for rows in scenes for row in rows if row.variant is v] for v in comparison.variants]
+    complete = [rows for rows in everywhere if len(rows) == len(scenes)]
+    columns = []
+    for name, (heading, digits, best) in METRICS.items():
+        means = [
+            [fmean(values) for row in rows if (values := row.figures("test", row.downscale, name))] for rows in complete
+        ]
+        if means and all(len(values) == len(scenes) for values in means):
+            columns.append(Column(heading, _cells([[fmean(values)] for values in means], digits, best)))
+    return Table([rows[0].variant for rows in complete], [Group("", columns)]) if columns else None
+
+
+def differing_settings(variants: Sequence[Variant]) -> dict[str, list[str]]:
+    """Return the settings that are not the same in all variants: place -> values by variant."""
+    places = differing([variant.settings for variant in variants])
+    return {place: [variant.settings.get(place, "–") for variant in variants] for place in places}
+
+
+def differing_conditions(rows: Sequence[Row]) -> Iterable[str]:
+    """Yield sentences about conditions that differ, so that figures of a column are not comparable."""
+    splits = [split for row in rows for run in row.runs for split in (run.metrics.test, run.metrics.train)]
+    averages = [one for split in splits for one in split.values()]
+    for key, name in CONDITIONS.items():
+        values = {str(value) for one in averages if (value := getattr(one, key, None)) is not None}
+        if len(values) > 1:
+            yield f"The {name} is not the same in all runs ({', '.join(sorted(values))})."
+    for split, downscale in _measured(rows):
+        found = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
+        counts = {one.colour_views for one in found if one is not None and one.figure("psnr_colour") is not None}
+        if len(counts) > 1:
+            name = f"number of {_title(rows, split, downscale)} with a PSNR in the photographs' colours"
+            yield f"The {name} is not the same in all runs ({', '.join(map(str, sorted(counts)))})."
+
+
+def _measured(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    """The splits and the divisors of the image sizes that any row was measured at."""
+    return [(split, downscale) for split in ("test", "train") for downscale in downscales(rows, split)]
+
+
+def _trained_on(rows: Sequence[Row]) -> list[Group]:
+    """The test metrics at the training size, where they were measured."""
+    downscale = rows[0].downscale
+    return [_group(rows, "test", downscale)] if downscale in downscales(rows, "test") else []
+
+
+def _group(rows: Sequence[Row], split: str, downscale: str) -> Group:
+    columns = [
+        Column(heading, _cells([row.figures(split, downscale, name) for row in rows], digits, best))
+        for name, (heading, digits, best) in METRICS.items()
+        if any(row.figures(split, downscale, name) for row in rows)
+    ]
+    return Group(_title(rows, split, downscale), columns)
+
+
+def _title(rows: Sequence[Row], split: str, downscale: str) -> str:
+    size = "full size" if downscale == "1" else f"1/{downscale}"
+    return f"{split} views" + ("" if downscale == rows[0].downscale == "1" else f" at {size}")
+
+
+def _table(rows: Sequence[Row], groups: list[Group]) -> Table:
+    return Table([row.variant for row in rows], groups, [_seeds(row) for row in rows])
+
+
+def _seeds(row: Row) -> str:
+    seeds = [str(run.metrics.seed) for run in row.runs]
+    return ", ".join(seeds) if len(seeds) <= MAX_SEEDS else f"{len(seeds)} seeds"
+
+
+def _cells(values: Sequence[list[float]], digits: int, best: Callable[..., float] | None = None) -> list[Cell]:
+    """A cell for each list of values; `best` of the means, as they are shown, is marked."""
+    means = [round(fmean(row), digits) if row else None for row in values]
+    present = [mean for mean in means if mean is not None]
+    top = best(present) if best and len(present) > 1 else None
+    return [_cell(row, mean, digits, mean == top) for row, mean in zip(values, means, strict=True)]
+
+
+def _cell(values: list[float], mean: float | None, digits: int, best: bool) -> Cell:
+    if mean is None:
+        return Cell("–")
+    deviation = stdev(values) if len(values) > 1 else 0.0
+    return Cell(f"{mean:,.{digits}f}", f"{deviation:,.{digits}f}" if deviation > 0 else "", best)
+
+
+# The charts of a comparison: quality and Gaussians over steps and CPU seconds, and quality over image sizes.
+
+MOST_LINES = len(COLOURS)  # that are told apart one by one
+
+
+def curves(rows: Sequence[Row]) -> list[Markup]:
+    """PSNR and Gaussians over steps, a line for each run, or, of many, for each variant; then quality over sizes."""
+    downscale = rows[0].runs[0].scene.downscale
+    are_many = sum(len(row.runs) for row in rows) > MOST_LINES
+    means = " (means)" if are_many and any(len(row.runs) > 1 for row in rows) else ""
+
+    def lines(points_of: Callable[[RunFolder], Points]) -> list[Line]:
+        if are_many:
+            of_rows = [_mean([points_of(run) for run in row.runs]) for row in rows]
+            return [
+                Line(points, row.variant.letter, row.variant.colour, i // len(COLOURS))
+                for i, (row, points) in enumerate(zip(rows, of_rows, strict=True))
+                if len(dict(points)) > 1
+            ]
+        return [
+            Line(points, name, row.variant.colour, i)
+            for row in rows
+            for i, (run, name) in enumerate(zip(row.runs, _names(row), strict=True))
+            if len(dict(points := points_of(run))) > 1  # steps: one is no line
+        ]
+
+    def tested(run: RunFolder) -> Points:
+        return run.points("evaluate", "psnr", split="test", downscale=downscale)
+
+    def trained(run: RunFolder) -> Points:
+        points = run.points("train", "psnr")
+        return list(zip([step for step, _ in points], over_views([psnr for _, psnr in points]), strict=True))
+
+    drawings = [
+        curve(f"test PSNR over steps, dB{means}", lines(tested)),
+        curve(f"test PSNR over CPU seconds of training, dB{means}", lines(lambda run: run.by_cpu_seconds(tested(run)))),
+        curve(f"training PSNR over steps, mean of {VIEWS} views, dB{means}", lines(trained)),
+        curve(f"Gaussians over steps{means}", lines(lambda run: run.points("train", "gaussians"))),
+    ]
+    return charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
+
+
+def _mean(lines: Sequence[Points]) -> Points:
+    """The means of lines, point by point, as far as all go."""
+    return [(fmean(x for x, _ in points), fmean(y for _, y in points)) for points in zip(*lines, strict=False)]
+
+
+def _names(row: Row) -> list[str]:
+    """The names of a row's lines where it has several runs: their seeds, or the folders of runs with one seed."""
+    runs = row.runs
+    if len(runs) == 1:
+        return [""]
+    choices = (
+        [f"seed {run.metrics.seed}" for run in runs],
+        [run.path.resolve().name for run in runs],
+        [str(run.path) for run in runs],
+    )
+    names = next((names for names in choices if len(set(names)) == len(runs)), choices[-1])
+    return [f"{row.variant.letter} {name}" for name in names]
+
+
+def _size_charts(rows: Sequence[Row], split: str) -> list[str]:
+    """PSNR and SSIM over image sizes, a line for each variant."""
+    sizes = downscales(rows, split)
+    if len(sizes) < 2:
+        return []
+    ticks = {float(i): "full size" if size == "1" else f"1/{size}" for i, size in enumerate(sizes)}
+    drawings = []
+    for metric, title in (("psnr", f"{split} PSNR by image size, dB"), ("ssim", f"{split} SSIM by image size")):
+        lines = []
+        for row in rows:
+            found = [(float(i), row.figures(split, size, metric)) for i, size in enumerate(sizes)]
+            lines.append(Line([(i, fmean(values)) for i, values in found if values], colour=row.variant.colour))
+        drawings.append(curve(title, lines, ticks=ticks))
+    return drawings
+
+
+LOG = logging.getLogger("clsplat")
+MAX_NAMES = 4  # of pipelines, in the title
+
+
+@dataclass(frozen=True)
+class CropFigure:
+    """A crop with its images as data URLs."""
+
+    view: str
+    overview: str
+    frame: dict[str, float]  # percent of the overview
+    photograph: str
+    renders: list[str]  # by variant
+    psnrs: list[float]  # dB, by variant
+
+
+@dataclass(frozen=True)
+class SeamFigure:
+    """The bands along the borders of blocks, as text and a data URL."""
+
+    text: str
+    rows: list[tuple[Variant, str, str]]  # PSNR of the band, and of the rest
+    picture: str
+
+
+@dataclass(frozen=True)
+class SceneSection:
+    """The section of the page about one scene."""
+
+    name: str
+    variants: list[Variant]
+    several_seeds: bool
+    explanations: list[str]  # of the tables
+    remarks: list[str]
+    main: Table
+    other: Table | None
+    curves: list[Markup]
+    crops: list[CropFigure]
+    no_crops: str  # the reason
+    seams: SeamFigure | None = None
+
+
+def write_comparison(
+    paths: Sequence[Path],
+    out: Path,
+    title: str = "",
+    remarks: Sequence[str] = (),
+    published: Sequence[PublishedTable] = (),
+) -> int:
+    """Write the page on some run folders; return the number of runs on it.  Raises what Comparison.read raises."""
+    comparison = Comparison.read(paths)
+    faults = [fault for run in comparison.runs for fault in run.missing_plugins]
+    for fault in faults:
+        LOG.warning("%s", fault)
+    remarks = [*remarks, *faults]
+    write_text(out, comparison_page(comparison, title, remarks, out.parent, published))
+    return len(comparison.runs)
+
+
+def comparison_page(
+    comparison: Comparison,
+    title: str,
+    remarks: Sequence[str],
+    folder: Path,
+    published: Sequence[PublishedTable] = (),
+) -> str:
+    """Return the page for a folder; the default title is the names of the pipelines; `remarks` are at the top."""
+    runs, scenes, variants = comparison.runs, comparison.scenes, comparison.variants
+    names = list(dict.fromkeys(run.metrics.pipeline for run in runs))
+    title = title or " · ".join([*names[:MAX_NAMES], *(["…"] if len(names) > MAX_NAMES else [])])
+    devices = {run.metrics.device for run in runs}
+    device = f"device: {devices.pop()}" if len(devices) == 1 else "several devices"
+    return render(
+        "compare.html.j2",
+        title=f"{title}: {amount(len(runs), 'run')}",
+        subtitle=f"{amount(len(variants), 'variant')} on {amount(len(scenes), 'scene')}; {device}",
+        remarks=remarks,
+        means=means_over_scenes(comparison) if len(scenes) > 1 else None,
+        scenes=[_section(name, rows) for name, rows in scenes.items()],
+        variants=variants,
+        published=published,
+        settings=differing_settings(variants),
+        runs=[(comparison.variant(run), str(run.path), run.metrics.seed, _links(run, folder)) for run in runs],
+    )
+
+
+def _links(run: RunFolder, folder: Path) -> dict[str, str]:
+    """The pages of a run, with their addresses from a folder."""
+    files = {stage: run.path / run.metrics.files.get(stage, "") for stage in ("report", "viewer")}
+    return {
+        stage: quote(Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix())
+        for stage, file in files.items()
+        if file.is_file()
+    }
+
+
+def _section(name: str, rows: Sequence[Row]) -> SceneSection:
+    crops, no_crops, seams = _pictures(rows)
+    several_seeds = any(len(row.runs) > 1 for row in rows)
+    explanations = ["mean ± standard deviation over seeds"] if several_seeds else []
+    return SceneSection(
+        name=name,
+        variants=[row.variant for row in rows],
+        several_seeds=several_seeds,
+        explanations=[*_sizes(rows[0].runs[0].scene), *explanations, *(["bold: the best"] if len(rows) > 1 else [])],
+        remarks=list(differing_conditions(rows)),
+        main=main_table(rows),
+        other=other_table(rows),
+        curves=curves(rows),
+        crops=[_figure(crop) for crop in crops],
+        no_crops=no_crops,
+        seams=_seam_figure(seams, rows) if seams else None,
+    )
+
+
+def _sizes(scene: SceneSettings) -> list[str]:
+    """What sizes mean, where the training did not see the photographs as they are, or saw several."""
+    first, *more = (f"1/{downscale:g}" if downscale != 1 else "full size" for downscale in scene.downscales)
+    if first == "full size" and not more:
+        return []
+    return [f"sizes are shares of the photographs' own; trained at {', '.join([first, *more])}"]
+
+
+def _pictures(rows: Sequence[Row]) -> tuple[list[Crop], str, Seams | None]:
+    """Crops of each row's first run, or why there are none, such as missing photographs; and seams of blocks."""
+    runs = [row.runs[0] for row in rows]
+    settings = runs[0].scene
+    try:
+        photographs, background = settings.read(runs[0].photographs)
+        scene = photographs.downscaled(settings.downscale)
+    except (DataError, ConfigError) as error:
+        LOG.warning("no crops: %s", error)
+        return [], str(error), None
+    crops = find_crops(runs, scene, background)
+    reason = "" if crops else "there is no view that all runs rendered; add `- render` to the stages"
+    return crops, reason, find_seams(runs, scene, background)
+
+
+def _seam_figure(seams: Seams, rows: Sequence[Row]) -> SeamFigure:
+    text = (
+        f"{100 * seams.share:.1f} % of the pixels of {amount(seams.views, 'view')} show what lies near a border of "
+        f"blocks; red in {seams.view}"
+    )
+    figures = zip(rows, seams.band, seams.rest, strict=True)
+    found = [(row.variant, f"{band:.2f}", f"{rest:.2f}") for row, band, rest in figures]
+    return SeamFigure(text, found, embedded(seams.picture))
+
+
+def _figure(crop: Crop) -> CropFigure:
+    """The crop for the page; PNG keeps every bit of its squares."""
+    return CropFigure(
+        view=crop.view,
+        overview=embedded(crop.overview),
+        frame=crop.frame,
+        photograph=embedded(crop.photograph, ".png"),
+        renders=[embedded(image, ".png") for image in crop.renders],
+        psnrs=crop.psnrs,
+    )

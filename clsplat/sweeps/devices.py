@@ -1,0 +1,207 @@
+"""The bits class of a device: the hash of what a fixed run gives on it.
+
+A name is not enough, and too much: other runtimes may give the same bits, and the same runtime others on another
+processor.  Devices of one class may go on with each other's cells.
+"""
+
+import hashlib
+import json
+import logging
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from clsplat.conformance.bench.packing import known_packing, told
+from clsplat.conformance.host import available_memory
+from clsplat.core import machine
+from clsplat.core.errors import ConfigError, DataError, DeviceError, OutputError, amount
+from clsplat.core.files import write_text
+from clsplat.core.machine import Owner, cache_folder
+from clsplat.core.reading import read_file, read_json, sha256
+from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
+from clsplat.sweeps.cell import code_digest
+from clsplat.sweeps.child import filled, run_command
+
+# How many runs share a CPU, and which cores each has.
+
+LOG = logging.getLogger("clsplat")
+Packing = int | Literal["auto"]
+Parts = list[tuple[int, ...]]  # the cores of each run; one without cores has all, and is not kept to any
+
+
+def shares_of(devices: Sequence[DeviceInfo], packing: Packing) -> list[Parts]:
+    """Return the cores of the runs of each device, and say what was chosen by a measurement.
+
+    A device that is no CPU has one run.  With "auto" so has each of several CPU devices, for they share the cores.
+    Raises ConfigError for more runs than cores.
+    """
+    own = machine.usable()
+    if packing != "auto" and packing > len(own):
+        raise ConfigError(f"execution.packing: {packing} runs cannot share {amount(len(own), 'core')}; expected fewer")
+    is_only = sum(info.kind == "CPU" for info in devices) == 1
+    return [_parts(info, own, packing, is_only) if info.kind == "CPU" else [()] for info in devices]
+
+
+def memory_of_each(info: DeviceInfo, runs: int) -> int:
+    """Return the bytes that each of the runs of a device may take: of a CPU they share what the host has free."""
+    if runs == 1:
+        return info.memory
+    free = available_memory()
+    return info.memory // runs if free is None else min(info.memory, free // runs)
+
+
+def _parts(info: DeviceInfo, own: tuple[int, ...], packing: Packing, is_only: bool) -> Parts:
+    if packing == "auto":
+        packing = _measured(info) if is_only and len(own) > 1 else 1
+    return machine.shares(own, packing) if packing > 1 else [()]
+
+
+def _measured(info: DeviceInfo) -> int:
+    known = known_packing(info)
+    how = "by `clsplat bench --packing`" if known else "`clsplat bench --packing` would tell whether several are faster"
+    LOG.info("%s: %s; %s", info.text, told(known or 1), how)
+    return known or 1
+
+
+TOLD = "clsplat"  # name of what a worker tells of its device, among the figures that Dask keeps of it
+CLASS = 8  # hexadecimal digits of a bits class
+SECONDS = 600.0  # that the fixed run may take: a runtime may build its kernels for minutes
+SCENE_OPTIONS = ("--size", "48", "--train", "8", "--test", "2", "--seed", "0")
+PIPELINE = """\
+# What a training may use: spherical harmonics, growth, a reset, both filters.
+name: probe
+model:
+  sh_degree: 3
+  world_filter: {type: smoothing, variance: 0.2}
+  screen_filter: {type: mip, variance: 0.1}
+stages:
+  - init: {count: 500}
+  - optimize:
+      steps: 60
+      losses: [{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}]
+      during:
+        - raise_sh: {every: 10}
+        - densify:
+            every: 10
+            start: 5
+            stop: 45
+            rules:
+              - {type: clone, gradient_above: 2.0e-4, size_below: 0.01}
+              - {type: split, gradient_above: 2.0e-4, size_above: 0.01}
+              - {type: prune_faint, opacity_below: 0.005}
+        - reset_opacity: {every: 20, stop: 30, to: 0.1}
+        - refresh_filter: {every: 10}
+  - export: {file: point_cloud.ply}
+"""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A device that runs cells, one at a time."""
+
+    worker: str  # who offers it
+    device: str  # as `--device` takes it
+    bits: str  # its class
+    text: str = ""  # what it is
+    cores: tuple[int, ...] = ()  # of a CPU that several runs share; none: all
+    memory: int = sys.maxsize  # bytes that a run may take
+    allocation: int = sys.maxsize  # bytes, largest single buffer
+    unified: bool = False  # its memory is the host's
+
+
+def place_of(address: str, worker: dict[str, Any]) -> Place | None:
+    """Return the device that a worker tells; None for a worker of another program, or version."""
+    try:
+        values = json.loads(str(worker["metrics"][TOLD]))
+        if values["code"] != code_digest():
+            return None
+        device, bits, text = (str(values[name]) for name in ("device", "bits", "host"))
+        memory, allocation = map(int, values["limits"])
+        return Place(address, device, bits, text, (), memory, allocation, bool(values["unified"]))
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) -> list[Place]:
+    """Return the devices of this machine that work, or those of a list of names, with their classes.
+
+    packing: the runs that share a CPU, each of which has a place; "auto": what was measured, else one.
+    Raises DeviceError where there is none, or one of the list does not work, ConfigError for more runs than cores.
+    """
+    infos = list_devices()
+    chosen = [choose(name) for name in devices] if devices is not None else [one for one in infos if not one.fault()]
+    if not chosen:
+        raise DeviceError("no OpenCL device works; `clsplat devices` tells why")
+    found = []
+    for info, parts in zip(chosen, shares_of(chosen, packing), strict=True):
+        own = Place(
+            worker,
+            word_of(info, infos),
+            bits_class(info, infos),
+            info.text,
+            memory=memory_of_each(info, len(parts)),
+            allocation=info.allocation,
+            unified=info.unified,
+        )
+        found += [replace(own, cores=part) for part in parts]
+    return found
+
+
+def word_of(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
+    """Return the words that name one device of several for `--device`."""
+    words = f"{info.platform} {info.name} {info.kind}"
+    same = [one.place for one in infos if one.matches(words)]
+    return f"{words}:{same.index(info.place)}"
+
+
+def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
+    """Return the class of a device; the fixed run is run once for a device, its driver and the program.
+
+    Raises DeviceError where it fails.
+    """
+    host = Owner.this().host
+    key = hashlib.sha256(json.dumps([host, info.text, info.driver, code_digest()]).encode()).hexdigest()
+    note = cache_folder() / "bits" / f"{key[:16]}.json"
+    with suppress(DataError):
+        found = read_json(note)
+        if isinstance(found, dict) and isinstance(found.get("bits"), str):
+            return str(found["bits"])
+    LOG.info("%s: a short run tells which devices give the same bits", info.text)
+    bits = _run(word_of(info, infos))
+    with suppress(OutputError):
+        write_text(note, json.dumps({"bits": bits, "device": info.text}) + "\n")
+    return bits
+
+
+def _run(device: str) -> str:
+    with tempfile.TemporaryDirectory(prefix="clsplat-") as name:
+        folder = Path(name)
+        write_text(folder / "probe.yaml", PIPELINE)
+        scene = str(folder / "scene")
+        _call(device, [sys.executable, "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder)
+        words = filled(run_command(device), folder / "probe.yaml", folder / "run")
+        _call(device, [*words, "--scene", scene], folder)
+        return sha256(folder / "run" / "point_cloud.ply")[:CLASS]
+
+
+def _call(device: str, command: list[str], folder: Path) -> None:
+    """Run a command of the test, whose input stays open.  Raises DeviceError where it fails."""
+    with (folder / "errors.txt").open("wb") as errors:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)
+        try:
+            process.wait(SECONDS)
+        except subprocess.TimeoutExpired:
+            raise DeviceError(f"{device}: the run of its test did not end in {SECONDS:.0f} s") from None
+        finally:
+            process.kill()
+            process.wait()
+            assert process.stdin
+            process.stdin.close()
+    if process.returncode:
+        lines = read_file(folder / "errors.txt").decode(errors="replace").strip().splitlines()
+        raise DeviceError(f"{device}: the run of its test failed: {lines[-1] if lines else process.returncode}")

@@ -1,0 +1,241 @@
+"""Hand the cells of a sweep to the devices of an engine: the longest first, one a device, those of one bits class."""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+from clsplat.core.errors import DeviceError, Interrupted, MemoryLimitError, amount, first_few
+from clsplat.sweeps.cell import Cell
+from clsplat.sweeps.child import plugin_files, run_command
+from clsplat.sweeps.devices import Place
+from clsplat.sweeps.memory_need import Need
+from clsplat.sweeps.store import Different, Store
+from clsplat.sweeps.task import Outcome, Terms, run_cell
+
+# What an engine is for a sweep, and the one that runs cells in this process.
+
+
+class Ticket(Protocol):
+    """A cell that was handed to an engine."""
+
+    def outcome(self) -> Outcome | None:
+        """Return how it ended; None while it runs.  Raises Lost where nobody runs it any more, and its errors."""
+
+
+class Lost(Exception):
+    """The process that ran a cell is gone; the cell goes on from its checkpoint elsewhere."""
+
+
+class Engine(Protocol):
+    """Devices, and a way to run a cell on one of them."""
+
+    def places(self) -> list[Place]:
+        """Return the devices that are there now.  Raises ClsplatError where there will be none."""
+
+    def may_join(self, waited: float) -> bool:
+        """Whether other devices may still join a sweep that has waited for them, for so many seconds."""
+
+    def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
+        """Begin to run a cell on a device that is free."""
+
+    def close(self) -> None:
+        """End what was started."""
+
+
+class _Ended:
+    def __init__(self, outcome: Outcome) -> None:
+        self._outcome = outcome
+
+    def outcome(self) -> Outcome:
+        return self._outcome
+
+
+class Inline:
+    """Runs a cell at a time, each as a child of this process."""
+
+    def __init__(self, store: Store, place: Place, is_stopped: Callable[[], bool]) -> None:
+        self._store, self._place, self._is_stopped = store, place, is_stopped
+
+    def places(self) -> list[Place]:
+        return [self._place]
+
+    def may_join(self, waited: float) -> bool:
+        return False
+
+    def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
+        command = run_command(place.device, plugin_files())
+        return _Ended(run_cell(cell, self._store, command, terms, self._is_stopped))
+
+    def close(self) -> None:
+        pass
+
+
+LOG = logging.getLogger("clsplat")
+LOOK = 0.05  # seconds between two looks at what runs
+ALONE = 60.0  # seconds without a device that may run a cell, after which a sweep ends
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A cell before a device is chosen."""
+
+    cell: Cell  # of no class
+    cost: float  # steps times pixels, to compare
+    need: Need | None = None  # of memory; None: not known, it may run anywhere
+
+    def on(self, bits: str) -> Cell:
+        """Return the cell in a bits class."""
+        return replace(self.cell, spec={**self.cell.spec, "bits": bits})
+
+
+@dataclass
+class Drive:
+    """A sweep in progress."""
+
+    store: Store
+    engine: Engine
+    is_same: bool  # all cells in one bits class
+    terms: Terms
+    is_stopped: Callable[[], bool] = lambda: False
+    began: Callable[[Cell], None] = lambda cell: None
+    ended: Callable[[Cell, Outcome], None] = lambda cell, outcome: None
+    look: Callable[[], None] = lambda: None  # called again and again
+    bits: str | None = None  # the class of all cells, once it is chosen
+    _seen: float = field(default_factory=time.monotonic)  # when a device of that class was there last
+    _unheld: float | None = None  # since when nothing runs, for no device holds what waits
+    _unsuited: tuple[list[Place], set[Place]] = field(default_factory=lambda: ([], set()))
+    """All devices, and those that suit no cell that waits."""
+    _running: dict[Place, tuple[Wanted, Cell, Ticket]] = field(default_factory=dict)
+
+    def run(self, wanted: Sequence[Wanted]) -> None:
+        """Run all cells, and tell `ended` how each did.
+
+        Raises Different where two runs of a cell have other bits, Interrupted, and what the engine raises; then the
+        cells that run are left to `close` of the engine.
+        """
+        waiting = sorted(wanted, key=lambda one: -one.cost)
+        while waiting or self._running:
+            if self.is_stopped():
+                raise Interrupted("stopped; the same command with --resume goes on")
+            self._hand_out(waiting)
+            if self._running:
+                self._unheld = None
+            elif waiting:
+                self._refuse(waiting)
+            before = len(self._running)
+            for place in list(self._running):
+                self._take_in(place, waiting)
+            self.look()
+            if (self._running and len(self._running) == before) or (waiting and not self._running):
+                time.sleep(LOOK)
+
+    def _hand_out(self, waiting: list[Wanted]) -> None:
+        places = self.engine.places()
+        classes = [place.bits for place in places]
+        if self.is_same and self.bits is None and classes:
+            self.bits = self._chosen(classes, waiting)
+        self._require_class(classes)
+        if self._unsuited[0] != places:
+            self._unsuited = (places, set())
+        for place in places:
+            if place in self._running or place in self._unsuited[1]:
+                continue
+            suited = next((i for i, one in enumerate(waiting) if self._suits(one, place, places)), None)
+            if suited is None:
+                self._unsuited[1].add(place)  # looking again and again would read the store each time
+                continue
+            one = waiting.pop(suited)
+            cell = one.on(place.bits)
+            self.began(cell)
+            self._running[place] = (one, cell, self.engine.start(cell, place, self.terms))
+
+    def _chosen(self, classes: Sequence[str], wanted: Sequence[Wanted]) -> str:
+        """Return the class of most devices; of several that in which most cells are published, then by name."""
+        counts = Counter(classes)
+        most = sorted(own for own in counts if counts[own] == max(counts.values()))
+        return max(most, key=lambda own: sum(self.store.folder(one.on(own).key).result.is_dir() for one in wanted))
+
+    def _require_class(self, classes: Sequence[str]) -> None:
+        """Raise DeviceError where devices are there, but for `ALONE` seconds none of the chosen class."""
+        now = time.monotonic()
+        if not self.is_same or not classes or self.bits in classes or self._running:
+            self._seen = now
+        elif now - self._seen > ALONE:
+            others = ", ".join(sorted({*classes}))
+            raise DeviceError(
+                f"no device of bits class {self.bits} for {ALONE:.0f} s; there are devices of {others}; "
+                "offer one of that class, or set placement: {bits: any}; what was done is in the store"
+            )
+
+    def _suits(self, one: Wanted, place: Place, places: Sequence[Place]) -> bool:
+        """Whether a cell may run on a device: of its class, and such that holds it, as it ends where one does."""
+        allowed = self._allowed(one, places)
+        need = self._need(one, allowed)
+        if need is None or place not in allowed:
+            return place in allowed
+        return need.ends_on(place) or (need.begins_on(place) and not any(map(need.ends_on, allowed)))
+
+    def _allowed(self, one: Wanted, places: Sequence[Place]) -> list[Place]:
+        """The devices in whose class a cell may run: one that has begun stays in its own, where that is there now."""
+        if self.is_same:
+            return [place for place in places if place.bits == self.bits]
+        begun = [own for own in {place.bits for place in places} if self.store.folder(one.on(own).key).path.is_dir()]
+        return [place for place in places if not begun or place.bits in begun]
+
+    def _need(self, one: Wanted, allowed: Sequence[Place]) -> Need | None:
+        """The memory that a cell needs; none where it is published."""
+        classes = {place.bits for place in allowed} if one.need else ()
+        return None if any(self.store.folder(one.on(own).key).result.is_dir() for own in classes) else one.need
+
+    def _refuse(self, waiting: list[Wanted]) -> None:
+        """End the cells that no device holds, where none that does may join; it is called when nothing runs, so that
+        the others are done."""
+        places, found = self.engine.places(), list[tuple[Wanted, Need, list[Place]]]()
+        for one in waiting:
+            allowed = self._allowed(one, places)
+            need = self._need(one, allowed)
+            if need is not None and allowed and not any(map(need.begins_on, allowed)):
+                found.append((one, need, allowed))
+        if found and not self._may_join(found):
+            for each in found:
+                self._give_up(*each)
+                waiting.remove(each[0])
+
+    def _may_join(self, found: Sequence[tuple[Wanted, Need, list[Place]]]) -> bool:
+        """Whether a device may still join that holds some of these cells; say so once."""
+        now = time.monotonic()
+        waited = 0.0 if self._unheld is None else now - self._unheld
+        if not self.engine.may_join(waited):
+            return False
+        if self._unheld is None:
+            names = first_few([one.cell.name for one, *_ in found])
+            LOG.warning("no device holds %s: %s; waiting for a larger one", amount(len(found), "cell"), names)
+        if self._unheld is None or waited > ALONE:
+            self._unheld = now
+        return True
+
+    def _give_up(self, one: Wanted, need: Need, allowed: Sequence[Place]) -> None:
+        largest = max(allowed, key=need.limit_on)
+        cell, code, message = one.on(largest.bits), MemoryLimitError.exit_code, need.refusal(largest)
+        self.store.add(cell).give_up(code, message)
+        self.store.tell("failed", cell=cell.key, exit_code=code)
+        self.ended(cell, Outcome("failed", "", code, message))
+
+    def _take_in(self, place: Place, waiting: list[Wanted]) -> None:
+        one, cell, ticket = self._running[place]
+        try:
+            outcome = ticket.outcome()
+        except Lost:
+            del self._running[place]
+            self.store.tell("lost", cell=cell.key, worker=place.worker)
+            waiting.insert(0, one)
+            self._unsuited[1].clear()
+            return
+        if outcome is not None and outcome.state == "different":
+            raise Different(outcome.message)
+        if outcome is not None:
+            del self._running[place]
+            self.ended(cell, outcome)

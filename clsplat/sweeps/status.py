@@ -1,0 +1,191 @@
+"""The state of a store, from its files alone."""
+
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from clsplat.core.errors import DataError, one_line
+from clsplat.core.files import METRICS, write_text
+from clsplat.core.page import duration, render
+from clsplat.core.reading import read_json
+from clsplat.runs.results import read_metrics
+from clsplat.sweeps.store import CELLS, SILENT, SPEC, Attempt, CellFolder, Store
+from clsplat.training.status import read_status
+
+GONE = 60.0  # seconds without a beat after which a run may have ended
+
+
+def is_store(folder: Path) -> bool:
+    """Whether a folder holds a store."""
+    return (folder / CELLS).is_dir()
+
+
+def store_status(root: Path) -> dict[str, Any]:
+    """Return the `cells` of a store with their states, `counts` of those, `events` by kind, and the `time` of it all.
+
+    State of a cell: published, failed, running, silent (its lease has no beat for a minute), stopped, or waiting.
+    Raises DataError when the folder holds no store.
+    """
+    store = Store.opened(root)
+    now = time.time()
+    names = {key: (sweep, name) for sweep, cells in store.sweeps() for name, key in cells.items()}
+    cells = [_cell(folder, names.get(folder.key, ("", "")), now) for folder in store.folders()]
+    cells.sort(key=lambda cell: (cell["sweep"], cell["name"], cell["key"]))
+    counts: dict[str, int] = {}
+    for cell in cells:
+        counts[cell["state"]] = counts.get(cell["state"], 0) + 1
+    events: dict[str, int] = {}
+    for event in store.events():
+        events[str(event.get("event"))] = events.get(str(event.get("event")), 0) + 1
+    return {"store": str(root), "time": now, "counts": counts, "events": events, "cells": cells}
+
+
+def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, Any]:
+    """What is known of a cell.  names: of a sweep, and of the cell in it."""
+    spec: Any = {}
+    with suppress(DataError):
+        spec = read_json(folder.path / SPEC)
+    spec = spec if isinstance(spec, dict) and isinstance(spec.get("pipeline"), dict) else {"pipeline": {}}  # damaged
+    pipeline = spec["pipeline"]
+    found = {"key": folder.key, "sweep": names[0], "name": names[1], "bits": spec.get("bits")}
+    found |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
+    if manifest := folder.manifest():
+        values = {key: manifest.get(key) for key in ("seconds", "device", "host", "worker")}
+        return {**found, "state": "published", **values, **_figures(folder)}
+    attempts = sorted(folder.attempts(), key=lambda attempt: attempt.beaten)
+    alive = [one for one in attempts if one.exit_code is None and now - one.beaten < GONE]
+    if (failed := folder.failed()) and not alive:
+        return {**found, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
+    last = (alive or attempts)[-1:]
+    return {**found, "attempts": len(attempts), **(_attempt(last[0], now) if last else {"state": "waiting"})}
+
+
+def _steps(pipeline: dict[str, Any]) -> int | None:
+    """The steps of all trainings of a resolved pipeline."""
+    with suppress(KeyError, TypeError, AttributeError):
+        return int(sum(part.get("steps", 0) for stage in pipeline["stages"] for part in stage.values()))
+    return None
+
+
+def _figures(folder: CellFolder) -> dict[str, Any]:
+    """PSNR and SSIM of a result at its first size, of its test views where it has some, and its Gaussians."""
+    with suppress(DataError):
+        metrics = read_metrics(folder.result / METRICS)
+        sizes = [*metrics.test.values(), *metrics.train.values()]
+        found = {"psnr": sizes[0].psnr, "ssim": sizes[0].ssim} if sizes else {}
+        return {**found, "step": metrics.steps, "gaussians": metrics.gaussians}
+    return {}
+
+
+def _attempt(attempt: Attempt, now: float) -> dict[str, Any]:
+    """The state of a cell by its last attempt."""
+    status = read_status(attempt.path)
+    silent = now - attempt.beaten
+    told = {"message": attempt.message(attempt.exit_code)} if attempt.has_failed and attempt.exit_code else {}
+    if attempt.exit_code is not None:
+        state = "stopped" if attempt.exit_code == 130 else "waiting"
+    else:
+        state = "running" if silent < GONE else "silent"
+    progress = {key: status.get(key) for key in ("step", "gaussians", "seconds_left", "stage", "device")}
+    worker = {key: attempt.lease.get(key) for key in ("host", "worker")}
+    return {"state": state, "silent": round(max(0.0, silent)), **progress, **worker, **told}
+
+
+def overview_text(found: dict[str, Any]) -> str:
+    """Return what `store_status` found as lines of text, a cell a line."""
+    counts = ", ".join(f"{count} {state}" for state, count in sorted(found["counts"].items())) or "no cells"
+    lines = [f"{found['store']}: {counts}"]
+    for cell in found["cells"]:
+        name = cell["name"] or f"{cell['pipeline']} seed={cell['seed']}"
+        lines.append(f"{cell['key']}  {cell['state']:9}  {name}{_detail(cell)}")
+    return "\n  ".join(map(one_line, lines))
+
+
+def _detail(cell: dict[str, Any]) -> str:
+    if cell["state"] == "published":
+        psnr = f", {cell['psnr']:.2f} dB" if "psnr" in cell else ""
+        return psnr + (f", {cell['seconds']:.0f} s" if isinstance(cell.get("seconds"), int | float) else "")
+    step = f", step {cell['step']}/{cell['steps']}" if cell.get("step") is not None else ""
+    more = f": {cell['message']}" if cell.get("message") else ""
+    if cell["state"] == "silent":
+        waits = "; it goes on when its sweep is run again" if cell["silent"] > SILENT else ""
+        more = f", no sign of life for {cell['silent']} s on {cell.get('host')}{waits}"
+    return step + more
+
+
+# The state of a store as one page that opens offline.
+
+LEVELS = {"published": "ready", "running": "note", "failed": "error", "silent": "warning", "stopped": "warning"}
+ORDER = ("published", "running", "waiting", "stopped", "silent", "failed")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A cell in the table."""
+
+    cell: dict[str, Any]
+
+    @property
+    def level(self) -> str:
+        """Which colour its state has."""
+        return LEVELS.get(self.cell["state"], "")
+
+    @property
+    def name(self) -> str:
+        """Its name, or that of its pipeline."""
+        return str(self.cell["name"] or f"{self.cell['pipeline']} seed={self.cell['seed']}")
+
+    @property
+    def place(self) -> str:
+        """The device that runs it, or has, and the machine."""
+        return " · ".join(str(self.cell[key]) for key in ("device", "host") if self.cell.get(key))
+
+    @property
+    def done(self) -> int:
+        """Steps done."""
+        return self.cell.get("step") or 0
+
+    @property
+    def quality(self) -> str:
+        """PSNR of the result."""
+        return f"{self.cell['psnr']:.2f}" if "psnr" in self.cell else ""
+
+    @property
+    def took(self) -> str:
+        """How long it took, or what is left."""
+        seconds, left = self.cell.get("seconds"), self.cell.get("seconds_left")
+        if isinstance(seconds, int | float):
+            return duration(seconds)
+        is_known = self.cell["state"] == "running" and isinstance(left, int | float)
+        return f"{duration(left)} left" if is_known and left is not None else ""
+
+    @property
+    def remark(self) -> str:
+        """Why it failed, or for how long nothing was heard of it."""
+        if self.cell["state"] == "silent":
+            return f"no sign of life for {duration(self.cell['silent'])}"
+        return str(self.cell.get("message") or "")
+
+
+def write_page(found: dict[str, Any], out: Path) -> None:
+    """Write what `store_status` returned.  Raises OutputError when that fails."""
+    write_text(out, store_page(found))
+
+
+def store_page(found: dict[str, Any]) -> str:
+    """Return the page."""
+    counts, cells = found["counts"], found["cells"]
+    known = [state for state in ORDER if state in counts]
+    verdict = ", ".join(f"{counts[state]} {state}" for state in [*known, *sorted(counts.keys() - {*ORDER})])
+    is_done = counts.get("published", 0) == len(cells) > 0
+    return render(
+        "store.html.j2",
+        title=f"{Path(found['store']).resolve().name}: cells of sweeps",
+        subtitle=f"{found['store']}, {time.strftime('%Y-%m-%d %H:%M:%S', time.gmtime(found['time']))} UTC",
+        level="error" if "failed" in counts else "ready" if is_done else "note",
+        verdict=f"{len(cells)} cells: {verdict}" if cells else "no cells",
+        rows=[Row(cell) for cell in cells],
+        events=found["events"],
+    )

@@ -1,0 +1,1 @@
+"""What a training step learns or knows of each photograph besides the Gaussians, a file each."""

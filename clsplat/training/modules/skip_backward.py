@@ -1,0 +1,90 @@
+"""Which steps skip the backward pass: those whose view has converged."""
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from clsplat.core.settings import Settings, in_one_sentence
+from clsplat.losses.base import ViewLosses
+from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
+COUNTS = ("steps", "whole", "warm_up", "above")  # names in the numbers of a run, in the folder `skip`
+
+
+@dataclass(frozen=True)
+class Visit:
+    """What a step does with its view."""
+
+    skipped: bool = False
+    numbers: Mapping[str, float] = field(default_factory=dict)  # those that change when the step is done
+
+
+class Skip(Settings):
+    """Skip the backward pass and the update where a view has converged (SkipGS, Li et al. 2026).
+
+    Every step after `start` renders its view, compares it, and adds the loss to the moving average of the view's
+    losses; a step whose loss is not above the average does nothing else.  A warm-up, in which nothing is skipped, finds
+    the least share of steps that do the whole work.  Ours, where the published text is silent: that share is one of all
+    steps after `start`, with those of the warm-up; a view's first visit has no average, and is never skipped; a size of
+    a view has an average of its own; penalties are no part of the loss.
+
+    A step that is skipped updates nothing: no parameter, no moment and no count of Adam's updates, no statistic (their
+    means are over the views that were not skipped), no number of a transform that learns; penalties are not computed,
+    and the loss that is recorded is without them.  It counts as a step: rates, weights, the order of views and all
+    stages of `during`, those that edit or add noise too, go on.
+    """
+
+    step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
+
+    start: Annotated[int, Field(ge=0)]
+    """Global step after which steps may be skipped: where growth has ended and photographs have their full size."""
+    decay: Annotated[float, Field(ge=0, lt=1)] = 0.95
+    """Share of a view's average that stays at a visit."""
+    warm_up: Annotated[int, Field(gt=0)] = 500
+    """Steps from `start` on that are not skipped; `auto` needs several for each photograph."""
+    least: Annotated[
+        Literal["auto"] | Annotated[float, Field(ge=0, le=1)], in_one_sentence("expected 'auto' or a share from 0 to 1")
+    ] = "auto"
+    """Least share of steps that do the whole work; `auto`: the share of the warm-up that would not have been
+    skipped."""
+
+    def visit(self, view: str, losses: ViewLosses, numbers: Mapping[str, float]) -> Visit:
+        """Decide on a step from `numbers`, which it leaves as they are; up to `start` the loss is not read.
+
+        view: its name.  A loss that is not finite is not skipped, and no part of an average.
+        """
+        if losses.comparison.step <= self.start:
+            return Visit()
+        camera = losses.comparison.camera
+        return self.decide(f"skip/loss/{camera.width}x{camera.height}/{view}", losses.loss, numbers)
+
+    def decide(self, name: str, loss: float, numbers: Mapping[str, float]) -> Visit:
+        """Decide on a step after `start`; name: of the view's average."""
+        if not math.isfinite(loss):
+            return Visit()
+        steps, whole, warm_up, above = (numbers.get(f"skip/{count}", 0.0) for count in COUNTS)
+        average, steps = numbers.get(name), steps + 1
+        converged = average is not None and loss <= average
+        if warming := warm_up < self.warm_up:
+            warm_up, above = warm_up + 1, above + (not converged)
+        skipped = converged and not warming and whole >= self._share(above, warm_up) * steps
+        counts = steps, whole + (not skipped), warm_up, above
+        after = loss if average is None else self.decay * average + (1 - self.decay) * loss
+        return Visit(skipped, {name: after, **dict(zip((f"skip/{count}" for count in COUNTS), counts, strict=True))})
+
+    def tell(self, run: Run) -> None:
+        """Say and record how many steps of a run were skipped."""
+        steps, whole, warm_up, above = (run.numbers.get(f"skip/{count}", 0.0) for count in COUNTS)
+        least, skipped = self._share(above, warm_up), steps - whole
+        run.records.add(run.step, "skip", steps=int(steps), skipped=int(skipped), least=least)
+        whole_at_least = f"at least {least:.1%} were to do the whole work"
+        LOG.info(f"{skipped:,.0f} of {steps:,.0f} steps after step {self.start:,} were skipped; {whole_at_least}")
+
+    def _share(self, above: float, warm_up: float) -> float:
+        """The least share of whole steps; warm_up: its steps so far, of which so many were `above` the average."""
+        return above / max(warm_up, 1) if self.least == "auto" else self.least

@@ -1,0 +1,84 @@
+"""The sky while a model is trained: its Adam, its losses, and its tables in a checkpoint."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError
+from clsplat.core.schedule import at_step
+from clsplat.gaussians.sky import SIDES, DeviceSky, Sky
+from clsplat.losses.base import Comparison, LossValue
+from clsplat.opencl.device import Array, Device
+from clsplat.photos.photographs import apply_mask
+from clsplat.render.backdrops import Directions
+from clsplat.render.rasterizer import Frame, Rasterizer
+
+FOLDER = "sky/"  # before the names of its tables in a checkpoint
+TEXELS, MOMENTS, BIASES, FREE = "texels", ("moment1", "moment2"), "biases", "free"
+WIDTHS = {TEXELS: 3, **dict.fromkeys(MOMENTS, 3), BIASES: 2, FREE: 1}
+Tables = dict[str, NDArray[np.float32]]
+
+
+class LearnedSky:
+    """The sky of a model, with Adam's moments, the bias of each texel's updates, and which texels are learned."""
+
+    def __init__(self, settings: Directions, sky: DeviceSky, free: NDArray[np.bool_] | None = None) -> None:
+        """The sky is changed in place by each update.  free: the texels that are learned, [side * side]; None: all."""
+        self.settings, self.sky = settings, sky
+        zeros, texels = sky.texels.device.zeros, sky.side**2
+        self._arrays = {name: zeros((width, texels)) for name, width in WIDTHS.items() if name != TEXELS}
+        chosen = np.ones(texels, bool) if free is None else free
+        self._arrays[FREE].set(chosen[None].astype(np.float32))
+
+    @classmethod
+    def of_tables(cls, settings: Directions, tables: Mapping[str, NDArray[np.float32]], device: Device) -> "LearnedSky":
+        """Return the sky of a checkpoint, by what `tables` has returned."""
+        found = cls(settings, Sky(tables[TEXELS]).upload(device))
+        for name, array in found._arrays.items():
+            array.set(tables[name].T)
+        return found
+
+    def tables(self) -> Tables:
+        """Copy its tables to the host, each [side * side, components]."""
+        arrays = {TEXELS: self.sky.texels, **self._arrays}
+        return {name: np.ascontiguousarray(array.get().T) for name, array in arrays.items()}
+
+    def cover(self, rasterizer: Rasterizer, frame: Frame, comparison: Comparison) -> tuple[Array, LossValue] | None:
+        """Return T dL/dT of the loss of what covers the sky, [1, rows, stride], and its value; None where it has no
+        weight."""
+        camera, step = comparison.camera, comparison.step
+        weight = at_step(self.settings.cover, step)
+        if not weight:
+            return None
+        scale, difference = weight / (camera.width * camera.height), at_step(self.settings.difference, step)
+        behind, sums = rasterizer.skies.cover(
+            self.sky, self._arrays[FREE], camera, comparison.photograph, frame.transmittance, difference, scale
+        )
+        if comparison.mask is not None:
+            apply_mask(rasterizer.workspace, camera, behind, comparison.mask)
+        return behind, LossValue("sky", lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
+
+    def by_texels(self, rasterizer: Rasterizer, frame: Frame, gradient: Array) -> Array:
+        """Return derivatives by the texels that a view shows, [3, shown], from those by its image."""
+        return rasterizer.skies.by_texels(self.sky, frame.camera, frame.transmittance, gradient)
+
+    def update(self, rasterizer: Rasterizer, frame: Frame, by_texels: Array, step: int) -> None:
+        """Change the texels that a view shows by Adam."""
+        rate = at_step(self.settings.rate, step)
+        rasterizer.skies.update(self.sky, frame.camera, by_texels, self._arrays, rate)
+
+
+def check_tables(tables: Tables) -> None:
+    """Raise DataError for tables that are not those of a sky; there may be none."""
+    if not tables:
+        return
+    if tables.keys() not in (WIDTHS.keys(), {TEXELS}):
+        raise DataError("it has another sky than one of its own tables")
+    texels = len(tables[TEXELS])
+    side = int(np.sqrt(texels))
+    for name, table in tables.items():
+        if side * side != texels or not SIDES[0] <= side <= SIDES[1] or table.shape != (texels, WIDTHS[name]):
+            raise DataError(f"{name} of its sky is not [side * side, {WIDTHS[name]}]")
+        if not np.isfinite(table).all():
+            raise DataError(f"{name} of its sky holds values that are not finite")

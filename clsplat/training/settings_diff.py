@@ -1,0 +1,66 @@
+"""Settings in which two resolved pipelines differ, and whether a run can go on with them."""
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal, NamedTuple
+
+from clsplat.core.errors import shortened
+from clsplat.core.settings import TAGS, Settings, resumable
+
+Kind = Literal["output", "training"] | None
+
+
+class Difference(NamedTuple):
+    """A setting in which two resolved pipelines differ."""
+
+    place: str  # such as stages[1].optimize.rates.quats
+    was: Any
+    now: Any
+    kind: Kind  # as its class says; None: a run cannot go on with the new value
+
+    def __str__(self) -> str:
+        return f"{self.place} was {shortened(repr(self.was), 80)}, is {shortened(repr(self.now), 80)}"
+
+    def is_of_place(self, were: Mapping[str, str], are: Mapping[str, str]) -> bool:
+        """Whether the same file lies at another place now.  were, are: hashes of the files that settings name."""
+        is_text = isinstance(self.was, str) and isinstance(self.now, str)
+        return is_text and self.was in were and were[self.was] == are.get(self.now)
+
+    @property
+    def stage(self) -> int | None:
+        """The stage of the pipeline that it belongs to, or None."""
+        found = re.match(r"stages\[(\d+)\]", self.place)
+        return int(found[1]) if found else None
+
+
+def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind: Kind = None) -> Iterator[Difference]:
+    """Yield the settings in which two resolved pipelines differ, in their order.
+
+    settings: what `new` was resolved from; its classes tell the kinds.
+    """
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in dict.fromkeys([*old, *new]):
+            inner, of = _inside(settings, key)
+            where = f"{place}.{key}" if place else str(key)
+            yield from differences(old.get(key), new.get(key), inner, where, kind or of)
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for i, (before, after) in enumerate(zip(old, new, strict=True)):
+            inner = settings[i] if isinstance(settings, list) else None
+            yield from differences(before, after, inner, f"{place}[{i}]", kind)
+    elif old != new:
+        yield Difference(place, old, new, kind)
+
+
+def first_difference(old: Any, new: Any) -> Difference | None:
+    """Return the first setting in which two resolved pipelines differ, or None."""
+    return next(differences(old, new), None)
+
+
+def _inside(settings: Any, key: str) -> tuple[Any, Kind]:
+    """The settings below a key, and what a change of the key means."""
+    if not isinstance(settings, Settings):
+        return None, None
+    if key in type(settings).model_fields:
+        return getattr(settings, key), resumable(type(settings), key)
+    named = any(getattr(settings, tag, None) == key for tag in TAGS)  # a stage is written as {name: fields}
+    return settings if named else None, None

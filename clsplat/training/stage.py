@@ -1,0 +1,245 @@
+"""The base of all stages: settings, needed and made parts of the run, and one method."""
+
+from abc import abstractmethod
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args
+
+from pydantic import AfterValidator, Field, field_validator
+
+from clsplat.core.errors import Interrupted, in_shell
+from clsplat.core.files import fault_of_output
+from clsplat.core.progress import Stopped
+from clsplat.core.schedule import EverySteps, is_act
+from clsplat.core.settings import OneOf, Settings
+from clsplat.training import checkpoint
+from clsplat.training.run import Run
+
+CADENCE = frozenset({"every", "start", "stop"})
+
+
+@dataclass(frozen=True)
+class PathInRun(AfterValidator):
+    """Marks a field that holds a path inside the run folder: a file where there is a suffix, else a folder."""
+
+    suffixes: tuple[str, ...] = ()
+
+
+def path_in_run(*suffixes: str) -> PathInRun:
+    """Mark a field that holds a file in the run folder whose name ends in one of `suffixes`, or a folder in it."""
+
+    def checked(text: str) -> str:
+        fault = fault_of_output(text)
+        if fault is None and suffixes and not PurePosixPath(text).name.lower().endswith(suffixes):
+            fault = f"it does not end in {', '.join(suffixes)}"
+        if fault:
+            raise ValueError(f"expected a path inside the run folder: {fault}")
+        return text
+
+    return PathInRun(checked, suffixes)
+
+
+def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
+    """The marks among metadata, and among those of the types that a type is made of."""
+    own = [mark for mark in metadata if isinstance(mark, PathInRun)]
+    return own + [mark for one in get_args(kind) for mark in _marks(one, getattr(one, "__metadata__", ()))]
+
+
+class Stage(Settings):
+    """One stage of a pipeline.  It changes the run and returns nothing."""
+
+    needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
+    makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
+    takes: ClassVar[frozenset[str]] = frozenset()  # parts that do not exist afterwards
+    edits: ClassVar[bool] = False  # changes the model; inside `during` it acts between two steps
+    changes_last: ClassVar[bool] = False  # says by run.changing() where its edit begins; else all of it is an edit
+    reads_harmonics: ClassVar[bool] = False  # of all Gaussians, with a kernel
+
+    stage: str
+    """Name of the stage."""
+
+    def check(self) -> None:
+        """Raise errors that do not depend on the run, such as a missing file, before the run starts."""
+
+    def check_in(self, run: Run) -> None:
+        """Raise errors of a run that can be known before its first stage, for one that is only described."""
+
+    @abstractmethod
+    def run(self, run: Run) -> None:
+        """Run the stage."""
+
+    def outputs(self, out: Path) -> list[Path]:
+        """Return the files and folders of the run folder `out` that the stage writes: those that its fields name."""
+        values = (getattr(self, name) for name in self.named_outputs())
+        return [out / value for value in values if value is not None]
+
+    @classmethod
+    def named_outputs(cls) -> dict[str, tuple[str, ...]]:
+        """Return the fields that hold a path inside the run folder, each with the suffixes that a file may have."""
+        marks = {name: _marks(field.annotation, field.metadata) for name, field in cls.model_fields.items()}
+        return {name: found[0].suffixes for name, found in marks.items() if found}
+
+    def verify(self, run: Run) -> None:
+        """Read back what the stage has written.  Raises DataError where it is missing or damaged."""
+
+    def act(self, run: Run) -> None:
+        """Run the stage, under its name in status.json; what fails inside of an edit leaves a run that is not whole.
+
+        A stage that fails is repeated from its beginning when the run goes on, so that its records do not stay.
+        """
+        changing = run.changing() if self.edits and not self.changes_last else nullcontext()
+        with run.status.stage(self.stage), changing, run.records.of_a_stage():
+            self.run(run)
+
+
+class Scheduled(Stage):
+    """A stage that may stand inside `optimize.during`, where it runs at a cadence.
+
+    It runs at every step that is a multiple of `every`, after `start` and before `stop`; of a number that is not whole,
+    at the whole steps at or below its multiples.
+    """
+
+    training_keys: ClassVar[frozenset[str]] = CADENCE
+    step_keys: ClassVar[frozenset[str]] = CADENCE
+    ends: ClassVar[bool] = False  # whether it runs after the last step of the training too
+
+    every: EverySteps | None = None
+    """Steps from one run of the stage to the next, which need not be whole; inside `during` only."""
+    start: Annotated[int, Field(ge=0)] = 0
+    """Global step after which the stage runs."""
+    stop: Annotated[int, Field(gt=0)] | None = None
+    """Global step before which the stage runs."""
+
+    def attach(self, run: Run) -> None:
+        """Add tables that the stage keeps beside the parameters, before the first step; a resumed run has them."""
+
+    def due(self, step: int, is_last: bool = False) -> bool:
+        """Return whether the stage runs at a global step, counted from 1; `is_last` of the training."""
+        if self.every is None or not (is_act(self.every, step) or (is_last and self.ends)):
+            return False
+        return step > self.start and (self.stop is None or step < self.stop)
+
+    def is_overdue(self, run: Run) -> bool:
+        """Return whether the stage runs now beside its cadence: for one that changes no bits."""
+        return False
+
+    def stale(self, run: Run) -> Collection[str]:
+        """Return the parameters whose gradients the edit makes invalid."""
+        return ()
+
+
+def written_twice(stages: Sequence[Stage]) -> str | None:
+    """Return a path that two stages would write, a file or what one stage takes for a folder; None if there is none.
+
+    Stages may share a folder, and those of a cadence may share a file with a later stage.  Names that differ in case
+    alone are one file on some systems.
+    """
+    written: list[tuple[tuple[str, ...], bool]] = []  # the parts of a path, and whether it is a file
+    for stage in stages:
+        if not (named := stage.named_outputs()):  # what other stages write for it
+            continue
+        suffixes = tuple(suffix for of_field in named.values() for suffix in of_field)
+        own = [
+            (tuple(part.casefold() for part in path.parts), path.name.lower().endswith(suffixes))
+            for path in stage.outputs(Path())
+        ]
+        for parts, is_file in own:
+            for other, other_is_file in written:
+                if (is_file and other[: len(parts)] == parts) or (other_is_file and parts[: len(other)] == other):
+                    return "/".join(parts)
+        written += own
+    return None
+
+
+# A stage that trains for a number of steps, with stages that run between them.
+
+
+class Training(Stage):
+    """A training with a number of steps, and stages that act between two of them."""
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
+    step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
+    rehearsed: ClassVar[int] = 200  # steps that tell what one takes; no time is so short that fewer are trained
+
+    steps: Annotated[int, Field(gt=0)]
+    """Number of training steps."""
+    if TYPE_CHECKING:  # fields of each training, behind its own: files have them in that order
+        during: list[OneOf[Scheduled]]
+        log_every: int
+
+    @field_validator("during", check_fields=False)
+    @classmethod
+    def _on_a_cadence(cls, during: list[Scheduled]) -> list[Scheduled]:
+        for stage in during:
+            if stage.every is None:
+                raise ValueError(f"'{stage.stage}' needs 'every' inside 'during'")
+        return during
+
+    def check(self) -> None:
+        for stage in self.during:
+            stage.check()
+
+    def check_in(self, run: Run) -> None:
+        for stage in self.during:
+            if stage.stop is None or stage.stop > run.step + 1:  # else its time has passed
+                stage.check_in(run)
+
+    def outputs(self, out: Path) -> list[Path]:
+        return [path for stage in self.during for path in stage.outputs(out)]
+
+    def acting(self, step: int) -> list[Scheduled]:
+        """Return the stages of `during` that run when the training begins after a global step."""
+        last = step + self.steps
+        before = range(step + 1, last)  # no edit follows the last
+        return [s for s in self.inner if any(map(s.due, before)) or (not s.edits and s.due(last, True))]
+
+    @property
+    def inner(self) -> list[Scheduled]:
+        """The stages that act between two steps."""
+        return self.in_turn(self.during)
+
+    def in_turn(self, during: Sequence[Scheduled]) -> list[Scheduled]:
+        """Return all stages of `during` in the order in which they act."""
+        return list(during)
+
+    def has_ended(self, run: Run) -> bool:
+        """Whether no step of the training is left."""
+        return run.stage_step >= self.steps
+
+    def judge(self, run: Run, stage: Scheduled) -> None:
+        """Take notice of a stage of `during` that has acted."""
+
+    def leave(self, run: Run) -> None:
+        """Do what the end of the training needs."""
+
+    def act(self, run: Run) -> None:
+        with run.status.stage(self.stage):  # it goes on in its middle, so that its records stay
+            self.run(run)
+
+    def act_between(self, run: Run) -> None:
+        """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
+        for place, stage in enumerate(self.inner):
+            due = run.stage_step > 0 and (stage.due(run.step, self.has_ended(run)) or stage.is_overdue(run))
+            if place < run.acted or stage.edits or not due:
+                continue
+            run.acted = place + 1  # a checkpoint is of the state after it
+            try:
+                stage.act(run)
+                self.judge(run, stage)
+            except BaseException:
+                run.acted = place
+                raise
+
+    def end_step(self, run: Run) -> None:
+        """Act after a step; save the state, and raise Interrupted, where the run is to stop."""
+        with suppress(Stopped):
+            self.act_between(run)
+        run.between()
+        if run.interrupted:
+            told = f"saved in {checkpoint.save(run)}; `clsplat resume {in_shell(run.out)}` goes on from it"
+            raise Interrupted(f"stopped at step {run.step}, {told}")
+        if self.has_ended(run):
+            self.leave(run)

@@ -1,1 +1,0 @@
-"""A model trained further, in a folder of its own, and measured; `compress`, `lod` and `blocks` do that."""

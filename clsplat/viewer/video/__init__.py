@@ -1,0 +1,1 @@
+"""Videos of a model: camera paths, the views along them, and encoding."""

@@ -1,0 +1,249 @@
+"""Camera paths in files: nerfstudio's camera_path.json, read and written, and the list of cameras of 3DGS, read.
+
+render_width, render_height  px       fps, seconds      camera_type  perspective
+camera_path  a frame each: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical), aspect,
+             render_time (0 to 1, of a scene that moves)
+"""
+
+import json
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+from clsplat.core.errors import ConfigError, DataError, quoted
+from clsplat.core.files import write_text
+from clsplat.core.reading import read_json
+from clsplat.formats.splats import is_moment
+from clsplat.scene import camera_files
+from clsplat.scene.camera import Camera
+from clsplat.scene.camera_files import centre_lost, width_lost
+from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
+from clsplat.scene.transforms_json import Frame, opengl_matrix, pose_of
+from clsplat.scene.view import View
+from clsplat.viewer.video.paths import MAX_FRAMES, Floats, Size, around, checked_rate, checked_size, even_size, placed
+
+LOG = logging.getLogger("clsplat")
+WORLD = "dataparser_transforms.json"  # beside a path: how nerfstudio moved the scene
+MAX_BYTES = 1 << 27
+KEYS = 24  # frames that nerfstudio's viewer shows as handles, at most
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """A path of a file."""
+
+    views: list[View]
+    fps: float
+    size: Size  # px
+
+    def resized(self, size: Size) -> list[View]:
+        """Return the views at another size, with the vertical field of view and all else of the lens."""
+        scale = size[1] / self.size[1]
+        return [replace(view, camera=placed(view.camera, size, scale)) for view in self.views]
+
+
+def read(path: Path, scene: Path | None = None) -> CameraPath:
+    """Read a camera_path.json, with its poses in the world of the scene in a folder.
+
+    nerfstudio moves and scales a scene, and says how in a file WORLD, which is looked for beside the path; without it
+    the poses are taken as they are, with a warning unless clsplat has written them.
+    Raises DataError for another file, for damaged numbers and for a camera that is not perspective.
+    """
+    table = read_json(path, "a camera_path.json of nerfstudio, or a cameras.json of 3DGS", limit=MAX_BYTES)
+    if isinstance(table, list):
+        return _of_cameras(path)
+    frames = table.get("camera_path") if isinstance(table, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise DataError(f"{path}: expected a table with a list `camera_path`, as nerfstudio exports it")
+    if not 1 <= len(frames) <= MAX_FRAMES:
+        raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
+    if (kind := table.get("camera_type", "perspective")) != "perspective":
+        raise DataError(f"{path}: camera_type is {quoted(kind)}; expected perspective: export the path again")
+    size, rate = _size_and_rate(Frame(path.parent, str(path), table))
+    move = _world(path, scene, known=table.get("world") == "scene")
+    views = []
+    for i, own in enumerate(frames):
+        frame = Frame(path.parent, f"{path}: camera_path[{i}]", own)
+        fov = frame.number("fov")
+        if fov is None or not 0.01 <= fov < 179:
+            raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0.01 to 179")
+        pose = pose_of(Frame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
+        time = frame.number("render_time")
+        if time is not None and not is_moment(time):
+            raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1: export the path again")
+        views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose), time=time))
+    return CameraPath(views, rate, size)
+
+
+def _of_cameras(path: Path) -> CameraPath:
+    """The cameras of a cameras.json as frames, each fitted into the size of the first."""
+    views = camera_files.read(path)
+    size = even_size(views[0].camera)
+    frames = [replace(view, name=f"frame_{i:05d}", camera=around(view.camera, size)) for i, view in enumerate(views, 1)]
+    return CameraPath(frames, 30.0, size)
+
+
+def write(path: Path, views: Sequence[View], fps: float) -> None:
+    """Write views as a camera_path.json, for nerfstudio's viewer and for `read`; of a lens it holds `fov` alone.
+
+    Raises OutputError.
+    """
+    camera = views[0].camera
+    frames = [_frame(view) for view in views]
+    keys = np.unique(np.linspace(0, len(frames) - 1, min(KEYS, len(frames))).round().astype(int))
+    table = {
+        "world": "scene",  # ours: not moved as nerfstudio would
+        "camera_type": "perspective",
+        "render_width": camera.width,
+        "render_height": camera.height,
+        "fps": fps,
+        "seconds": len(views) / fps,
+        "is_cycle": False,
+        "smoothness_value": 0.0,
+        "default_fov": frames[0]["fov"],
+        "default_transition_sec": len(views) / fps / max(1, len(keys) - 1),
+        "keyframes": [{"matrix": frames[i]["camera_to_world"], **_lens(frames[i])} for i in keys],
+        "camera_path": frames,
+    }
+    write_text(path, json.dumps(table, indent=1) + "\n")
+    for warn in (centre_lost, width_lost):
+        warn(path, [view.camera for view in views], "its readers")
+
+
+def spread(views: Sequence[View], frames: int) -> list[View]:
+    """Return views at even places along a path, between two poses on the straight and the shortest turn.
+
+    Times, where all views have one, are between those of the two.
+    """
+    if frames == len(views):
+        return list(views)
+    if len(views) == 1:
+        return [replace(views[0], name=f"frame_{i:05d}") for i in range(1, frames + 1)]
+    places = np.linspace(0, len(views) - 1, frames)
+    poses = np.stack([view.world_to_camera for view in views])
+    turns = scipy.spatial.transform.Slerp(
+        np.arange(len(views)), scipy.spatial.transform.Rotation.from_matrix(poses[:, :, :3])
+    )(places).as_matrix()
+    lenses = np.array([[c.fx, c.fy, c.cx, c.cy] for c in (view.camera for view in views)])
+    centres, lenses = (
+        np.stack([np.interp(places, np.arange(len(views)), column) for column in columns.T], axis=1)
+        for columns in (np.stack([view.position for view in views]), lenses)
+    )
+    known = [view.time for view in views if view.time is not None]
+    moves = len(known) == len(views)
+    times = np.interp(places, np.arange(len(views)), known).tolist() if moves else [None] * frames
+    first = views[0].camera
+    return [
+        View(
+            f"frame_{i:05d}",
+            Camera(first.width, first.height, *lens),
+            np.column_stack([turn, -turn @ centre]),
+            time=time,
+        )
+        for i, (turn, centre, lens, time) in enumerate(zip(turns, centres, lenses.tolist(), times, strict=True), 1)
+    ]
+
+
+def _frame(view: View) -> dict[str, Any]:
+    camera, matrix = view.camera, opengl_matrix(view.world_to_camera)
+    fov = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
+    moment = {} if view.time is None else {"render_time": view.time}
+    return {"camera_to_world": matrix.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height, **moment}
+
+
+def _lens(frame: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "fov": frame["fov"],
+        "aspect": frame["aspect"],
+        "override_transition_enabled": False,
+        "override_transition_sec": None,
+    }
+
+
+def _camera(size: Size, fov: float) -> Camera:
+    """A camera with a vertical field of view in rad."""
+    focal = size[1] / 2 / math.tan(fov / 2)
+    return Camera(*size, focal, focal, size[0] / 2, size[1] / 2)
+
+
+def _size_and_rate(whole: Frame) -> tuple[Size, float]:
+    """The size of the pictures, in even numbers, and how many a second: the usual ones where a file says none."""
+    sides, fps = [whole.number(key) for key in ("render_width", "render_height")], whole.number("fps")
+    width, height = (1280, 720) if sides == [None, None] else (int(side or 0) // 2 * 2 for side in sides)
+    try:
+        return checked_size((width, height)), checked_rate(30.0 if fps is None else fps)
+    except ConfigError as error:
+        raise DataError(f"{whole.where}: {error}; export the path again") from error
+
+
+def _rows(numbers: Any) -> Any:
+    """16 numbers as four rows; what is nothing of the kind stays."""
+    if not isinstance(numbers, list) or len(numbers) != 16:
+        return numbers
+    return [numbers[i : i + 4] for i in range(0, 16, 4)]
+
+
+def _world(path: Path, scene: Path | None, known: bool) -> Any:
+    """A function that takes poses, [3, 4] world to camera, to the world of the scene."""
+    file = path.parent / WORLD
+    if not file.is_file():
+        if not known:
+            LOG.warning(
+                "%s: its poses are taken as those of the scene; where nerfstudio has moved it, put %s beside the path",
+                *(path, WORLD),
+            )
+        return lambda pose: pose
+    matrix, scale = _affine(file)
+    rotation, shift = matrix[:, :3], matrix[:, 3]
+    before = _applied(scene)
+
+    @np.errstate(all="ignore")  # a pose that is not finite is refused
+    def move(pose: Floats) -> Floats:
+        """x' = scale · (rotation x + shift) is nerfstudio's world."""
+        centre = -pose[:, :3].T @ pose[:, 3]
+        turned = pose[:, :3] @ rotation @ before[:, :3].T
+        place = before[:, :3] @ (rotation.T @ (centre / scale - shift)) + before[:, 3]
+        return np.column_stack([turned, -turned @ place])
+
+    return move
+
+
+def _affine(file: Path) -> tuple[Floats, float]:
+    """The rotation with its shift, [3, 4], and the scale of a file WORLD.  Raises DataError."""
+    table = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
+    frame = Frame(file.parent, str(file), table if isinstance(table, dict) else {})
+    scale = frame.number("scale")
+    return _rigid(frame, "transform"), _positive(file, scale)
+
+
+def _positive(file: Path, scale: float | None) -> float:
+    if scale is None or not scale > 0:
+        raise DataError(f"{file}: scale is {quoted(scale)}; expected a number above 0: export the file again")
+    return scale
+
+
+def _rigid(frame: Frame, key: str) -> Floats:
+    """A rotation and a shift, [3, 4].  Raises DataError."""
+    try:
+        matrix = np.array(frame.value(key), np.float64)[:3]
+    except (ValueError, TypeError, OverflowError, IndexError):
+        matrix = np.empty(0)
+    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3]) - 1) > 1e-3:
+        raise DataError(f"{frame.where}: {key} is not 3x4 numbers with a rotation; export the file again")
+    return matrix
+
+
+def _applied(scene: Path | None) -> Floats:
+    """What nerfstudio did to the poses of a scene's transforms.json before: a rotation and a shift, [3, 4]."""
+    file = scene / TRANSFORMS if scene else None
+    if file is None or not file.is_file():
+        return np.eye(3, 4)
+    table = read_json(file, "cameras in JSON", limit=MAX_BYTES)
+    frame = Frame(file.parent, str(file), table if isinstance(table, dict) else {})
+    return np.eye(3, 4) if frame.value("applied_transform") is None else _rigid(frame, "applied_transform")

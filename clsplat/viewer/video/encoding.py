@@ -1,0 +1,211 @@
+"""Files of video: WebM (VP8) by OpenCV, MP4 (H.264) by PyAV.  The same pictures give the same bytes."""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from fractions import Fraction
+from importlib import import_module
+from itertools import chain
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import ConfigError, OutputError
+from clsplat.core.files import atomic_name, check_result
+from clsplat.metrics.images import to_8_bits
+from clsplat.viewer.video.paths import Size, checked_rate, checked_size
+
+# The numbers that FFmpeg draws by chance for the tracks of a WebM file.
+
+SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS = 0x18538067, 0x1654AE6B, 0xAE, 0x1254C367, 0x7373, 0x63C0
+PARENTS = {SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS}
+CLUSTER = 0x1F43B675  # the first pictures: the tracks stand before them
+UIDS = {0x73C5, 0x63C5}  # of a track, and of a track that a tag belongs to
+HEAD = 1 << 16  # bytes that hold all of them
+
+
+def without_chance(path: Path) -> None:
+    """Give every track of a WebM file the number 1, in place, so that the same pictures give the same file."""
+    with path.open("rb+") as file:
+        head = file.read(HEAD)
+        for start, size in _uids(head, 0, len(head)):
+            file.seek(start)
+            file.write((1).to_bytes(size, "big"))
+
+
+def _uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
+    """Place and size of each number."""
+    while start + 2 <= end:
+        kind, start = _number(data, start, marked=True)
+        size, start = _number(data, start, marked=False)
+        if kind == CLUSTER or start > end:
+            return
+        if kind in UIDS and start + size <= end:
+            yield start, size
+        elif kind in PARENTS:
+            yield from _uids(data, start, min(start + size, end))
+        start += size
+
+
+def _number(data: bytes, start: int, marked: bool) -> tuple[int, int]:
+    """A number whose leading zero bits tell how many bytes it has, with that mark or without it, and where it ends."""
+    length = 9 - data[start].bit_length() if start < len(data) else 1
+    value = int.from_bytes(data[start : start + length], "big")
+    return (value if marked else value & ((1 << (7 * length)) - 1)), start + length
+
+
+Image = NDArray[np.uint8]
+Write = Callable[[Image], None]  # one picture, RGB, [height, width, 3]
+CODEC = "VP80"  # as OpenCV sets them, VP9 has the same size and PSNR, and takes 4.5 times as long
+QUALITY = "18"  # of H.264, a constant rate factor: hardly a loss to see
+WITHOUT_TREE = "0"  # with x264's macroblock tree the bits differ from run to run where a processor has AVX-512
+BT709 = 1  # of colours, as FFmpeg numbers it
+WITHOUT = "or write pictures alone, into --out DIR, which any encoder reads"
+
+
+def check_file(path: Path) -> None:
+    """Raise ConfigError where no video of this name can be written: its suffix, its encoder, or a file of a run."""
+    check_encoder(path)
+    check_result(path, path.suffix.lower())
+
+
+def check_encoder(path: Path) -> None:
+    """Raise ConfigError where there is no encoder for the suffix of a video."""
+    suffix = path.suffix.lower()
+    if suffix not in WRITERS:
+        raise ConfigError(f"{path}: expected the name of a video that ends in {' or '.join(WRITERS)}")
+    if suffix == ".mp4":
+        _av()
+
+
+@contextmanager
+def opened(path: Path, size: Size, fps: float) -> Iterator[Write]:
+    """Yield a function that adds a picture; at the end of the block the file is there, whole and read back.
+
+    size: of a picture, even numbers.  Raises OutputError; an earlier file then stays.
+    """
+    suffix, count = path.suffix.lower(), 0
+    with atomic_name(path, suffix) as temporary:
+        with WRITERS[suffix](temporary, size, fps) as write:
+
+            def counted(image: Image) -> None:
+                nonlocal count
+                count += 1
+                write(image)
+
+            yield counted
+        if suffix == ".webm":
+            without_chance(temporary)
+        if (found := frames_of(temporary)) != count:
+            raise OutputError(f"{path}: {found} of {count} frames can be read back; check the folder and its space")
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+
+
+def write_all(path: Path, images: Iterable[NDArray[np.generic]], fps: float) -> int:
+    """Write pictures of one size, [height, width, 3] uint8 or floats in [0, 1]; return their number.
+
+    Raises ConfigError for a name, a rate or a size that no video can have, ValueError for pictures of several sizes.
+    """
+    check_file(path)
+    checked_rate(fps)
+    pictures = map(to_8_bits, images)
+    first = next(pictures, None)
+    if first is None:
+        raise ValueError("a video needs at least one picture")
+    height, width = first.shape[:2]
+    count = 0
+    with opened(path, checked_size((width, height)), fps) as write:
+        for picture in chain([first], pictures):
+            if picture.shape != (height, width, 3):
+                raise ValueError(f"picture {count} has shape {picture.shape}; expected {(height, width, 3)}")
+            write(picture)
+            count += 1
+    return count
+
+
+def frames_of(path: Path) -> int:
+    """Return how many frames of a video can be decoded."""
+    reader, count = cv2.VideoCapture(str(path)), 0
+    try:
+        while reader.grab():
+            count += 1
+    finally:
+        reader.release()
+    return count
+
+
+@contextmanager
+def _webm(path: Path, size: Size, fps: float) -> Iterator[Write]:
+    with _without_remarks():
+        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*CODEC), float(fps), size)
+    try:
+        if not writer.isOpened():
+            raise OutputError(
+                f"{path.parent}: OpenCV cannot write WebM (VP8) there; check the folder, and that OpenCV is that of "
+                f"pip, with FFmpeg; or write .mp4 with the extra clsplat[video], {WITHOUT}"
+            )
+
+        def write(image: Image) -> None:
+            writer.write(np.ascontiguousarray(image[:, :, ::-1]))
+
+        yield write
+    finally:
+        writer.release()
+
+
+@contextmanager
+def _mp4(path: Path, size: Size, fps: float) -> Iterator[Write]:
+    av = _av()
+    try:
+        with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+            stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+            stream.width, stream.height = size
+            stream.pix_fmt, stream.options = "yuv420p", {"crf": QUALITY, "mbtree": WITHOUT_TREE}
+            context = stream.codec_context
+            context.thread_count = 1  # the bits depend on their number
+            context.colorspace = context.color_primaries = context.color_trc = BT709
+
+            def write(image: Image) -> None:
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+                frame = frame.reformat(format="yuv420p", dst_colorspace=BT709)
+                for packet in stream.encode(frame):
+                    container.mux(packet)
+
+            yield write
+            for packet in stream.encode(None):
+                container.mux(packet)
+    except av.FFmpegError as error:
+        raise OSError(error.errno, error.strerror) from error
+
+
+WRITERS: dict[str, Callable[[Path, Size, float], AbstractContextManager[Write]]] = {".webm": _webm, ".mp4": _mp4}
+
+
+def _av() -> ModuleType:
+    try:
+        return import_module("av")
+    except ImportError as error:
+        raise ConfigError(
+            f"MP4 needs PyAV; install it: pip install 'clsplat[video]', or give a name that ends in .webm, {WITHOUT}"
+        ) from error
+
+
+@contextmanager
+def _without_remarks() -> Iterator[None]:
+    """Keep a remark of OpenCV's FFmpeg about the codec's name from the terminal: no setting turns it off."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # closed
+        yield
+        return
+    with open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

@@ -1,0 +1,209 @@
+"""Choose the views of a film, and draw them one after the other."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.core.errors import ConfigError, quoted
+from clsplat.core.files import check_result
+from clsplat.formats.splats import is_moment
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import View
+from clsplat.scene.view_selection import Choice, choose
+from clsplat.viewer.video import camera_path, encoding
+from clsplat.viewer.video.paths import (
+    PATHS,
+    Floats,
+    Rig,
+    Size,
+    checked_frames,
+    checked_rate,
+    checked_size,
+    even_size,
+    like,
+    stay,
+)
+from clsplat.viewer.video.pictures import LAYERS, Canvas, Image, beside, shown
+
+# The moments of a film's frames, for scenes that move.
+
+Times = tuple[float, float]  # of the first and of the last frame, in [0, 1] of the scene
+WHOLE: Times = (0.0, 1.0)
+EXPECTED = "expected a time from 0 to 1, or two such as 0..1"
+
+
+def times_of(given: "str | float | Sequence[float] | None") -> Times | None:
+    """Return the moments of the first and the last frame from one number, two, or text such as 0..1; None stays.
+
+    The second may come before the first: time runs backwards.  Raises ConfigError.
+    """
+    if given is None:
+        return None
+    parts = given.split("..") if isinstance(given, str) else [given] if isinstance(given, int | float) else list(given)
+    try:
+        found = [float(part) for part in parts]
+    except (ValueError, TypeError):
+        found = []
+    if len(found) not in (1, 2) or not all(map(is_moment, found)):
+        raise ConfigError(f"the time {quoted(given)}: {EXPECTED}")
+    return found[0], found[-1]
+
+
+def in_time(views: Sequence[View], times: Times) -> list[View]:
+    """Return views at evenly spaced moments from the first to the last; of one view, the first."""
+    return [replace(view, time=float(time)) for view, time in zip(views, np.linspace(*times, len(views)), strict=True)]
+
+
+def as_time_runs(views: Sequence[View], times: Times | None, moves: bool) -> list[View]:
+    """Return the views of a film with their moments: those asked for, or their own, or the whole of a scene that moves.
+
+    moves: whether the model does.  Raises ConfigError where moments are asked for of a model that does not.
+    """
+    if times is not None:
+        require_motion(moves)
+        return in_time(views, times)
+    if moves and any(view.time is None for view in views):
+        return in_time(views, WHOLE)
+    return list(views)
+
+
+def require_motion(moves: bool) -> None:
+    """Raise ConfigError for moments of a model that does not move."""
+    if not moves:
+        raise ConfigError("a time was given, and the model does not move; leave the time out")
+
+
+FROM = ":"  # between a path and the name of a view
+FRAMES, FPS = 120, 30.0  # where neither the caller nor a file says
+Through = Callable[[Sequence[View]], Iterable[View]]  # what views pass, such as a display of progress
+Side = Callable[[View], Image]  # what stands beside a view's picture
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What film was asked for, checked before any work: None is a default."""
+
+    path: str = "ellipse"  # one of PATHS, fixed:NAME of a view, or a file of a camera path
+    frames: int | None = None
+    fps: float | None = None
+    size: Size | None = None
+    times: Times | None = None  # of a scene that moves
+
+    @classmethod
+    def of(
+        cls,
+        path: str,
+        frames: int | None,
+        fps: float | None,
+        size: str | Size | None,
+        times: str | float | Sequence[float] | None = None,
+    ) -> "Wish":
+        """Check what can be checked without a scene.  Raises ConfigError."""
+        if path.partition(FROM)[0] not in PATHS and not path.lower().endswith(".json"):
+            raise ConfigError(f"no path {quoted(path)}; there are {', '.join(PATHS)}, and files of nerfstudio (.json)")
+        if FROM in path and path.partition(FROM)[0] in PATHS and not path.startswith(f"fixed{FROM}"):
+            raise ConfigError(f"no path {quoted(path)}; only `fixed{FROM}NAME` names a view")
+        return cls(
+            path,
+            None if frames is None else checked_frames(frames),
+            None if fps is None else checked_rate(fps),
+            None if size is None else checked_size(size),
+            times_of(times),
+        )
+
+    @property
+    def of_a_file(self) -> bool:
+        """Whether the path is in a file, and needs no scene."""
+        return self.path.partition(FROM)[0] not in PATHS
+
+
+@dataclass(frozen=True)
+class Film:
+    """The views of a film, one a frame, all of one size."""
+
+    views: list[View]
+    fps: float
+
+    @property
+    def size(self) -> Size:
+        """Width and height of a picture, px."""
+        camera = self.views[0].camera
+        return camera.width, camera.height
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts."""
+        return len(self.views) / self.fps
+
+
+def plan(wish: Wish, scene: Scene | None, points: Floats, moves: bool = False) -> Film:
+    """Return the film of a scene.  points: [M, 3], means of a model, or points of the scene; moves: whether it does.
+
+    Raises ConfigError without a scene where the path needs one, and for times where nothing moves; DataError where the
+    scene has no such path.
+    """
+    found = _path(wish, scene, points)
+    return replace(found, views=as_time_runs(found.views, wish.times, moves))
+
+
+def _path(wish: Wish, scene: Scene | None, points: Floats) -> Film:
+    """The film without regard to time."""
+    if wish.of_a_file:
+        found = camera_path.read(Path(wish.path), scene.path if scene else None)
+        views = found.resized(wish.size) if wish.size else found.views
+        return Film(camera_path.spread(views, wish.frames or len(views)), wish.fps or found.fps)
+    if scene is None:
+        raise ConfigError(f"the path {wish.path} needs the cameras of a scene; give --scene, a run folder, or a file")
+    rig = Rig.of(scene.views, points)
+    size = wish.size or even_size(rig.camera)
+    if FROM in wish.path:
+        names = [view.name for view in scene.views]
+        (chosen,) = choose(Choice(names=[wish.path.partition(FROM)[2]]), names, [])
+        return Film(stay(scene.views[chosen], wish.frames or FRAMES, size), wish.fps or FPS)
+    return Film(PATHS[wish.path](rig, wish.frames or FRAMES, size), wish.fps or FPS)
+
+
+def files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
+    """Return the file of each layer: that of the colours, and others beside it.  Raises ConfigError for their names."""
+    found = {
+        layer: video if layer == LAYERS[0] else video.with_name(f"{video.stem}_{layer}{video.suffix}")
+        for layer in layers
+    }
+    for path in found.values():
+        encoding.check_file(path)
+    return found
+
+
+def shoot(canvas: Canvas, film: Film, videos: Mapping[str, Path], side: Side | None, through: Through) -> None:
+    """Render the views into videos, one a layer.  side: what stands on the right of the colours."""
+    wide = film.size[0] * (1 if side is None else 2)
+    checked_size((wide, film.size[1]))
+    depths = canvas.depth_range(film.views) if "depth" in videos else (0.0, 0.0)
+    with ExitStack() as stack:
+        writers = {
+            layer: stack.enter_context(
+                encoding.opened(path, (wide if layer == LAYERS[0] else film.size[0], film.size[1]), film.fps)
+            )
+            for layer, path in videos.items()
+        }
+        for view in through(film.views):
+            found = canvas.layers(view, "depth" in videos)
+            for layer, write in writers.items():
+                picture = shown(found, layer, depths)
+                write(beside(picture, side(view)) if side and layer == LAYERS[0] else picture)
+
+
+def still(view: View, size: Size | None = None) -> View:
+    """Return a view for a film from one place: at another size, or with even sides."""
+    wanted = size or even_size(view.camera)
+    if wanted == (view.camera.width, view.camera.height):
+        return view
+    return View(view.name, like(view.camera, wanted), view.world_to_camera, view.image_path, time=view.time)
+
+
+def check_path_file(path: Path) -> None:
+    """Raise ConfigError where no camera path can be written."""
+    check_result(path, ".json")

@@ -1,0 +1,436 @@
+"""Camera paths about and through a scene, by name.
+
+Each is a function of a rig, a number of frames and a size, and returns a view for each frame.
+"""
+
+import logging
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from clsplat.core.errors import ConfigError, DataError, quoted
+from clsplat.scene.camera import Camera
+from clsplat.scene.scene import strayed
+from clsplat.scene.view import View
+from clsplat.scene.viewpoint import closest_point, upward
+
+# What a camera path is made from: where the photographs were taken, what they look at, and which way is up.
+
+Floats = NDArray[np.floating]
+MOST_POINTS = 20_000  # that are looked at for near and far
+SHARES = 0.05, 0.95  # of what a camera sees lies before near, and before far
+PARALLEL = 0.9  # length of the mean direction of view, from which on the axes hardly say where they meet
+BEYOND = 1.5  # times near and far: farther from what is seen they do not meet
+TOWARDS = 0.5  # share of the cameras that must have the focus before them
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras of a scene without those that strayed, and points of what they look at."""
+
+    views: Sequence[View]
+    points: Floats  # [M, 3], the means of a model or the points of a scene
+
+    @classmethod
+    def of(cls, views: Sequence[View], points: Floats) -> "Rig":
+        """Leave out cameras far away from all others, and points that are not finite.
+
+        Raises DataError without a view.
+        """
+        if not views:
+            raise DataError("a camera path needs the cameras of a scene; there is none")
+        stray = strayed(views)
+        finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        step = -(-len(finite) // MOST_POINTS) or 1
+        return cls([view for view, far in zip(views, stray, strict=True) if not far], finite[::step])
+
+    @cached_property
+    def positions(self) -> Floats:
+        """Camera centres, [V, 3]."""
+        return np.stack([view.position for view in self.views])
+
+    @cached_property
+    def forwards(self) -> Floats:
+        """Directions of view, [V, 3]."""
+        return np.stack([view.world_to_camera[2, :3] for view in self.views])
+
+    @cached_property
+    def ups(self) -> Floats:
+        """Upward axes of the images, [V, 3]."""
+        return np.stack([-view.world_to_camera[1, :3] for view in self.views])
+
+    @cached_property
+    def up(self) -> Floats:
+        """What is up, [3], unit."""
+        return upward(self.views)
+
+    @cached_property
+    def focus(self) -> Floats:
+        """The point nearest to the optical axes, [3]; of axes that are almost parallel, one amid what they show.
+
+        Raises DataError where most cameras look away from it.
+        """
+        middle = np.median(self.points, axis=0) if len(self.points) else self.positions.mean(axis=0)
+        focus = closest_point(self.positions, self.forwards, middle)
+        forward, (near, far) = self.forwards.mean(axis=0), self.depths
+        ahead = float(np.median(self._before(focus)))
+        if np.linalg.norm(forward) > PARALLEL and not near / BEYOND < ahead < far * BEYOND:
+            focus = self.positions.mean(axis=0) + unit(forward) * (near + far) / 2
+        if (self._before(focus) > 0).mean() < TOWARDS:
+            raise DataError(
+                "the cameras look away from each other, so that there is nothing to turn about; use the path through"
+            )
+        return focus
+
+    def _before(self, point: Floats) -> Floats:
+        """The depth of a point in each view, [V]."""
+        return np.asarray(((point - self.positions) * self.forwards).sum(axis=1))
+
+    @cached_property
+    def depths(self) -> tuple[float, float]:
+        """Near and far: between them lies most of what the cameras see, scene units."""
+        found = [self._seen(view) for view in self.views[:: -(-len(self.views) // 64)]]
+        depths = np.concatenate(found)
+        if not len(depths):
+            return 1.0, 10.0
+        near, far = np.quantile(depths, SHARES)
+        return float(near), float(far)
+
+    def _seen(self, view: View) -> Floats:
+        """Depths of the points in a view's image."""
+        x, y, z = view.world_to_camera[:, :3] @ self.points.T + view.world_to_camera[:, 3:]
+        c = view.camera
+        with np.errstate(all="ignore"):
+            u, v = c.fx * x / z + c.cx, c.fy * y / z + c.cy
+        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < c.width) & (v < c.height)
+        return np.asarray(z[inside])
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera whose field of view is the middle one."""
+        cameras = sorted((view.camera for view in self.views), key=lambda c: c.width * c.height / (c.fx * c.fy))
+        return cameras[len(cameras) // 2]
+
+
+def unit(vectors: Floats) -> Floats:
+    """Return vectors, [..., 3], with length 1."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+# A walk through the views of a scene: their order, and a smooth curve along them.
+
+Indices = NDArray[np.intp]
+DEGREE = 5  # of the B-spline
+LOOSENESS = 0.25  # of the median step between neighbours: how far the curve may pass from a view
+UP_WEIGHT = 0.1  # of the upward axes beside positions, times the distance
+MOST_VIEWS = 1000  # of those, evenly by name, that a walk visits
+ROUNDS = 20  # of shortening
+
+
+def order(rig: Rig) -> Indices:
+    """Return the indices of the views by name, or from neighbour to neighbour where that way is shorter, [V]."""
+    spread = float(np.median(np.linalg.norm(rig.positions - np.median(rig.positions, axis=0), axis=1))) or 1.0
+    places = np.hstack([rig.positions / spread, rig.forwards])
+    by_name = np.array(sorted(range(len(rig.views)), key=lambda i: rig.views[i].name))
+    by_name = by_name[:: -(-len(by_name) // MOST_VIEWS)]
+    between = scipy.spatial.distance.cdist(places[by_name], places[by_name])
+    ways = np.arange(len(by_name)), _shortened(_neighbours(between), between)
+    return np.asarray(by_name[min(ways, key=lambda way: _length(between, way))])
+
+
+def smooth(places: Floats, frames: int, distance: float) -> Floats:
+    """Return a B-spline of degree 5 near the places at even steps, [frames, C].
+
+    places: [V, C], positions, targets at a distance and upward axes.
+    """
+    weights = np.repeat([1.0, 1.0, UP_WEIGHT * distance], 3)
+    scaled = places * weights
+    steps = np.linalg.norm(np.diff(scaled, axis=0), axis=1)
+    kept = np.append(True, steps > 1e-9 * max(1e-30, float(steps.max(initial=0.0))))  # no place twice
+    scaled = scaled[kept]
+    if len(scaled) == 1:
+        return np.repeat(places[:1], frames, axis=0)
+    loose = len(scaled) * (LOOSENESS * float(np.median(steps[kept[1:]]))) ** 2
+    curve, _ = scipy.interpolate.splprep(
+        scaled.T, k=min(DEGREE, len(scaled) - 1), s=loose if len(scaled) > DEGREE else 0
+    )
+    return np.asarray(np.stack(scipy.interpolate.splev(np.linspace(0, 1, frames), curve), axis=1) / weights)
+
+
+def _neighbours(between: Floats) -> Indices:
+    """From the first view always on to the nearest that is left."""
+    way, left = [0], set(range(1, len(between)))
+    while left:
+        rest = np.array(sorted(left))
+        way.append(int(rest[between[way[-1], rest].argmin()]))
+        left.remove(way[-1])
+    return np.array(way)
+
+
+def _shortened(way: Indices, between: Floats) -> Indices:
+    """Turn parts of the way round as long as that makes it shorter (2-opt)."""
+    for _ in range(ROUNDS):
+        changed = False
+        for i in range(len(way) - 2):
+            steps = np.append(between[way[i + 2 : -1], way[i + 3 :]], 0.0)  # nothing follows the last view
+            ends = np.append(between[way[i + 1], way[i + 3 :]], 0.0)
+            gain = between[way[i], way[i + 1]] + steps - between[way[i], way[i + 2 :]] - ends
+            j = int(gain.argmax())
+            if gain[j] > 1e-9:
+                way[i + 1 : i + 3 + j] = way[i + 1 : i + 3 + j][::-1].copy()
+                changed = True
+        if not changed:
+            break
+    return way
+
+
+def _length(between: Floats, way: Indices) -> float:
+    return float(between[way[:-1], way[1:]].sum())
+
+
+# Cameras of the size of a film.
+
+SIDES = 16, 8192  # px of a picture's side, least and most
+MAX_FRAMES = 100_000
+RATES = 1, 240  # frames a second
+Size = tuple[int, int]  # width, height
+
+
+def checked_size(size: str | Size) -> Size:
+    """Return the size of a film, given as text such as 640x480 or as numbers.
+
+    Raises ConfigError unless both are even, as codecs need them, and in bounds.
+    """
+    if isinstance(size, str):
+        found = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", size.strip().lower())
+        pair = (int(found[1]), int(found[2])) if found else None
+    else:
+        pair = (size[0], size[1]) if len(size) == 2 and all(isinstance(side, int) for side in size) else None
+    if pair is None or not SIDES[0] <= min(pair) <= max(pair) <= SIDES[1] or pair[0] % 2 or pair[1] % 2:
+        raise ConfigError(
+            f"size {quoted(size)}: expected WIDTHxHEIGHT in even numbers from {SIDES[0]} to {SIDES[1]}, such as 640x480"
+        )
+    return pair
+
+
+def size_of(text: str) -> str:
+    """Return a size as it is.  Raises ValueError, as a validator does, where no film has it."""
+    try:
+        checked_size(text)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    return text
+
+
+def checked_frames(frames: int) -> int:
+    """Return a number of frames.  Raises ConfigError where it is out of bounds."""
+    if isinstance(frames, bool) or not isinstance(frames, int) or not 1 <= frames <= MAX_FRAMES:
+        raise ConfigError(f"frames {quoted(frames)}: expected a whole number from 1 to {MAX_FRAMES}")
+    return frames
+
+
+def checked_rate(fps: float) -> float:
+    """Return a number of frames a second.  Raises ConfigError where it is out of bounds."""
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not RATES[0] <= fps <= RATES[1]:
+        raise ConfigError(f"fps {quoted(fps)}: expected frames a second from {RATES[0]} to {RATES[1]}")
+    return fps
+
+
+def even_size(camera: Camera) -> Size:
+    """Return the size of a camera's image, a pixel less where it is odd, inside the bounds of a film."""
+    shrink = min(1.0, SIDES[1] / max(camera.width, camera.height))
+    width, height = (max(SIDES[0], int(side * shrink) // 2 * 2) for side in (camera.width, camera.height))
+    return width, height
+
+
+def like(camera: Camera, size: Size) -> Camera:
+    """Return a camera of another size that sees as much: its image shows as large an area, with the middle amid it."""
+    width, height = size
+    scale = math.sqrt(width * height / (camera.width * camera.height))
+    return Camera(width, height, camera.fx * scale, camera.fy * scale, width / 2, height / 2)
+
+
+def around(camera: Camera, size: Size) -> Camera:
+    """Return a camera of another size whose image holds all of a camera's, in its middle."""
+    return placed(camera, size, fit(camera, size))
+
+
+def placed(camera: Camera, size: Size, scale: float) -> Camera:
+    """Return a camera of another size whose image has a camera's, larger by a factor, in its middle."""
+    width, height = size
+    left, top = (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
+    return Camera(
+        width, height, camera.fx * scale, camera.fy * scale, scale * camera.cx + left, scale * camera.cy + top
+    )
+
+
+def fit(camera: Camera, size: Size) -> float:
+    """Return the factor by which a camera's image just fits into another size."""
+    return min(size[0] / camera.width, size[1] / camera.height)
+
+
+LOG = logging.getLogger("clsplat")
+WIDEST_GAP = math.radians(100)  # between neighbours on a ring about the focus: a wider one was never photographed
+SHARE = 90  # percentile of the cameras' distances that an ellipse and a spiral reach (Barron et al. 2022)
+FARNESS = 0.75  # of the focus of a spiral, between near (0) and far (1), by inverse depth (Mildenhall et al. 2019)
+TURNS = 2  # of a spiral
+SWAY = 0.3  # of its distance from what it looks at, at most: cameras that surround a scene give no front
+KEPT = 0.85  # of an arc that was photographed: at its ends half of what is seen was not
+MOMENT = 1e-3  # what the whole time of a scene counts beside a right angle: between the moments of one camera
+AGREEMENT = 0.5  # length of the mean direction of view: below it the cameras do not face one way
+
+
+def ellipse(rig: Rig, frames: int, size: Size) -> list[View]:
+    """Circle the focus on an ellipse as wide as the cameras stand; where they stand on one side, swing before it.
+
+    The half axes are the 90th percentiles of the distances along the principal axes across the upward axis, as in
+    Mip-NeRF 360 (Barron et al. 2022); the height is the mean height.
+    """
+    across, offsets, height = _ring(rig)
+    half = np.percentile(np.abs(offsets), SHARE, axis=0)
+    if min(half) <= 1e-6 * max(half):
+        half = np.maximum(half, 0.05 * max(half, default=0.0))
+    angles = _sweep(np.arctan2(offsets[:, 1] / half[1], offsets[:, 0] / half[0]), frames)
+    flat = np.stack([half[0] * np.cos(angles), half[1] * np.sin(angles)], axis=1)
+    return _looking(rig, rig.focus + flat @ across + height.mean() * rig.up, rig.focus, size)
+
+
+def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
+    """Turn once about the focus, on a circle of the cameras' median distance and height: a turntable for objects."""
+    across, offsets, height = _ring(rig)
+    radius = float(np.median(np.linalg.norm(offsets, axis=1)))
+    taken = np.arctan2(offsets[:, 1], offsets[:, 0])
+    if (unseen := _gap(taken)[0]) > WIDEST_GAP:
+        LOG.warning(
+            "the orbit shows %.0f degrees from where no photograph was taken; the path ellipse keeps to the others",
+            math.degrees(unseen),
+        )
+    angles = taken[0] + 2 * np.pi * np.arange(frames) / frames
+    flat = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return _looking(rig, rig.focus + flat @ across + np.median(height) * rig.up, rig.focus, size)
+
+
+def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
+    """Sway about the mean of the cameras, two turns, and look at one point: for scenes that are faced from one side.
+
+    Formulas of Local Light Field Fusion (Mildenhall et al. 2019).
+    """
+    forward, middle = rig.forwards.mean(axis=0), rig.positions.mean(axis=0)
+    if np.linalg.norm(forward) < AGREEMENT:
+        raise DataError("the cameras look in many directions, so that a spiral has no front; use ellipse or through")
+    forward = unit(forward)
+    right = unit(np.cross(forward, rig.up))
+    axes = np.stack([right, np.cross(forward, right), forward])
+    near, far = rig.depths
+    target = middle + forward / ((1 - FARNESS) / near + FARNESS / far)
+    radii = np.percentile(np.abs((rig.positions - middle) @ axes.T), SHARE, axis=0)
+    radii *= min(1.0, SWAY * float(np.linalg.norm(target - middle)) / max(float(radii.max()), 1e-30))
+    turn = 2 * np.pi * TURNS * np.arange(frames) / frames
+    steps = np.stack([np.cos(turn), np.sin(turn), np.sin(turn / 2)], axis=1) * radii
+    positions = middle + steps @ axes
+    return named(
+        positions, np.broadcast_to(target, positions.shape), np.broadcast_to(rig.up, positions.shape), rig, size
+    )
+
+
+def through(rig: Rig, frames: int, size: Size) -> list[View]:
+    """Fly along the views, by name or from neighbour to neighbour, whichever way is shorter, on a smooth curve."""
+    chosen = order(rig)
+    distance = float(np.median(rig.depths))
+    places = np.hstack([rig.positions, rig.positions + distance * rig.forwards, rig.ups])[chosen]
+    track = smooth(places, frames, distance)
+    return named(track[:, :3], track[:, 3:6], track[:, 6:], rig, size)
+
+
+def views(rig: Rig, frames: int, size: Size) -> list[View]:
+    """Show the cameras of the photographs one after the other, with their own lenses; of more than `frames` some."""
+    chosen = np.unique(np.linspace(0, len(rig.views) - 1, min(frames, len(rig.views))).round().astype(int))
+    return [replace(rig.views[i], camera=around(rig.views[i].camera, size), lens=None, mask_path=None) for i in chosen]
+
+
+def fixed(rig: Rig, frames: int, size: Size) -> list[View]:
+    """Stay at the camera in the middle of all: a film of what moves."""
+    middle = np.median(rig.positions, axis=0)
+    return stay(rig.views[int(np.linalg.norm(rig.positions - middle, axis=1).argmin())], frames, size)
+
+
+def stay(view: View, frames: int, size: Size) -> list[View]:
+    """Return a view as often as there are frames, without its photograph's moment."""
+    still = replace(view, camera=around(view.camera, size), lens=None, mask_path=None, time=None)
+    return [replace(still, name=f"frame_{i:05d}") for i in range(1, frames + 1)]
+
+
+PATHS: dict[str, Callable[[Rig, int, Size], list[View]]] = {
+    "ellipse": ellipse,
+    "spiral": spiral,
+    "orbit": orbit,
+    "through": through,
+    "views": views,
+    "fixed": fixed,
+}
+
+
+def named(positions: Floats, targets: Floats, ups: Floats, rig: Rig, size: Size) -> list[View]:
+    """Return views at positions that look at targets, [F, 3] each.  Raises DataError where one looks along its up."""
+    camera = like(rig.camera, size)
+    try:
+        return [
+            View.looking_at(position, target, up, camera, f"frame_{i:05d}")
+            for i, (position, target, up) in enumerate(zip(positions, targets, ups, strict=True), 1)
+        ]
+    except ValueError as error:
+        raise DataError(f"the cameras of the scene give no such path: {error}; use another --path") from error
+
+
+def _ring(rig: Rig) -> tuple[Floats, Floats, Floats]:
+    """Two axes across the upward one, [2, 3], and the cameras' offsets from the focus: along them, [V, 2], and up, [V].
+
+    The axes are the principal ones, so that an ellipse along them fits.
+    """
+    offsets = rig.positions - rig.focus
+    height = offsets @ rig.up
+    flat = offsets - height[:, None] * rig.up
+    _, vectors = np.linalg.eigh(flat.T @ flat + 1e6 * float((flat**2).sum() + 1e-30) * np.outer(rig.up, rig.up))
+    first = vectors[:, 1] * (1.0 if vectors[:, 1] @ offsets[0] >= 0 else -1.0)
+    across = np.stack([first, np.cross(rig.up, first)])
+    return across, flat @ across.T, height
+
+
+def _sweep(taken: Floats, frames: int) -> Floats:
+    """Angles of the frames: around once, or to and fro where an arc was never photographed.  taken: [V]."""
+    gap, begin = _gap(taken)
+    turn = 2 * np.pi * np.arange(frames) / frames
+    if gap < WIDEST_GAP:
+        return np.asarray(taken[0] + turn)
+    half = np.pi - gap / 2
+    return np.asarray(begin + half + KEPT * half * np.sin(turn))
+
+
+def _gap(taken: Floats) -> tuple[float, float]:
+    """The widest angle without a camera, and the angle of the camera behind it."""
+    ring = np.sort(taken % (2 * np.pi))
+    gaps = np.diff(np.append(ring, ring[0] + 2 * np.pi))
+    widest = int(gaps.argmax())
+    return float(gaps[widest]), float(ring[(widest + 1) % len(ring)])
+
+
+def _looking(rig: Rig, positions: Floats, target: Floats, size: Size) -> list[View]:
+    targets, ups = (np.broadcast_to(vector, positions.shape) for vector in (target, rig.up))
+    return named(positions, targets, ups, rig, size)
+
+
+def nearest(view: View, views: Sequence[View], reach: float) -> View:
+    """Return the photograph's view whose camera is closest: `reach` of distance counts as much as a right angle.
+
+    Of the moments of one camera it is the nearest.
+    """
+    apart = np.array([np.linalg.norm(view.position - other.position) for other in views]) / reach
+    turned = np.array([1 - view.world_to_camera[2, :3] @ other.world_to_camera[2, :3] for other in views])
+    late = np.array([abs((view.time or 0.0) - (other.time or 0.0)) for other in views])
+    return views[int((apart + turned + MOMENT * late).argmin())]

@@ -1,0 +1,102 @@
+"""Pictures of the layers of a view, 8 bits a channel, and the canvas that they are drawn on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.metrics.images import to_8_bits
+from clsplat.metrics.views import require_finite
+from clsplat.render.camera import upload_camera
+from clsplat.render.painter import Layers, Painter
+from clsplat.scene.view import View
+
+Image = NDArray[np.uint8]
+LAYERS = ("colour", "depth", "alpha")
+PROBES = 8  # views whose depths set the range of colours
+PROBE_SIDE = 240  # px
+OPAQUE = 0.5  # alpha of pixels that have a depth
+SHARES = 0.02, 0.98  # of these pixels lie before near, and before far
+SMALLEST_RANGE = 1e-3  # of far
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """What paints a model, and the pictures of its views."""
+
+    painter: Painter
+
+    def layers(self, view: View, depth: bool = False) -> Layers:
+        """Render a view.  Raises NumericError where the picture is not finite."""
+        found = self.painter.layers(upload_camera(self.painter.workspace.device, view), depth)
+        for values in found.arrays:
+            require_finite(values, view)
+        return found
+
+    def picture(self, view: View) -> Image:
+        """Render a view to 8 bits, [height, width, 3]."""
+        return to_8_bits(self.layers(view).image)
+
+    def depth_range(self, views: Sequence[View]) -> tuple[float, float]:
+        """Return near and far, between which lie the depths of most pixels of some of the views, scene units."""
+        depths = []
+        for i in np.unique(np.linspace(0, len(views) - 1, min(PROBES, len(views))).round().astype(int)):
+            view, longest = views[i], max(views[i].camera.width, views[i].camera.height)
+            small = replace(view, camera=view.camera.downscaled(max(1, longest / PROBE_SIDE)))
+            found = self.layers(small, depth=True)
+            assert found.depth is not None
+            depths.append(found.depth[found.alpha > OPAQUE])
+        all_depths = np.concatenate(depths)
+        if not len(all_depths):
+            return 1.0, 2.0
+        near, far = np.quantile(all_depths, SHARES)
+        return float(min(near, far * (1 - SMALLEST_RANGE))), float(far)
+
+
+def shown(found: Layers, layer: str, depths: tuple[float, float]) -> Image:
+    """Return one of LAYERS as 8 bits, RGB, [height, width, 3]."""
+    if layer == "colour":
+        return to_8_bits(found.image)
+    if layer == "alpha":
+        return np.repeat(to_8_bits(found.alpha)[:, :, None], 3, axis=2)
+    assert found.depth is not None
+    return depth_picture(found.depth, found.alpha, depths)
+
+
+def values(found: Layers, layer: str) -> NDArray[np.float32]:
+    """Return one of LAYERS as floats, [height, width] or [height, width, 3]."""
+    array = {"colour": found.image, "depth": found.depth, "alpha": found.alpha}[layer]
+    assert array is not None
+    return array
+
+
+def depth_picture(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: tuple[float, float]) -> Image:
+    """Return depths, [height, width], as colours from red (near) to blue (far), black where nothing is.
+
+    The colours are even in inverse depth: what is near is told apart finely, as by the eye.
+    """
+    near, far = depths
+    with np.errstate(divide="ignore"):
+        place = (1 / np.maximum(depth, 1e-30) - 1 / far) / (1 / near - 1 / far)
+    colours = cv2.applyColorMap(to_8_bits(place.astype(np.float32)), cv2.COLORMAP_TURBO)[:, :, ::-1]
+    cover = np.where(depth > 0, alpha, 0)[:, :, None]
+    return to_8_bits((colours / np.float32(255) * cover).astype(np.float32))
+
+
+def beside(image: Image, other: Image) -> Image:
+    """Return two pictures of one height side by side."""
+    return np.hstack([image, other])
+
+
+def letterboxed(image: Image, size: tuple[int, int]) -> Image:
+    """Return a picture in the middle of a black one of another size (width, height), as large as it fits."""
+    width, height = size
+    factor = min(width / image.shape[1], height / image.shape[0])
+    inner = max(1, min(width, round(image.shape[1] * factor))), max(1, min(height, round(image.shape[0] * factor)))
+    mode = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
+    box = np.zeros((height, width, 3), np.uint8)
+    left, top = (width - inner[0]) // 2, (height - inner[1]) // 2
+    box[top : top + inner[1], left : left + inner[0]] = cv2.resize(image, inner, interpolation=mode)
+    return box

@@ -1,0 +1,1 @@
+"""Models made from models: blocks, levels of detail, compression, further training."""

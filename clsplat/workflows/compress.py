@@ -1,0 +1,371 @@
+"""Look for the file that meets a target: a ladder of pruning shares by settings of the harmonics, all measured."""
+
+import json
+import logging
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from clsplat.core.errors import ConfigError, quoted
+from clsplat.core.files import write_text
+from clsplat.core.page import charts, render
+from clsplat.core.reading import read_file, sha256
+from clsplat.core.text_table import text_table
+from clsplat.formats.packing import written
+from clsplat.formats.splats import Quality, Reading, Writing, require_still, with_degree
+from clsplat.formats.table import bytes_of, located, tell_losses
+from clsplat.gaussians.model import MODEL, load
+from clsplat.gaussians.sky import keep_sky, sky_beside
+from clsplat.pipeline.loading import Pipeline
+from clsplat.runs.model_file import ModelFile
+from clsplat.viewer.charts import Line, curve
+from clsplat.workflows.finetune import Measurer, Tuning, claimed, require_steps
+
+# The rungs of the ladder: a model with fewer and fewer Gaussians, each trained from the one before.
+
+STAGES = ("init", "prune_least", "optimize", "take_average")  # of the recipe; what a rung writes is a PLY
+PALETTE = "palette_sh"
+# what trains the harmonics that a SOG holds, rounds them and other tables, and trains the last ones with them
+VECTORS = ("reduce_sh", PALETTE, "optimize", "take_average", "share_palette", PALETTE)
+FITTING = ("init", *VECTORS, "round_tables", "optimize", "take_average", "round_tables")
+FITTED, SOG = "fitted", "model.sog"
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Where rungs are trained, and with what."""
+
+    out: Path
+    tuning: Tuning
+
+    def rung(self, keep: float, before: float) -> Path:
+        """Prune from a share of the first model's Gaussians to another, and train; return the model's file.
+
+        What an earlier call has finished is left alone, and what it has begun goes on.
+        """
+        if keep == 1:
+            return self.tuning.source.file
+        file = self.tuning.source.file if before == 1 else self.folder(before) / MODEL
+        return self.tuning.trained(self.pipeline(file, keep / before), self.folder(keep))
+
+    def folder(self, keep: float) -> Path:
+        """Return the run folder of a rung."""
+        return self.out / f"keep_{round(100 * keep):02d}"
+
+    def fitted(self, file: Path, name: str, degree: int, quality: str) -> Path:
+        """Train a rung with the harmonics of a SOG of it; return that SOG."""
+        values = {"init.file": str(file.resolve()), "reduce_sh.degree": degree}
+        values |= {f"stages.{place}.quality": quality for place, name in enumerate(FITTING) if name == PALETTE}
+        pipeline = self.tuning.pipeline(FITTING, values, file=SOG, quality=quality)
+        return self.tuning.trained(pipeline, self.out / FITTED / name, SOG)
+
+    def pipeline(self, file: Path, keep: float) -> Pipeline:
+        """Return the recipe as it is run: to prune a model file to a share of it."""
+        return self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), "prune_least.keep": keep})
+
+
+def checked_keeps(keeps: Sequence[float]) -> list[float]:
+    """Return shares of the Gaussians, from many to few.  Raises ConfigError for what is no share, and for none."""
+    ordered = sorted(set(keeps), reverse=True)
+    if not ordered or not all(0.01 <= keep <= 1 for keep in ordered):
+        raise ConfigError("--keep: expected shares of the Gaussians from 0.01 to 1, such as 1,0.7,0.5")
+    if len({round(100 * keep) for keep in ordered}) < len(ordered):
+        raise ConfigError("--keep: expected shares that differ by a hundredth")
+    return ordered
+
+
+# What a compressed model may weigh, or lose.
+
+UNITS = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+EXPECTED = "expected a size such as 5MB, or a loss such as -0.1dB"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A file that was written and measured."""
+
+    file: str  # in the folder of the search
+    keep: float  # share of the Gaussians
+    degree: int  # of the harmonics
+    quality: str
+    gaussians: int
+    bytes: int
+    psnr: float  # dB, of the file as it is read back
+    ssim: float
+
+
+@dataclass(frozen=True)
+class Target:
+    """A size, or a PSNR that is not to be missed."""
+
+    text: str
+    most: int | None = None  # bytes
+    change: float | None = None  # dB, of the PSNR of the model
+
+    @classmethod
+    def of(cls, text: str) -> "Target":
+        """Read '5MB' (1 MB = 10^6 bytes; MiB = 2^20) or '-0.1dB'.  Raises ConfigError."""
+        found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*([a-z]+)\s*", text, re.IGNORECASE | re.ASCII)
+        unit = found[2].lower() if found else ""
+        if found is None or unit not in (*UNITS, "db"):
+            raise ConfigError(f"--target {quoted(text)}: {EXPECTED}")
+        value = float(found[1])
+        if not math.isfinite(value * UNITS.get(unit, 1)):
+            raise ConfigError(f"--target {quoted(text)}: {EXPECTED}")
+        if unit == "db":
+            if value > 0:
+                raise ConfigError(f"--target {quoted(text)}: a gain; {EXPECTED}")
+            return cls(text.strip(), change=value)
+        if value * UNITS[unit] < 1:
+            raise ConfigError(f"--target {quoted(text)}: {EXPECTED}")
+        return cls(text.strip(), most=int(value * UNITS[unit]))
+
+    def is_met(self, point: Point, psnr: float) -> bool:
+        """Return whether a file meets the target; psnr: of the model that it was made from, dB."""
+        if self.most is not None:
+            return point.bytes <= self.most
+        return point.psnr >= psnr + (self.change or 0)
+
+    def best(self, points: Sequence[Point], psnr: float) -> Point | None:
+        """Return the best file for a size, or the smallest for a PSNR; None where none meets the target."""
+        met = [point for point in points if self.is_met(point, psnr)]
+        if self.most is not None:
+            return max(met, key=lambda point: (point.psnr, -point.bytes), default=None)
+        return min(met, key=lambda point: (point.bytes, -point.psnr), default=None)
+
+    def nearest(self, points: Sequence[Point]) -> Point:
+        """Return the file that misses the target least."""
+        smallest, best = min(points, key=lambda point: point.bytes), max(points, key=lambda point: point.psnr)
+        return best if self.most is None else smallest
+
+    @property
+    def remedy(self) -> str:
+        """What to do where no file meets it."""
+        if self.most is not None:
+            return "give a larger size, or a smaller share of the Gaussians with --keep"
+        return "allow a larger loss, or train for longer with --steps"
+
+    def ends(self, rung: Sequence[Point], psnr: float) -> bool:
+        """Return whether files of fewer Gaussians cannot be better: all of these fit, or none is good enough."""
+        met = [self.is_met(point, psnr) for point in rung]
+        return all(met) if self.most is not None else not any(met)
+
+
+# The rate–distortion curve of a search, and its table, as text and as a page that opens offline.
+
+HEADINGS = ("Gaussians", "share", "degree", "quality", "MB", "of the model", "PSNR, dB", "change, dB", "SSIM")
+
+
+def cells(point: Point, source: Point) -> list[str]:
+    """Return a row of the table."""
+    return [
+        f"{point.gaussians:,}",
+        f"{point.keep:.0%}",
+        str(point.degree),
+        point.quality or "–",
+        f"{point.bytes / 1e6:.3g}",
+        f"{point.bytes / source.bytes:.1%}",
+        f"{point.psnr:.2f}",
+        f"{point.psnr - source.psnr:+z.2f}",
+        f"{point.ssim:.4f}",
+    ]
+
+
+def table(found: dict[str, Any]) -> str:
+    """Return the record of a search as lines of text; a star marks the file that was chosen."""
+    source, points = Point(**found["source"]), [Point(**point) for point in found["points"]]
+    chosen = found["chosen"] and Point(**found["chosen"])
+    marks = ["", "", *("*" if point == chosen else "" for point in points)]
+    rows = [HEADINGS, *(cells(point, source) for point in (source, *points))]
+    return text_table([[mark, *row] for mark, row in zip(marks, rows, strict=True)])
+
+
+def page(
+    target: Target,
+    source: Point,
+    points: Sequence[Point],
+    chosen: Point | None,
+    split: str,
+    scene: str,
+    model: str,
+    result: str = "",
+) -> str:
+    """Return the page on a search for a model's file; `result`: the name of the one that it wrote."""
+    return render(
+        "compress.html.j2",
+        title=f"{scene} · {source.file}, compressed to {target.text}",
+        subtitle=f"{model}; PSNR and SSIM of {split} views, of every file as it is read back",
+        result=result,
+        verdict=_verdict(target, source, chosen),
+        curves=charts([curve("PSNR, dB, over the file's size, MB", _lines(target, source, points))]),
+        headings=HEADINGS,
+        rows=[(point.file, cells(point, source), point == chosen) for point in (source, *points)],
+    )
+
+
+def _verdict(target: Target, source: Point, chosen: Point | None) -> str:
+    if chosen is None:
+        return f"No file meets the target {target.text} so far."
+    return (
+        f"{chosen.file}: {chosen.bytes / 1e6:.3g} MB, {chosen.bytes / source.bytes:.1%} of the model, "
+        f"{chosen.psnr:.2f} dB, {chosen.psnr - source.psnr:+z.2f} dB"
+    )
+
+
+def _lines(target: Target, source: Point, points: Sequence[Point]) -> list[Line]:
+    """A line for each share of the Gaussians, and the target."""
+    shares = dict.fromkeys(point.keep for point in points)
+    lines = [
+        Line(sorted((p.bytes / 1e6, p.psnr) for p in points if p.keep == keep), f"{keep:.0%} of the Gaussians")
+        for keep in shares
+    ]
+    largest = max((point.bytes for point in points), default=0) / 1e6
+    if target.change is not None and points:
+        level = source.psnr + target.change
+        lines.append(Line([(0, level), (largest, level)], f"target {target.text}", "var(--target)", dash=1))
+    return lines
+
+
+LOG = logging.getLogger("clsplat")
+Format = Literal["sog", "spz"]
+KEEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)  # shares of the Gaussians
+SETTINGS: dict[Format, tuple[tuple[int, Quality], ...]] = {  # of the harmonics: degree, quality
+    "sog": ((3, "high"), (3, "balanced"), (3, "small")),  # a palette of a lower degree is hardly smaller
+    "spz": ((3, "balanced"), (3, "small"), (2, "small"), (1, "small"), (0, "small")),
+}
+RECORD, PAGE, TRIALS = "compress.json", "compress.html", "trials"
+
+
+@dataclass
+class Search:
+    """A search in its folder: what was measured so far."""
+
+    out: Path
+    target: Target
+    question: dict[str, Any]  # what is compressed, and how
+    source: Point  # the model itself
+    split: str  # views that are measured
+    scene: str  # its name on pages
+    points: list[Point] = field(default_factory=list)
+
+    @property
+    def chosen(self) -> Point | None:
+        return self.target.best(self.points, self.source.psnr)
+
+    def data(self) -> dict[str, Any]:
+        """Return all as plain data."""
+        chosen = self.chosen
+        return {
+            **self.question,
+            "target": self.target.text,
+            "split": self.split,
+            "source": asdict(self.source),
+            "points": [asdict(point) for point in self.points],
+            "chosen": chosen and asdict(chosen),
+        }
+
+    def write(self, result: str = "") -> None:
+        """Write what was measured, as JSON and as a page, which leads to the file of the result."""
+        write_text(self.out / RECORD, json.dumps(self.data(), indent=1) + "\n")
+        measured = self.target, self.source, self.points, self.chosen, self.split
+        write_text(self.out / PAGE, page(*measured, self.scene, self.question["model"], result))
+
+
+def compress(
+    model: Path,
+    scene: Path | None,
+    target: str,
+    out: Path,
+    *,
+    form: Format = "sog",
+    keeps: Sequence[float] = KEEPS,
+    steps: int | None = None,
+    device: Any = None,
+) -> dict[str, Any]:
+    """Look for a file that meets a target; write it, a page and a record; return the record.
+
+    From one share of the Gaussians to the next the model is pruned and trained for some steps.  Each rung is written
+    with several settings of its harmonics, and every file is read back and measured.  The search goes down until files
+    of fewer Gaussians cannot be better.  A search that was interrupted goes on.
+    Raises ConfigError for a target that no file meets, after the page is written; OutputError where another process
+    searches in `out`.
+    """
+    wanted, shares = Target.of(target), checked_keeps(keeps)
+    if steps is not None:
+        require_steps(steps)
+    if form not in get_args(Format):
+        raise ConfigError(f"--format {quoted(form)}: expected one of {', '.join(get_args(Format))}")
+    opened = ModelFile(model, scene, device)
+    source, first, measurer = opened.source, opened.gaussians, Measurer(opened)
+    require_still(source.file, first.as_file(), form)
+    question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
+    question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": shares, "steps": steps}
+    size = bytes_of(source.file)  # which a damaged model has not: before the folder is made
+    with claimed(out, question, RECORD, "a search", "another --out"):
+        tell_losses(_result(out, form), first.as_file())
+        whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
+        search = Search(out, wanted, question, whole, measurer.split, source.scene_name)
+        ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))
+        before = 1.0
+        for keep in shares:
+            rung = _measured(ladder, ladder.rung(keep, before), keep, form, measurer)
+            search.points += rung
+            search.write()
+            before = keep
+            if wanted.ends(rung, whole.psnr) and keep < 1:  # after the model itself: a trained rung can be better
+                break
+        return _finished(search, form)
+
+
+def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer: Measurer) -> list[Point]:
+    """Write a rung with each setting of its harmonics, and measure the files as they are read back."""
+    points, model = [], load(source)
+    for degree, quality in _settings(form, model.sh_degree):
+        name = f"keep_{round(100 * keep):02d}_degree_{degree}_{quality}"
+        file = ladder.out / TRIALS / f"{name}.{form}"
+        if form == "sog":
+            _copy(ladder.fitted(source, name, degree, quality), file)
+        else:
+            lower = replace(model, sh_rest=with_degree(model.tables(), degree)["sh_rest"])
+            lower.save(file, Writing(quality=quality, quiet=True))
+        size, figures = file.stat().st_size, measurer.figures(load(file, Reading(quiet=True)))
+        point = Point(f"{TRIALS}/{file.name}", keep, degree, quality, len(model), size, *figures)
+        LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, point.psnr)
+        points.append(point)
+    return points
+
+
+def _settings(form: Format, degree: int) -> Iterable[tuple[int, Quality]]:
+    """Those of a model of this degree that differ: without harmonics there is one."""
+    lower = ((min(most, degree), quality) for most, quality in SETTINGS[form])
+    return dict.fromkeys((most, quality if most else "balanced") for most, quality in lower)
+
+
+def _finished(search: Search, form: Format) -> dict[str, Any]:
+    """Write the chosen file under its own name.  Raises ConfigError where there is none."""
+    chosen, psnr = search.chosen, search.source.psnr
+    file = _result(search.out, form)
+    if chosen is None:
+        near = search.target.nearest(search.points)
+        raise ConfigError(
+            f"--target {search.target.text}: no file meets it; the nearest, {search.out / near.file}, has "
+            f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+z.2f} dB; {search.target.remedy}"
+            + (f"; {file.name} there is of another target" if file.exists() else "")
+        )
+    _copy(search.out / chosen.file, file)
+    search.write(file.name)
+    return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
+
+
+def _result(out: Path, form: Format) -> Path:
+    return out / f"compressed.{form}"
+
+
+def _copy(source: Path, file: Path) -> None:
+    """Copy a model file, and the sky beside it."""
+    with written(file) as output:
+        output.write(read_file(source))
+    keep_sky(sky_beside(source), file, output.sha256)

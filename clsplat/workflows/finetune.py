@@ -1,0 +1,233 @@
+"""A model file trained further, from the photographs of its scene: stages of the recipe `compress`, as runs."""
+
+import json
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from clsplat.core import lock
+from clsplat.core.errors import ConfigError, DataError, Interrupted
+from clsplat.core.files import LOCK, PIPELINE, is_there, make_folder, sweep, told_as, write_text
+from clsplat.core.reading import read_json
+from clsplat.gaussians.model import MODEL, Model
+from clsplat.metrics.views import mean, measure
+from clsplat.opencl.device import Device
+from clsplat.photos.photographs import Photographs
+from clsplat.pipeline.files import find
+from clsplat.pipeline.loading import Pipeline, checked
+from clsplat.pipeline.stretching import stretched
+from clsplat.pipeline.yaml_file import Document, read_yaml
+from clsplat.render.painter import Splats
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.runs.model_file import ModelFile, Source
+from clsplat.runs.run_folder import Start
+from clsplat.runs.state import changed, is_done_with
+from clsplat.scene.identity import Identity, decode_all, require_whole
+from clsplat.sweeps.experiment import run_pipeline
+from clsplat.training import checkpoint
+
+LOG = logging.getLogger("clsplat")
+RECIPE, TRAINING = "compress", "optimize"
+LEAST = 20  # steps: each training of the recipe has some to average then
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """With which photographs models are trained, as one is rendered, and how long."""
+
+    name: str  # of the pipelines that are run
+    source: Source
+    model: Model
+    steps: int | None  # None: those of the recipe
+    device: Device
+
+    def pipeline(self, stages: Sequence[str], values: Mapping[str, Any], **export: str) -> Pipeline:
+        """Return stages of the recipe, in its order, and one that writes the model, with other values by place."""
+        path = find(RECIPE)
+        data = read_yaml(path).data
+        chosen = [*_chosen(data["stages"], stages), {"export": {"file": MODEL, **export}}]
+        document = Document({**data, "name": self.name, "stages": chosen})
+        settings = {**self._scene(), **self._rendering(), **values}
+        pipeline = checked(path, document, [f"{place}={json.dumps(value)}" for place, value in settings.items()])
+        if self.steps is None:
+            return pipeline
+        first = next(stage for stage in data["stages"] if _is(stage, TRAINING))[TRAINING]["steps"]
+        return replace(pipeline, settings=stretched(pipeline.settings, Fraction(self.steps, first)))
+
+    def trained(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
+        """Run a pipeline in a folder, as the function `trained`; return the file that it writes there."""
+        return trained(pipeline, folder, self.device, file)
+
+    def _scene(self) -> dict[str, Any]:
+        settings, numbers = self.source.settings, self.model.rendering
+        return {
+            "scene.path": str(self.source.folder.resolve()),
+            "scene.downscale": settings.downscale,
+            "scene.holdout": settings.holdout,
+            "scene.alpha": self.source.alpha or numbers.alpha,
+            "scene.background": numbers.background or settings.background,
+        }
+
+    def _rendering(self) -> dict[str, Any]:
+        numbers = self.model.rendering
+        screen = {"type": "dilation", "variance": numbers.screen_variance, "compensate": int(numbers.compensate)}
+        if numbers.pixel_box:
+            screen = {"type": "box"}
+        sky = self.model.sky and {"type": "directions", "side": self.model.sky.side}
+        return {
+            "model.sh_degree": self.model.sh_degree,
+            "model.near": numbers.near,
+            "model.screen_filter": screen,
+            **({"model.background": sky} if sky else {}),
+        }
+
+
+def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL) -> Path:
+    """Run a pipeline in a folder; return the file that it writes there.
+
+    What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.  Where
+    all checkpoints are damaged it begins anew.
+    """
+    if not is_trained(pipeline, folder):
+        is_whole = _is_any_whole(folder)
+        if checkpoint.saved(folder) and not is_whole:
+            LOG.warning("%s: no checkpoint is whole; it is trained again from the beginning", folder)
+        begun: Start = "resume" if is_whole else "restart"
+        start: Start = begun if is_there(folder) else "new"
+        try:
+            run_pipeline(pipeline, folder, device, start)
+        except Interrupted as error:
+            raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
+    return folder / file
+
+
+def is_trained(pipeline: Pipeline, folder: Path) -> bool:
+    """Whether a run of a pipeline has come to its end in a folder, with files that are whole."""
+    return is_done_with(pipeline, folder) and not changed(folder)
+
+
+def _is_any_whole(folder: Path) -> bool:
+    """Whether a checkpoint of a run can be read, or is of another format, which the run will say."""
+    for path in reversed(checkpoint.saved(folder)):
+        try:
+            checkpoint.load(path)
+        except DataError:
+            continue
+        except ConfigError:
+            pass
+        return True
+    return False
+
+
+def require_steps(steps: int) -> None:
+    """Raise ConfigError for fewer steps than the recipe can be stretched to."""
+    if steps < LEAST:
+        raise ConfigError(f"--steps {steps}: expected a number of at least {LEAST}")
+
+
+def _chosen(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
+    """The stages of a file that have these names, in order; their steps count from the first of them on."""
+    chosen, left, skipped = [], iter(stages), 0
+    for name in names:
+        while not _is(stage := next(left), name):
+            skipped += stage[TRAINING]["steps"] if _is(stage, TRAINING) else 0
+        chosen.append(_earlier(stage, skipped) if _is(stage, TRAINING) else stage)
+    return chosen
+
+
+def _earlier(training: Any, steps: int) -> Any:
+    """A training of a file so many steps earlier: cadences begin at steps of the whole run."""
+    keys = training[TRAINING]
+    during = [
+        {name: {**inner, **({"start": inner["start"] - steps} if "start" in inner else {})}}
+        for stage in keys.get("during", ())
+        for name, inner in stage.items()
+    ]
+    return {TRAINING: {**keys, "during": during}}
+
+
+def _is(stage: Any, name: str) -> bool:
+    """Whether a stage of a file, which is its name where it has no settings, has this name."""
+    return bool(stage == name or (isinstance(stage, dict) and name in stage))
+
+
+# The folder in which models are trained: it belongs to one question, and what was interrupted in it goes on.
+
+WORDS = {"sha256": "the model's bytes"}  # for keys of a question, where they are no words
+
+
+@contextmanager
+def claimed(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> Iterator[None]:
+    """Make the folder, with the question in its record, sweep it of what killed processes left, and hold it.
+
+    what: the question in a word, such as "a search"; remedy: what to give in the place of this folder.
+    Raises ConfigError where it holds something else, OutputError where another process uses it.
+    """
+    _require_own(out, question, record, what, remedy)
+    with told_as(out):
+        make_folder(out)
+    with lock.held(out):
+        _require_own(out, question, record, what, remedy)  # again: another may have begun since
+        sweep(out, border=PIPELINE)
+        if not (out / record).exists():
+            write_text(out / record, json.dumps(question, indent=1) + "\n")
+        yield
+
+
+def _require_own(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> None:
+    """Raise ConfigError where a folder holds another question, or something else."""
+    if not is_there(out / record):
+        if is_there(out) and not (out.is_dir() and all(_is_nobodys(path.name) for path in out.iterdir())):
+            raise ConfigError(f"{out}: holds something else than {what}; give {remedy}")
+        return
+    try:
+        before = read_json(out / record)
+    except DataError:
+        before = None
+    if not isinstance(before, dict):
+        raise ConfigError(f"{out / record}: is not the record of {what}; remove {out}, or give {remedy}")
+    differing = [WORDS.get(key, key) for key, value in question.items() if before.get(key) != value]
+    if differing:
+        raise ConfigError(f"{out}: holds {what} that differs in {', '.join(differing)}; remove it, or give {remedy}")
+
+
+def _is_nobodys(name: str) -> bool:
+    """Whether a file may be what a process leaves that was killed before its record: its lock, or a hidden file."""
+    return name == LOCK or name[0] == "."
+
+
+# Models measured at the views of a scene, as they come from training and from files.
+
+
+class Measurer:
+    """Measures models at the test views of a scene; at its training views where it has no others."""
+
+    def __init__(self, opened: ModelFile) -> None:
+        self.opened = opened
+        self.split = "test" if opened.scene.split("test") else "train"
+        if self.split == "train":
+            LOG.warning(
+                "%s: has no test views; the training views are measured; scene.holdout keeps some for it",
+                opened.scene.path,
+            )
+        self.rasterizer = Rasterizer(opened.device)
+        self.photographs = Photographs(opened.device, opened.background)
+
+    def identity(self) -> str:
+        """Return a hash of the photographs, cameras and points.  Raises DataError where a photograph is damaged."""
+        scene = self.opened.scene
+        files = decode_all(scene.views)
+        require_whole(scene.path, files)
+        return Identity.of(scene, files).digest
+
+    def figures(self, model: Model) -> tuple[float, float]:
+        """Return PSNR, dB, and SSIM."""
+        views = self.opened.scene.split(self.split)
+        painter = Splats(self.rasterizer, model.upload(self.opened.device), self.photographs.background)
+        results = measure(painter, views, self.photographs)
+        averages = mean(results)
+        return averages["psnr"], averages["ssim"]
