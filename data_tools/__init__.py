@@ -1,0 +1,1 @@
+"""Datasets: made scenes, downloads, and conversions; only the command line imports it."""

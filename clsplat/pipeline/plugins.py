@@ -1,7 +1,7 @@
 """Losses, rules, filters, stages, readers and more from outside the package.
 
 A plug-in is a Python file, given by `--plugin FILE.py`, or a module that an installed package names in the entry-point
-group `clsplat.pipeline.plugins`.  Its classes can be used after its import; kernels lie beside it and may include the headers
+group `clsplat.plugins`.  Its classes can be used after its import; kernels lie beside it and may include the headers
 of `cl_kernels`.  A run records the name and the content hash of each of its plug-ins.
 """
 
@@ -25,7 +25,7 @@ from clsplat.core.settings import Settings, fault_of, rebuild
 from clsplat.scene.detect import readers
 from clsplat.scene.reader import Reader
 
-GROUP = "clsplat.pipeline.plugins"
+GROUP = "clsplat.plugins"
 _KERNEL_FILE = re.compile(r"[\w-]+\.(?:cl|h)\b")
 _loaded: dict[str, "Plugin"] = {}  # by name
 

@@ -1,4 +1,4 @@
-"""Files are read by `clsplat.core.reading` alone, which takes regular files only; and what happens where they are none."""
+"""Only `clsplat.core.reading` reads files, and only regular ones; what happens to others."""
 
 import ast
 import json

@@ -121,7 +121,8 @@ def test_two_variants_of_one_name_are_refused():
     with pytest.raises(ConfigError) as error:
         variants(Order)
     assert str(error.value) == (
-        "two variants of Order have the name 'paper': clsplat.photos.sampling.Paper and tests.core.test_settings.Other; "
+        "two variants of Order have the name 'paper': "
+        "clsplat.photos.sampling.Paper and tests.core.test_settings.Other; "
         "rename one"
     )
 

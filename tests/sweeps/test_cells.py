@@ -274,8 +274,8 @@ def test_a_copy_of_a_result_gets_its_manifest_last(store, terms, tmp_path, monke
     result, copied = store.folder(CELL.key).result, []
     for name in "abcdefgh":
         (result / name).touch()
-    for module in ("copies", "placing"):
-        monkeypatch.setattr(f"clsplat.cluster.{module}.link_or_copy", lambda _, target: copied.append(target.name))
+    for module in ("store", "batch"):
+        monkeypatch.setattr(f"clsplat.sweeps.{module}.link_or_copy", lambda _, target: copied.append(target.name))
     place_copy(result, tmp_path / "copy")
     assert copied[-1] == MANIFEST != copied[-2]
 

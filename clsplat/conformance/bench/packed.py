@@ -1,7 +1,8 @@
 """One process of a packing: training steps on its cores, while the others of the packing have theirs.
 
-It is started as `python -m clsplat.conformance.bench.packed WORDS`, WORDS as `Task.json`.  It says "ready", waits for a line, times
-its steps, tells them, and goes on with steps until its standard input ends, so that no process is timed alone.
+It is started as `python -m clsplat.conformance.bench.packed WORDS`, WORDS as `Task.json`.  It prints "ready", waits
+for a line, times its steps, prints them, and continues with steps until its standard input ends, so that no process is
+timed on an idle machine.
 """
 
 import json
