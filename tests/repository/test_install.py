@@ -109,7 +109,7 @@ def test_only_clsplat_appears_and_its_commands_run(version, way, built, checkout
 
 
 @pytest.mark.slow
-def test_the_source_distribution_holds_docs_examples_and_the_changelog(built):
+def test_sdist_holds_docs_examples_and_the_changelog(built):
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     for folder in ("docs", "examples", "data_tools", "cl_kernels", "pipelines"):

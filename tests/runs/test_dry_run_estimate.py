@@ -43,7 +43,7 @@ def expected(pipeline: str, photos: Path, *sets: str) -> list[str]:
     return module.expected(asked, planned, names, known(asked, names), device, None)  # type: ignore[arg-type]
 
 
-def test_the_time_of_parts_follows_from_the_number_of_their_pieces(photos):
+def test_time_of_parts_follows_from_the_number_of_pieces(photos):
     """23 photographs have 253 pairs; 20 are trained on, until 5 measurements 350 steps apart and a refit of 350, or
     7,000 steps and as many again."""
     steps = ", ".join(f"{{stage: {name}}}" for name in ("find_features", "match_features", "map_cameras", "undistort"))
