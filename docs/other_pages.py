@@ -5,7 +5,7 @@ import functools
 import inspect
 import re
 import typing
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import typer
@@ -92,7 +92,7 @@ def python_page() -> str:
     public = {name: getattr(clsplat, name) for name in clsplat.__all__}
     classes = [named for named in public.values() if isinstance(named, type)]
     functions = [named for named in public.values() if callable(named) and not isinstance(named, type)]
-    modules = [named for named in public.values() if not callable(named)]
+    modules = [named for named in public.values() if isinstance(named, ModuleType)]
     text = "# Python reference\n\nAll of these are names of `clsplat`; [Python](../python.md) shows their use.\n\n"
     text += "## Classes\n\n" + "".join(class_section(kind) for kind in classes)
     text += "## Functions\n\n" + "".join(directive(function, 3) for function in functions)

@@ -318,7 +318,7 @@ class _Sog:
         return value
 
 
-# Write SOG, version 2 (layout: sog.py): the same model gives the same bytes.
+# Write SOG, version 2: the same model gives the same bytes.
 
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most, of a palette for all
 SHARES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # entries at most for a splat, of a palette for neighbours
@@ -346,7 +346,7 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
 def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: Writing) -> str:
     """Write a SOG as `write_sog` does, whose splats stay in the order that they have.
 
-    weights: their binary logarithms, [N], of weights.py: of the model that the splats may be a part of.
+    weights: their binary logarithms, [N], of `log_weights`: of the model that the splats may be a part of.
     """
     in_folder = path.name == META
     p, harmonics = _quantised(splats.parameters, weights, options)

@@ -50,7 +50,7 @@ def weighed_means(
 ) -> NDArray[np.float32]:
     """Return positions [N, 3] in steps of about `share` of the size of each Gaussian, those of median weight.
 
-    The step is as 1 / sqrt(weight) (sh_rounding.py): a power of two of the levels of a SOG.
+    The step is as 1 / sqrt(weight) (see `steps`): a power of two of the levels of a SOG.
     """
     levels, low, level = _levels(means)
     sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
@@ -193,7 +193,7 @@ def tree_palette(
 ) -> tuple[Doubles, Labels]:
     """Return vectors [E, 3 K], E at most `entries`, for harmonics [N, 3 K], and for each Gaussian its vector, [N].
 
-    log_weights: of weights.py; median_step: of vectors, in LEVELS, in the median, for harmonics of the usual size.
+    log_weights: those of `log_weights`; median_step: of vectors, in LEVELS, in the median, for harmonics of the usual size.
     """
     run = len(rest) if _repeated(rest) else max(RUN, -(-len(rest) // entries))
     runs = np.arange(len(rest)) // run
@@ -280,7 +280,7 @@ def _sums(labels: Labels, weights: Doubles, points: NDArray[np.floating], parts:
 
 LARGEST = 10.0  # of the logarithms, on both sides of 0
 # A sky is behind a gap: a distance within which are all but a few, and behind it many.  The spheres of
-# gaussians/sky_splats.py are 10 times as far as 97 % of the scene.  Their rows are found by it, not by their number:
+# clsplat/gaussians/conversion.py are 10 times as far as 97 % of the scene.  Their rows are found by it, not by their number:
 # models are cropped, merged to fewer Gaussians, sorted and rounded afterwards.
 GAP, INSIDE = 5.0, 0.97
 FEWEST_INSIDE, FEWEST_BEHIND = 0.01, 0.05  # of all

@@ -3,7 +3,7 @@
     means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
     filter_variance [1] scene units², the world filter; only in our own PLY, as is
-    motion [5 or more], where Gaussians move (clsplat/formats/splats.py)
+    motion [5 or more], where Gaussians move
 
 Axes are those of the PLY of 3DGS: x right, y down, z ahead.
 """

@@ -46,7 +46,7 @@ from clsplat.formats.splats import (
     unit,
 )
 
-# The planes of an SPZ file: numbers as bytes, and bytes as numbers (layout: spz.py).
+# The planes of an SPZ file: numbers as bytes, and bytes as numbers.
 
 LOG = logging.getLogger("clsplat")
 MAGIC = b"NGSP"
@@ -171,7 +171,7 @@ def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
 def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: int, options: Writing) -> list[bytes]:
     """Return the bytes of each plane; values beyond its range are cut.
 
-    weights: binary logarithms, [N], of weights.py.  Gaussians whose harmonics have fine steps come first, and keep
+    weights: binary logarithms, [N], of `log_weights`.  Gaussians whose harmonics have fine steps come first, and keep
     their order among themselves: alike bytes compress.
     """
     sh_steps = _sh_steps(p["sh_rest"], weights, options)

@@ -253,7 +253,7 @@ def half_boxes(level: Parameters) -> Floats:
     return half
 
 
-# Write streamed SOG, version 1 (layout: lod.py): the same levels give the same bytes.
+# Write streamed SOG, version 1: the same levels give the same bytes.
 
 USUAL = Limits()
 

@@ -62,7 +62,7 @@ class Dropout:
         return 1 / (1 - self.probability)
 
 
-HIDDEN = "hidden"  # which training views leave a Gaussian out; see left_out.py
+HIDDEN = "hidden"  # which training views leave a Gaussian out
 INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
 ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
 GROWTH = 1.125  # of the capacity: every edit moves all tables in any case

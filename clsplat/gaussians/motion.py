@@ -1,6 +1,6 @@
 """Gaussians that move, on the host: one moment of them, and the motion of those that stand still.
 
-The columns of the table are told in clsplat/formats/splats.py, and the formulas in cl_kernels/motion.cl.
+The columns of the table are described in clsplat/formats/splats.py, and the formulas in cl_kernels/motion.cl.
 """
 
 from collections.abc import Mapping, Sequence

@@ -235,8 +235,8 @@ class ViewMetrics:
     ssim: float
     perceptual: dict[str, float | None] = field(default_factory=dict)
     colours: dict[str, float] = field(default_factory=dict)  # dB, by name, where photographs have colours of their own
-    still: dict[str, float] = field(default_factory=dict)  # of static pixels, where the scene moves: stillness.py
-    moments: dict[str, float] = field(default_factory=dict)  # dB, by whether the moment is held out: held_out.py
+    still: dict[str, float] = field(default_factory=dict)  # of static pixels, where the scene moves
+    moments: dict[str, float] = field(default_factory=dict)  # dB, by whether the moment is held out
 
     def line(self) -> dict[str, Any]:
         """Return the figures as in a line of metrics.jsonl."""

@@ -388,7 +388,7 @@ def _figure(record: dict[str, Any], image: Image, photograph: Image) -> ViewFigu
 
 
 LOG = logging.getLogger("clsplat")
-MORE = {  # metrics/colours.py, metrics/stillness.py, metrics/held_out.py: name and unit
+MORE = {  # of clsplat/metrics/views.py: name and unit
     "psnr_colour": ("PSNR in the photographs' colours", "dB"),
     "psnr_affine": ("PSNR with colours fitted", "dB"),
     "psnr_held_out_moments": ("PSNR at held-out moments", "dB"),

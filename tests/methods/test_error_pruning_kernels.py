@@ -1,4 +1,4 @@
-"""Pruning by what the training views lose without the Gaussians (sparing.py), against the reference."""
+"""Pruning by what the training views lose without the Gaussians (error_pruning.py), against the reference."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Growth and pruning by wrong pixels (accuracy.py) and draws without replacement, against the formulas in float64."""
+"""Growth and pruning by wrong pixels (fastgs.py) and draws without replacement, against the formulas in float64."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Relocation and noise of 3DGS-MCMC (relocation.py, noise.cl) against the paper's equations in float64."""
+"""Relocation and noise of 3DGS-MCMC (mcmc.py, noise.cl) against the paper's equations in float64."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Importance by blend weights in several views (importance.py), against the reference."""
+"""Importance by blend weights in several views (mini_splatting.py), against the reference."""
 
 from types import SimpleNamespace
 

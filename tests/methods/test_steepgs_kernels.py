@@ -1,4 +1,4 @@
-"""The splitting matrix and the rule that reads it (saddle.cl, saddle.py), against float64 and finite differences."""
+"""The splitting matrix and the rule that reads it (saddle.cl, steepgs.py), against float64 and finite differences."""
 
 from dataclasses import replace
 

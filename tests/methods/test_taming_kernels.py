@@ -1,4 +1,4 @@
-"""Draws by score within a budget (score.py, budget.py), against the formulas in float64."""
+"""Draws by score within a budget (taming.py, clsplat/density/budget.py), against the formulas in float64."""
 
 from types import SimpleNamespace
 

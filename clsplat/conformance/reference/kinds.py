@@ -77,7 +77,7 @@ class Splats:
     depth: NDArray[Any]  # [N] z
     radius: NDArray[Any]  # [N] px, whole; 0 = not visible to density control; independent of opacity
     visible: NDArray[Any]  # [N] bool: blended
-    pixel_box: bool = False  # integrated over the box of each pixel (pixel_box.py)
+    pixel_box: bool = False  # integrated over the box of each pixel (blending.py)
 
 
 class SplatGradients(NamedTuple):

@@ -38,7 +38,7 @@ class Live extends Walk {
     this.draw();
   }
 
-  // The camera of the next picture: that of a view, or of the stage; pace: as in orders.py.
+  // The camera of the next picture: that of a view, or of the stage; pace: as in preview.py.
   wish() {
     if (!this.state.drawn || this.state.ended) return null;
     const {width, height} = this.pane(), exact = this.at >= 0;
