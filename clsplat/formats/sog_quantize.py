@@ -193,7 +193,8 @@ def tree_palette(
 ) -> tuple[Doubles, Labels]:
     """Return vectors [E, 3 K], E at most `entries`, for harmonics [N, 3 K], and for each Gaussian its vector, [N].
 
-    log_weights: those of `log_weights`; median_step: of vectors, in LEVELS, in the median, for harmonics of the usual size.
+    log_weights: as `log_weights` returns them; median_step: of vectors, in LEVELS, in the median, for harmonics of the
+    usual size.
     """
     run = len(rest) if _repeated(rest) else max(RUN, -(-len(rest) // entries))
     runs = np.arange(len(rest)) // run
@@ -280,8 +281,8 @@ def _sums(labels: Labels, weights: Doubles, points: NDArray[np.floating], parts:
 
 LARGEST = 10.0  # of the logarithms, on both sides of 0
 # A sky is behind a gap: a distance within which are all but a few, and behind it many.  The spheres of
-# clsplat/gaussians/conversion.py are 10 times as far as 97 % of the scene.  Their rows are found by it, not by their number:
-# models are cropped, merged to fewer Gaussians, sorted and rounded afterwards.
+# clsplat/gaussians/conversion.py are 10 times as far as 97 % of the scene.  Their rows are found by it, not by their
+# number: models are cropped, merged to fewer Gaussians, sorted and rounded afterwards.
 GAP, INSIDE = 5.0, 0.97
 FEWEST_INSIDE, FEWEST_BEHIND = 0.01, 0.05  # of all
 

@@ -41,7 +41,7 @@ def test_html_stands_in_templates_only(path):
         assert any(TAG.search(text) for _, text in strings(path)), "it draws no more; take it from the list"
         return
     for line, text in strings(path):
-        assert not TAG.search(text), f"{name}:{line}: HTML belongs into clsplat/core/templates"
+        assert not TAG.search(text), f"{name}:{line}: HTML belongs into clsplat/pages/templates"
     assert "html.escape" not in path.read_text(), f"{name}: templates escape what they show"
 
 
