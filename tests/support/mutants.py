@@ -11,7 +11,6 @@ import ast
 import json
 import random
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -177,7 +176,7 @@ def main() -> None:
     results = []
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "checkout"
-        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "build", "demo", ".*_cache"))
+        subprocess.run(["git", "clone", "-q", ROOT, copy], check=True)  # what is committed
         for mutant in draw(options.seed, options.count):
             killed = is_killed(copy, mutant, tests_of(mutant), options.limit)
             if not killed and options.whole:
