@@ -240,8 +240,14 @@ FRESH = {"state": "running", "time": 2.0}
 known_boot = pytest.mark.skipif(Owner.this().boot is None, reason="the system does not say which start this is")
 
 
-@pytest.mark.parametrize("name", ["another", pytest.param(platform.node(), marks=known_boot)])
-@pytest.mark.parametrize("status", [FRESH, {"state": "starting", "time": -30.0}, {"state": "running", "time": -3600.0}])
+@pytest.mark.parametrize(
+    ("name", "status"),
+    [
+        ("another", {"state": "starting", "time": -30.0}),
+        ("another", {"state": "running", "time": -3600.0}),
+        pytest.param(platform.node(), FRESH, marks=known_boot),
+    ],
+)
 def test_remote_run_is_not_joined_where_locks_are_local(name, status, tmp_path, monkeypatch):
     """As with NFS and `local_lock`: the lock is free here.  A negative age is that of a clock that is ahead."""
     (tmp_path / LOCK).write_text(json.dumps({**ELSEWHERE, "host": name}))
