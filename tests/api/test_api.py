@@ -52,7 +52,8 @@ def test_names_for_readers_and_for_type_checkers_agree():
         (alias,) = node.names
         assert alias.name == alias.asname, "`import X as X` makes a name public for type checkers"
         typed[alias.name] = node.module
-    assert typed == {**clsplat._PLACES, **dict.fromkeys(clsplat._MODULES, "clsplat")}
+    modules = {name: place.rpartition(".")[0] for name, place in clsplat._MODULES.items()}
+    assert typed == {**clsplat._PLACES, **modules}
     assert sorted(typed) == clsplat.__all__
     assert {*clsplat.__all__, "__version__"} == set(dir(clsplat))
 

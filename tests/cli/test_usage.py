@@ -121,8 +121,8 @@ def test_the_device_stands_before_the_command_or_after_it(finished):
 
 
 JSON = ["check smoke --json", "check --schema", "pipelines --json", "pipelines splat --json", "status RUN --json",
-        "inspect SCENE --json", "pipelines smoke --copy FILE --json"]  # fmt: skip
-JSON_OF_DEVICES = ["devices --json", "evaluate RUN", "evaluate RUN/point_cloud.ply --scene SCENE",
+        "inspect SCENE --json", "pipelines smoke --copy FILE --json", "evaluate RUN"]  # fmt: skip
+JSON_OF_DEVICES = ["evaluate RUN/point_cloud.ply --scene SCENE",
                    "bench --scenes , --model RUN/point_cloud.ply --scene SCENE --repeats 1 --json"]  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import Axis, fewest_steps, in_steps, last_edit, with_steps
 from clsplat.training.stage import Training
-from tests.support.pipelines import KINDS
+from tests.support.pipelines import SCHEDULED
 
 
 def edits(training: Training, recipe: Training) -> list[tuple[int, int]]:
@@ -34,7 +34,7 @@ def known(name: str) -> tuple[PipelineFile, list[tuple[int, int]]]:
     return recipe, edits(recipe.training, recipe.training)
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", SCHEDULED)
 @settings(max_examples=3)
 @given(data=st.data())
 def test_edits_keep_order_and_distance_in_any_number_of_steps(name, data):
@@ -97,7 +97,7 @@ def test_a_cadence_below_a_step_is_refused():
     assert load("splat_7k", ["densify.every=2.94"]).settings.training.during[1].every == 2.94
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", SCHEDULED)
 @settings(max_examples=3)
 @given(data=st.data())
 def test_corrected_step_count_keeps_all_up_to_the_last_edit(name, data):

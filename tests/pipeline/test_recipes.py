@@ -36,10 +36,9 @@ LEARNS = {"auto_opti3dgs_7k"}
 ALONE = """
 import functools, sys
 from pathlib import Path
-from clsplat.opencl import device, program
-from tests.support.pipelines import KINDS
+from clsplat.opencl import device
 from tests.support.recipes import short, train
-device.context_of, program.built = functools.cache(device.context_of), functools.cache(program.built)
+device.context_of, device.built = functools.cache(device.context_of), functools.cache(device.built)
 for name in sys.argv[3:]:
     train(short(name, Path(sys.argv[1])), Path(sys.argv[2]) / name)
 """

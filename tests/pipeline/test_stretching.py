@@ -12,7 +12,7 @@ from clsplat.photos.detail import DetailDivisor
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.stretching import in_steps, last_edit, stretched, with_steps
-from tests.support.pipelines import KINDS, flat
+from tests.support.pipelines import KINDS, SCHEDULED, flat
 
 STEPS = ("steps", "start", "stop", "over", "until", "every")
 
@@ -59,7 +59,7 @@ def test_only_steps_change_and_all_of_them(name):
 
 @pytest.mark.parametrize(
     ("name", "factor"),
-    list(zip(KINDS[1:], cycle((0.0371, 0.617, 1.9)), strict=False)),  # without smoke, which has few steps as it is
+    list(zip(SCHEDULED[1:], cycle((0.0371, 0.617, 1.9)), strict=False)),  # without smoke, which has few steps as it is
 )
 def test_what_ends_acts_as_often(name, factor):
     settings = load(name).settings
@@ -85,7 +85,7 @@ def test_a_recipe_has_the_steps_that_were_asked_for(name, steps):
     assert in_steps(load(name).settings, steps).training.steps == steps
 
 
-@pytest.mark.parametrize(("name", "factor"), list(zip(KINDS, cycle((0.01, 0.13, 1.0, 3.7)), strict=False)))
+@pytest.mark.parametrize(("name", "factor"), list(zip(SCHEDULED, cycle((0.01, 0.13, 1.0, 3.7)), strict=False)))
 def test_every_stretched_recipe_is_valid(name, factor):
     settings = load(name).settings
     new = stretched(settings, factor)
@@ -128,7 +128,7 @@ def test_corrected_step_count_keeps_what_comes_later(tmp_path, name, done, left)
         assert before.start <= done or done < after.start + 1 < new.steps
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", SCHEDULED)
 def test_corrected_count_is_after_growth_and_small_photographs(name):
     training = load(name).settings.training
     last, resolution = last_edit(training), training.views.resolution

@@ -59,3 +59,7 @@ KINDS = (
     *("auto_7k", "auto_opti3dgs_7k", "box_7k", "dynamic_7k", "gdgs_7k", "micro_splatting_v2_7k", "mini_7k"),
     *("opti3dgs_7k", "splat_ewa_7k", "steep_7k"),
 )
+# Those of them whose schedules differ.
+SCHEDULED = tuple(
+    name for name in KINDS if name not in ("box_7k", "gdgs_7k", "opti3dgs_7k", "splat_ewa_7k", "steep_7k")
+)
