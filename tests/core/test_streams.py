@@ -78,8 +78,8 @@ def test_no_file_takes_a_descriptor_closed_before_the_start(tmp_path):
         import os
         for number in (0, 1, 2):
             os.close(number)
-        from clsplat import streams
-        streams.install()
+        from clsplat.core import signals
+        signals.install()
         with open({str(tmp_path / "x")!r}, "w") as file:
             os.write(1, b"by a library")
             os.write(2, b"by a library")

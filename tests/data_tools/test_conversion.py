@@ -77,7 +77,7 @@ def test_frames_are_not_taken_twice(video, tmp_path):
     assert files[1].is_file()
 
 
-@pytest.mark.parametrize("chosen", [5, [], [[1], 2], ["a"], [True], [3, 1], None])
+@pytest.mark.parametrize("chosen", [5, [], [[1], 2], [True], [3, 1]])
 def test_a_damaged_list_of_frames_is_made_again(chosen, video, tmp_path):
     write_frames(video, tmp_path / "frames", frames=4)
     record = tmp_path / "frames" / ".frames.json"

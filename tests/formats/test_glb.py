@@ -26,8 +26,7 @@ def attribute(tree, binary, name):
     return rows.reshape(accessor["count"], -1)
 
 
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("count", [1, 200])
+@pytest.mark.parametrize(("count", "degree"), [(1, 3), (200, 0), (200, 1), (200, 2)])
 def test_a_glb_comes_back_within_its_digits(tmp_path, rng, count, degree):
     source = splats(rng, count, degree, "mip")
     found = there_and_back(tmp_path / "a.glb", source)

@@ -25,8 +25,7 @@ def payload(data: bytes) -> bytes:
     return data.split(b"end_header\n", 1)[1]
 
 
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("count", [0, 1, 20])
+@pytest.mark.parametrize(("count", "degree"), [(0, 3), (1, 0), (20, 1), (1, 2), (20, 3)])
 def test_round_trip(tmp_path, rng, degree, count):
     path = tmp_path / "a" / "model.ply"
     written = parameters(rng, count, degree)

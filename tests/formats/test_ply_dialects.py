@@ -76,8 +76,7 @@ def test_a_compressed_ply_of_another_program_is_the_source(name, rows):
     assert np.median(difference) < 0.01
 
 
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("count", [1, CHUNK, 600])
+@pytest.mark.parametrize(("count", "degree"), [(1, 3), (CHUNK, 0), (CHUNK, 1), (600, 2), (600, 3)])
 def test_a_compressed_ply_comes_back_within_its_steps(tmp_path, rng, count, degree):
     source = splats(rng, count, degree, "mip")
     found = there_and_back(tmp_path / "a.compressed.ply", source)

@@ -50,9 +50,9 @@ def test_an_spz_of_another_program_is_the_source(version):
     assert angles(read(interop("train1000.ply")), read(interop(f"train1000.v{version}.spz"))).max() < 0.2
 
 
-@pytest.mark.parametrize("axes", ["spz", "ply"])
-@pytest.mark.parametrize("version", [3, 4])
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize(
+    ("degree", "version", "axes"), [(0, 3, "spz"), (1, 4, "spz"), (2, 3, "ply"), (3, 4, "ply"), (3, 3, "spz")]
+)
 def test_an_spz_comes_back_within_its_steps(tmp_path, rng, degree, version, axes):
     if version == 4:
         pytest.importorskip("zstandard")

@@ -14,15 +14,10 @@ from tests.support.runs import train
 pytestmark = pytest.mark.slow
 
 PRUNE = "{type: prune_faint, opacity_below: 0.005}"
-SADDLE = "{type: split_saddle, gradient_above: 1.0e-5, distance: 0.5, shrink: 1.6}"
-CROWDED = "{type: clone_crowded, gradient_above: 1.0e-5, size_below: 0.1, ratio_above: 2.0, cells: 3, extremes: 8}"
 GAINFUL = "{type: clone, statistic: gain, gradient_above: 0.1, size_below: 0.1}"
 SPARE = "{type: prune_spare, error_rise: 0.1, views: 3}"
 ENTROPY = "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: weight_entropy, weight: 0.05}]"
 CASES = {  # what acts -> settings
-    "split_saddle": (f"densify.rules=[{SADDLE}, {PRUNE}]",),
-    "clone_crowded": (f"densify.rules=[{CROWDED}, {{type: clone}}, {PRUNE}]",),
-    "clone": (f"densify.rules=[{GAINFUL}, {PRUNE}]",),
     "prune_spare": (f"densify.rules=[{GAINFUL}, {SPARE}]",),
     "weight_entropy": (ENTROPY,),
 }

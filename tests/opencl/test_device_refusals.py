@@ -22,10 +22,12 @@ CALLS = {
 }
 
 
+FAULTS = (cl.MemoryError, MemoryLimitError, 5), (cl.RuntimeError, DeviceError, 4)
+
+
 @pytest.mark.parametrize(
-    ("error", "expected", "code"), [(cl.MemoryError, MemoryLimitError, 5), (cl.RuntimeError, DeviceError, 4)]
+    ("name", "error", "expected", "code"), [(name, *FAULTS[i % 2]) for i, name in enumerate(CALLS)]
 )
-@pytest.mark.parametrize("name", CALLS)
 def test_a_refused_call_has_the_code_of_its_fault(name, error, expected, code, info, monkeypatch):
     def refuse(*arguments, **values):
         raise error("the runtime refuses")

@@ -8,6 +8,7 @@ import pytest
 
 from clsplat.core.errors import KernelError
 from clsplat.opencl.device import Program
+from tests.support.devices import one_schedule
 
 
 def test_a_missing_kernel_file_is_named(device, tmp_path):
@@ -22,6 +23,7 @@ def test_kernel_without_a_group_size_is_refused_with_the_form(device, tmp_path):
         device.program(file)
 
 
+@one_schedule
 @pytest.mark.parametrize(
     "fault",
     [

@@ -3,12 +3,12 @@
 import pytest
 
 from clsplat.core.errors import ConfigError, OverrideError
-from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.overrides import settable
+from tests.support.pipelines import KINDS
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", KINDS)
 def test_every_listed_key_can_be_set_to_its_listed_value(name):
     pipeline = load(name)
     keys = settable(pipeline.settings)
@@ -41,7 +41,6 @@ def test_default_left_out_of_the_file_can_be_changed_in_part():
 
 REFUSED = {
     "optimize.steps=abc": "expected a whole number, got 'abc'",
-    "optimize.steps=2024-01-01": "expected a whole number, got '2024-01-01'",
     "optimize.stps=5": "unknown key 'stps'; did you mean 'steps'?",
     "seed=-1": "expected a value of at least 0, got -1",
     "scene.levels=20": "expected a value of at most 8, got 20",
@@ -52,13 +51,11 @@ REFUSED = {
     "init.count.x=3": "nothing lies below 'count'",
     "optimize.losses.0={type: 3}": "no loss named '3'",
     "steps=100": "no key 'steps' at the top of a pipeline; did you mean optimize.steps?",
-    "stps=100": "no key 'stps' at the top of a pipeline; did you mean optimize.steps?",
     "max_gaussians=9": "no key 'max_gaussians' at the top of a pipeline; did you mean densify.max_gaussians?",
     "rates.means.start=1": "no 'rates' in this pipeline; did you mean optimize.rates.means.start?",
     "optimze.steps=5": "no 'optimze' in this pipeline; did you mean optimize.steps?",
     "optimize.losses.9.weight=1": "expected a number below 2 in a list of 2, got '9'; did you mean",
     "optimize.losses.²=1": "expected a number below 2 in a list of 2, got '²'",
-    "seed.x=1": "nothing lies below 'seed'",
     "optimize.steps": "expected stage.key=value",
     "=3": "expected stage.key=value",
     "optimize.steps=!!float x": "the value cannot be read: 'x' cannot be read as float",
@@ -66,11 +63,8 @@ REFUSED = {
     "optimize.steps=&a [*a]": "the value cannot be read: ",
     "optimize.steps=[": "the value cannot be read: ",
     "name=../up": "expected text that matches",
-    "name=..": "expected text that matches",
-    "name=.": "expected text that matches",
     "stages=[int]": "stages[0]: no stage named 'int'; did you mean 'init'?",
     "plugins.a=b": "'plugins' cannot be set; a run writes it; load a plug-in with --plugin FILE",
-    "plugins={}": "'plugins' cannot be set",
     "optimize.during=[{every: 3}, {to: 1, every: 3}]": "expected a 'stage', the name of the stage",
     "optimize.losses=[{weight: 3}]": "expected a 'type', the name of the loss",
     "densify.budget={gaussians: 1}": "expected a 'type', the name of the budget",

@@ -1,5 +1,6 @@
 """Pipeline files: what is accepted, what is refused and in which words."""
 
+import functools
 import json
 import re
 from pathlib import Path
@@ -16,7 +17,7 @@ from clsplat.pipeline.plugins import load_file
 from clsplat.pipeline.recipes import json_schema
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.stages.optimize import Optimize
-from tests.support.pipelines import flat
+from tests.support.pipelines import KINDS, flat
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SHIPPED = sorted(path.stem for path in resource_dir("pipelines").glob("*.yaml"))
@@ -50,28 +51,54 @@ def write(tmp_path):
     return write
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_pipelines_are_valid_and_resolve_to_themselves(name, write):
-    pipeline = load(name)
-    assert pipeline.settings.name == name
-    again = load(write(pipeline.text()))
-    assert again.resolved() == pipeline.resolved()
+def test_shipped_pipelines_are_valid_and_resolve_to_themselves(write):
+    pipelines = {name: load(name) for name in SHIPPED}
+    faults = [f"{name}: is named {one.settings.name}" for name, one in pipelines.items() if one.settings.name != name]
+    again = {name: load(write(one.text())) for name, one in pipelines.items()}
+    faults += [
+        f"{name}: resolves to another" for name in SHIPPED if again[name].resolved() != pipelines[name].resolved()
+    ]
+    assert not faults, "\n".join(faults)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_every_scheduled_stage_of_a_shipped_pipeline_acts(name):
-    loops, before = [stage for stage in load(name).settings.stages if isinstance(stage, Optimize)], 0
-    for loop in loops:
-        last = before + loop.steps
-        for stage in loop.during:
-            steps = range(before + 1, last + (0 if stage.edits else 1))  # nothing is edited after the last step
-            assert any(stage.due(step) for step in steps), f"{stage.stage}, every {stage.every}"
-        before = last
+def test_every_scheduled_stage_of_a_shipped_pipeline_acts():
+    faults = []
+    for name in SHIPPED:
+        before = 0
+        for loop in [stage for stage in load(name).settings.stages if isinstance(stage, Optimize)]:
+            last = before + loop.steps
+            for stage in loop.during:
+                steps = range(before + 1, last + (0 if stage.edits else 1))  # nothing is edited after the last step
+                if not any(stage.due(step) for step in steps):
+                    faults.append(f"{name}: {stage.stage}, every {stage.every}")
+            before = last
+    assert not faults, "\n".join(faults)
+
+
+def kinds_of(node: object) -> set[str]:
+    """Names of stages, rules, losses, filters and all else that has a type."""
+    if isinstance(node, list):
+        return {kind for item in node for kind in kinds_of(item)}
+    if not isinstance(node, dict):
+        return set()
+    named = {str(node["type"])} if "type" in node else set()
+    return named.union({str(node["stage"])} if "stage" in node else set(), *map(kinds_of, node.values()))
+
+
+def test_the_recipes_that_stand_for_all_have_all_kinds():
+    kinds = {name: kinds_of(load(name).settings.model_dump(mode="json")) for name in SHIPPED}
+    trained = [found for found in kinds.values() if "optimize" in found]
+    assert set().union(*trained) - set().union(*(kinds[name] for name in KINDS)) == set()
+
+
+@functools.cache
+def settings_of(recipe: str) -> dict[str, object]:
+    return flat(load(recipe).resolved())
 
 
 def changes(base: str, recipe: str) -> set[str]:
     """Places, shortened, in which a recipe has other settings than its base."""
-    old, new = flat(load(base).resolved()), flat(load(recipe).resolved())
+    old, new = settings_of(base), settings_of(recipe)
     places = {place for place in old.keys() | new.keys() if old.get(place, "-") != new.get(place, "-")}
     return {place.removeprefix("stages.optimize.").removeprefix("during.") for place in places - {"name"}}
 
@@ -262,9 +289,14 @@ DIFFERENCES = {
 }
 
 
-@pytest.mark.parametrize(("base", "recipe"), DIFFERENCES, ids="-".join)
-def test_recipes_differ_only_where_their_headers_say(base, recipe):
-    assert changes(base, recipe) == DIFFERENCES[base, recipe]
+def test_recipes_differ_only_where_their_headers_say():
+    found = {pair: changes(*pair) for pair in DIFFERENCES}
+    faults = [
+        f"{base}-{recipe}: {sorted(places ^ DIFFERENCES[base, recipe])}"
+        for (base, recipe), places in found.items()
+        if places != DIFFERENCES[base, recipe]
+    ]
+    assert not faults, "\n".join(faults)
 
 
 @pytest.mark.parametrize(("full", "short"), [("splat", "splat_7k"), ("splat_ewa", "splat_ewa_7k")])
@@ -442,19 +474,21 @@ def read_yaml_text(text: str) -> object:
     return YAML(typ="safe").load(text)
 
 
-FILES = [*resource_dir("pipelines").glob("*.yaml"), *EXAMPLES.glob("*.yaml")]
+def faults_of_schema(path: Path, schema: Draft202012Validator | None) -> list[str]:
+    matrix = load_experiment(str(path))
+    texts = {"the file": path.read_text(), "the resolved file": matrix.text if matrix else load(str(path)).text()}
+    return [f"{path.name}: {what}" for what, text in texts.items() if not valid(text, schema)]
 
 
 @pytest.mark.usefixtures("without_plugins")
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_the_schema_accepts_what_the_loader_accepts(path, own_schema):
-    schema = own_schema
-    if (plugin := path.with_suffix(".py")).is_file():
-        load_file(plugin)
-        schema = None
-    assert valid(path.read_text(), schema)
-    matrix = load_experiment(str(path))
-    assert valid(matrix.text if matrix else load(str(path)).text(), schema), "the resolved file"
+def test_the_schema_accepts_what_the_loader_accepts(own_schema):
+    faults = [fault for name in SHIPPED for fault in faults_of_schema(Path(load(name).path), own_schema)]
+    for path in EXAMPLES.glob("*.yaml"):
+        plugin = path.with_suffix(".py")
+        if plugin.is_file():
+            load_file(plugin)
+        faults += faults_of_schema(path, None if plugin.is_file() else own_schema)
+    assert not faults, "\n".join(faults)
 
 
 @pytest.mark.parametrize(

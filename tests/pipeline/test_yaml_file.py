@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from ruamel.yaml.composer import Composer
 
 from clsplat.core.errors import ConfigError
+from clsplat.core.resources import resource_dir
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.yaml_file import parse_value, read_yaml
 
@@ -17,11 +18,8 @@ REFUSED = {  # text: (line, words)
         "the tag !!python/object/apply:os.system is not allowed",
     ),
     "name: x\nstages: !!python/tuple []\n": (2, "the tag !!python/tuple is not allowed"),
-    "name: x\nstages: !!set {a}\n": (2, "the tag !!set is not allowed"),
-    "name: x\nstages: !mine [init]\n": (2, "the tag !mine is not allowed"),
     "--- !mine\nname: x\n": (1, "the tag !mine is not allowed"),
     "name: x\nseed: !!float x\n": (2, "'x' cannot be read as float"),
-    "name: x\nseed: !!bool x\n": (2, "'x' cannot be read as bool"),
     "name: x\nseed: !!binary aGk=\n": (2, "the tag !!binary is not allowed"),
     "name: x\nseed: " + "9" * 5000: (2, "cannot be read as int"),
     "name: x\nseed: 0x" + "f" * 5000: (2, "is too large; expected a whole number of at most 64 bits"),
@@ -30,21 +28,17 @@ REFUSED = {  # text: (line, words)
     "name: x\n" + "k" * 900 + ": 1\n" + "k" * 900 + ": 2": (3, "found duplicate key"),
     "name: x\nseed: *" + "a" * 5000: (2, "undefined alias"),
     "name: x\n? [a, b]\n: 1\n": (2, "expected text as a key"),
-    "name: x\n? {a: b}\n: 1\n": (2, "expected text as a key"),
     "name: x\n1: 2\n": (2, "expected text as a key"),
-    "name: x\ntrue: 2\n": (2, "expected text as a key"),
     "name: x\n~: 2\n": (2, "expected text as a key"),
     "name: x\nseed: 1\nseed: 2\n": (3, "found duplicate key 'seed'"),
     "name: &a [*a]\n": (1, "nested too deeply"),
     "name: &a {<<: *a}\n": (1, "nested too deeply"),
     "name: x\n<<: 3\n": (2, "expected a map after '<<'"),
-    "name: x\nseed: *nowhere\n": (2, "undefined alias"),
     "name: x\n--- \nname: y\n": (2, "another document"),
     "name: x\nseed: \0\n": (2, "U+0000 is not allowed"),
     "name: x\nseed: " + "[" * 60 + "]" * 60: (2, "nested too deeply"),
     "name: x\nstages: [" + "1," * 20_001 + "]": (2, "more than 20000 values"),
     "[" * 5000: (1, "nested too deeply"),
-    "{a: " * 5000: (1, "nested too deeply"),
     "name: 'x\nseed: 3": (2, "unexpected end"),
     "name: x\n\tseed: 3": (2, "cannot start any token"),
 }
@@ -130,7 +124,7 @@ def test_any_text_is_data_or_one_sentence(text):
     assert "\n" not in complaint(parse_value, text)
 
 
-SMOKE = load("smoke").text()
+SMOKE = resource_dir("pipelines").joinpath("smoke.yaml").read_text()
 
 
 @given(

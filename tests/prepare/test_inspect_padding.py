@@ -23,8 +23,7 @@ def bordered(grey, edge, px, kind=cv2.BORDER_REPLICATE):
     return cv2.copyMakeBorder(grey, *(px * side for side in SIDES[edge]), kind, value=0)
 
 
-@pytest.mark.parametrize("px", [1, 3, WIDEST])
-@pytest.mark.parametrize("edge", EDGES)
+@pytest.mark.parametrize(("edge", "px"), list(zip(EDGES, (1, WIDEST, 3, WIDEST), strict=True)))
 def test_the_lines_that_repeat_at_an_edge_are_counted(rng, edge, px):
     assert filled(bordered(photograph(rng), edge, px)) == [px if name == edge else 0 for name in EDGES]
 

@@ -317,13 +317,12 @@ def test_kernels_that_ask_for_most_keep_the_limits(vendor, target):
     assert len(table) == sum(len(build.kernels) for build, _ in work)
 
 
-@vendors
 @pytest.mark.parametrize(
-    ("source", "words"),
+    ("vendor", "target", "source", "words"),
     [
-        (SPILLING, "planted spills registers"),
-        (LOCAL.format(group=64, floats=10240), "takes 40960 bytes of local memory"),
-        (LOCAL.format(group=512, floats=1024), "has groups of 512 items"),
+        ("amd", "gfx1030", SPILLING, "planted spills registers"),
+        ("nvidia", "sm_86", LOCAL.format(group=64, floats=10240), "takes 40960 bytes of local memory"),
+        ("intel", "tgllp", LOCAL.format(group=512, floats=1024), "has groups of 512 items"),
     ],
     ids=["spill", "local", "group"],
 )

@@ -80,8 +80,7 @@ def test_real_scene_equals_pycolmap(name: str) -> None:
     assert_same_points(path / "sparse" / "0", reconstruction)
 
 
-@pytest.mark.parametrize("name", STATUES)
-@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize(("name", "kind"), [(name, ("bin", "txt")[i % 2]) for i, name in enumerate(STATUES)])
 def test_every_camera_model_equals_pycolmap(name: str, kind: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     folder = data_set(name) / ("text" if kind == "txt" else ".")

@@ -46,10 +46,12 @@ def test_bytes_after_the_last_record_are_a_data_error(tmp_path: Path, stem: str)
 
 
 @pytest.mark.parametrize(
-    ("stem", "offset"),
-    [("cameras", 0), ("images", 0), ("points3D", 0), ("images", 8 + 64 + len("b.jpg") + 1), ("points3D", 8 + 43)],
+    ("stem", "offset", "count"),
+    [
+        *(("cameras", 0, 2**60), ("images", 0, 2**63), ("points3D", 0, 2**64 - 1)),
+        *(("images", 8 + 64 + len("b.jpg") + 1, 2**64 - 1), ("points3D", 8 + 43, 2**60)),
+    ],
 )
-@pytest.mark.parametrize("count", [2**60, 2**63, 2**64 - 1])
 def test_huge_count_allocates_nothing(tmp_path: Path, stem: str, offset: int, count: int) -> None:
     file = write_scene(tmp_path, tiny_model()) / "sparse" / "0" / f"{stem}.bin"
     data = bytearray(file.read_bytes())
@@ -111,11 +113,8 @@ def test_pose_that_is_none(tmp_path: Path, quaternion: tuple[float, ...], transl
     assert "the pose of 'bad.jpg'" in refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), images=images)))
 
 
-@pytest.mark.parametrize("kind", ["bin", "txt"])
-@pytest.mark.parametrize("width", [2**15 + 1, 2**63, 99999999999999999999])
-def test_a_camera_wider_than_any_photograph(tmp_path: Path, width: int, kind: str) -> None:
-    if kind == "bin" and width >= 2**64:
-        pytest.skip("does not fit the file")
+@pytest.mark.parametrize(("kind", "width"), [("bin", 2**15 + 1), ("bin", 2**63), ("txt", 99999999999999999999)])
+def test_a_camera_wider_than_any_photograph(tmp_path: Path, kind: str, width: int) -> None:
     camera = replace(PINHOLE, width=width)
     message = refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]), kind))
     assert f"camera 1 is {width}x48" in message
@@ -166,7 +165,6 @@ def test_distorted_camera_without_images_does_no_harm(tmp_path: Path) -> None:
         replace(PINHOLE, height=0),
         replace(PINHOLE, params=(0.0, 51.0, 30.5, 25.25)),
         replace(PINHOLE, params=(50.0, -51.0, 30.5, 25.25)),
-        replace(PINHOLE, params=(50.0, math.nan, 30.5, 25.25)),
         replace(PINHOLE, params=(math.inf, 51.0, 30.5, 25.25)),
         replace(PINHOLE, params=(50.0, 51.0, math.nan, 25.25)),
     ],

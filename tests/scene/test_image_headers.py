@@ -41,15 +41,17 @@ def test_real_photographs(name):
         assert header.complete
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize(("orientation", "expected"), [(1, 1), (6, 6), (8, 8), (0, 1), (99, 1)])
+@pytest.mark.parametrize(
+    ("order", "orientation", "expected"), [("<", 6, 6), (">", 6, 6), ("<", 8, 8), (">", 0, 1), ("<", 9, 1)]
+)
 def test_orientation(tmp_path, order, orientation, expected):
     (tmp_path / "a.jpg").write_bytes(with_exif(encoded(".jpg"), order, orientation))
     assert read_header(tmp_path / "a.jpg") == Header(37, 23, expected)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-@pytest.mark.parametrize("behind", [b"", bytes(100), bytes(200_000)], ids=["nothing", "a little", "a film"])
+@pytest.mark.parametrize(
+    ("suffix", "behind"), [(".png", b""), (".jpg", bytes(100)), (".png", bytes(200_000)), (".jpg", bytes(200_000))]
+)
 def test_the_end_is_found_before_what_is_appended(tmp_path, suffix, behind):
     whole = encoded(suffix)
     (tmp_path / f"a{suffix}").write_bytes(whole + behind)

@@ -136,8 +136,13 @@ def test_alpha_is_averaged_apart_from_the_colours(tmp_path: Path) -> None:
     assert (exact - image).min() > -1e-2
 
 
-@pytest.mark.parametrize(("size", "camera"), [((90, 90), (30, 30)), ((101, 67), (50, 34)), ((100, 100), (7, 7))])
-@pytest.mark.parametrize("level", [1, 37, 200, 255])
+@pytest.mark.parametrize(
+    ("size", "camera", "level"),
+    [
+        *(((90, 90), (30, 30), 1), ((101, 67), (50, 34), 37), ((100, 100), (7, 7), 200), ((90, 90), (30, 30), 255)),
+        ((100, 100), (7, 7), 37),
+    ],
+)
 def test_flat_region_keeps_its_level(tmp_path: Path, size, camera, level: int) -> None:
     """Truncation must not turn 199.99999 into 199."""
     flat = np.full((size[1], size[0], 4), level, np.uint8)
@@ -154,7 +159,7 @@ def test_every_downscaled_camera_finds_its_image(tmp_path_factory, width: int, h
     assert load_image(View("v", camera, np.eye(3, 4), path)).shape == (camera.height, camera.width, 3)
 
 
-@pytest.mark.parametrize("size", [(64, 50), (50, 64), (32, 26), (128, 96), (65, 48), (1, 2)])
+@pytest.mark.parametrize("size", [(64, 50), (65, 48), (32, 26), (128, 96)])
 def test_wrong_size_names_both(tmp_path: Path, size: tuple[int, int]) -> None:
     path = stored(tmp_path / "a.png", random(48, 64, 3))
     message = refusal(load_image, view_of(path, *size))

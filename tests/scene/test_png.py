@@ -43,9 +43,10 @@ def with_chunk(data: bytes, more: bytes) -> bytes:
     return data[:33] + more + data[33:]  # after IHDR
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("what", METADATA)
-@pytest.mark.parametrize("wrong", [0, 1], ids=["right", "wrong checksum"])
+@pytest.mark.parametrize(
+    ("what", "kind", "wrong"),
+    [(what, [*KINDS][i % 4], i // 4 ^ i & 1) for i, what in enumerate(METADATA)],
+)
 def test_metadata_change_no_pixel_and_print_nothing(kind, what, wrong, tmp_path, capfd):
     data = encoded(KINDS[kind])
     (tmp_path / "a.png").write_bytes(data)

@@ -1,6 +1,7 @@
 """Sparse points as PLY files."""
 
 import struct
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from tests.support.data_sets import data_set
 from tests.support.refusals import refusal
 from tests.support.transforms_scene import LENS, frames, write
 
+LITTLE = "binary_little_endian"
 ROWS = np.array([[1, 2, 3, 255, 0, 51], [-4, 0.5, 1e-3, 0, 1, 2]])
 
 
@@ -33,8 +35,10 @@ def ply(form: str, properties: list[tuple[str, str]], rows, count: int | None = 
 PLAIN = [*[("f", name) for name in "xyz"], *[("B", name) for name in ("red", "green", "blue")]]
 
 
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-@pytest.mark.parametrize("dialect", ["plain", "double", "extra", "order"])
+@pytest.mark.parametrize(
+    ("dialect", "form"),
+    [*(("plain", "ascii"), ("double", LITTLE), ("extra", "ascii"), ("extra", LITTLE), ("order", LITTLE))],
+)
 def test_ply_dialects(tmp_path: Path, form: str, dialect: str) -> None:
     properties, rows = list(PLAIN), ROWS
     if dialect == "double":
@@ -109,28 +113,29 @@ def test_real_ply() -> None:
     assert 0.1 < points.colours.mean() < 0.9
 
 
+DAMAGE = [
+    (b"ply\n", b"pla\n"),
+    (b"end_header", b"the_end"),
+    (b"binary_little_endian", b"binary_big_endian"),
+    (b"format binary_little_endian 1.0\n", b""),
+    (b"element vertex 2", b"element vertex two"),
+    (b"element vertex 2", b"element vertex -2"),
+    (b"element vertex 2", b"element vertex 3"),
+    (b"element vertex 2", b"element vertex 1152921504606846976"),
+    (b"element vertex 2", b"element vertex " + b"9" * 5000),
+    (b"element vertex 2", b"element face 2"),
+    (b"float y", b"float x"),
+    (b"float y", b"float w"),
+    (b"float y", b"quad y"),
+    (b"float y", b"list uchar float y"),
+    (b"end_header", b"property list uchar int neighbours\nend_header"),
+    (b"uchar green", b"float green"),
+]
+
+
 @pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (b"ply\n", b"pla\n"),
-        (b"end_header", b"the_end"),
-        (b"binary_little_endian", b"binary_big_endian"),
-        (b"format binary_little_endian 1.0\n", b""),
-        (b"element vertex 2", b"element vertex two"),
-        (b"element vertex 2", b"element vertex -2"),
-        (b"element vertex 2", b"element vertex 3"),
-        (b"element vertex 2", b"element vertex 1152921504606846976"),
-        (b"element vertex 2", b"element vertex " + b"9" * 5000),
-        (b"element vertex 2", b"element face 2"),
-        (b"float y", b"float x"),
-        (b"float y", b"float w"),
-        (b"float y", b"quad y"),
-        (b"float y", b"list uchar float y"),
-        (b"end_header", b"property list uchar int neighbours\nend_header"),
-        (b"uchar green", b"float green"),
-    ],
+    ("old", "new", "form"), [(*one, form) for one, form in zip(DAMAGE, cycle(("ascii", LITTLE)), strict=False)]
 )
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 def test_damaged_ply(tmp_path: Path, form: str, old: bytes, new: bytes) -> None:
     data = ply(form, PLAIN, ROWS)
     path = tmp_path / "p.ply"
@@ -162,8 +167,13 @@ def test_ascii_ply_with_a_wrong_line(tmp_path: Path, line: bytes) -> None:
 CLOUD = PointCloud(np.float32([[1, 2, 3]]), np.float32([[1, 0, 0.2]]))
 
 
-@pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
-@pytest.mark.parametrize(("file", "keys"), [("points3d.ply", {}), ("a/p.ply", {"ply_file_path": "./a/p.ply"})])
+@pytest.mark.parametrize(
+    ("name", "file", "keys"),
+    [
+        ("transforms_train.json", "points3d.ply", {}),
+        ("transforms.json", "a/p.ply", {"ply_file_path": "./a/p.ply"}),
+    ],
+)
 def test_points(tmp_path: Path, name: str, file: str, keys: dict) -> None:
     write(tmp_path, name, **LENS, **keys, frames=frames("a.png", "b.png"))
     write_points_ply(tmp_path / file, CLOUD)

@@ -1,9 +1,6 @@
 """Pipeline files with a matrix, and the settings of recipes."""
 
-from clsplat.pipeline.files import shipped
-from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Experiment
-from clsplat.stages.optimize import Optimize
 
 STAGES = """\
 stages:
@@ -56,4 +53,13 @@ def flat(value: object, place: str = "") -> dict[str, object]:
     return {place: value}
 
 
-TRAINING = [name for name in shipped() if any(isinstance(stage, Optimize) for stage in load(name).stages)]
+# Recipes that stand for all: together they have every stage, rule, loss, filter and transform of those that train.
+KINDS = (
+    *("smoke", "splat", "fast", "photos", "blocks", "compress", "dash_mip_7k", "mcmc_7k", "fastgs_7k", "taming_7k"),
+    *("auto_7k", "auto_opti3dgs_7k", "box_7k", "dynamic_7k", "gdgs_7k", "micro_splatting_v2_7k", "mini_7k"),
+    *("opti3dgs_7k", "splat_ewa_7k", "steep_7k"),
+)
+# Those of them whose schedules differ.
+SCHEDULED = tuple(
+    name for name in KINDS if name not in ("box_7k", "gdgs_7k", "opti3dgs_7k", "splat_ewa_7k", "steep_7k")
+)

@@ -18,7 +18,7 @@ from clsplat.runs.film import names
 from clsplat.scene.detect import read_scene
 from clsplat.stages.export import Viewer
 from clsplat.viewer import page as module
-from tests.support.commands import process
+from tests.support.commands import ran
 from tests.support.html_page import Page
 
 pytestmark = pytest.mark.slow
@@ -223,7 +223,8 @@ def test_errors_are_one_line(run, tmp_path):
         (["view", tmp_path / "none.ply"], 3),
         (["view", run, "--scene", tmp_path / "nowhere"], 3),
     ):
-        process(*arguments, expect=code)
+        done = ran(*arguments)
+        assert (done.returncode, done.stderr.count("error: ")) == (code, 1)
 
 
 def test_errors_of_the_function(run, tmp_path, monkeypatch):

@@ -96,9 +96,7 @@ def test_a_film_that_fails_leaves_the_earlier_one(few_steps, tmp_path, monkeypat
     assert list(pictures(tmp_path / "out")) == ["frame_00001.png"]
 
 
-@pytest.mark.parametrize(
-    "record", [["../a.png", "frame_00001.png"], {"../a.png": True, "sub/b.png": True, "\0.png": True}, "x", [[]]]
-)
+@pytest.mark.parametrize("record", [{"../a.png": True, "sub/b.png": True, "\0.png": True}, "x", [["a.png"]]])
 def test_a_record_that_is_not_ours_removes_nothing(record, few_steps, tmp_path):
     (tmp_path / "out" / "sub").mkdir(parents=True)
     for name in ("a.png", "out/sub/b.png"):

@@ -40,7 +40,7 @@ def test_times_are_one_moment_or_two(given, expected):
     assert times_of(given) == expected
 
 
-@pytest.mark.parametrize("given", ["", "a", "0..2", "-1", "0..1..2", "nan", [], [0.1, 0.2, 0.3], "0.."])
+@pytest.mark.parametrize("given", ["", "a", "0..2", "-1", "nan", [0.1, 0.2, 0.3], "0.."])
 def test_other_times_are_refused(given):
     with pytest.raises(ConfigError, match="expected a time from 0 to 1, or two such as 0"):
         times_of(given)
