@@ -12,9 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from clsplat.api.arguments import Overrides, PathLike, load_plugins, overrides, path_of
 from clsplat.core.errors import ConfigError
-from clsplat.opencl.device import Device
-from clsplat.pipeline.matrix import Experiment
-from clsplat.sweeps.experiment import Job
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.opencl.device import Device
@@ -189,11 +186,11 @@ def _job(
     return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start, values_of(path_of(on)))
 
 
-# Run what a command was given: a matrix through a store, where its `execution` has one.
-
-
-def run_job(job: Job, device: str | Device | None, live: int | None = None, minutes: float | None = None) -> Path:
+def run_job(job: "Job", device: "str | Device | None", live: int | None = None, minutes: float | None = None) -> Path:
     """Run a job, and return its folder; arguments as for `Job.run`.  Raises ClsplatError."""
+    from clsplat.opencl.device import Device
+    from clsplat.pipeline.matrix import Experiment
+
     work = job.work
     if not isinstance(work, Experiment) or work.execution.keeps is None:
         job.run(device, live, minutes)
@@ -213,9 +210,6 @@ def run_job(job: Job, device: str | Device | None, live: int | None = None, minu
 
 
 # A model made small, or in levels of detail, as functions; errors and `device` as in `clsplat.api.commands`.
-
-if TYPE_CHECKING:  # the command line starts without OpenCL
-    from clsplat.opencl.device import Device
 
 
 def compress_model(
@@ -273,11 +267,6 @@ def write_levels(
 
 
 # A scene trained in blocks, as a function; errors and `device` as in `clsplat.api.commands`.
-
-if TYPE_CHECKING:  # the command line starts without OpenCL
-    from collections.abc import Sequence
-
-    from clsplat.opencl.device import Device
 
 
 def plan_in_blocks(

@@ -56,10 +56,10 @@ def _commit(root: Path) -> str:
 def _git(root: Path, *words: str) -> str | None:
     """What git prints, None where it fails or is not installed."""
     try:
-        found = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=10, check=True)
+        done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
-    return found.stdout.strip()
+    return done.stdout.decode("utf-8", "replace").strip()
 
 
 def _digest(lines: Sequence[str]) -> str:
