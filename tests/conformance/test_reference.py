@@ -7,6 +7,7 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from clsplat.conformance import reference as ref
+from tests.support.devices import each_once
 from tests.support.oracle import BACKGROUND, HEIGHT, WIDTH, general_camera, random_gaussians, to_world
 
 STEP = 1e-4  # of the five-point differences below, whose error goes like STEP⁴
@@ -762,8 +763,7 @@ def test_pixels_show_the_sky_where_six_of_nine_match():
     assert ref.shows_sky(sky, photograph, 0.1).any(axis=1).tolist() == [False, False, True, True, True]
 
 
-@pytest.mark.parametrize("turns", [False, True])
-@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize(("degree", "turns"), each_once([1, 2, 3], [False, True]))
 def test_gradients_of_a_motion(rng, degree, turns):
     """By the motion and by the logit at the centre, of a sum over what is there at a time."""
     count, time = 6, 0.4
