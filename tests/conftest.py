@@ -1,9 +1,10 @@
 """Devices and random numbers for tests.
 
 Kernel tests are the modules `test_*_kernels.py`; `-m kernels` selects them. They run on every device named in
-CLSPLAT_TEST_DEVICES (parts of names, separated by `;`; default: the device that clsplat would choose), each with the
-wide schedule at 16 and 8 lanes and with the simt schedule. Their launches are recorded for the test that every kernel
-has a test.
+CLSPLAT_TEST_DEVICES (parts of names, separated by `;`; default: the device that clsplat would choose), with the wide
+schedule at 16 and 8 lanes and with the simt schedule: a test without parameters with each of the three settings, the
+cases of a test with parameters with one each, in turn (`on_devices`). Their launches are recorded for the test that
+every kernel has a test.
 """
 
 import functools
@@ -130,11 +131,16 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
 )
 def device(request: pytest.FixtureRequest) -> Device:
     """An open device; its kernels are built once for the whole session."""
-    name, tuning = request.param
+    return opened(*request.param)
+
+
+@functools.cache
+def opened(name: str, tuning: str) -> Device:
+    """A device with one of the settings; cases of a test take them in turn."""
     schedule, lanes = TUNINGS[tuning]
-    opened = Device(choose(name or None), schedule)
-    opened.tuning["LANES"] = lanes
-    return opened
+    found = Device(choose(name or None), schedule)
+    found.tuning["LANES"] = lanes
+    return found
 
 
 @pytest.fixture(scope="session")

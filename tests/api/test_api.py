@@ -17,7 +17,7 @@ from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.scene.scene import Scene, make_scene
-from tests.support.devices import one_schedule
+from tests.support.devices import on_one_setting
 from tests.support.models import model_of
 
 ROOT = Path(__file__).parents[2]
@@ -135,7 +135,7 @@ def test_views_can_be_compared_and_kept_in_sets():
     assert one in [other, one]
 
 
-@one_schedule
+@on_one_setting
 def test_a_view_made_by_hand_renders(device, rng):
     model = model_of(random_case(rng, 30))
     middle = np.median(model.means, axis=0)
@@ -153,7 +153,7 @@ def hand_made_scene() -> Scene:
     return make_scene(Path("by hand"), views, {0}, None)
 
 
-@one_schedule
+@on_one_setting
 def test_a_scene_made_by_hand_is_for_rendering(device, rng):
     scene, model = hand_made_scene(), model_of(random_case(rng, 30))
     renderer = Renderer(model, device)
@@ -168,7 +168,7 @@ def test_a_split_that_there_is_not_is_refused():
         hand_made_scene().split("tset")
 
 
-@one_schedule
+@on_one_setting
 def test_a_device_is_given_by_name_or_open_everywhere(device, rng, tiny_scene, tmp_path):
     case = random_case(rng, 5)
     assert Renderer(model_of(case), device).device is device
@@ -250,7 +250,7 @@ def test_a_view_of_no_size_is_refused(downscale):
         clsplat.View("front", CAMERA, np.eye(3, 4)).resized(downscale)
 
 
-@one_schedule
+@on_one_setting
 @pytest.mark.parametrize("changes", [{"width": 50.5}, {"height": 32.0}])
 def test_a_camera_with_part_of_a_pixel_is_refused(changes, device, rng):
     view = clsplat.View("front", replace(CAMERA, **changes), np.eye(3, 4))
@@ -258,7 +258,7 @@ def test_a_camera_with_part_of_a_pixel_is_refused(changes, device, rng):
         Renderer(model_of(random_case(rng, 5)), device).render(view)
 
 
-@one_schedule
+@on_one_setting
 @pytest.mark.parametrize("background", [np.nan, 5, -1, "white", [0, 0.5, 2]])
 def test_a_background_that_is_no_colour_is_refused(background, device, rng):
     view = clsplat.View("front", CAMERA, np.eye(3, 4))

@@ -14,7 +14,7 @@ from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.core.errors import NumericError
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.opencl import device as program
-from tests.support.devices import one_schedule
+from tests.support.devices import on_one_setting
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 SIZE = 33, 21  # px: neither side is whole tiles
@@ -43,7 +43,7 @@ def test_depth_is_that_of_a_single_gaussian(device, rng):
     np.testing.assert_array_equal(picture.depth[picture.alpha == 0], 0)
 
 
-@one_schedule
+@on_one_setting
 def test_depth_changes_neither_image_nor_alpha(device, rng):
     case = with_world_filter(random_case(rng, 30, *SIZE, compensate=1.0), rng)
     renderer = Renderer(model_of(case), device)
@@ -52,7 +52,7 @@ def test_depth_changes_neither_image_nor_alpha(device, rng):
     np.testing.assert_array_equal(without.alpha, with_depth.alpha)
 
 
-@one_schedule
+@on_one_setting
 @pytest.mark.parametrize(("array", "values"), [("image", np.nan), ("image", -np.inf), ("transmittance", np.nan)])
 def test_a_picture_with_values_that_are_not_finite_is_an_error(device, rng, monkeypatch, array, values):
     """Of a device, or a model, that gives them, as `clsplat render` says; one pixel is enough."""
@@ -102,7 +102,7 @@ def test_gradients_agree_with_finite_differences(smooth, rng):
         assert got == pytest.approx(expected, abs=2e-3 * scale + 1e-3), name
 
 
-@one_schedule
+@on_one_setting
 def test_gradients_by_image_and_by_alpha_add_up(device, rng):
     case = random_case(rng, 20, *SIZE)
     picture = Renderer(model_of(case), device).render(case.view, 0.3)
@@ -113,7 +113,7 @@ def test_gradients_by_image_and_by_alpha_add_up(device, rng):
         np.testing.assert_allclose(getattr(both, name), parts, atol=1e-4 * max(1e-6, np.abs(parts).max()))
 
 
-@one_schedule
+@on_one_setting
 def test_no_gaussian_gives_the_background(device, rng):
     case = random_case(rng, 3, *SIZE)
     picture = Renderer(model_of(case)[:0], device).render(case.view, 0.25, depth=True)
@@ -122,7 +122,7 @@ def test_no_gaussian_gives_the_background(device, rng):
     assert picture.backward(image=np.ones_like(picture.image)).means.shape == (0, 3)
 
 
-@one_schedule
+@on_one_setting
 def test_derivatives_of_another_shape_are_refused(device, rng):
     case = random_case(rng, 3, *SIZE)
     picture = Renderer(model_of(case), device).render(case.view)
@@ -130,13 +130,13 @@ def test_derivatives_of_another_shape_are_refused(device, rng):
         picture.backward(alpha=np.zeros((3, 3)))
 
 
-@one_schedule
+@on_one_setting
 def test_pictures_show_themselves(device, rng):
     case = random_case(rng, 3, *SIZE)
     assert Renderer(model_of(case), device).render(case.view)._repr_png_().startswith(b"\x89PNG")
 
 
-@one_schedule
+@on_one_setting
 def test_renderers_on_one_device_do_not_disturb_each_other(device, rng):
     cases = [random_case(rng, count, *size) for count, size in ((40, SIZE), (90, (64, 48)))]
     renderers = [Renderer(model_of(case), device) for case in cases]
@@ -153,7 +153,7 @@ def test_renderers_on_one_device_do_not_disturb_each_other(device, rng):
             np.testing.assert_array_equal(getattr(expected, name), getattr(gradients, name))
 
 
-@one_schedule
+@on_one_setting
 def test_threads_sharing_a_device_keep_their_kernel_arguments(device, monkeypatch):
     enqueue = program.cl.enqueue_nd_range_kernel
 
@@ -175,7 +175,7 @@ def test_threads_sharing_a_device_keep_their_kernel_arguments(device, monkeypatc
         assert all(pool.map(filled, range(1, 5)))
 
 
-@one_schedule
+@on_one_setting
 def test_threads_build_a_program_and_open_the_device_once(device, monkeypatch):
     built, opened = [], []
 
@@ -199,7 +199,7 @@ def test_threads_build_a_program_and_open_the_device_once(device, monkeypatch):
     assert (len(opened), len(set(found))) == (1, 1)
 
 
-@one_schedule
+@on_one_setting
 def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
     case = random_case(rng, 20, *SIZE)
     model, plain = model_of(case), model_of(case)
@@ -215,7 +215,7 @@ def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
         np.testing.assert_array_equal(getattr(expected, name), getattr(again, name))
 
 
-@one_schedule
+@on_one_setting
 def test_gradients_are_of_the_render_before_in_place_changes(device, rng):
     case = random_case(rng, 20, *SIZE)
     model, by_image = model_of(case), np.ones((SIZE[1], SIZE[0], 3))
@@ -230,7 +230,7 @@ def test_gradients_are_of_the_render_before_in_place_changes(device, rng):
     assert (renderer.render(case.view).backward(image=by_image).means != expected.means).any()
 
 
-@one_schedule
+@on_one_setting
 def test_arrays_of_a_picture_are_the_callers_own(device, rng):
     case = random_case(rng, 20, *SIZE)
     renderer = Renderer(model_of(case), device)
@@ -242,7 +242,7 @@ def test_arrays_of_a_picture_are_the_callers_own(device, rng):
     assert repr(picture.backward()) == "Gradients(of 20 Gaussians)"
 
 
-@one_schedule
+@on_one_setting
 def test_impossible_backgrounds_and_cameras_are_refused(device, rng):
     case = random_case(rng, 3, *SIZE)
     renderer = Renderer(model_of(case), device)
@@ -252,7 +252,7 @@ def test_impossible_backgrounds_and_cameras_are_refused(device, rng):
         renderer.render(replace(case.view, camera=replace(case.view.camera, fx=-1.0)))
 
 
-@one_schedule
+@on_one_setting
 def test_the_background_is_that_of_the_model(device, rng):
     case = random_case(rng, 3, *SIZE)
     model = model_of(case)

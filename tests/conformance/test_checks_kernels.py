@@ -1,8 +1,10 @@
 """The checks of `clsplat doctor` hold on the devices of the tests, and every kernel has a test."""
 
 import io
+import itertools
 import queue
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -11,10 +13,25 @@ from clsplat.conformance.check import Note
 from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS
 from clsplat.core.resources import resource_dir
 from clsplat.opencl.device import parse_kernels
+from tests.support.devices import NAMES, TUNINGS
 from tests.support.figures import hold
 
 
-@pytest.mark.parametrize("check", [*KERNELS, *ESSENTIAL, *BITONIC], ids=lambda check: check.name.replace(" ", "_"))
+def cases() -> list[Any]:
+    """Each check of the kernels with both schedules, the wide one with either number of lanes in turn; those before a
+    run, which are smaller, with one setting.
+    """
+    wide = [(check, setting) for check, setting in zip(KERNELS, itertools.cycle(("wide16", "wide8")), strict=False)]
+    small = zip((*ESSENTIAL, *BITONIC), itertools.cycle(TUNINGS), strict=False)
+    found = [*wide, *((check, "simt") for check in KERNELS), *small]
+    return [
+        pytest.param((name, setting), check, id=f"{name}-{setting}-{check.name.replace(' ', '_')}")
+        for name in NAMES
+        for check, setting in found
+    ]
+
+
+@pytest.mark.parametrize(("device", "check"), cases(), indirect=["device"])
 def test_the_figures_of_a_check_hold(device, check):
     found = list(check.figures(device))
     hold(one for one in found if not isinstance(one, Note))

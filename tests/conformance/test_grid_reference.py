@@ -87,7 +87,6 @@ def test_grid_parameters_follow_the_networks_and_start_near_zero():
     first = gridded.first_parameters(3)
     own = first[gridded.of_network : gridded.of_network + gridded.grid.learned]
     assert 0 < np.abs(own).min() < np.abs(own).max() < 1e-4
-    assert "grid" not in plain.model_dump()
     assert FieldShape.model_validate(gridded.model_dump()) == gridded
 
 

@@ -1,7 +1,6 @@
 """The sum of blend weights by which Gaussians are pruned, against the reference, at the edges of tiles and groups."""
 
 import numpy as np
-import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
@@ -11,6 +10,7 @@ from clsplat.density.control import contributions
 from clsplat.density.survey import Look
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Budget, Rasterizer
+from tests.support.devices import on_devices, on_one_setting
 
 
 def weights(rasterizer, model, photographs):
@@ -18,9 +18,7 @@ def weights(rasterizer, model, photographs):
     return contributions(looks, model.gaussians.count)
 
 
-@pytest.mark.parametrize(
-    ("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 24, 24)]
-)
+@on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 24, 24)])
 def test_weights_are_those_of_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     found = weights(Rasterizer(device, "radix"), case.model(device), [photograph_of(device, case)])
@@ -47,6 +45,7 @@ def test_masked_pixels_do_not_count(device, rng):
     assert (halves[0] < whole).any()
 
 
+@on_one_setting
 def test_sums_over_views_in_bands_have_the_same_bits(device, rng):
     case = random_case(rng, 60, 70, 50)
     photographs = [photograph_of(device, case)] * 3
@@ -57,6 +56,7 @@ def test_sums_over_views_in_bands_have_the_same_bits(device, rng):
     np.testing.assert_allclose(whole, 3 * once, rtol=1e-6)
 
 
+@on_one_setting
 def test_schedules_agree(device, rng):
     case = random_case(rng, 60, 70, 50)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
@@ -66,7 +66,7 @@ def test_schedules_agree(device, rng):
     np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["means", "logit_opacity"])
+@on_devices("name", ["means", "logit_opacity"])
 def test_nan_gaussian_contributes_nothing_and_hides_nothing(device, rng, name):
     case = safe_case(rng, 17, 33, 31, MARGIN)
     without = {key: table.copy() for key, table in case.parameters.items()}

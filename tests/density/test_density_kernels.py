@@ -16,6 +16,7 @@ from clsplat.methods.adc import Clone, PruneFaint, PruneLarge, Split
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
+from tests.support.devices import each_once, on_devices, on_one_setting
 
 RULES = [
     Clone(gradient_above=2e-4, size_below=0.01),
@@ -52,8 +53,7 @@ def edited(device: Device, rng, count: int, step: int, rules=RULES, limit: int |
     return before, gaussians, change
 
 
-@pytest.mark.parametrize("count", [1, 15, 16, 17, 63, 64, 65, 300])
-@pytest.mark.parametrize("step", [600, 3100])
+@on_devices("count, step", each_once([1, 15, 16, 17, 63, 64, 65, 300], [600, 3100]))
 def test_adaptive_density_control(device, rng, count, step):
     before, gaussians, change = edited(device, rng, count, step)
     size = np.exp(before["log_scales"]).max(axis=1)
@@ -85,8 +85,7 @@ def test_adaptive_density_control(device, rng, count, step):
     assert (np.linalg.norm(offsets, axis=1) < 6 * sizes).all()
 
 
-@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 300])
-@pytest.mark.parametrize("children", [2, 3, 8])
+@on_devices("count, children", each_once([0, 1, 63, 64, 65, 300], [2, 3, 8]))
 def test_rows_sharing_an_opacity_transmit_as_much_as_one_did(device, rng, count, children):
     case = random_case(rng, count)
     logits = np.resize([-30.0, -5.0, 0.0, 2.0, 9.0, 40.0, 90.0], (count, 1)) + rng.normal(0, 0.1, (count, 1))
@@ -104,6 +103,7 @@ def test_rows_sharing_an_opacity_transmit_as_much_as_one_did(device, rng, count,
     np.testing.assert_allclose(gaussians.get("logit_opacity")[:, 0], np.repeat(expected, rows), rtol=1e-5, atol=1e-5)
 
 
+@on_one_setting
 def test_growth_that_is_undone_shares_nothing(device, rng):
     before, gaussians, change = edited(device, rng, 64, 600, rules=[Clone(opacity="shared")])
     assert change.after > 64
@@ -113,6 +113,7 @@ def test_growth_that_is_undone_shares_nothing(device, rng):
 
 
 @pytest.mark.large
+@on_one_setting
 def test_children_follow_their_parents_distribution(device, rng):
     count = 4000
     case = random_case(rng, 1)
@@ -132,6 +133,7 @@ def test_children_follow_their_parents_distribution(device, rng):
     np.testing.assert_allclose(np.cov(noise.T), np.eye(3), atol=0.06)
 
 
+@on_one_setting
 def test_random_numbers_depend_on_seed_and_step_alone(device, rng):
     seed_state = rng.bit_generator.state
     results = []
@@ -143,12 +145,14 @@ def test_random_numbers_depend_on_seed_and_step_alone(device, rng):
     assert (results[0] != results[2]).any()
 
 
+@on_one_setting
 def test_everything_may_be_pruned(device, rng):
     _, gaussians, change = edited(device, rng, 30, 600, rules=[PruneFaint(opacity_below=1.0)])
     assert change.after == 0
     assert gaussians.get("means").shape == (0, 3)
 
 
+@on_one_setting
 def test_capacity_grows_when_needed(device, rng):
     _, gaussians, change = edited(
         device, rng, 64, 600, rules=[Split(gradient_above=1e-12, size_above=1e-9, children=8)]
@@ -158,6 +162,7 @@ def test_capacity_grows_when_needed(device, rng):
     assert gaussians.capacity % 64 == 0
 
 
+@on_one_setting
 def test_identity_rearrangement_changes_nothing(device, rng):
     gaussians = random_case(rng, 50).model(device).gaussians
     before = {name: gaussians.get(name) for name in gaussians.tables}
@@ -167,7 +172,7 @@ def test_identity_rearrangement_changes_nothing(device, rng):
         np.testing.assert_array_equal(gaussians.get(name), table)
 
 
-@pytest.mark.parametrize("count", [0, 1, 63, 64, 65])
+@on_devices("count", [0, 63, 64])
 def test_opacity_is_capped(device, rng, count):
     gaussians = random_case(rng, count).model(device).gaussians
     before = gaussians.get("logit_opacity")
@@ -195,7 +200,7 @@ def test_opacity_is_capped_after_the_world_filter(device, rng):
     assert (ratio / (1 + np.exp(-after)) <= 0.3 * (1 + 1e-5)).all()
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@on_devices("value", [np.nan, np.inf, -np.inf])
 def test_values_that_are_not_finite_are_found(device, rng, value):
     case = random_case(rng, 65)
     assert case.model(device).gaussians.not_finite() == []

@@ -16,6 +16,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.tiles import Tiler
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam
+from tests.support.devices import each_once, on_devices, on_one_setting
 
 COUNT = 150
 ROWS = (0, 1, 15, 16, 17, 63, 64, 65, COUNT)
@@ -36,8 +37,7 @@ def edit_of(gaussians: Gaussians, step: int = 600, seed: int = 3) -> Edit:
     return Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step, seed)
 
 
-@pytest.mark.parametrize("count", ROWS)
-@pytest.mark.parametrize("name", ["means", "logit_opacity", "sh_rest"])
+@on_devices("count, name", each_once(ROWS, ["means", "logit_opacity", "sh_rest"]))
 def test_rows_are_set_and_the_others_stay(device, rng, count, name):
     gaussians = gaussians_of(device, rng)
     rows = rng.permutation(COUNT)[:count]
@@ -49,6 +49,7 @@ def test_rows_are_set_and_the_others_stay(device, rng, count, name):
         np.testing.assert_array_equal(gaussians[table].get(), planes, err_msg=table)
 
 
+@on_one_setting
 def test_rows_of_another_shape_are_refused(device, rng):
     gaussians = gaussians_of(device, rng)
     with pytest.raises(ValueError, match=r"means: expected \(2, 3\), got \(2, 4\)"):
@@ -65,8 +66,7 @@ WRONG_ROWS = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG_ROWS)
-@pytest.mark.parametrize("verb", ["set_rows", "zero_moments", "zero_rows"])
+@on_devices("case, verb", each_once(WRONG_ROWS, ["set_rows", "zero_moments", "zero_rows"]))
 def test_wrong_rows_are_refused_and_change_nothing(device, rng, verb, case):
     rows, message = WRONG_ROWS[case]
     gaussians = gaussians_of(device, rng)
@@ -103,7 +103,7 @@ WRONG_CHOICES = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG_CHOICES)
+@on_devices("case", WRONG_CHOICES)
 def test_a_wrong_choice_is_refused(device, rng, case):
     arguments, message = WRONG_CHOICES[case]
     edit = edit_of(gaussians_of(device, rng))
@@ -112,6 +112,7 @@ def test_a_wrong_choice_is_refused(device, rng, case):
     assert (edit.rows() == 1).all()
 
 
+@on_one_setting
 @pytest.mark.parametrize("numbers", [{"copies": -1, "kept": 0}, {"copies": 2, "kept": -1}])
 def test_a_mark_with_negative_numbers_is_refused(device, rng, numbers):
     edit = edit_of(gaussians_of(device, rng))
@@ -119,6 +120,7 @@ def test_a_mark_with_negative_numbers_is_refused(device, rng, numbers):
         edit.mark(**numbers)
 
 
+@on_one_setting
 def test_edit_with_more_rows_than_32_bits_changes_nothing(device, rng):
     gaussians = gaussians_of(device, rng)
     before = {table: gaussians[table].get() for table in gaussians.tables}
@@ -131,7 +133,7 @@ def test_edit_with_more_rows_than_32_bits_changes_nothing(device, rng):
         np.testing.assert_array_equal(gaussians[table].get(), planes, err_msg=table)
 
 
-@pytest.mark.parametrize("count", ROWS)
+@on_devices("count", ROWS)
 def test_moments_of_rows_become_zero_and_the_others_stay(device, rng, count):
     gaussians = gaussians_of(device, rng)
     rows = rng.permutation(COUNT)[:count]
@@ -144,14 +146,14 @@ def test_moments_of_rows_become_zero_and_the_others_stay(device, rng, count):
         np.testing.assert_array_equal(gaussians[table].get(), planes, err_msg=table)
 
 
+@on_one_setting
 def test_moments_without_an_optimizer_need_no_zeroing(device, rng):
     gaussians = random_case(rng, 5).model(device).gaussians
     edit_of(gaussians).zero_moments(np.arange(5))
     assert not [name for name in gaussians.tables if name.startswith("adam/")]
 
 
-@pytest.mark.parametrize("count", [1, 15, 16, 17, 63, 64, 65, 150])
-@pytest.mark.parametrize("kept", [0, 1, 3])
+@on_devices("count, kept", each_once([1, 15, 16, 17, 63, 64, 65, 150], [0, 1, 3]))
 def test_each_chosen_gaussian_has_its_own_number_of_rows(device, rng, count, kept):
     """`kept` of them are the old one, if there are as many; the first growth decides, and removal overrides."""
     edit = edit_of(gaussians_of(device, rng, count))
@@ -178,7 +180,7 @@ class Multiply(Rule):
         edit.choose(np.ones(len(self.copies), bool), np.array(self.copies), self.kept)
 
 
-@pytest.mark.parametrize("kept", [1, 2])
+@on_devices("kept", [1, 2])
 def test_kept_rows_keep_moments_and_fresh_ones_start_at_zero(device, rng, kept):
     gaussians = gaussians_of(device, rng, 65)
     copies = rng.integers(0, 5, 65)
@@ -212,6 +214,7 @@ class Relocate(Rule):
         edit.choose(copies != 1, copies, kept=1)
 
 
+@on_one_setting
 def test_a_relocation_keeps_the_number_of_gaussians(device, rng):
     """Copies have their source's place and its new opacity; sources forget their moments, bystanders do not."""
     gaussians = gaussians_of(device, rng)
@@ -231,6 +234,7 @@ def test_a_relocation_keeps_the_number_of_gaussians(device, rng):
         np.testing.assert_array_equal(after[moment], np.where(alone, before[moment][source], 0))
 
 
+@on_one_setting
 def test_random_numbers_of_an_edit_depend_on_seed_step_and_rule(device, rng):
     gaussians = gaussians_of(device, rng)
 
@@ -246,6 +250,7 @@ def test_random_numbers_of_an_edit_depend_on_seed_step_and_rule(device, rng):
     assert len({tuple(numbers) for numbers in (same, *others)}) == 4
 
 
+@on_one_setting
 def test_a_rule_draws_the_same_whichever_rules_acted_before(device, rng):
     """Its place in the list counts, not what came of the others."""
     seen = []

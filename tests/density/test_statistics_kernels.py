@@ -4,7 +4,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import relative_error
@@ -17,6 +16,7 @@ from clsplat.losses.base import ViewGradients
 from clsplat.methods.adc import Clone, PruneFaint, Split
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
+from tests.support.devices import on_devices, on_one_setting, product
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 ALL = ABS_X + 2
@@ -37,9 +37,7 @@ def expected_abs(case: Case, weights: np.ndarray) -> np.ndarray:
     return ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights).mean2d_abs
 
 
-@pytest.mark.parametrize(
-    ("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24)]
-)
+@on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24)])
 def test_absolute_gradients(device, rng, count, width, height):
     case = with_world_filter(random_case(rng, count, width, height, variance=0.1, compensate=1.0), rng)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
@@ -48,6 +46,7 @@ def test_absolute_gradients(device, rng, count, width, height):
     assert relative_error(pixel_sums[:, :PIXEL_SUMS], pixel_sums_of(device, case, weights, PIXEL_SUMS)) < 1e-6
 
 
+@on_one_setting
 def test_schedules_agree(device, rng):
     case = random_case(rng, 400, 90, 70)
     weights = rng.normal(size=(3, 70, 90)).astype(np.float32)
@@ -76,7 +75,7 @@ def test_absolute_sums_do_not_cancel(device):
 OF_GRADIENTS = ("screen_grad", "screen_grad_abs", "screen_grad_abs_sum")
 
 
-@pytest.mark.parametrize("names", [(), ("screen_grad",), OF_GRADIENTS])
+@on_devices("names", product([(), ("screen_grad",), OF_GRADIENTS]))
 def test_columns(device, rng, names):
     case = random_case(rng, 65)
     case.parameters["means"][::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
@@ -106,6 +105,7 @@ def test_columns(device, rng, names):
     assert not any(gaussians.get(f"stats/{name}").any() for name in (*names, "seen"))
 
 
+@on_one_setting
 def test_columns_come_and_go_and_keep_their_sums(device, rng):
     gaussians = random_case(rng, 20).model(device).gaussians
     stats = SplatStats(gaussians, ["screen_grad"])
@@ -134,6 +134,7 @@ def made(device: Device, screen_grad: list[float], absolute: list[float], size: 
     return np.bincount(gaussians.get("sh_base")[:, 0].astype(int), minlength=count).tolist()
 
 
+@on_one_setting
 def test_absgs_splits_where_gradients_cancel(device):
     """Clone by the ordinary gradient, split by the absolute one, divided at 0.001 of the extent."""
     rules = [
@@ -154,6 +155,7 @@ def test_absgs_splits_where_gradients_cancel(device):
     assert [1 + (action in (ref.CLONE, ref.SPLIT)) for action in oracle] == rows
 
 
+@on_one_setting
 def test_as_many_as_takes_the_matching_quantile(device):
     """Two of eight reach the ordinary threshold, so the two or so largest absolute gradients qualify as well."""
     grad = [9e-4, 5e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]
@@ -166,6 +168,7 @@ def test_as_many_as_takes_the_matching_quantile(device):
     assert made(device, grad, absolute, [0.1] * 8, [clone, matching]) == [2, 2, 1, 1, 1, 1, 2, 2]
 
 
+@on_one_setting
 def test_as_many_as_never_takes_those_without_any(device):
     """If so many qualify that the quantile is zero, a Gaussian without gradient still does not."""
     grad, absolute = [9e-4, 9e-4, 9e-4, 0.0], [0.0, 0.0, 0.0, 1e-3]
@@ -202,6 +205,7 @@ def test_texture_under_splats(device, rng):
     assert stats.pixel_sums == WEIGHT + 2
 
 
+@on_one_setting
 def test_texture_counts_views_by_their_weight(device, rng):
     """A view that hides a Gaussian says nothing of its texture, one that shows little says little."""
     model = random_case(rng, 3).model(device)

@@ -14,6 +14,7 @@ from clsplat.losses.image import L1, Dssim
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Mask, Photograph
 from clsplat.render.rasterizer import PIXEL_SUMS, Budget, Rasterizer
+from tests.support.devices import on_devices, on_one_setting
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 SIZES = [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 24, 24)]
@@ -35,7 +36,7 @@ def squares(case: Case) -> np.ndarray:
     return sum(ref.falloff_squares(case.project(), width, height, background, gradient) for gradient in unit)
 
 
-@pytest.mark.parametrize(("count", "width", "height"), SIZES)
+@on_devices("count, width, height", SIZES)
 def test_numbers_of_flagged_pixels_are_exact(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     flags, mask = rng.random((2, height, width)) < 0.6
@@ -47,7 +48,7 @@ def test_numbers_of_flagged_pixels_are_exact(device, rng, count, width, height):
     assert not look.sum(BLENDED).any()
 
 
-@pytest.mark.parametrize(("count", "width", "height"), SIZES)
+@on_devices("count, width, height", SIZES)
 def test_squares_are_those_of_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     look = look_at(device, case)
@@ -77,6 +78,7 @@ def test_squares_are_those_of_finite_differences(rng):
         assert found[i] == pytest.approx((by_falloff**2).sum(), rel=1e-3)
 
 
+@on_one_setting
 def test_other_sums_do_not_change(device, rng):
     case = random_case(rng, 60, 40, 30)
     look = look_at(device, case)
@@ -101,6 +103,7 @@ def test_bands_and_repetitions_have_the_same_bits(device, rng):
         np.testing.assert_array_equal(found[0], found[2])
 
 
+@on_one_setting
 def test_schedules_agree(device, rng):
     case = random_case(rng, 60, 70, 50)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
@@ -111,7 +114,7 @@ def test_schedules_agree(device, rng):
     np.testing.assert_allclose(theirs.sum(SQUARE, channel=2), expected, rtol=1e-4, atol=1e-6 * expected.max())
 
 
-@pytest.mark.parametrize("name", ["means", "logit_opacity"])
+@on_devices("name", ["means", "logit_opacity"])
 def test_a_gaussian_that_is_not_a_number_or_not_seen_has_none(device, rng, name):
     case = safe_case(rng, 17, 33, 31, MARGIN)
     case.parameters["means"][5] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
@@ -123,7 +126,7 @@ def test_a_gaussian_that_is_not_a_number_or_not_seen_has_none(device, rng, name)
         assert found.any()
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@on_devices("masked", [False, True])
 def test_errors_and_losses_are_those_of_the_pixels_that_count(device, rng, masked):
     case = random_case(rng, 30, 33, 17)
     mask = rng.random((17, 33)) < 0.7 if masked else None

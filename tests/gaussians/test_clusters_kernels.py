@@ -15,6 +15,7 @@ from clsplat.formats.sog import Harmonics
 from clsplat.gaussians import clusters as members
 from clsplat.gaussians.clusters import AT_ONCE, DeviceClusters, most_alike
 from clsplat.gaussians.gaussians import Gaussians
+from tests.support.devices import each_once, on_devices, on_one_setting
 from tests.support.models import splats
 
 
@@ -22,9 +23,9 @@ def whole(rng: np.random.Generator, rows: int, components: int, most: int = LEVE
     return rng.integers(-most, most + 1, (rows, components)).astype(np.float32)
 
 
-@pytest.mark.parametrize("components", [3, 9, 45])
-@pytest.mark.parametrize(
-    ("count", "entries"), [(0, 1), (1, 1), (15, 7), (16, 8), (17, 9), (64, 16), (65, 3), (129, 33)]
+@on_devices(
+    "count, entries, components",
+    each_once([(0, 1), (1, 1), (15, 7), (16, 8), (17, 9), (64, 16), (65, 3), (129, 33)], [3, 9, 45]),
 )
 def test_labels_distances_and_sums_are_exact(device, rng, count, entries, components):
     points, vectors = whole(rng, count, components), whole(rng, entries, components)
@@ -74,7 +75,7 @@ def test_vectors_of_several_launches(device, rng):
     np.testing.assert_array_equal(distance, apart)
 
 
-@pytest.mark.parametrize(("count", "entries"), [(1, 1), (17, 9), (130, 40)])
+@on_devices("count, entries", [(1, 1), (17, 9), (130, 40)])
 def test_vector_with_the_largest_product_is_found_in_blocks(device, rng, count, entries, monkeypatch):
     points, vectors = (rng.normal(size=(rows, 165)).astype(np.float32) for rows in (count, entries))
     products = points.astype(np.float64) @ vectors.T.astype(np.float64)
@@ -84,7 +85,7 @@ def test_vector_with_the_largest_product_is_found_in_blocks(device, rng, count, 
     np.testing.assert_array_equal(most_alike(device, points, vectors), whole)
 
 
-@pytest.mark.parametrize(("count", "entries"), [(1, 1), (100, 64), (3000, 64)])
+@on_devices("count, entries", [(1, 1), (100, 64), (3000, 64)])
 def test_a_palette_is_the_same_bits_with_and_without_a_device(device, rng, count, entries):
     points = rng.normal(size=(count, 24)).astype(np.float32)
     for found, expected in zip(
@@ -94,6 +95,7 @@ def test_a_palette_is_the_same_bits_with_and_without_a_device(device, rng, count
 
 
 @pytest.mark.large
+@on_one_setting
 def test_sog_harmonics_are_equal_with_and_without_a_device(device, rng):
     rest = splats(rng, 1100, 3).parameters["sh_rest"]
     host, other = Harmonics.of(rest, "balanced"), Harmonics.of(rest, "balanced", partial(DeviceClusters, device))
@@ -108,10 +110,12 @@ def clustered(device, rng, count: int, clusters: int) -> tuple[Gaussians, np.nda
     return gaussians, labels, weights
 
 
-@pytest.mark.parametrize(
-    ("count", "clusters"), [(1, 1), (15, 3), (16, 16), (17, 1), (64, 65), (65, 9), (300, 2), (129, 200)]
+@on_devices(
+    "count, clusters, name",
+    each_once(
+        [(1, 1), (15, 3), (16, 16), (17, 1), (64, 65), (65, 9), (300, 2), (129, 200)], ["sh_rest", "logit_opacity"]
+    ),
 )
-@pytest.mark.parametrize("name", ["sh_rest", "logit_opacity"])
 def test_each_row_becomes_the_weighted_mean_of_its_cluster(device, rng, count, clusters, name):
     gaussians, labels, weights = clustered(device, rng, count, clusters)
     expected = ref.shared_means(gaussians.get(name), labels, weights)
@@ -122,6 +126,7 @@ def test_each_row_becomes_the_weighted_mean_of_its_cluster(device, rng, count, c
     np.testing.assert_array_equal(gaussians.get("means"), others)
 
 
+@on_one_setting
 def test_rows_that_are_equal_stay_as_they_are(device, rng):
     gaussians, _, _ = clustered(device, rng, 70, 6)
     members.share(gaussians, "sh_rest")
@@ -130,6 +135,7 @@ def test_rows_that_are_equal_stay_as_they_are(device, rng):
     np.testing.assert_array_equal(gaussians.get("sh_rest"), before)
 
 
+@on_one_setting
 def test_a_cluster_without_weight_gets_its_first_row(device, rng):
     gaussians, labels, weights = clustered(device, rng, 40, 4)
     weights[labels == 2] = 0
@@ -139,6 +145,7 @@ def test_a_cluster_without_weight_gets_its_first_row(device, rng):
     np.testing.assert_array_equal(gaussians.get("sh_rest")[labels == 2], np.broadcast_to(before[0], before.shape))
 
 
+@on_one_setting
 def test_the_cluster_of_a_gaussian_moves_with_it(device, rng):
     gaussians, labels, _ = clustered(device, rng, 50, 5)
     source = rng.permutation(50)[:30]

@@ -3,19 +3,19 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.training import DROPOUT, dropout_figures, hidden_figures
 from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.gaussians.gaussians import Dropout
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.devices import on_devices, on_one_setting
 from tests.support.figures import hold
 
 COUNTS = (1, 15, 16, 17, 63, 64, 65)
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@on_devices("count", COUNTS)
 def test_a_step_leaves_out_what_the_oracle_draws(device, rng, count):
     case = replace(random_case(rng, count), dropout=DROPOUT)
     hold(dropout_figures(device, case, rng, "the scene"))
@@ -34,6 +34,7 @@ def test_the_share_that_is_left_out_is_the_probability():
     assert not ref.dropped(0.0, 7, 1, 500).any()
 
 
+@on_one_setting
 def test_the_mean_of_many_pictures_is_the_picture(device, rng):
     """Of one layer, in which no Gaussian covers another: opacities are larger by as much as fewer are drawn."""
     case = random_case(rng, 12, 64, 64)

@@ -13,7 +13,7 @@ from clsplat.core.errors import OutputError
 from clsplat.core.harmonics import basis, rotated_sh
 from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.scene.view import View
-from tests.support.devices import one_schedule
+from tests.support.devices import on_one_setting
 from tests.support.html_page import HOSTILE, Page
 from tests.support.models import WIDTHS, model_of
 
@@ -73,7 +73,7 @@ def test_a_model_shares_no_memory_with_arrays_or_other_models(rng):
             assert not np.shares_memory(table, getattr(model, name)), name
 
 
-@one_schedule
+@on_one_setting
 @pytest.mark.parametrize("degree", WIDTHS)
 def test_moved_model_looks_the_same_to_a_moved_camera(device, rng, degree):
     case = with_world_filter(random_case(rng, 40, compensate=1.0), rng)

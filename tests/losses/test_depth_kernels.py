@@ -17,6 +17,7 @@ from clsplat.photos.depths import PointDepths, nearest_in_pixels
 from clsplat.scene.scene import Tracks
 from clsplat.stages.optimize import Optimize
 from tests.support.device_images import trainer_of
+from tests.support.devices import on_one_setting
 from tests.support.figures import hold, same_of_schedules
 
 
@@ -33,6 +34,7 @@ def test_the_box_of_the_pixel(device, rng):
     hold(depth_figures(device, case, rng.normal(size=(4, 30, 33)).astype(np.float32), "the pixel's box"))
 
 
+@on_one_setting
 def test_schedules_agree(device, rng):
     case, weights = random_case(rng, 150, 50, 70), rng.normal(size=(4, 70, 50)).astype(np.float32)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
@@ -109,6 +111,7 @@ def known(device: Device, trainer, photograph, count: int = 30) -> PointDepths:
     return PointDepths(device, tracks, ["a", "x"], 2.0)
 
 
+@on_one_setting
 def test_points_that_more_photographs_show_weigh_more(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1()])
     found = known(device, trainer, photograph)
@@ -121,6 +124,7 @@ def test_points_that_more_photographs_show_weigh_more(device, rng):
     assert found.at(photograph.camera) is None, "a view that is not trained on"
 
 
+@on_one_setting
 def test_steps_with_the_loss_bring_depths_to_the_known_ones(device, rng):
     """Of Gaussians that were moved along their rays; without weight the bits are those of a training without it."""
     values = []
@@ -136,6 +140,7 @@ def test_steps_with_the_loss_bring_depths_to_the_known_ones(device, rng):
     assert values[1] < 0.7 * values[0]
 
 
+@on_one_setting
 def test_two_fourth_planes_are_refused(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1(), InverseDepth(), WeightEntropy()])
     with pytest.raises(ConfigError, match="losses read entropy and inverse_depth of an image; expected one of them"):

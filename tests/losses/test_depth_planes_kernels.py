@@ -17,6 +17,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import Tracks
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
+from tests.support.devices import on_one_setting
 
 DEPTH, BEGUN, STEPS, NAMES = 4.0, 3.4, 160, ["0", "1", "2"]
 RATES = Rates(means=8e-3, quats=0, log_scales=1e-3, logit_opacity=1e-2, sh_base=1e-2, sh_rest=0)
@@ -52,6 +53,7 @@ def error_after(device, weight: float) -> float:
     return float(np.median(np.abs(model.gaussians.get("means")[plain, 2] - DEPTH)))
 
 
+@on_one_setting
 def test_points_halve_the_error_of_a_plain_wall(device):
     without, found = (error_after(device, weight) for weight in (0.0, 1.0))
     print(without, found)

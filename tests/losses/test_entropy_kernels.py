@@ -18,6 +18,7 @@ from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Budget, Rasterizer
 from clsplat.stages.optimize import Optimize
 from tests.support.device_images import SIZES, trainer_of
+from tests.support.devices import on_devices, on_one_setting, product
 from tests.support.figures import same_of_schedules
 
 
@@ -90,9 +91,7 @@ def test_reference_gradient_is_that_of_finite_differences(rng):
             assert difference == pytest.approx(values[place], rel=1e-4, abs=1e-6 * np.abs(values).max())
 
 
-@pytest.mark.parametrize(
-    ("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24), (30, 5, 3)]
-)
+@on_devices("count, width, height", [(0, 16, 16), (40, 40, 30), (30, 5, 3)])
 def test_the_plane_and_its_gradient(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, 1e-5)
     expected = ref.weight_entropy(case.project(), width, height)
@@ -147,7 +146,7 @@ def with_entropy(device: Device, rng, width: int, height: int) -> tuple[Comparis
     return replace(comparison, gradient=gradient), x[3]
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height", SIZES[3:9])
 def test_value_and_gradient_of_the_loss(device, rng, width, height):
     comparison, entropy = with_entropy(device, rng, width, height)
     value = WeightEntropy(weight=[[0, 0.5], [10, 1.5]]).add(replace(comparison, step=5))
@@ -160,6 +159,7 @@ def test_value_and_gradient_of_the_loss(device, rng, width, height):
     assert (planes[3] == 7).all(), "nothing is added outside the image"
 
 
+@on_one_setting
 def test_a_frame_without_the_plane_is_refused(device, rng):
     x = rng.uniform(0, 1, (3, 5, 5)).astype(np.float32)
     with pytest.raises(ConfigError, match="weight_entropy needs a frame whose content is 'entropy'"):
@@ -171,8 +171,7 @@ def mean_difference(image: np.ndarray, photograph: np.ndarray) -> tuple[float, n
     return float(np.abs(difference).mean()), np.sign(difference) / difference.size
 
 
-@pytest.mark.parametrize("colours", [L1(), HostLoss(mean_difference)])
-@pytest.mark.parametrize("first", [True, False])
+@on_devices("first, colours", product([True, False], [L1(), HostLoss(mean_difference)]))
 def test_the_trainer_adds_it_to_other_losses_in_any_order(device, rng, colours, first):
     """With a mask, whose pixels count in no plane."""
     entropy = WeightEntropy(weight=0.3)
@@ -190,6 +189,7 @@ def test_the_trainer_adds_it_to_other_losses_in_any_order(device, rng, colours, 
     assert image[3, :, 13:].mean() > 0.05
 
 
+@on_one_setting
 def test_steps_with_the_loss_alone_make_pixels_clearer(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1(weight=0.0), WeightEntropy(weight=1.0)])
     values = [trainer.step(photograph, step).loss for step in range(1, 40)]

@@ -15,16 +15,17 @@ from clsplat.losses.image import L1, L2, Dssim, ssim_maps
 from clsplat.photos.photographs import Photograph, apply_mask, unpack
 from clsplat.render.workspace import Workspace
 from tests.support.device_images import SIZES, gradient_of
+from tests.support.devices import each_once, on_devices, on_one_setting
 from tests.support.figures import hold
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
-@pytest.mark.parametrize(("loss", "oracle", "kernel"), LOSSES)
+@on_devices("width, height, loss, oracle, kernel", each_once(SIZES, LOSSES))
 def test_value_and_gradient(device, rng, width, height, loss, oracle, kernel):
     x, y = images(rng, width, height)
     hold(loss_figures(device, loss(weight=0.7), 0.7, oracle, kernel, x, y))
 
 
+@on_one_setting
 def test_ssim_of_too_many_pixels_is_refused_before_allocation(device, rng):
     comparison = comparison_of(device, *images(rng, 5, 3))
     tile = comparison.camera.tile
@@ -34,6 +35,7 @@ def test_ssim_of_too_many_pixels_is_refused_before_allocation(device, rng):
     assert comparison.workspace.nbytes < 2**20
 
 
+@on_one_setting
 def test_losses_add_up(device, rng):
     x, y = images(rng, 50, 20)
     comparison = comparison_of(device, x, y)
@@ -45,6 +47,7 @@ def test_losses_add_up(device, rng):
     np.testing.assert_allclose(gradient_of(comparison), expected, atol=2e-4 * np.abs(expected).max())
 
 
+@on_one_setting
 def test_equal_images_have_no_loss(device, rng):
     x, _ = images(rng, 40, 30)
     for loss in (kind for kind in variants(ImageLoss).values() if kind.reads_photograph):
@@ -62,7 +65,7 @@ def test_flat_images(device):
     assert np.abs(gradient_of(comparison) - expected).max() < 2e-7
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height", SIZES[3:9])
 def test_pixels_are_unpacked_times_a_factor(device, rng, width, height):
     pixels = rng.integers(0, 256, (4, height, width)).astype(np.uint8)
     camera = camera_of(device, width, height)
@@ -76,6 +79,7 @@ def test_pixels_are_unpacked_times_a_factor(device, rng, width, height):
         assert (planes[:, :, width:] == 0).all()
 
 
+@on_one_setting
 def test_ssim_against_scikit_image(device, rng):
     """Away from the border, where padding does not matter, the map's mean is scikit-image's."""
     metrics = pytest.importorskip("skimage.metrics")
@@ -88,7 +92,7 @@ def test_ssim_against_scikit_image(device, rng):
     assert sums.get().sum(dtype=np.float64) / x.size == pytest.approx(oracle.mean(), rel=1e-5)
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height", SIZES[3:9])
 def test_a_mask_blackens_what_it_leaves_out(device, rng, width, height):
     camera = camera_of(device, width, height)
     colours = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
@@ -106,6 +110,7 @@ def test_a_mask_blackens_what_it_leaves_out(device, rng, width, height):
     np.testing.assert_array_equal(planes.colours.get(), before * counted)
 
 
+@on_one_setting
 def test_a_photograph_without_a_mask_counts_everywhere(device, rng):
     photograph = Photograph(camera_of(device, 5, 3), device.upload(rng.integers(0, 256, (3, 3, 5)).astype(np.uint8)))
     assert photograph.planes(Workspace(device)).mask is None

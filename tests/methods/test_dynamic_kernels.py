@@ -21,6 +21,7 @@ from clsplat.methods.dynamic import PruneAbsent, SplitInTime
 from clsplat.photos.photographs import Photographs
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
+from tests.support.devices import on_one_setting
 
 WIDTH = width_of(3, True)
 
@@ -33,6 +34,7 @@ def statistics_of(gaussians: Gaussians, gradients: np.ndarray) -> SplatStats:
     return stats
 
 
+@on_one_setting
 def test_what_travels_far_is_two_on_the_same_path(device, rng):
     case = moving_case(rng, 65, WIDTH)
     case.parameters[MOTION][:, :3] *= 5
@@ -76,6 +78,7 @@ def _since(motion: np.ndarray, times: np.ndarray) -> np.ndarray:
     return shifted
 
 
+@on_one_setting
 def test_what_no_view_shows_is_removed(device, rng):
     case = moving_case(rng, 65)
     motion = case.parameters[MOTION]
@@ -91,6 +94,7 @@ def test_what_no_view_shows_is_removed(device, rng):
     assert model.gaussians.count == 45
 
 
+@on_one_setting
 @pytest.mark.parametrize("rule", [SplitInTime(), PruneAbsent()])
 def test_rules_of_motion_need_one(device, rng, rule):
     gaussians = random_case(rng, 17).model(device).gaussians

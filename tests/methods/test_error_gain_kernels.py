@@ -18,12 +18,13 @@ from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
+from tests.support.devices import on_devices, on_one_setting
 
 SIZES = ((1, 1), (5, 3), (16, 16), (17, 33), (255, 12), (257, 9), (600, 4))
 COLUMNS = ("screen_grad", "gain")
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height", SIZES)
 def test_the_error_of_a_view_is_that_of_its_loss(device, rng, width, height):
     """L1 itself, and twice L2: the gradient by the image times what is missing to the photograph."""
     x, y = pictures(rng, width, height)
@@ -34,6 +35,7 @@ def test_the_error_of_a_view_is_that_of_its_loss(device, rng, width, height):
         np.testing.assert_allclose(view_error(comparison).get(), [expected], rtol=1e-5)
 
 
+@on_one_setting
 def test_equal_pictures_have_no_error(device, rng):
     x, _ = pictures(rng, 40, 30)
     assert view_error(comparison_of(device, x, x)).get() == 0
@@ -66,6 +68,7 @@ def rows_of(stats: SplatStats, statistic: str, gradient_above: float) -> list[in
     return edit.rows().tolist()
 
 
+@on_one_setting
 @pytest.mark.parametrize("exposure", [0.5, 0.25])
 def test_half_the_exposure_gives_the_same_choice(device, exposure):
     """That of the gradient itself is another one: it is half as large."""
@@ -81,6 +84,7 @@ def test_half_the_exposure_gives_the_same_choice(device, exposure):
     assert sum(rows_of(dim, "screen_grad", own)) < sum(rows_of(bright, "screen_grad", own))
 
 
+@on_one_setting
 def test_a_loss_of_another_weight_gives_the_same(device):
     """Any sum of losses, as it is the loss's own gradient that measures the error."""
     once, thrice = (
@@ -89,6 +93,7 @@ def test_a_loss_of_another_weight_gives_the_same(device):
     np.testing.assert_allclose(thrice.mean("gain"), once.mean("gain"), rtol=1e-4, atol=1e-7)
 
 
+@on_one_setting
 def test_it_is_a_sum_by_the_sum_of_the_errors(device):
     """Over all views, also those that do not see it, times their number: twice as many photographs promise twice."""
     mask = np.arange(32 * 48).reshape(32, 48) % 5 > 0
@@ -108,7 +113,7 @@ def test_it_is_a_sum_by_the_sum_of_the_errors(device):
     assert sum(rows_of(twice, "gain", above)) > sum(chosen)
 
 
-@pytest.mark.parametrize("count", [1, 63, 64, 65])
+@on_devices("count", [1, 63, 64, 65])
 def test_it_is_the_largest_change_over_all_directions(device, rng, count):
     """A shift by one standard deviation of the splat, in a thousand directions; in pixels of the image."""
     case = random_case(rng, count, 48, 32)
@@ -129,6 +134,7 @@ def test_it_is_the_largest_change_over_all_directions(device, rng, count):
     np.testing.assert_allclose(model.gaussians.get("stats/gain")[:, 0], expected, rtol=1e-3)
 
 
+@on_one_setting
 def test_gaussians_that_no_view_saw_do_not_grow(device):
     stats = stats_of(device, 60, 1.0, [L1()])
     seen = stats.gaussians.get("stats/seen")[:, 0] > 0
@@ -137,7 +143,7 @@ def test_gaussians_that_no_view_saw_do_not_grow(device):
     assert chosen.any()
 
 
-@pytest.mark.parametrize("count", [0, 1, 2])
+@on_devices("count", [0, 1, 2])
 def test_few_gaussians(device, count):
     stats = stats_of(device, count, 1.0, [L1()])
     assert len(stats.mean("gain")) == count

@@ -19,6 +19,7 @@ from clsplat.methods.mini_splatting import drawn_weights
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.devices import on_devices, on_one_setting
 
 BACKGROUND = np.array([0.25, 0.5, 0.125], np.float32)
 
@@ -67,7 +68,7 @@ def pruned(survey: Survey, rule: PruneSpare) -> np.ndarray:
     return np.flatnonzero(edit.rows() == 0)
 
 
-@pytest.mark.parametrize(("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
+@on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
 def test_as_many_go_as_the_views_allow(device, rng, count, width, height):
     """Those with the least weight; one more would raise the error of the reference's images above the limit."""
     case = safe_case(rng, count, width, height, MARGIN)
@@ -88,6 +89,7 @@ def test_as_many_go_as_the_views_allow(device, rng, count, width, height):
             assert error_of(case, order[number + 1 :], photographs, masks) >= (1 + rise) * before * 0.998
 
 
+@on_one_setting
 def test_half_the_exposure_gives_the_same_choice(device, rng):
     case = safe_case(rng, 40, 32, 24, MARGIN)
     photographs = photographs_like(rng, case, 2)
@@ -101,6 +103,7 @@ def test_half_the_exposure_gives_the_same_choice(device, rng):
     np.testing.assert_array_equal(pruned(survey_of(device, dim, half, masks, 0.5), PruneSpare(error_rise=0.1)), bright)
 
 
+@on_one_setting
 def test_a_picture_without_error_keeps_what_is_seen(device, rng):
     """Where nothing may be lost, those without weight go and no others."""
     case = safe_case(rng, 20, 24, 24, MARGIN)

@@ -19,6 +19,7 @@ from clsplat.methods.fastgs import PruneInaccurate, PruneSampled, UngrowAccurate
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.devices import each_once, on_devices, on_one_setting
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 
@@ -66,8 +67,9 @@ def expected_wrong(
     return total // len(photographs), (weighted - weighted.min()) / (spread or 1)
 
 
-@pytest.mark.parametrize(("count", "width", "height"), [(1, 16, 16), (16, 17, 15), (17, 33, 31), (40, 24, 24)])
-@pytest.mark.parametrize("masked", [False, True])
+@on_devices(
+    "count, width, height, masked", each_once([(1, 16, 16), (16, 17, 15), (17, 33, 31), (40, 24, 24)], [False, True])
+)
 def test_wrong_pixels_are_counted_exactly(device, rng, count, width, height, masked):
     case = safe_case(rng, count, width, height, MARGIN)
     photographs = photographs_of(rng, case, 4)
@@ -78,6 +80,7 @@ def test_wrong_pixels_are_counted_exactly(device, rng, count, width, height, mas
     np.testing.assert_allclose(found.score, score, atol=1e-4)
 
 
+@on_one_setting
 def test_no_gaussians_and_no_errors_are_no_wrong_pixels(device, rng):
     case = random_case(rng, 0)
     found = wrong_pixels(surveyed(device, case, [np.zeros((3, 30, 40), np.uint8)]), 10, 0.1)
@@ -88,6 +91,7 @@ def test_no_gaussians_and_no_errors_are_no_wrong_pixels(device, rng):
     assert not wrong_pixels(black, 10, 0.1).score.any()
 
 
+@on_one_setting
 def test_only_so_many_views_are_rendered(device, rng):
     case, asked = random_case(rng, 5), []
     survey = surveyed(device, case, [np.zeros((3, 30, 40), np.uint8)] * 12)
@@ -126,6 +130,7 @@ def edit_of(device: Device, rng, count: int, wrong: Wrong, sizes=0.01, opacity=0
     return Edit(gaussians, stats, SceneScale(1.0), step=600, seed=3, survey=survey)
 
 
+@on_one_setting
 def test_growth_needs_wrong_pixels(device, rng):
     wrong = Wrong(np.array([0, 5, 6, 100, 5, 6]), np.zeros(6))
     edit = edit_of(device, rng, 6, wrong, sizes=np.repeat([0.001, 0.1], 3))
@@ -138,6 +143,7 @@ def test_growth_needs_wrong_pixels(device, rng):
     np.testing.assert_array_equal(edit.gaussians.get("log_scales")[kept], scales[[0, 1, 4]])
 
 
+@on_one_setting
 def test_ungrown_gaussians_keep_their_size_for_later_rules(device, rng):
     """Split and undone: its own size counts for the removal of large ones, not that of its children."""
     edit = edit_of(device, rng, 2, Wrong(np.array([0, 9]), np.zeros(2)), sizes=0.12)
@@ -146,7 +152,7 @@ def test_ungrown_gaussians_keep_their_size_for_later_rules(device, rng):
     assert edit.gaussians.count == 2, "of 0.12, which goes, and of 0.12 / 1.6, twice"
 
 
-@pytest.mark.parametrize("faint", [0, 1, 7, 20])
+@on_devices("faint", [0, 1, 7, 20])
 def test_so_many_of_the_faint_and_large_are_removed(device, rng, faint):
     opacity = np.where(np.arange(40) < faint, 0.001, 0.5)
     sizes = np.where(np.arange(40) >= 35, 0.2, 0.01)  # five large ones
@@ -162,6 +168,7 @@ def test_so_many_of_the_faint_and_large_are_removed(device, rng, faint):
     assert (again.rows() == 0).sum() == faint + 5
 
 
+@on_one_setting
 def test_those_with_wrong_pixels_are_removed_sooner(device, rng):
     """Of two, one goes: weights 1 and 4, and the one with the largest score always."""
     counts = np.zeros(2)
@@ -177,13 +184,14 @@ def test_those_with_wrong_pixels_are_removed_sooner(device, rng):
     assert edit.rows().tolist() == [1, 0, 1]
 
 
+@on_one_setting
 def test_a_large_score_is_removed_late(device, rng):
     edit = edit_of(device, rng, 4, Wrong(np.zeros(4, int), np.array([0.0, 0.9, 0.91, 1.0])))
     PruneInaccurate(score_above=0.9).mark(edit)
     assert edit.rows().tolist() == [1, 1, 0, 0]
 
 
-@pytest.mark.parametrize("rule", [UngrowAccurate(), PruneSampled(), PruneInaccurate()])
+@on_devices("rule", [UngrowAccurate(), PruneSampled(), PruneInaccurate()])
 def test_rules_without_photographs_say_so(device, rng, rule: Rule):
     gaussians = random_case(rng, 4).model(device).gaussians
     with pytest.raises(ConfigError, match="needs training photographs; expected"):

@@ -1,7 +1,6 @@
 """The rule that copies where Gaussians with a large gradient crowd (gdgs.py), against loops over all of them."""
 
 import numpy as np
-import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
@@ -15,6 +14,7 @@ from clsplat.methods.gdgs import CloneCrowded, cells_of
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
+from tests.support.devices import on_devices, on_one_setting
 
 EXTENT = 2.0
 
@@ -54,7 +54,7 @@ def expected(before: dict[str, np.ndarray], cells: int, extremes: int) -> tuple[
     return chosen, sum(numbers[:extremes]) / max(sum(numbers[-extremes:]), 1)
 
 
-@pytest.mark.parametrize("count", [1, 17, 64, 65, 600])
+@on_devices("count", [1, 17, 64, 65, 600])
 def test_gaussians_in_the_fullest_cells_are_copied_and_moved(device, rng, count):
     gaussians = crowded(device, rng, count)
     before = {name: gaussians.get(name) for name in gaussians.tables}
@@ -84,6 +84,7 @@ def test_gaussians_in_the_fullest_cells_are_copied_and_moved(device, rng, count)
         np.testing.assert_allclose(np.cov(noise.T), np.eye(3), atol=0.6)
 
 
+@on_one_setting
 def test_it_acts_from_its_ratio_on(device, rng):
     gaussians = crowded(device, rng, 600)
     before = {name: gaussians.get(name) for name in gaussians.tables}
@@ -97,6 +98,7 @@ def test_it_acts_from_its_ratio_on(device, rng):
     assert apply(gaussians, CloneCrowded(ratio_above=ratio * 0.999, **rule)).after == 600 + 2 * len(chosen)
 
 
+@on_one_setting
 def test_moves_depend_on_the_step_alone(device, rng):
     state, found = rng.bit_generator.state, []
     for step in (700, 700, 800):
@@ -108,6 +110,7 @@ def test_moves_depend_on_the_step_alone(device, rng):
     assert (found[0] != found[2]).any()
 
 
+@on_one_setting
 def test_growth_stops_at_the_limit(device, rng):
     gaussians = crowded(device, rng, 300)
     means = gaussians.get("means")

@@ -17,6 +17,7 @@ from clsplat.methods.mcmc import Relocate, divided, systematic
 from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
+from tests.support.devices import each_once, on_devices, on_one_setting
 
 SIZES = (0, 1, 15, 16, 17, 63, 64, 65, 150)  # around the sizes of vectors and groups
 
@@ -56,7 +57,7 @@ def shrinkage(opacity: float, new: float, copies: int) -> float:
     return opacity / total
 
 
-@pytest.mark.parametrize("opacity", [0.3, 0.9, 1.0])
+@on_devices("opacity", [0.3, 0.9, 1.0])
 def test_sources_get_the_opacity_and_the_scales_of_the_paper(device, rng, opacity):
     """One opaque Gaussian, from which all copies come; the paper's formula holds to 50."""
     for copies in range(1, 52):
@@ -75,7 +76,7 @@ def test_sources_get_the_opacity_and_the_scales_of_the_paper(device, rng, opacit
         np.testing.assert_allclose(gaussians.get("log_scales"), np.tile(expected, (copies, 1)), atol=2e-5)
 
 
-@pytest.mark.parametrize("limit", [None, 1000, 155, 150, 140, 101, 100, 60])
+@on_devices("limit", [None, 1000, 155, 150, 140, 101, 100, 60])
 def test_relocation_keeps_the_optical_depth_whatever_the_limit(device, rng, limit):
     """-ln(1 - opacity), summed over a source and its copies, is that of the source; no source fades without copies."""
     gaussians = some_gaussians(device, rng, 150, faint=50)
@@ -95,6 +96,7 @@ class Alone(Rule):
         edit.undo_growth(np.arange(edit.gaussians.count) % 2 == 0)
 
 
+@on_one_setting
 def test_a_source_that_a_later_rule_leaves_alone_stays_as_it_is(device, rng):
     gaussians = some_gaussians(device, rng, 60, faint=30)
     before = {name: gaussians.get(name) for name in ("logit_opacity", "log_scales")}
@@ -108,6 +110,7 @@ def test_a_source_that_a_later_rule_leaves_alone_stays_as_it_is(device, rng):
         np.testing.assert_array_equal(gaussians.get(name)[rows], table[alone])
 
 
+@on_one_setting
 def test_sources_and_copies_start_without_moments(device, rng):
     gaussians = some_gaussians(device, rng, 100, faint=20)
     before = gaussians.get("adam/means/moment1")
@@ -118,6 +121,7 @@ def test_sources_and_copies_start_without_moments(device, rng):
     np.testing.assert_array_equal(gaussians.get("adam/means/moment1"), expected)
 
 
+@on_one_setting
 @pytest.mark.parametrize("limit", [None, 130])
 def test_gaussians_that_an_earlier_rule_took_are_no_sources(device, rng, limit):
     class Take(Rule):
@@ -137,6 +141,7 @@ def test_gaussians_that_an_earlier_rule_took_are_no_sources(device, rng, limit):
     assert gaussians.count == 100, "60 of the old, 20 copies of the first rule, 20 more by growth"
 
 
+@on_one_setting
 def test_without_an_opaque_gaussian_nothing_changes(device, rng):
     gaussians = some_gaussians(device, rng, 30, faint=30)
     before = gaussians.get("means")
@@ -144,8 +149,7 @@ def test_without_an_opaque_gaussian_nothing_changes(device, rng):
     np.testing.assert_array_equal(gaussians.get("means"), before)
 
 
-@pytest.mark.parametrize("count", SIZES)
-@pytest.mark.parametrize(("rate", "below"), [(200.0, 0.005), (750.0, 0.3)])
+@on_devices("count, rate, below", each_once(SIZES, [(200.0, 0.005), (750.0, 0.3)]))
 def test_the_noise_is_that_of_the_formula(device, rng, count, rate, below):
     """Opacities on both sides of the gate, and above its reach; the same normal numbers in float64."""
     gaussians = some_gaussians(device, rng, count, faint=count // 2, opacity=(0.001, 0.6))
@@ -174,8 +178,7 @@ def test_the_noise_follows_the_rate_of_the_means(recipe):
         assert noise.rate.at(step) == pytest.approx(5e5 * training.rates.means.at(step))
 
 
-@pytest.mark.parametrize("draws", [0, 1, 2, 7, 100, 1000])
-@pytest.mark.parametrize("count", [1, 2, 63, 150])
+@pytest.mark.parametrize(("draws", "count"), each_once([0, 1, 2, 7, 100, 1000], [1, 2, 63, 150]))
 def test_systematic_draws_are_those_of_equal_distances(rng, count, draws):
     """Against places on the line of weights one by one, in Python's whole numbers."""
     weights = rng.integers(0, 2**24, count).astype(np.uint64)
@@ -202,8 +205,7 @@ def test_places_of_many_draws_do_not_overflow():
     assert sorted(found) == [666667, 666668, 666668]
 
 
-@pytest.mark.parametrize("opacity", [0.05, 0.3, 0.73, 0.95, 0.999])
-@pytest.mark.parametrize("rows", [1, 2, 5, 20, 50])
+@pytest.mark.parametrize(("opacity", "rows"), each_once([0.05, 0.3, 0.73, 0.95, 0.999], [1, 2, 50, 20, 5]))
 def test_rows_in_one_place_keep_the_centre_and_the_integral(opacity, rows):
     """Equations 8 and 9: o at the centre, and 1 - (1 - o' G(x / factor))^n has the integral of o G(x) over a line."""
     (new,), (factor,) = divided(np.array([opacity]), np.array([rows]), 1e-9)
@@ -214,6 +216,7 @@ def test_rows_in_one_place_keep_the_centre_and_the_integral(opacity, rows):
     assert together.sum() == pytest.approx(alone.sum(), rel=1e-4)
 
 
+@on_one_setting
 def test_relocation_keeps_the_image(device, rng):
     """One in twenty is faint, shows next to nothing, and becomes a copy of another: the picture stays, above 45 dB."""
     count = 300

@@ -1,7 +1,6 @@
 """Rules that subdivide, thin and merge, on constructed cases."""
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.conformance.scenes import random_case
@@ -15,6 +14,7 @@ from clsplat.methods.adc import Clone, PruneFaint
 from clsplat.methods.micro_splatting import MergeNeighbours, PruneUnimportant, SplitOversized, SplitTextured
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
+from tests.support.devices import on_devices, on_one_setting
 
 COLUMNS = ["screen_grad", "texture", "screen_radius"]
 EXTENT = 2.0
@@ -46,6 +46,7 @@ class Edited:
         return np.flatnonzero((self.gaussians.get("sh_rest") == self.before["sh_rest"][source]).all(axis=1))
 
 
+@on_one_setting
 def test_texture_splits_and_children_are_half_as_large(device, rng):
     texture = np.tile([0.01, 0.3], 20)
     case = Edited(device, rng, 40, texture=texture, screen_grad=1.0)
@@ -66,6 +67,7 @@ def test_texture_splits_and_children_are_half_as_large(device, rng):
                 assert (case.gaussians.get(table)[rows] == 0).all(), table
 
 
+@on_one_setting
 def test_strict_and_lowered(device, rng):
     """The lowered form also needs some screen gradient; both forms ignore smooth places and tiny splats."""
     columns = {
@@ -79,6 +81,7 @@ def test_strict_and_lowered(device, rng):
         assert [len(case.rows_of(n)) for n in range(4)] == expected
 
 
+@on_one_setting
 def test_only_the_most_textured_share_splits(device, rng):
     texture = rng.permutation(np.linspace(0.2, 0.9, 100))
     case = Edited(device, rng, 100, texture=texture)
@@ -92,6 +95,7 @@ def test_ties_go_to_the_first():
     assert chosen.tolist() == [True, False, True, False]
 
 
+@on_one_setting
 def test_quantiles_are_of_pixels_or_of_gaussians(device, rng):
     texture = np.linspace(0.01, 0.1, 50)
     of_pixels = PixelQuantile(quantile=0.5, of="pixels")
@@ -101,6 +105,7 @@ def test_quantiles_are_of_pixels_or_of_gaussians(device, rng):
         assert case.apply(rule).after == 50 + expected
 
 
+@on_one_setting
 def test_quantiles_are_of_those_that_were_seen(device, rng):
     texture = np.where(np.arange(50) < 10, np.linspace(0.01, 0.1, 50), 0.0)
     case = Edited(device, rng, 50, texture=texture)
@@ -112,7 +117,7 @@ def test_quantiles_are_of_those_that_were_seen(device, rng):
     assert unseen.apply(rule).after == 50
 
 
-@pytest.mark.parametrize(("rms_above", "pixels"), [(0.01, None), (0.01, 4.0), (Quantile(quantile=0.8), None)])
+@on_devices("rms_above, pixels", [(0.01, None), (0.01, 4.0), (Quantile(quantile=0.8), None)])
 def test_oversized_ones_split(device, rng, rms_above, pixels):
     case = Edited(device, rng, 60)
     log_scales = rng.normal(np.log(0.02), 0.5, (60, 3)).astype(np.float32)
@@ -130,6 +135,7 @@ def test_oversized_ones_split(device, rng, rms_above, pixels):
     assert [len(case.rows_of(n)) for n in range(60)] == np.where(penalised, 2, 1).tolist()
 
 
+@on_one_setting
 def test_first_growing_rule_takes_it_and_pruning_overrides(device, rng):
     case = Edited(device, rng, 30, texture=1.0, screen_grad=1.0)
     logits = np.where(np.arange(30) % 3 == 0, -7.0, 2.0).astype(np.float32)
@@ -140,6 +146,7 @@ def test_first_growing_rule_takes_it_and_pruning_overrides(device, rng):
     assert [len(case.rows_of(n)) for n in range(30)] == np.where(logits < 0, 0, 2).tolist()
 
 
+@on_one_setting
 def test_growth_stops_at_the_limit_with_the_largest_gradients(device, rng):
     gradient = rng.permutation(np.linspace(1e-3, 1, 50))
     case = Edited(device, rng, 50, screen_grad=gradient)
@@ -150,6 +157,7 @@ def test_growth_stops_at_the_limit_with_the_largest_gradients(device, rng):
     assert crowded.apply(Clone(size_below=1e9), limit=10).after == 50  # nothing is removed to reach it
 
 
+@on_one_setting
 def test_the_limit_ranks_by_gradient_whatever_else_is_measured(device, rng):
     gradient = rng.permutation(np.linspace(1e-3, 1, 50))
     case = Edited(device, rng, 50, ("rendered_texture", "screen_grad", "screen_radius"))
@@ -159,6 +167,7 @@ def test_the_limit_ranks_by_gradient_whatever_else_is_measured(device, rng):
     assert {n for n in range(50) if len(case.rows_of(n)) == 2} == set(np.argsort(-gradient)[:8])
 
 
+@on_one_setting
 def test_least_important_ones_go(device, rng):
     case = Edited(device, rng, 40)
     change = case.apply(PruneUnimportant(share=0.25))
@@ -168,6 +177,7 @@ def test_least_important_ones_go(device, rng):
     assert {n for n in range(40) if len(case.rows_of(n)) == 0} == set(np.argsort(score)[:10])
 
 
+@on_one_setting
 def test_merged_neighbors_have_the_mean_and_covariance_of_both(device, rng):
     """Twins merge; a stranger of another colour and one far away stay."""
     case = Edited(device, rng, 4)
@@ -200,6 +210,7 @@ def test_merged_neighbors_have_the_mean_and_covariance_of_both(device, rng):
     np.testing.assert_array_equal(got["means"][1:], means[2:])
 
 
+@on_one_setting
 def test_twins_in_one_place_merge(device, rng):
     case = Edited(device, rng, 40)
     for name in ("means", "sh_base"):
@@ -207,6 +218,7 @@ def test_twins_in_one_place_merge(device, rng):
     assert case.apply(MergeNeighbours()).after == 20
 
 
+@on_one_setting
 def test_nothing_merges_where_a_mean_is_not_finite(device, rng):
     case = Edited(device, rng, 4)
     means = case.gaussians.get("means")

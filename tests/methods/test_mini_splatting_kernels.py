@@ -16,9 +16,10 @@ from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
 from clsplat.methods.mini_splatting import PruneUseless, drawn_weights, useless
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.devices import on_devices, on_one_setting
 
 
-@pytest.mark.parametrize(("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
+@on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
 def test_weights_are_those_of_the_reference(device, rng, count, width, height):
     """Two views that differ by their masks; the useful ones by adding weights one after another."""
     case = safe_case(rng, count, width, height, MARGIN)
@@ -39,6 +40,7 @@ def test_weights_are_those_of_the_reference(device, rng, count, width, height):
     np.testing.assert_array_equal(found.views, views)
 
 
+@on_one_setting
 def test_some_views_are_drawn(device, rng):
     case = safe_case(rng, 17, 33, 31, MARGIN)
     held = [photograph_of(device, case, rng.random((31, 33)) < 0.8) for _ in range(5)]
@@ -53,7 +55,7 @@ def test_some_views_are_drawn(device, rng):
     np.testing.assert_array_equal(drawn_weights(survey, 0.9, 9).total, drawn_weights(survey, 0.9).total)
 
 
-@pytest.mark.parametrize(("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
+@on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
 def test_a_view_has_no_use_for_the_rest_of_what_it_sees(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN)
     case.parameters["means"][::7] += 100.0  # out of sight
@@ -86,6 +88,7 @@ def test_the_fewest_that_make_a_share(weight, share, expected):
     assert largest_of(np.array(weight, float), share).tolist() == expected
 
 
+@on_one_setting
 def test_what_few_views_need_and_what_has_little_weight_goes(device, rng):
     gaussians = random_case(rng, 5).model(device).gaussians
     found = Weights(np.array([500.0, 300, 200, 0.5, 0.4]), np.array([3, 1, 2, 3, 4]))

@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
@@ -15,13 +14,14 @@ from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
 from clsplat.methods.outliers import PruneFar, PruneWide, largest_on_screen
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.devices import on_devices, on_one_setting
 
 
 def edit_of(gaussians, survey=None) -> Edit:
     return Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3, survey=survey)
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e3])
+@on_devices("unit", [1.0, 1e-3, 1e3])
 def test_far_is_by_the_size_of_the_scene(device, rng, unit):
     """Of distances 1 around a middle that is not the origin, with two that are farther."""
     case = random_case(rng, 43)
@@ -36,13 +36,14 @@ def test_far_is_by_the_size_of_the_scene(device, rng, unit):
     assert np.flatnonzero(edit.rows() == 0).tolist() == [41, 42]
 
 
+@on_one_setting
 def test_no_gaussians_have_no_middle(device, rng):
     edit = edit_of(random_case(rng, 0).model(device).gaussians)
     PruneFar().mark(edit)
     assert edit.rows().tolist() == []
 
 
-@pytest.mark.parametrize(("count", "width", "height"), [(0, 16, 16), (17, 33, 31), (40, 24, 24)])
+@on_devices("count, width, height", [(0, 16, 16), (17, 33, 31), (40, 24, 24)])
 def test_sizes_are_those_where_a_photograph_shows_it(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN)
     mask = rng.random((height, width)) < 0.2

@@ -19,6 +19,7 @@ from clsplat.methods.adc import Clone, Split
 from clsplat.methods.taming import GrowScored, PruneScored, by_median, view_scores
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.devices import on_devices, on_one_setting
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 
@@ -82,7 +83,7 @@ def edit_of(device, rng, sizes, opacity=0.5, losses=1.0, gradient=1.0) -> Edit:
     return Edit(gaussians, stats, SceneScale(1.0), step=600, seed=3, survey=survey)
 
 
-@pytest.mark.parametrize("limit", [None, 400, 200, 150, 131, 101, 100, 99, 40])
+@on_devices("limit", [None, 400, 200, 150, 131, 101, 100, 99, 40])
 def test_growth_keeps_to_the_budget_and_to_the_shares(device, rng, limit):
     """60 to clone and 30 to split in two: the room is divided two to one."""
     edit = edit_of(device, rng, np.repeat([0.005, 0.05, 0.005], [60, 30, 10]), gradient=np.repeat([1.0, 0.0], [90, 10]))
@@ -94,13 +95,14 @@ def test_growth_keeps_to_the_budget_and_to_the_shares(device, rng, limit):
     assert change.causes["clone"] + change.causes["split"] == room
 
 
-@pytest.mark.parametrize("limit", [200, 99, 40])
+@on_devices("limit", [200, 99, 40])
 def test_where_nothing_grows_nothing_is_drawn(device, rng, limit):
     edit = edit_of(device, rng, np.full(100, 0.005), gradient=0.0)
     rules = [Clone(size_below=0.01), GrowScored()]
     assert densify(edit, rules, Rasterizer(device, "radix").tiler, limit).after == 100
 
 
+@on_one_setting
 def test_growth_is_drawn_by_score(device, rng):
     """Score of one in ten is (25 * 39 + 125) / (25 + 125) times that of the others; half of the weight grows most."""
     gradient = np.where(np.arange(200) < 20, 39.0, 1.0)
@@ -116,6 +118,7 @@ def test_growth_is_drawn_by_score(device, rng):
     assert counts[:20].sum() / counts.sum() == pytest.approx(share, abs=0.06)
 
 
+@on_one_setting
 def test_a_low_score_is_removed_sooner(device, rng):
     """Of two faint ones with scores 1 and 4, one goes: the first four times of five."""
     counts = np.zeros(2)

@@ -3,21 +3,25 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from clsplat.opencl import device as program
 from clsplat.opencl.device import Array
+from tests.support.devices import each_once, on_devices
 
 
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 1023, 1024, 1025])
-@pytest.mark.parametrize(("dtype", "value"), [(np.float32, 0.0), (np.float32, -1.5), (np.uint32, 7), (np.uint32, 0)])
+@on_devices(
+    "count, dtype, value",
+    each_once(
+        [0, 1, 15, 16, 17, 1023, 1024, 1025], [(np.float32, 0.0), (np.float32, -1.5), (np.uint32, 7), (np.uint32, 0)]
+    ),
+)
 def test_fill(device, count, dtype, value):
     array = device.upload(np.full(count, 3, dtype))
     array.fill(value)
     np.testing.assert_array_equal(array.get(), np.full(count, value, dtype))
 
 
-@pytest.mark.parametrize(("count", "lines"), [(2**32, 2**28), (2**32 + 1, 2**28 + 1), (2**33 - 16, 2**29 - 1)])
+@on_devices("count, lines", [(2**32, 2**28), (2**32 + 1, 2**28 + 1), (2**33 - 16, 2**29 - 1)])
 def test_the_number_of_words_may_pass_32_bits(device, monkeypatch, count, lines):
     """A stand-in for the queue takes the launch: the buffer is small."""
     launched = []

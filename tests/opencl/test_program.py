@@ -8,7 +8,7 @@ import pytest
 
 from clsplat.core.errors import KernelError
 from clsplat.opencl.device import Program
-from tests.support.devices import one_schedule
+from tests.support.devices import on_one_setting
 
 
 def test_a_missing_kernel_file_is_named(device, tmp_path):
@@ -23,7 +23,7 @@ def test_kernel_without_a_group_size_is_refused_with_the_form(device, tmp_path):
         device.program(file)
 
 
-@one_schedule
+@on_one_setting
 @pytest.mark.parametrize(
     "fault",
     [

@@ -17,6 +17,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.exposure import Affine, Gain, PhotographColours, change_colours
 from clsplat.training.trainer import Trainer
+from tests.support.devices import on_devices, on_one_setting, product
 from tests.support.figures import hold
 
 SMOOTH = (L2(),)
@@ -24,11 +25,12 @@ BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
 SIZES = ((1, 1), (2, 1), (15, 4), (16, 16), (17, 5), (33, 18), (127, 32), (129, 65), (257, 3))
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height", SIZES)
 def test_image_and_derivatives(device, rng, width, height):
     hold(colour_figures(device, rng, width, height))
 
 
+@on_one_setting
 def test_no_change_cuts_white_alone(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera = camera_of(device, 33, 18)
@@ -58,8 +60,7 @@ class Case:
         return self.trainer.compare(self.photograph, 1).loss
 
 
-@pytest.mark.parametrize("colours", [Gain(), Affine(weight=0.3)], ids=lambda one: one.type)
-@pytest.mark.parametrize("share", [None, 0.7])
+@on_devices("colours, share", product([Gain(), Affine(weight=0.3)], [None, 0.7]))
 def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, monkeypatch, colours, share):
     """By finite differences of the loss; l2 is smooth."""
     case, found = Case(device, rng, colours, share=share), []
@@ -84,6 +85,7 @@ def gradients_of(device, rng, colours, losses) -> dict[str, np.ndarray]:
     return {name: found[name].get() for name in ("means", "sh_base", "logit_opacity")}
 
 
+@on_one_setting
 @pytest.mark.parametrize("losses", [(L1(weight=0.8), Dssim(weight=0.2)), (L2(), WeightEntropy(weight=0.1))])
 def test_numbers_of_no_change_give_the_gradients_of_none(device, rng, monkeypatch, losses):
     """The entropy of the fourth plane passes as it is."""

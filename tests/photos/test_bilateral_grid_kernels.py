@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.appearance import CASES, grid_figures, grids_of, table_figures
+from clsplat.conformance.checks.appearance import grid_figures, grids_of, table_figures
 from clsplat.conformance.checks.images import camera_of, planes_of
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
@@ -18,13 +18,14 @@ from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.bilateral_grid import Grid, PhotographGrids
 from clsplat.training.modules.exposure import Affine, PhotographColours
 from clsplat.training.trainer import Trainer
+from tests.support.devices import on_devices, on_one_setting, product
 from tests.support.figures import hold
 
 MORE = ((2, 1, (16, 16, 16)), (15, 4, (2, 2, 2)), (16, 16, (3, 3, 3)), (129, 65, (4, 4, 4)), (3, 257, (4, 16, 1)))
 WIDTH, HEIGHT = 50, 36
 
 
-@pytest.mark.parametrize(("width", "height", "nodes"), [*CASES, *MORE])
+@on_devices("width, height, nodes", MORE)
 def test_image_and_derivatives(device, rng, width, height, nodes):
     hold(grid_figures(device, rng, width, height, nodes))
 
@@ -33,11 +34,12 @@ def test_a_fourth_plane_is_copied(device, rng):
     hold(grid_figures(device, rng, 33, 18, (4, 4, 4), channels=4))
 
 
-@pytest.mark.parametrize("nodes", [(4, 4, 4), (1, 1, 1), (5, 1, 3), (16, 16, 8)])
+@on_devices("nodes", product([(16, 16, 8)]))
 def test_smoothness_updates_and_the_mean(device, rng, nodes):
     hold(table_figures(device, rng, nodes))
 
 
+@on_one_setting
 def test_no_change_cuts_white_alone(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera, tables = camera_of(device, 33, 18), GridTables(device, 1, (4, 4, 4))
@@ -83,7 +85,7 @@ class Case:
         return self.trainer.compare(self.photograph, 1).loss
 
 
-@pytest.mark.parametrize("share", [None, 0.7])
+@on_devices("share", [None, 0.7])
 def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, share):
     """By finite differences of the loss; l2 is smooth.  Adam's first moment is a tenth of the gradient."""
     case, step = Case(device, rng, share=share), 2e-3
@@ -97,6 +99,7 @@ def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, share):
     assert case.numbers["colours/b/updates"] == 1
 
 
+@on_one_setting
 def test_the_mean_over_photographs_and_places_stays_at_no_change(device, rng):
     case = Case(device, rng)
     for step in (1, 2, 3):
@@ -112,6 +115,7 @@ def test_the_mean_over_photographs_and_places_stays_at_no_change(device, rng):
     assert values.mean(axis=(0, 3)) == pytest.approx(np.zeros((12, 4)), abs=bound)
 
 
+@on_one_setting
 def test_one_matrix_is_the_affine_kind(device, rng):
     """Its image, and the derivatives by both."""
     numbers, values = {}, rng.normal(0, 0.2, (2, 12, 1, 1, 1)).astype(np.float32)
@@ -133,6 +137,7 @@ def test_one_matrix_is_the_affine_kind(device, rng):
     assert by_grid == pytest.approx(caught[0].ravel(), rel=1e-4, abs=1e-4)
 
 
+@on_one_setting
 def test_a_mask_hides_pixels_whatever_their_colours_become(device, rng):
     case = Case(device, rng, share=0.5)
     values = case.values.copy().reshape(2, 12, -1)

@@ -12,13 +12,12 @@ from clsplat.photos.transforms import Blur, MeanFilter
 from clsplat.pipeline.loading import load
 from clsplat.stages.optimize import Optimize
 from tests.support.device_images import colours_of, planes_of
+from tests.support.devices import each_once, on_devices, product
 
 SIZES = ((1, 1), (2, 3), (15, 4), (16, 16), (17, 5), (33, 18), (63, 3), (64, 2), (65, 7))  # tiles and groups
 
 
-@pytest.mark.parametrize("share", [None, 0.7, 0.05], ids=["no mask", "most count", "few count"])
-@pytest.mark.parametrize("sigma", [0.3, 1.0, 2.5, 200.0])
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height, sigma, share", each_once(SIZES, product([0.3, 1.0, 2.5, 200.0], [None, 0.7, 0.05])))
 def test_the_blur_is_the_oracles(device, rng, width, height, sigma, share):
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     mask = None if share is None else rng.random((height, width)) < share
@@ -37,7 +36,7 @@ def test_a_pixel_keeps_its_value_where_nothing_near_it_counts(device, rng):
     np.testing.assert_allclose(found[:, near], np.broadcast_to(image[:, 10, 5, None], (3, 49)), rtol=1e-6)
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@on_devices("masked", [False, True])
 def test_neither_the_edge_nor_a_mask_darkens_a_flat_image(device, rng, masked):
     image = np.full((3, 18, 33), 0.75, np.float32)
     mask = rng.random((18, 33)) < 0.5 if masked else None
@@ -55,8 +54,10 @@ def test_without_a_sigma_the_photograph_stays(device, rng):
     np.testing.assert_allclose(colours_of(blur.apply(planes_of(device, image), step=10)), expected, rtol=2e-5)
 
 
-@pytest.mark.parametrize(("share", "reach"), [(0.0, 0), (0.09, 0), (0.1, 1), (0.24, 2), (0.25, 2), (0.5, 5), (3.0, 30)])
-@pytest.mark.parametrize("masked", [False, True])
+@on_devices(
+    "share, reach, masked",
+    each_once([(0.0, 0), (0.09, 0), (0.1, 1), (0.24, 2), (0.25, 2), (0.5, 5), (3.0, 30)], [False, True]),
+)
 def test_the_mean_filter_is_the_oracles(device, rng, share, reach, masked):
     image = rng.uniform(0, 1, (3, 17, 20)).astype(np.float32)
     mask = rng.random((17, 20)) < 0.5 if masked else None

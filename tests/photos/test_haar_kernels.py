@@ -20,6 +20,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
+from tests.support.devices import each_once, on_devices, on_one_setting, product
 from tests.support.figures import hold
 
 SIZES = ((1, 1), (2, 1), (1, 2), (3, 3), (15, 4), (16, 16), (17, 5), (33, 18), (127, 32), (128, 33), (129, 65))
@@ -42,8 +43,7 @@ def through(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> 
     return Haar().apply(planes, step=1).colours.get()[:, : camera.height, : camera.width]
 
 
-@pytest.mark.parametrize("share", [None, 0.7, 0.1], ids=["no mask", "most count", "few count"])
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height, share", each_once(SIZES, [None, 0.7, 0.1]))
 def test_photograph_and_derivatives_are_the_oracles(device, rng, width, height, share):
     for taps in ((0.0, 0.0), HAAR, (0.3, 0.9)):
         hold(haar_figures(device, rng, width, height, share, np.array(taps)))
@@ -62,7 +62,7 @@ def test_the_oracle_is_the_closed_form(rng, share):
     np.testing.assert_allclose(ref.haar_filtered(image, share * np.array(HAAR)), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@on_devices("masked", [False, True])
 def test_without_a_filter_squares_are_means_and_haar_is_identity(device, rng, masked):
     image = rng.uniform(0, 1, (3, 10, 22)).astype(np.float32)
     mask = rng.random((10, 22)) < 0.6 if masked else np.ones((10, 22), bool)
@@ -119,8 +119,7 @@ def trainer_of(device, rng, losses, masked: bool = True) -> tuple[Trainer, Photo
     return trainer, Photograph(case.device_camera(device), device.upload(colours), mask)
 
 
-@pytest.mark.parametrize("learn", ["filter", "scale"])
-@pytest.mark.parametrize("masked", [False, True])
+@on_devices("learn, masked", product(["filter", "scale"], [False, True]))
 def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked):
     """Finite differences of the float64 losses of the rendered image, by each number."""
     losses = [L1(weight=0.8), Dssim(weight=0.2), L2(weight=3.0), Anisotropy(above=1.0)]
@@ -153,7 +152,7 @@ def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked)
     assert own == pytest.approx(0.01 * 2 * ((taps_of(before) - HAAR) ** 2).sum())
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@on_devices("masked", [False, True])
 def test_what_the_filter_needs_changes_no_loss_and_no_gradient(device, rng, masked):
     """Bit for bit those of the changed photograph alone."""
     trainer, photograph = trainer_of(device, rng, [L1(weight=0.8), L2(), Dssim(weight=0.2)], masked)
@@ -167,6 +166,7 @@ def test_what_the_filter_needs_changes_no_loss_and_no_gradient(device, rng, mask
     np.testing.assert_array_equal(alone.gradient.get(), gradient)
 
 
+@on_one_setting
 def test_differentiating_changes_no_number(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1()])
     trainer.differentiate(photograph, 1, [Haar()])
@@ -175,7 +175,7 @@ def test_differentiating_changes_no_number(device, rng):
     assert trainer.numbers.keys() > Haar().first().keys()
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@on_devices("masked", [False, True])
 def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
     """The filter's derivatives are those without it, and it adds to the gradient as elsewhere."""
     of_colours, moments = [L1(weight=0.8), Dssim(weight=0.2)], []
@@ -193,6 +193,7 @@ def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
     assert trainer.numbers["haar/scale/moment1"] / 0.1 == pytest.approx(-0.2), "its own loss alone"
 
 
+@on_one_setting
 def test_a_loss_that_is_not_symmetric_is_refused(device, rng):
     def brightness(image: np.ndarray, photograph: np.ndarray) -> tuple[float, np.ndarray]:
         return float(image.mean()), np.full(image.shape, 1 / image.size)
@@ -205,6 +206,7 @@ def test_a_loss_that_is_not_symmetric_is_refused(device, rng):
         trainer.differentiate(photograph, 1, [Haar()])
 
 
+@on_one_setting
 def test_a_copy_that_was_begun_is_of_what_was_there(device):
     array = device.upload(np.arange(40, dtype=np.float32))
     copied = array.get_later()

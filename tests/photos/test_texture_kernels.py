@@ -9,6 +9,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.photos.photographs import Photograph, known_gradient, texture_quantile
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
+from tests.support.devices import on_devices
 
 SIZES = ((1, 1), (2, 3), (7, 5), (8, 8), (9, 2), (15, 4), (16, 16), (17, 17), (40, 30), (65, 3))
 
@@ -20,7 +21,7 @@ def magnitude_of(image: np.ndarray) -> np.ndarray:
     return np.hypot(across, down) / 8
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height", SIZES)
 def test_image_gradient(device, rng, width, height):
     camera = camera_of(device, width, height)
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
@@ -43,7 +44,7 @@ def test_image_gradient(device, rng, width, height):
     assert (found == 0).all()
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height", SIZES)
 def test_what_is_masked_has_no_texture(device, rng, width, height):
     """Nor have its neighbours, and neither the texture nor its quantiles depend on what is hidden."""
     camera, workspace = camera_of(device, width, height), Workspace(device)
@@ -69,7 +70,7 @@ def test_what_is_masked_has_no_texture(device, rng, width, height):
         )
 
 
-@pytest.mark.parametrize("count", [1, 63, 64, 65, 150])
+@on_devices("count", [1, 63, 64, 65, 150])
 def test_sample_at_projected_means(device, rng, count):
     case = random_case(rng, count, 40, 30)
     rasterizer = Rasterizer(device, "radix")

@@ -1,19 +1,17 @@
 """transients.cl: residuals, their numbers by size, and the mask without the large ones."""
 
 import numpy as np
-import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.images import SCALES, camera_of, planes_of, transient_figures
 from clsplat.render.workspace import Workspace
 from clsplat.training.modules.transients import BINS, mask_transients, measure_residuals
 from tests.support.device_images import SIZES
+from tests.support.devices import each_once, on_devices, product
 from tests.support.figures import hold
 
 
-@pytest.mark.parametrize("share", [None, 0.5, 0.0])
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@on_devices("width, height, scale, share", each_once(SIZES, product(SCALES, [None, 0.5, 0.0])))
 def test_residuals_numbers_and_masks_are_those_of_the_reference(device, rng, width, height, scale, share):
     hold(transient_figures(device, rng, width, height, scale, share))
 

@@ -12,6 +12,7 @@ from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import MAX_PAIRS, Budget, Rasterizer
 from clsplat.render.tiles import Band, Footprints, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
+from tests.support.devices import each_once, on_devices, on_one_setting
 
 
 def results(device, case, weights, budget=None, sort="radix", rasterizer=None):
@@ -25,12 +26,21 @@ def results(device, case, weights, budget=None, sort="radix", rasterizer=None):
     return image, pixel_sums, frame
 
 
-@pytest.mark.parametrize("sort", ["radix", "bitonic"])
-@pytest.mark.parametrize(
-    ("budget", "bands"),
-    [(Budget(MAX_PAIRS), 1), (Budget(600), 2), (Budget(250), 4), (Budget(1), 5), (Budget(MAX_PAIRS, 3), 1),
-     (Budget(1, 1), 5), (Budget(250, 1000), 4)],
-)  # fmt: skip
+@on_devices(
+    "budget, bands, sort",
+    each_once(
+        [
+            (Budget(MAX_PAIRS), 1),
+            (Budget(600), 2),
+            (Budget(250), 4),
+            (Budget(1), 5),
+            (Budget(MAX_PAIRS, 3), 1),
+            (Budget(1, 1), 5),
+            (Budget(250, 1000), 4),
+        ],
+        ["radix", "bitonic"],
+    ),
+)
 def test_image_and_sums_over_pixels_are_the_same_bits(device, rng, budget, bands, sort):
     case = random_case(rng, 300, 60, 70)
     case.parameters["log_scales"][:20] += 1.5  # some over many rows of tiles, and too many tiles for a mask
@@ -45,6 +55,7 @@ def test_image_and_sums_over_pixels_are_the_same_bits(device, rng, budget, bands
     np.testing.assert_array_equal(banded_sums, pixel_sums)
 
 
+@on_one_setting
 def test_nothing_in_a_band(device, rng):
     case = random_case(rng, 0, 40, 64)
     image, _, _ = results(device, case, 0.0, Budget(1, 2))
@@ -58,6 +69,7 @@ def limited(device, allocation):
     return other
 
 
+@on_one_setting
 def test_room_to_grow_ends_at_the_largest_buffer(device):
     workspace = Workspace(limited(device, 4096))
     workspace.array("table", 900)
@@ -82,7 +94,7 @@ def test_records_may_fill_the_largest_buffer(device, rng):
     np.testing.assert_array_equal(limited_sums, pixel_sums)
 
 
-@pytest.mark.parametrize("refused", ["pair_sums", "pair_tile", "tile_pairs", "tile_values0"])
+@on_devices("refused", ["pair_sums", "pair_tile", "tile_pairs", "tile_values0"])
 def test_a_refusal_of_memory_leads_to_bands_and_the_same_bits(device, rng, monkeypatch, refused):
     case = random_case(rng, 300, 60, 70)
     case.parameters["log_scales"][:20] += 1.5
@@ -105,6 +117,7 @@ def test_a_refusal_of_memory_leads_to_bands_and_the_same_bits(device, rng, monke
     assert max(rasterizer._bands.values()) > 1
 
 
+@on_one_setting
 def test_memory_that_a_runtime_refuses_at_a_copy_leads_to_bands(device, rng, monkeypatch):
     """Some take it at the first use."""
     case, copy, refused = random_case(rng, 300, 60, 70), cl.enqueue_copy, []
@@ -125,14 +138,17 @@ def test_memory_that_a_runtime_refuses_at_a_copy_leads_to_bands(device, rng, mon
     np.testing.assert_array_equal(banded_sums, pixel_sums)
 
 
+@on_one_setting
 def test_memory_that_one_row_of_tiles_exceeds_is_refused(device, rng):
     small = limited(device, 300 * 64)
     with pytest.raises(MemoryLimitError):
         results(small, random_case(rng, 301, 60, 70), 0.0)
 
 
-@pytest.mark.parametrize("sort", ["radix", "bitonic"])
-@pytest.mark.parametrize("counts", [[2**31, 2**31, 5], [2**31, 5, 2**31], [MAX_PAIRS + 1], [2**24] * 300])
+@on_devices(
+    "counts, sort",
+    each_once([[2**31, 2**31, 5], [2**31, 5, 2**31], [MAX_PAIRS + 1], [2**24] * 300], ["radix", "bitonic"]),
+)
 def test_more_pairs_than_32_bits_count_are_too_many(device, sort, counts):
     counts = np.array(counts, np.uint32)
     nothing = np.zeros_like(counts)
@@ -143,6 +159,7 @@ def test_more_pairs_than_32_bits_count_are_too_many(device, sort, counts):
         )
 
 
+@on_one_setting
 def test_frame_with_more_pairs_than_32_bits_renders_in_bands(device, rng, monkeypatch):
     """Each Gaussian of a band of several rows stands for many: the counts, which nothing but their sum reads."""
     case = random_case(rng, 300, 60, 70)
@@ -162,6 +179,7 @@ def test_frame_with_more_pairs_than_32_bits_renders_in_bands(device, rng, monkey
     np.testing.assert_array_equal(banded_sums, pixel_sums)
 
 
+@on_one_setting
 def test_row_of_tiles_with_too_many_pairs_is_refused(device, rng, monkeypatch):
     monkeypatch.setattr("clsplat.render.rasterizer.MAX_PAIRS", 50)
     case = random_case(rng, 300, 60, 70)

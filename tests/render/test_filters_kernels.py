@@ -15,6 +15,7 @@ from clsplat.render.filters import Dilation, Ewa, FilterViews, Mip, NoWorldFilte
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
+from tests.support.devices import each_once, on_devices, on_one_setting
 
 COUNTS = (1, 15, 16, 17, 63, 64, 65, 200)
 
@@ -43,8 +44,7 @@ def refreshed(device: Device, case: Case, views: list[View], settings: Smoothing
     return gaussians.get("filter_variance")[:, 0]
 
 
-@pytest.mark.parametrize("focal", ["per_camera", "global_max"])
-@pytest.mark.parametrize("count", COUNTS)
+@on_devices("count, focal", each_once(COUNTS, ["per_camera", "global_max"]))
 def test_filter_variance(device, rng, count, focal):
     case = random_case(rng, count)
     case.parameters["means"][::3] *= 4  # out of sight of some, or of all
@@ -57,6 +57,7 @@ def test_filter_variance(device, rng, count, focal):
     np.testing.assert_allclose(variance, 0.2 * interval**2, rtol=1e-5)
 
 
+@on_one_setting
 def test_a_shared_focal_length_makes_both_definitions_equal(device, rng):
     case = random_case(rng, 100)
     views = [replace(view, camera=replace(view.camera, fx=40.0)) for view in around(case, rng, 5)]
@@ -76,6 +77,7 @@ def test_who_is_not_seen_takes_the_largest(device, rng):
     assert (refreshed(device, case, [case.view], Smoothing()) == 0).all(), "no Gaussian is seen"
 
 
+@on_one_setting
 def test_nothing_to_filter(device, rng):
     case = random_case(rng, 0)
     assert refreshed(device, case, [case.view], Smoothing()).shape == (0,)
@@ -110,6 +112,7 @@ def grid_of_specks(device: Device, screen: Dilation | Ewa | Mip, scale: int) -> 
     return float(frame.image.get().sum(dtype=np.float64)) * scale**2
 
 
+@on_one_setting
 def test_specks_keep_their_brightness_when_zoomed_out(device):
     """Mip and EWA to 1 % at 1/8, where a disc of 0.5 px has become 0.06 px; dilation makes it far brighter."""
     smooth = Device(device.info, device.schedule)

@@ -3,13 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import GRADIENT, relative_error
 from clsplat.conformance.scenes import SHARP, Case, random_case, safe_case, with_world_filter
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame, Rasterizer
+from tests.support.devices import on_devices, on_one_setting
 
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
 
@@ -63,7 +63,7 @@ def _faint(parameters: dict[str, np.ndarray]) -> None:
     parameters["logit_opacity"][:] = -4.6
 
 
-@pytest.mark.parametrize("count", [255, 256, 257, 512, 513])
+@on_devices("count", [255, 256, 257, 512, 513])
 def test_tiles_whose_lists_end_where_a_batch_does(device, rng, count):
     case = safe_case(rng, count, 14, 14, change=_faint)
     weights = rng.normal(size=(3, 14, 14)).astype(np.float32)
@@ -72,9 +72,7 @@ def test_tiles_whose_lists_end_where_a_batch_does(device, rng, count):
     compare(values, expected_gradients(case, weights), GRADIENT)
 
 
-@pytest.mark.parametrize(
-    ("count", "width", "height"), [(1, 16, 16), (16, 20, 18), (17, 33, 15), (40, 40, 30), (65, 24, 24)]
-)
+@on_devices("count, width, height", [(1, 16, 16), (16, 20, 18), (17, 33, 15), (40, 40, 30), (65, 24, 24)])
 def test_gradients(device, rng, count, width, height):
     case = safe_case(rng, count, width, height)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
@@ -82,7 +80,7 @@ def test_gradients(device, rng, count, width, height):
     compare(values, expected_gradients(case, weights), GRADIENT)
 
 
-@pytest.mark.parametrize(("variance", "compensate"), [(0.3, 1.0), (0.1, 1.0)])
+@on_devices("variance, compensate", [(0.3, 1.0), (0.1, 1.0)])
 def test_gradients_with_filters(device, rng, variance, compensate):
     case = with_world_filter(random_case(rng, 30, 32, 24), rng)
     case = replace(case, variance=variance, compensate=compensate)
@@ -140,6 +138,7 @@ def test_finite_differences_on_the_device(device, rng):
             assert abs(difference - values[name][index]) < 0.02 * scale, (name, index)
 
 
+@on_one_setting
 def test_sorts_give_the_same_bits(device, rng):
     case = random_case(rng, 300, 70, 50)
     weights = rng.normal(size=(3, 50, 70)).astype(np.float32)
@@ -157,6 +156,7 @@ def pixel_sums_of(result: tuple[dict, Frame, Rasterizer]) -> np.ndarray:
     return pixel_sums / np.linalg.norm(pixel_sums, axis=1, keepdims=True)
 
 
+@on_one_setting
 def test_schedules_agree(device, rng):
     """The same sums in another order differ by rounding: 1e-6 in what blending sums over pixels, a little more where
     the way to the parameters amplifies it."""
@@ -169,6 +169,7 @@ def test_schedules_agree(device, rng):
         assert relative_error(mine[0][name], theirs[0][name]) < 2e-5, name
 
 
+@on_one_setting
 def test_the_same_bits_twice(device, rng):
     case = random_case(rng, 300, 70, 50)
     weights = rng.normal(size=(3, 50, 70)).astype(np.float32)

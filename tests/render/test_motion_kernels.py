@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import CONIC, relative_error
@@ -16,6 +15,7 @@ from clsplat.gaussians.model import Model
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.render.motion import at_moment
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.devices import on_devices, on_one_setting
 from tests.support.figures import hold
 
 
@@ -23,11 +23,12 @@ def test_motion_and_its_gradients(device, rng):
     hold(motion(device, rng))
 
 
-@pytest.mark.parametrize("count", [16, 63, 64, 129])
+@on_devices("count", [16, 63, 64, 129])
 def test_sizes_around_the_groups(device, rng, count):
     hold(moment_figures(device, rng, count, width_of(2, True)))
 
 
+@on_one_setting
 def test_a_moment_on_the_host_looks_like_that_on_the_device(device, rng):
     case = moving_case(rng, 65, width_of(3, True))
     model = Model(**case.parameters)
@@ -85,6 +86,7 @@ def test_what_stands_still_for_ever_has_the_bits_of_none(device, rng):
         np.testing.assert_array_equal(one, other)
 
 
+@on_one_setting
 def test_what_is_not_there_counts_as_not_seen(device, rng):
     case = moving_case(rng, 65)
     frame = Rasterizer(device, "radix").forward(case.model(device), case.device_camera(device), device.zeros(3))

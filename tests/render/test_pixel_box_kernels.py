@@ -9,12 +9,13 @@ from scipy.special import ndtr
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import blend_figures, pixel_sums_of, render, sum_figures
-from clsplat.conformance.checks.pixel_box import BOX, CHECKS, SIZES, of_size
+from clsplat.conformance.checks.pixel_box import BOX, SIZES, of_size
 from clsplat.conformance.checks.projection import not_drawable, record_figures, splats_of
 from clsplat.conformance.reference.blending import box_derivatives, box_response
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.devices import each_once, on_devices, on_one_setting
 from tests.support.figures import same_of_schedules
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(48)
@@ -87,8 +88,7 @@ def test_a_blur_of_a_tenth_is_further_from_the_integral(rng):
     assert mine < theirs / 10
 
 
-@pytest.mark.parametrize("degrees", [0, 20, 70, 110, 160])
-@pytest.mark.parametrize("sigma", [0.15, 0.5, 2.0])
+@pytest.mark.parametrize(("degrees", "sigma"), each_once([0, 20, 70, 110, 160], [0.15, 0.5, 2.0]))
 def test_derivatives_of_the_reference_are_those_of_the_integral(rng, sigma, degrees):
     """Finite differences of the formula against finite differences of the integral, which the formula only nears."""
     v, step = covariance(sigma, 2.5, degrees), 1e-3 * sigma
@@ -136,13 +136,7 @@ def hold(figures) -> None:
         assert figure.holds, figure.text
 
 
-@pytest.mark.parametrize("check", CHECKS.listed, ids=lambda check: check.name)
-def test_checks_hold(device, check):
-    hold(check.figures(device))
-
-
-@pytest.mark.parametrize(("width", "height"), [(16, 16), (17, 15), (33, 31), (5, 3)])
-@pytest.mark.parametrize("size", SIZES)
+@on_devices("width, height, size", each_once([(16, 16), (17, 15), (33, 31), (5, 3)], SIZES))
 def test_edges_of_tiles(device, rng, width, height, size):
     case = of_size(SIZES[size], rng, 20, width, height)
     hold(blend_figures(device, case, size))
@@ -192,6 +186,7 @@ def test_round_splats_at_the_change(device, rng):
     hold(blend_figures(device, case, "round Gaussians"))
 
 
+@on_one_setting
 def test_schedules_give_the_same_image(device, rng):
     case = random_case(rng, 200, 70, 50, **BOX)
     case.parameters["log_scales"][:60] -= 2

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from clsplat.conformance.checks.projection import (
     beyond_the_clamp,
@@ -11,7 +10,6 @@ from clsplat.conformance.checks.projection import (
     hidden_figures,
     not_drawable,
     pose_figures,
-    poses,
     record_figures,
     splats_of,
 )
@@ -19,36 +17,32 @@ from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.gaussians.gaussians import HIDDEN_VIEWS, hide
 from clsplat.render.camera import CAMERA
 from clsplat.render.rasterizer import RECORD, Budget, Rasterizer
+from tests.support.devices import each_once, on_devices, on_one_setting
 from tests.support.figures import hold
 
-COUNTS = (1, 7, 8, 9, 15, 16, 17, 63, 64, 65, 200)
+COUNTS = (7, 8, 9, 16, 63, 64, 200)  # others are in the checks of projection.py
 
 
 def compare(device, case: Case) -> None:
     hold(record_figures(device, case, "the scene"))
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@on_devices("count", COUNTS)
 def test_records_at_group_edges(device, rng, count):
     compare(device, random_case(rng, count))
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_harmonics_degrees(device, rng, degree):
-    compare(device, random_case(rng, 50, degree=degree))
-
-
-@pytest.mark.parametrize(("variance", "compensate"), [(0.3, 0.0), (0.3, 1.0), (0.1, 1.0), (0.0, 0.0)])
+@on_devices("variance, compensate", [(0.3, 0.0)])
 def test_filters(device, rng, variance, compensate):
     compare(device, with_world_filter(random_case(rng, 60, variance=variance, compensate=compensate), rng))
 
 
-@pytest.mark.parametrize("views", [1, HIDDEN_VIEWS, 2 * HIDDEN_VIEWS + 1])
-@pytest.mark.parametrize("count", COUNTS)
+@on_devices("count, views", each_once(COUNTS, [1, HIDDEN_VIEWS, 2 * HIDDEN_VIEWS + 1]))
 def test_a_view_leaves_out_what_is_hidden_in_it(device, rng, count, views):
     hold(hidden_figures(device, random_case(rng, count), rng, views))
 
 
+@on_one_setting
 def test_other_pictures_leave_out_nothing(device, rng):
     case = random_case(rng, 40)
     model, camera = case.model(device), case.device_camera(device)
@@ -61,6 +55,7 @@ def test_other_pictures_leave_out_nothing(device, rng):
     assert not nothing.any()
 
 
+@on_one_setting
 def test_bands_leave_out_the_same(device, rng):
     """A frame in several bands is projected again by the backward pass."""
     case = random_case(rng, 60, 70, 50)
@@ -77,12 +72,14 @@ def test_bands_leave_out_the_same(device, rng):
     np.testing.assert_allclose(sums[1], sums[0], rtol=1e-4, atol=1e-5)
 
 
+@on_one_setting
 def test_nothing_to_project(device, rng):
     records, keys, _ = splats_of(device, random_case(rng, 0))
     assert records.shape == (0, RECORD)
     assert keys.shape == (0,)
 
 
+@on_one_setting
 def test_what_cannot_be_drawn_is_culled(device, rng):
     case = not_drawable(rng)
     records, keys, radius = splats_of(device, case)
@@ -94,6 +91,7 @@ def test_what_cannot_be_drawn_is_culled(device, rng):
     compare(device, Case({k: v[9:] for k, v in case.parameters.items()}, case.view))
 
 
+@on_one_setting
 def test_camera_struct_has_the_kernels_layout(device):
     assert CAMERA.itemsize == 4 * 27
     assert all(CAMERA.fields[name][1] % 4 == 0 for name in CAMERA.names)
@@ -103,21 +101,17 @@ def backward_case(device, rng, case: Case) -> None:
     hold(gradient_figures(device, case, rng, "the scene"))
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@on_devices("count", COUNTS)
 def test_gradients_at_group_edges(device, rng, count):
     backward_case(device, rng, random_case(rng, count))
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_gradients_of_harmonics(device, rng, degree):
-    backward_case(device, rng, random_case(rng, 40, degree=degree))
-
-
-@pytest.mark.parametrize(("variance", "compensate"), [(0.3, 1.0), (0.1, 1.0), (0.3, 0.0)])
+@on_devices("variance, compensate", [(0.3, 0.0)])
 def test_gradients_through_the_filters(device, rng, variance, compensate):
     backward_case(device, rng, with_world_filter(random_case(rng, 60, variance=variance, compensate=compensate), rng))
 
 
+@on_one_setting
 def test_gradients_where_the_ray_is_clamped(device, rng):
     case = beyond_the_clamp(rng)
     in_camera = case.parameters["means"] @ case.camera().rotation.T + case.camera().translation
@@ -126,10 +120,6 @@ def test_gradients_where_the_ray_is_clamped(device, rng):
     backward_case(device, rng, case)
 
 
-def test_derivatives_by_a_pose(device, rng):
-    hold(poses(device, rng))
-
-
-@pytest.mark.parametrize("count", [16, 64, 511, 513])
+@on_devices("count", [16, 64, 511, 513])
 def test_sums_over_groups(device, rng, count):
     hold(pose_figures(device, random_case(rng, count), rng, f"{count} Gaussians"))

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.blending import loss_of_what_is_left
-from clsplat.conformance.checks.sky import adam_of_the_sky, cover_figures, sky_figures
+from clsplat.conformance.checks.sky import cover_figures, sky_figures
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.sky import Sky
@@ -18,27 +17,20 @@ from clsplat.render.sky import Skies
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.sky import LearnedSky
 from clsplat.training.trainer import Trainer
+from tests.support.devices import on_devices, on_one_setting
 from tests.support.figures import hold
 
 SIZES = ((1, 1, 8), (2, 1, 9), (15, 4, 8), (16, 16, 16), (17, 5, 33), (33, 18, 8), (127, 9, 21), (129, 17, 64))
 
 
-@pytest.mark.parametrize(("width", "height", "side"), SIZES)
+@on_devices("width, height, side", SIZES)
 def test_picture_and_derivatives(device, rng, width, height, side):
     hold(sky_figures(device, rng, width, height, side))
 
 
-@pytest.mark.parametrize(("width", "height", "side"), SIZES)
+@on_devices("width, height, side", SIZES)
 def test_what_covers_the_sky(device, rng, width, height, side):
     hold(cover_figures(device, rng, width, height, side))
-
-
-def test_adam_of_the_texels_that_a_view_shows(device, rng):
-    hold(adam_of_the_sky(device, rng))
-
-
-def test_a_loss_of_the_transmittance_reaches_the_splats(device, rng):
-    hold(loss_of_what_is_left(device, rng))
 
 
 class Scene:
@@ -74,7 +66,7 @@ def numeric(scene: Scene, array, place: tuple[int, int], step: float) -> float:
     return (losses[0] - losses[1]) / (2 * step)
 
 
-@pytest.mark.parametrize("share", [None, 0.7])
+@on_devices("share", [None, 0.7])
 def test_the_gradient_by_the_sky_is_that_of_the_losses(device, rng, share):
     scene = Scene(device, rng, Directions(side=8, cover=0), share)
     view = scene.trainer.compare(scene.photograph, 1)
@@ -88,6 +80,7 @@ def test_the_gradient_by_the_sky_is_that_of_the_losses(device, rng, share):
         assert found[channel, place] == pytest.approx(expected, rel=0.01, abs=1e-6)
 
 
+@on_one_setting
 def test_masked_pixels_are_not_asked_to_show_the_sky(device, rng):
     scene = Scene(device, rng, Directions(side=8, cover=0.5, difference=0.5), 0.7)
     view = scene.trainer.compare(scene.photograph, 1)
@@ -112,6 +105,7 @@ def test_the_gradient_by_opacities_has_that_of_the_cover(device, rng):
     assert abs(plain[row] - expected) > 0.2 * abs(expected)
 
 
+@on_one_setting
 def test_runs_of_pixels_are_kept_within_a_budget(device, rng):
     scene = Scene(device, rng, Directions(side=8))
     camera, workspace = scene.photograph.camera, scene.trainer.rasterizer.workspace

@@ -9,6 +9,7 @@ import clsplat
 from clsplat.core.settings import variants
 from clsplat.photos.transforms import PhotographTransform
 from tests.support.device_images import colours_of, planes_of
+from tests.support.devices import each_once, on_devices
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -30,8 +31,8 @@ def window_mean(image: np.ndarray, reach: int) -> np.ndarray:
     return result
 
 
-@pytest.mark.parametrize(
-    ("width", "height", "reach"), [(1, 1, 0), (15, 4, 2.6), (16, 16, 0.4), (17, 5, 80), (64, 2, 2.6), (65, 7, 80)]
+@on_devices(
+    "width, height, reach", each_once([(1, 1), (15, 4), (16, 16), (17, 5), (64, 2), (65, 7)], [0, 0.4, 2.6, 80])
 )
 def test_the_box_blur_is_the_mean_of_a_window(device, rng, width, height, reach):
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)

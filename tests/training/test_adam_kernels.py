@@ -13,6 +13,7 @@ from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.training import adam as average
 from clsplat.training.adam import Adam, Rates, Rows
+from tests.support.devices import each_once, on_devices, on_one_setting, product
 from tests.support.figures import hold
 
 
@@ -65,15 +66,24 @@ def touches_a_pixel(case: Case) -> np.ndarray:
     return truth.visible & (alpha >= 1 / 255).any(axis=0)
 
 
-@pytest.mark.parametrize("count", [1, 15, 16, 17, 64, 65])
+@on_devices("count", [16, 64, 150])
 def test_steps(device, rng, count):
     hold(step_figures(device, rng, count))
 
 
-@pytest.mark.parametrize("count", [1, 17, 64, 150])
-@pytest.mark.parametrize(
-    ("degree", "sh_rest", "rows"),
-    [(0, 1e-4, "all"), (2, 1e-4, "all"), (3, 1e-4, "all"), (3, {"every": 2, "value": 1e-4}, "all"), (3, 1e-4, "seen")],
+@on_devices(
+    "degree, sh_rest, rows, count",
+    each_once(
+        [
+            (0, 1e-4, "all"),
+            (2, 1e-4, "all"),
+            (3, 1e-4, "all"),
+            (3, {"every": 2, "value": 1e-4}, "all"),
+            (3, 1e-4, "seen"),
+            (3, 1e-4, "seen"),
+        ],
+        [64, 17, 150, 1],
+    ),
 )
 def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree, sh_rest, rows):
     """update_gaussians against project_backward and adam_step, bit for bit, moments and screen gradients too."""
@@ -104,6 +114,7 @@ def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree
         np.testing.assert_array_equal(tables[1][name], table, err_msg=name)
 
 
+@on_one_setting
 def test_bands_above_the_active_degree_stay(device, rng):
     case = random_case(rng, 20, degree=1)
     model = case.model(device)
@@ -115,7 +126,7 @@ def test_bands_above_the_active_degree_stay(device, rng):
     assert not moved[:, 9:].any()
 
 
-@pytest.mark.parametrize("count", [1, 17, 150])
+@on_devices("count", [1, 17, 150])
 def test_bands_whose_rate_is_0_stay_with_their_moments(device, rng, count):
     """Their number of updates too, so that the next one is corrected as it must be; all else is as with a rate."""
     case = random_case(rng, count)
@@ -139,6 +150,7 @@ def test_bands_whose_rate_is_0_stay_with_their_moments(device, rng, count):
             np.testing.assert_array_equal(table, tables[0][name], err_msg=name)
 
 
+@on_one_setting
 def test_parameters_left_out_stay(device, rng):
     case = random_case(rng, 20)
     model = case.model(device)
@@ -151,7 +163,7 @@ def test_parameters_left_out_stay(device, rng):
     assert adam.updates["quats"] == 1
 
 
-def test_rate_of_the_means_decays(device):
+def test_rate_of_the_means_decays():
     rates = Rates()
     assert rates.at(0, 1.0)["means"] == pytest.approx(1.6e-4)
     assert rates.at(15_000, 1.0)["means"] == pytest.approx(1.6e-5)
@@ -162,13 +174,15 @@ def test_rate_of_the_means_decays(device):
 # ---- rows that the view sees
 
 
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 63, 64, 65, 150])
+@on_devices("count", [0, 16, 63, 64, 150])
 def test_seen_rows(device, rng, count):
     hold(seen_figures(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians"))
 
 
-@pytest.mark.parametrize("from_memory", [False, True])
-@pytest.mark.parametrize("seen", [(), (0,), (16,), (63, 64), (149,), range(16, 32), range(150)])
+@on_devices(
+    "seen, from_memory",
+    each_once(product([(), (0,), (16,), (63, 64), (149,), range(16, 32), range(150)]), [False, True]),
+)
 def test_rows_change_that_are_seen_and_no_others(device, rng, seen, from_memory):
     """Alone, at the edges of vectors and blocks, a whole vector; gradients of penalties change nothing of it."""
     case = random_case(rng, 150)
@@ -185,6 +199,7 @@ def test_rows_change_that_are_seen_and_no_others(device, rng, seen, from_memory)
         np.testing.assert_array_equal(table[list(seen)], everywhere[name][list(seen)], err_msg=name)
 
 
+@on_one_setting
 def test_what_has_a_pixel_is_seen(device, rng):
     """By the slow formula; of those without a pixel, the few whose extent reaches the photograph change too."""
     case = random_case(rng, 300)
@@ -196,7 +211,7 @@ def test_what_has_a_pixel_is_seen(device, rng):
     assert (changed & ~touches).sum() < 0.1 * (~touches).sum()
 
 
-@pytest.mark.parametrize("from_memory", [False, True])
+@on_devices("from_memory", [False, True])
 def test_rows_that_cannot_be_drawn_keep_their_bits(device, rng, from_memory):
     """Behind the camera, huge, faint or not numbers."""
     case = not_drawable(rng)
@@ -208,8 +223,7 @@ def test_rows_that_cannot_be_drawn_keep_their_bits(device, rng, from_memory):
     assert seen.sum() > 15
 
 
-@pytest.mark.parametrize("rows", ["all", "seen"])
-@pytest.mark.parametrize("vectors", [1, 2, 8])
+@on_devices("vectors, rows", each_once([1, 2, 8, 1, 2, 8], ["all", "seen"]))
 def test_bits_do_not_depend_on_the_vectors_of_an_item(device, rng, vectors, rows):
     case = behind_each_fifth(random_case(rng, 150))
     case.parameters["means"][40:90] -= 20 * case.view.world_to_camera[2, :3]  # whole vectors
@@ -218,11 +232,12 @@ def test_bits_do_not_depend_on_the_vectors_of_an_item(device, rng, vectors, rows
         np.testing.assert_array_equal(table, expected[name], err_msg=name)
 
 
-@pytest.mark.parametrize("count", [1, 15, 16, 17, 63, 64, 65, 150])
+@on_devices("count", [16, 64, 150])
 def test_the_average_of_three_steps(device, rng, count):
     hold(average_figures(device, rng, count))
 
 
+@on_one_setting
 def test_rows_without_an_average_keep_values_and_tables_go(device, rng):
     gaussians = random_case(rng, 20).model(device).gaussians
     before = {name: gaussians.get(name) for name in gaussians.tables}
@@ -233,6 +248,7 @@ def test_rows_without_an_average_keep_values_and_tables_go(device, rng):
         np.testing.assert_array_equal(gaussians.get(name), before[name])
 
 
+@on_one_setting
 def test_no_gaussian(device, rng):
     gaussians = random_case(rng, 0).model(device).gaussians
     average.attach(gaussians)
@@ -241,6 +257,7 @@ def test_no_gaussian(device, rng):
     assert gaussians.count == 0
 
 
+@on_one_setting
 def test_an_average_of_equal_values_is_the_value(device, rng):
     """To the bit, as a table of the parameters that no step changes."""
     gaussians = random_case(rng, 65).model(device).gaussians

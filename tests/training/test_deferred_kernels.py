@@ -12,6 +12,7 @@ from clsplat.gaussians.structs import Gradients
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
+from tests.support.devices import each_once, on_devices, on_one_setting, product
 from tests.support.figures import hold
 
 
@@ -58,15 +59,17 @@ def assert_equal(device: Device, case: Case, **settings: object) -> None:
         np.testing.assert_array_equal(table, at_once[name], err_msg=name)
 
 
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 63, 64, 65, 150])
+@on_devices("count", [0, 16, 64])
 def test_updates_that_wait(device, rng, count):
     hold(deferred_figures(device, rng, count))
 
 
-@pytest.mark.parametrize("from_memory", [False, True])
-@pytest.mark.parametrize(
-    ("count", "degree", "sh_rest"),
-    [(1, 3, 1e-4), (150, 0, 1e-4), (150, 2, 1e-4), (300, 3, {"every": 2, "value": 1e-4}), (300, 3, 1e-4)],
+@on_devices(
+    "count, degree, sh_rest, from_memory",
+    each_once(
+        [(1, 3, 1e-4), (150, 0, 1e-4), (150, 2, 1e-4), (300, 3, {"every": 2, "value": 1e-4}), (300, 3, 1e-4)],
+        [False, True],
+    ),
 )
 def test_bits_are_those_of_updates_at_once(device, rng, count, degree, sh_rest, from_memory):
     case = behind_each_fifth(with_world_filter(random_case(rng, count, degree=degree), rng))
@@ -103,7 +106,7 @@ def drop_bands(model: DeviceModel, adam: Adam, step: int) -> None:
         model.degree = 1
 
 
-@pytest.mark.parametrize("edit", [raise_degree, move_rows, write_rows, drop_bands])
+@on_devices("edit", [raise_degree, move_rows, write_rows, drop_bands])
 def test_who_changes_rows_finds_them_up_to_date(device, rng, edit):
     assert_equal(device, behind_each_fifth(random_case(rng, 100)), edit=edit)
 
@@ -121,6 +124,7 @@ def test_the_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
             np.testing.assert_array_equal(tables[name].view(np.uint32), found[0][name].view(np.uint32))
 
 
+@on_one_setting
 def test_rows_that_no_view_sees_wait(device, rng):
     """Their harmonics lie as they were, and whoever asks for them gets what they are."""
     case = random_case(rng, 150)
@@ -141,6 +145,7 @@ def test_rows_that_no_view_sees_wait(device, rng):
     assert (model.gaussians.get("adam/sh_rest/moment1") != first).all()
 
 
+@on_one_setting
 def test_a_penalty_on_harmonics_that_wait_is_refused(device, rng):
     gradients = Gradients(random_case(rng, 5).model(device).gaussians)
     assert gradients.without_deferred()["means"] is gradients["means"]
@@ -148,9 +153,10 @@ def test_a_penalty_on_harmonics_that_wait_is_refused(device, rng):
         gradients.without_deferred()["sh_rest"]
 
 
-@pytest.mark.parametrize("from_memory", [False, True])
-@pytest.mark.parametrize("rows", ["all", "seen"])
-@pytest.mark.parametrize(("count", "degree"), [(0, 3), (1, 3), (17, 2), (64, 0), (65, 3), (300, 3)])
+@on_devices(
+    "count, degree, rows, from_memory",
+    each_once([(0, 3), (1, 3), (17, 2), (64, 0), (65, 3), (300, 3)], product(["all", "seen"], [False, True])),
+)
 def test_the_bits_do_not_depend_on_where_harmonics_lie(device, rng, count, degree, rows, from_memory):
     case = behind_each_fifth(with_world_filter(random_case(rng, count, degree=degree), rng))
     on_device = bits_after(device, case, rows, from_memory=from_memory)
@@ -159,7 +165,7 @@ def test_the_bits_do_not_depend_on_where_harmonics_lie(device, rng, count, degre
         np.testing.assert_array_equal(on_host[name], table, err_msg=name)
 
 
-@pytest.mark.parametrize("edit", [raise_degree, move_rows, write_rows, drop_bands])
+@on_devices("edit", [raise_degree, move_rows, write_rows, drop_bands])
 def test_who_changes_rows_finds_them_on_the_host(device, rng, edit):
     case = behind_each_fifth(random_case(rng, 100))
     on_device = bits_after(device, case, "all", edit=edit)
@@ -167,6 +173,7 @@ def test_who_changes_rows_finds_them_on_the_host(device, rng, edit):
         np.testing.assert_array_equal(table, on_device[name], err_msg=name)
 
 
+@on_one_setting
 def test_needing_all_rows_explains_that_they_are_on_the_host(device, rng):
     model = random_case(rng, 20).model(device)
     before = model.gaussians.get("sh_rest")
