@@ -1,7 +1,6 @@
-"""Every shipped recipe, in few steps: the same bits again, after a stop, and with one thread in the place of two.
+"""Kinds of recipes in few steps: the same bits again, after a stop, and with one thread instead of two.
 
-Methods of growth also take the filters and losses of others. Of two recipes that differ in numbers alone only the one
-of 7 000 steps is trained.
+Methods of growth also take the filters and losses of others.
 """
 
 import os
@@ -17,36 +16,31 @@ from clsplat.core.errors import ConfigError
 from clsplat.gaussians.model import load as load_model
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
-from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint, records
 from clsplat.training.checkpoint import State
 from tests.support.recipes import ONE_THREAD, digest, short, train
 
 pytestmark = pytest.mark.slow
 
-RECIPES = [
-    name
-    for name, file in shipped().items()
-    if name not in ("compress", "blocks", "blocks_coarse")  # two start from a model, one is splat_7k at half size
-    and f"{name}_7k" not in shipped()
-    and not load(name).settings.prepare
-    and not load(name).settings.model.time  # they need a scene that moves: test_dynamic.py
-    and any(isinstance(s, Optimize) for s in load(name).stages)
-]
+RECIPES = (  # each has a rule, loss, filter or transform that no other one of them has; test_dynamic.py has motion
+    "auto_7k", "auto_opti3dgs_7k", "box_7k", "dash_7k", "fast", "fastgs_7k", "gdgs_7k", "mcmc_7k",
+    "micro_splatting_v2_7k", "mini_7k", "mip_splatting_gof_7k", "opti3dgs_7k", "smoke", "speedy_7k", "splat_ewa_7k",
+    "steep_7k", "taming_7k",
+)  # fmt: skip
 LOOKS_AT_VIEWS = {"fastgs_7k", "speedy_7k", "mini_7k", "taming_7k"}
 ACTS = {  # what decides in a family of recipes; `clone` in all others
-    "auto": "clone split prune_spare", "fast": "clone prune_useless", "fast_30k": "clone prune_useless",
+    "auto": "clone split prune_spare", "fast": "clone prune_useless",
     "fastgs": "split prune_inaccurate", "gdgs": "clone_crowded", "mcmc": "relocate",
-    "micro_splatting": "split_textured", "micro_splatting_v2": "merge_neighbours prune_unimportant",
+    "micro_splatting_v2": "split_textured merge_neighbours prune_unimportant",
     "mini": "clone prune_useless", "speedy": "prune_least", "steep": "split_saddle",
 }  # fmt: skip
-LEARNS = {"auto_opti3dgs", "auto_opti3dgs_7k"}
+LEARNS = {"auto_opti3dgs_7k"}
 ALONE = """
 import functools, sys
 from pathlib import Path
-from clsplat.opencl import device, program
+from clsplat.opencl import device
 from tests.support.recipes import short, train
-device.context_of, program.built = functools.cache(device.context_of), functools.cache(program.built)
+device.context_of, device.built = functools.cache(device.context_of), functools.cache(device.built)
 for name in sys.argv[3:]:
     train(short(name, Path(sys.argv[1])), Path(sys.argv[2]) / name)
 """
@@ -67,10 +61,10 @@ def words(node: Any) -> list[str]:
     )
 
 
-@pytest.mark.parametrize("name", [name for name in shipped() if f"{name}_7k" in shipped()])
-def test_recipe_of_7000_steps_differs_from_its_twin_in_numbers(name):
-    twins = [load(recipe).settings.model_dump(mode="json") for recipe in (name, f"{name}_7k")]
-    assert words(twins[0]) == words(twins[1])
+def test_recipes_of_7000_steps_differ_from_their_twins_in_numbers():
+    twins = {name: f"{name}_7k" for name in shipped() if f"{name}_7k" in shipped()}
+    made_of = {name: words(load(name).settings.model_dump(mode="json")) for pair in twins.items() for name in pair}
+    assert not [name for name, twin in twins.items() if made_of[name] != made_of[twin]]
 
 
 @pytest.fixture(scope="module")
@@ -109,9 +103,7 @@ def test_recipe_has_the_same_bits_after_a_stop_and_on_one_thread(name, tiny_scen
     assert newest(stopped).numbers == numbers
 
 
-FAMILIES = {"absgs", "auto", "auto_opti3dgs", "dash", "fast", "fast_30k", "fastgs", "gdgs", "mcmc", "mini"}
-FAMILIES |= {"opti3dgs", "speedy", "steep", "taming"}
-GROWTH = sorted(name for name in shipped() if name.removesuffix("_7k") in FAMILIES)
+FAMILIES = ("absgs", "auto_opti3dgs", "dash", "fast", "fastgs", "gdgs", "mcmc", "mini", "speedy", "taming")
 EWA = ["model.screen_filter={type: ewa, variance: 0.3}"]
 MIP = ["model.screen_filter={type: mip, variance: 0.1}", "model.world_filter={type: smoothing, variance: 0.2}"]
 BOX = ["model.screen_filter=box"]
@@ -121,12 +113,12 @@ MICRO = [
 ]
 
 
-@pytest.mark.parametrize("name", GROWTH)
+@pytest.mark.parametrize("name", [*FAMILIES, "auto", "steep"])
 def test_each_takes_the_filters_and_the_losses_of_others(name):
     """Each pair is checked as a whole; the pixel's box has no conic, which some rules read."""
     for settings in (EWA, MIP, MICRO):
         load(name, settings)
-    if name.removesuffix("_7k") in ("auto", "steep"):
+    if name not in FAMILIES:
         with pytest.raises(ConfigError, match="reads the inverse covariance"):
             load(name, BOX)
     else:
@@ -138,8 +130,8 @@ def test_each_takes_the_filters_and_the_losses_of_others(name):
     [("mcmc_7k", EWA, 0.3), ("steep_7k", MIP, 0.1), ("mini_7k", MICRO, 0.3)],
     ids=["mcmc with ewa", "steep with mip", "mini with micro"],
 )
-def test_three_of_them_train(name, settings, variance, tiny_scene, tmp_path):
-    own = train(short(name, tiny_scene), tmp_path / "own")
+def test_three_of_them_train(name, settings, variance, tiny_scene, tmp_path, with_one_thread):
+    own = digest(with_one_thread / name)
     assert train(short(name, tiny_scene, *settings), tmp_path / "both") != own
     rendering = load_model(tmp_path / "both").rendering
     assert (rendering.screen_variance, rendering.compensate) == (pytest.approx(variance), float(settings is not MICRO))
