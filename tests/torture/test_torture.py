@@ -81,7 +81,7 @@ def test_a_row_counts_the_cases_that_its_tests_have_tried(tmp_path):
     assert torture.tested("a", "holds", 7, str(tmp_path / "test_none.py")).cases == 7
 
 
-CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 4  # of each moment; `make torture` tries every file
+CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 2  # of each moment; `make torture` tries every file
 
 
 def test_whichever_file_is_being_written_nothing_is_lost(tiny_scene, tmp_path, record_property):
@@ -90,6 +90,6 @@ def test_whichever_file_is_being_written_nothing_is_lost(tiny_scene, tmp_path, r
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
-    assert len(found) >= 8
+    assert len(found) >= 4
     assert [case for case in found if case[2:] != [True, 0, True]] == []
     record_property("cases", len(found))
