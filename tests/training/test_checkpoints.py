@@ -22,6 +22,7 @@ CRAFTED = {
     "cursor": lambda notes, arrays: notes.update(cursor=99),
     "a negative step": lambda notes, arrays: notes.update(step=-1),
     "no step": lambda notes, arrays: notes.pop("step"),
+    "a word": lambda notes, arrays: notes.update(stage_step="4"),
     "degree": lambda notes, arrays: notes.update(degree=7),
     "too few harmonics": lambda notes, arrays: (
         notes.update(degree=3),
