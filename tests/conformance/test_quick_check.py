@@ -99,7 +99,7 @@ def test_a_damaged_cache_of_kernels_is_no_fault_of_the_device(monkeypatch, info,
 USE = """
 import os, sys
 from pathlib import Path
-from clsplat.conformance import uses
+from clsplat.conformance import quick as uses
 uses.begin([Path(name) for name in sys.argv[2:]])
 if sys.argv[1] == "suddenly":
     os.abort()
@@ -245,8 +245,7 @@ WORK: dict[str, Callable[[Path, Path, Path, object], object]] = {
 }
 
 
-@pytest.mark.parametrize("given", ["default", "name", "open"])
-@pytest.mark.parametrize("work", WORK)
+@pytest.mark.parametrize(("work", "given"), list(zip(WORK, 2 * ["default", "name", "open"], strict=True)))
 def test_a_wrong_device_makes_no_picture_and_no_model(
     work, given, monkeypatch, info, empty_cache, tiny_scene, model, tmp_path
 ):

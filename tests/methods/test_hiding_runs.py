@@ -30,19 +30,24 @@ stages:
 """
 
 
-@pytest.fixture
-def pipeline(tmp_path):
-    file = tmp_path / "hiding.yaml"
+@pytest.fixture(scope="module")
+def pipeline(tmp_path_factory):
+    file = tmp_path_factory.mktemp("pipeline") / "hiding.yaml"
     file.write_text(HIDING)
     return str(file)
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_scene, tmp_path_factory, pipeline):
+    return train(tiny_scene, tmp_path_factory.mktemp("hiding") / "run", pipeline=pipeline)
 
 
 def bits(path) -> np.ndarray:
     return checkpoint.load(path)[1][f"gaussians/{HIDDEN}"][:, 0].astype(int)
 
 
-def test_it_is_the_same_after_a_stop_and_when_it_is_done_again(tiny_scene, tmp_path, pipeline):
-    whole = train(tiny_scene, tmp_path / "whole", pipeline=pipeline).out
+def test_it_is_the_same_after_a_stop(tiny_scene, tmp_path, pipeline, finished):
+    whole = finished.out
     of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.saved(whole)}
     assert not bits(of_step[5]).any(), "an edit follows its step"
     assert bits(of_step[6]).any()
@@ -58,8 +63,8 @@ def test_it_is_the_same_after_a_stop_and_when_it_is_done_again(tiny_scene, tmp_p
     assert (again / "point_cloud.ply").read_bytes() == expected
 
 
-def test_what_is_new_is_hidden_where_its_source_was(tiny_scene, tmp_path, pipeline):
-    of_step = checkpoint.saved(train(tiny_scene, tmp_path / "run", pipeline=pipeline).out)
+def test_what_is_new_is_hidden_where_its_source_was(finished):
+    of_step = checkpoint.saved(finished.out)
     before, after = (next(path for path in of_step if path.stem.endswith(f"_{step:06d}")) for step in (14, 15))
     assert len(bits(after)) > len(bits(before))
     assert set(bits(after)) == set(bits(before))
@@ -79,8 +84,8 @@ def test_a_step_changes_nothing_that_its_view_leaves_out(tiny_scene, tmp_path, p
     assert moved[~everywhere].any()
 
 
-def test_all_are_drawn_behind_the_training(tiny_scene, tmp_path, pipeline):
-    run = train(tiny_scene, tmp_path / "run", pipeline=pipeline)
+def test_all_are_drawn_behind_the_training(finished):
+    run = finished
     assert HIDDEN not in run.model.gaussians.tables
     assert len(read_ply(run.out / "point_cloud.ply").parameters["means"]) == run.model.gaussians.count
     assert useless(run.survey(), 0.6).any()

@@ -86,7 +86,7 @@ def test_a_field_is_trained_longer_by_its_steps(finished, tmp_path):
 
 
 def test_training_makes_the_loss_smaller(tiny_scene, tmp_path, pipeline):
-    train(tiny_scene, tmp_path / "run", "train_field.steps=60", "train_field.log_every=1", pipeline=pipeline)
+    train(tiny_scene, tmp_path / "run", "train_field.steps=40", "train_field.log_every=1", pipeline=pipeline)
     lines = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     losses = [line["loss"] for line in lines if line["kind"] == "train"]
     assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:3])
@@ -244,12 +244,12 @@ def test_a_checkpoint_of_another_shape_is_refused(finished):
     assert state.field is not None
     other = state.model_copy(update={"field": state.field | {"shape": state.field["shape"] | {"width": 64}}})
     with pytest.raises(DataError, match="parameters of its field is not"):
-        checkpoint.run_tables.check(other, tables)
+        checkpoint.check_run_tables(other, tables)
     with pytest.raises(DataError, match="has not the tables"):
-        checkpoint.run_tables.check(state, {"field/parameters": tables["field/parameters"]})
+        checkpoint.check_run_tables(state, {"field/parameters": tables["field/parameters"]})
     tables["field/moment1"] = np.full_like(tables["field/moment1"], np.nan)
     with pytest.raises(DataError, match="moment1 of its field holds values that are not finite"):
-        checkpoint.run_tables.check(state, tables)
+        checkpoint.check_run_tables(state, tables)
 
 
 @pytest.mark.parametrize("stage", ["export", "viewer", "densify: {rules: []}"])
@@ -302,7 +302,7 @@ def small_field() -> Field:
     return Field.first(shape, 1, device.upload(np.array([1.0, 0.5, 0.0], np.float32)))
 
 
-@pytest.mark.parametrize("size", [(1, 1), (63, 1), (64, 1), (65, 1), (97, 11)])
+@pytest.mark.parametrize("size", [(1, 1), (64, 1), (65, 1), (97, 11)])
 def test_pictures_of_all_sizes_are_whole(small_field, size):
     """Around tiles of samples, and around the rays that are rendered at a time; a pixel has its own ray."""
     camera = Camera(*size, 50.0, 50.0, size[0] / 2, size[1] / 2)

@@ -23,7 +23,7 @@ from clsplat.training.modules.bilateral_grid import Grid
 from clsplat.training.modules.exposure import Gain
 from clsplat.training.trainer import Trainer
 
-VIEWS, STEPS = 8, 400
+VIEWS, STEPS = 8, 240
 RATES = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=2e-2, sh_rest=0)  # the colours alone are unknown
 LUMINANCE = np.array([0.299, 0.587, 0.114])
 

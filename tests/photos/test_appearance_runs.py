@@ -38,9 +38,8 @@ def with_gains(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_gains, tiny_scene, tmp_path):
     out = killed(with_gains, tmp_path / "run")
     run = train(tiny_scene, out, *GAIN, resume=True)
-    again = train(tiny_scene, tmp_path / "again", *GAIN)
-    assert digest(out) == digest(with_gains) == digest(tmp_path / "again")
-    assert run.numbers == again.numbers
+    assert digest(out) == digest(with_gains)
+    assert run.numbers == checkpoint.load(checkpoint.saved(with_gains)[-1])[0].numbers
 
 
 def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp_path, few_steps):

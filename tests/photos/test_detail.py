@@ -47,7 +47,7 @@ def test_without_detail_the_size_is_full_from_the_start():
     assert "full size" in course(grey)
 
 
-@pytest.mark.parametrize("size", [(48, 64), (33, 57), (1, 20), (2, 2)])
+@pytest.mark.parametrize("size", [(48, 64), (33, 57), (1, 20)])
 def test_a_spectrum_sums_what_the_centred_window_holds(size):
     image = np.random.default_rng(3).integers(0, 256, (*size, 3), dtype=np.uint8)
     amplitudes = np.abs(np.fft.fft2(image.astype(np.float64), axes=(0, 1))).sum(axis=2)

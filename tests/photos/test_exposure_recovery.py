@@ -56,11 +56,10 @@ def held_out(run: Path) -> float:
 
 
 def test_known_exposures_are_found_again_from_scratch(as_they_are, rng, tmp_path):
-    """Exposures begin alike, for the dataset has no tracks.  `plain`: of the photographs as they are."""
+    """Exposures begin alike, for the dataset has no tracks."""
     truth = changed(as_they_are, tmp_path / "gain_scene", rng)
     shutil.copytree(tmp_path / "gain_scene", tmp_path / "none_scene")
-    shutil.copytree(as_they_are, tmp_path / "plain_scene")
-    for name, more in (("gain", (GAIN,)), ("none", ()), ("plain", ())):
+    for name, more in (("gain", (GAIN,)), ("none", ())):
         train(tmp_path / f"{name}_scene", tmp_path / name, *FEW, *more)
     table = json.loads((tmp_path / "gain" / "view_colours.json").read_text())["photographs"]
     names = list(table)
@@ -69,6 +68,6 @@ def test_known_exposures_are_found_again_from_scratch(as_they_are, rng, tmp_path
     errors = found - found.mean() - (known - known.mean())
     assert np.std(known) > 0.25
     assert np.sqrt(np.mean(errors**2)) < 0.08, "measured: 0.05"
-    psnr = {name: held_out(tmp_path / name) for name in ("gain", "none", "plain")}
-    assert psnr["gain"] > psnr["plain"] - 0.7, "dB; measured: 29.1 and 29.3"
+    psnr = {name: held_out(tmp_path / name) for name in ("gain", "none")}
+    assert psnr["gain"] > 28.4, "dB; measured: 29.1, and 29.3 of the photographs as they were"
     assert psnr["none"] < psnr["gain"] - 1.2, "dB; measured: 27.0"

@@ -29,7 +29,7 @@ def test_a_loss_that_is_not_symmetric_is_refused_before_a_run():
         training.model_copy(update={"losses": [*training.losses, other]}).check()
 
 
-@pytest.mark.parametrize("recipe", ["auto_opti3dgs", "auto_opti3dgs_7k"])
+@pytest.mark.parametrize("recipe", ["auto_opti3dgs_7k"])
 def test_filter_follows_the_same_course_in_its_share_of_steps(recipe):
     """By its own loss: from the mean of squares to the photograph, long before the end."""
     training = load(recipe).settings.training

@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import DataError
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import DeviceInfo
 from clsplat.photos.photographs import Photographs
 from clsplat.render.camera import upload_camera
 from clsplat.scene.detect import read_scene
+
+
+@pytest.fixture
+def any_device(info: DeviceInfo) -> Device:
+    """What is held of photographs depends on no schedule."""
+    return Device(info)
 
 
 def test_buffers_are_counted_while_they_live(device):
@@ -24,11 +32,11 @@ def test_buffers_are_counted_while_they_live(device):
     assert device.allocated == before
 
 
-@pytest.mark.parametrize("kept", [0, 1, 3, 100])
-def test_photographs_keep_to_the_budget(device, tiny_scene, kept):
+@pytest.mark.parametrize("kept", [0, 3, 100])
+def test_photographs_keep_to_the_budget(any_device, tiny_scene, kept):
     views = read_scene(tiny_scene).split("train")
     size = 3 * views[0].camera.width * views[0].camera.height
-    tight, plenty = Photographs(device, "white", budget=kept * size), Photographs(device, "white")
+    tight, plenty = Photographs(any_device, "white", budget=kept * size), Photographs(any_device, "white")
     for turn in range(3):
         tight.announce(views[turn : turn + 2])
         for view in views:
@@ -37,25 +45,25 @@ def test_photographs_keep_to_the_budget(device, tiny_scene, kept):
 
 
 @pytest.mark.parametrize("kept", [0, 100])
-def test_photograph_has_the_camera_of_the_requested_view(device, tiny_scene, kept):
+def test_photograph_has_the_camera_of_the_requested_view(any_device, tiny_scene, kept):
     """Whatever camera the same photograph had before: one of a measurement, in a training that learns cameras."""
     view = read_scene(tiny_scene).views[0]
     other = replace(
         view, camera=view.camera.zoomed(0.9), world_to_camera=view.world_to_camera + np.float64([0, 0, 0, 0.1])
     )
-    photographs = Photographs(device, "white", budget=kept << 20)
+    photographs = Photographs(any_device, "white", budget=kept << 20)
     for one in (other, view, other):
-        expected = upload_camera(device, one)
+        expected = upload_camera(any_device, one)
         for camera in (photographs.get(one).camera, photographs.camera(one)):
             assert camera.values == expected.values
             np.testing.assert_array_equal(camera.array.get(), expected.array.get())
 
 
-def test_damaged_photograph_read_ahead_is_reported_on_request(device, tiny_scene, tmp_path):
+def test_damaged_photograph_read_ahead_is_reported_on_request(any_device, tiny_scene, tmp_path):
     damaged = tmp_path / "damaged.png"
     damaged.write_bytes(b"not an image")
     view = replace(read_scene(tiny_scene).split("train")[0], image_path=damaged)
-    photographs = Photographs(device, "white")
+    photographs = Photographs(any_device, "white")
     photographs.announce([view])
     with pytest.raises(DataError, match=r"damaged\.png"):
         photographs.get(view)

@@ -21,7 +21,7 @@ from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.camera_optimizer import FocalLengths, Move, PhotographPoses, Poses
 from clsplat.training.trainer import Trainer
 
-VIEWS, STEPS, ANGLE, DEPTH = 6, 900, np.radians(0.3), 3.0
+VIEWS, STEPS, ANGLE, DEPTH = 6, 300, np.radians(0.3), 3.0
 STILL = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=0, sh_rest=0)  # cameras alone are unknown
 
 
@@ -36,7 +36,7 @@ def errors(truth: list[View], found: list[np.ndarray]) -> tuple[float, float]:
 
 
 def learned(
-    rng: np.random.Generator, info, jitter: float, zoom: float = 1.0, steps: int = STEPS
+    rng: np.random.Generator, info, jitter: float, zoom: float = 1.0
 ) -> tuple[tuple[float, float], tuple[float, float], float]:
     """Errors of cameras before and after they are learned, and of the focal length after it as a factor.
 
@@ -61,26 +61,18 @@ def learned(
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
         photographs.append(Photograph(replace(upload_camera(device, given), view=number), device.upload(pixels)))
     numbers = dict[str, float]()
-    rate = Decay(initial=2e-3, final=2e-5, over=steps)
+    rate = Decay(initial=2e-3, final=2e-5, over=STEPS)
     settings = Poses(start=0, turn=rate, shift=rate, focal="auto")
-    focals = FocalLengths.of(views, settings.focal_rate(steps, 1))
-    poses = PhotographPoses(views, 0, *settings.rates(steps, VIEWS), focals)
+    focals = FocalLengths.of(views, settings.focal_rate(STEPS, 1))
+    poses = PhotographPoses(views, 0, *settings.rates(STEPS, VIEWS), focals)
     poses.begin(numbers, dict.fromkeys((view.name for view in views), DEPTH))
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians, []), background
     trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), STILL, numbers=numbers, poses=poses)
-    for step in range(1, steps + 1):
+    for step in range(1, STEPS + 1):
         trainer.step(photographs[step % VIEWS], step)
     given = [view.world_to_camera for view in views]
     found = [poses.pose(numbers, number) for number in range(VIEWS)]
     return errors(truth, given), errors(truth, found), zoom * poses.focals.factor(numbers, views[-1].name)
-
-
-def test_jittered_cameras_are_found_again(rng, info):
-    before, after, _ = learned(rng, info, 1.0)
-    print(np.degrees(before[0]), np.degrees(after[0]), before[1], after[1])
-    assert np.degrees(before[0]) > 0.4
-    assert after[0] < before[0] / 5
-    assert after[1] < before[1] / 5
 
 
 def test_exact_cameras_stay(rng, info):
@@ -93,8 +85,9 @@ def test_exact_cameras_stay(rng, info):
 
 
 def test_a_wrong_focal_length_is_found_again_beside_poses(rng, info):
-    before, after, factor = learned(rng, info, 1.0, 0.98, steps=STEPS // 3)
+    before, after, factor = learned(rng, info, 1.0, 0.98)
     print(factor, np.degrees(after[0]), after[1])
+    assert np.degrees(before[0]) > 0.4
     assert factor == pytest.approx(1, abs=0.001)
     assert after[0] < before[0] / 5
     assert after[1] < before[1] / 5

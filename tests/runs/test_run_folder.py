@@ -36,20 +36,18 @@ def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
         outputs.check_places(load("photos", [f"scene.path={str(photographs)!r}"]), photographs / "run")
 
 
-@pytest.mark.parametrize(
-    "name", ["renders", "report.html", "point_cloud.ply", *sorted(files.OF_A_RUN - {files.PIPELINE})]
-)
-def test_a_link_that_leads_outside_is_not_followed(name, tiny_scene, tmp_path):
-    out = tmp_path / "run"
-    out.mkdir()
-    (out / name).symlink_to(tmp_path / "elsewhere")
-    for _ in ("new", "with a run"):
-        with pytest.raises(ConfigError, match=f"{name}: a link leads outside of the run folder"):
-            opened(tiny_scene, out)
-        (out / "pipeline.yaml").touch()
-    (out / name).unlink()
-    (out / name).symlink_to(out / "inside")
-    opened(tiny_scene, out)
+def test_a_link_that_leads_outside_is_not_followed(tiny_scene, tmp_path):
+    for name in ("renders", "report.html", "point_cloud.ply", *files.OF_A_RUN - {files.PIPELINE}):
+        out = tmp_path / f"run of {name}"
+        out.mkdir()
+        (out / name).symlink_to(tmp_path / "elsewhere")
+        for _ in ("new", "with a run"):
+            with pytest.raises(ConfigError, match=f"{name}: a link leads outside of the run folder"):
+                opened(tiny_scene, out)
+            (out / "pipeline.yaml").touch()
+        (out / name).unlink()
+        (out / name).symlink_to(out / "inside")
+        opened(tiny_scene, out)
 
 
 def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path):
@@ -68,21 +66,24 @@ def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path
     opened(tiny_scene, tmp_path)
 
 
-@pytest.mark.parametrize("name", sorted(files.OF_A_RUN - {files.PIPELINE, files.CHECKPOINTS, files.UNDISTORTED}))
-def test_foreign_files_with_names_of_a_run_are_not_replaced(name, tiny_scene, tmp_path):
-    (tmp_path / name).write_text('{"state": "mine"}')
-    for start in ("new", "resume", "restart"):
+def test_foreign_files_with_names_of_a_run_are_not_replaced(tiny_scene, tmp_path):
+    for name in files.OF_A_RUN - {files.PIPELINE, files.CHECKPOINTS, files.UNDISTORTED}:
+        out = tmp_path / f"run of {name}"
+        out.mkdir()
+        (out / name).write_text('{"state": "mine"}')
+        for start in ("new", "resume", "restart"):
+            with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
+                Job.open("smoke", tiny_scene, out, start=start).run()
+        assert [path.name for path in out.iterdir()] == [name]
+        assert (out / name).read_text() == '{"state": "mine"}'
+
+
+def test_foreign_files_with_names_of_a_matrix_are_not_replaced(tmp_path):
+    for name in files.OF_A_MATRIX - {files.PIPELINE}:
+        (tmp_path / name).write_text("mine")
         with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
-            Job.open("smoke", tiny_scene, tmp_path, start=start).run()
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-    assert (tmp_path / name).read_text() == '{"state": "mine"}'
-
-
-@pytest.mark.parametrize("name", sorted(files.OF_A_MATRIX - {files.PIPELINE}))
-def test_foreign_files_with_names_of_a_matrix_are_not_replaced(name, tmp_path):
-    (tmp_path / name).write_text("mine")
-    with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
-        experiment.check_matrix_folder(tmp_path)
+            experiment.check_matrix_folder(tmp_path)
+        (tmp_path / name).unlink()
 
 
 def test_what_a_run_that_never_began_has_left_is_its_own(tiny_scene, tmp_path):

@@ -99,7 +99,6 @@ def test_the_step_is_that_of_the_last_report_where_it_is_later(tmp_path):
         ("time", "1e999"),
         ("time", "NaN"),
         ("time", "9" * 400),
-        ("seconds_left", "9" * 4000),
         ("step", "9" * 4000),
         ("cells", "[]"),
         ("host", "{}"),

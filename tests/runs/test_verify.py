@@ -107,7 +107,7 @@ def test_a_changed_byte_in_any_file_is_noticed(finished, copy):
     assert damaged(copy) == {}
 
 
-@pytest.mark.parametrize("content", [None, b"", b"[", b"\xff\x00", b"[]", b"1"])
+@pytest.mark.parametrize("content", [None, b"", b"\xff\x00", b"[]"])
 def test_a_file_that_is_gone_or_no_such_file_is_noticed(content, finished, copy):
     older = min(path.relative_to(finished).as_posix() for path in finished.glob("checkpoints/*"))
     for one in clsplat.check(finished)["objects"]:

@@ -57,8 +57,9 @@ def each_file(scene: Path, folder: Path, cases: int) -> list[tuple[str, int, boo
     whole, found = folder / "whole", []
     AtFile(scene, whole).wait()
     total = int(whole.with_suffix(".count").read_text())
-    for moment in MOMENTS:
-        for at in range(1, total + 1, max(1, total // cases)):
+    stride = max(1, total // cases)
+    for number, moment in enumerate(MOMENTS):
+        for at in range(1 + stride * (1 + 2 * number) // 4, total + 1, stride):
             out = folder / f"{moment} {at}"
             killed = AtFile(scene, out, at, moment).end() == -signal.SIGKILL
             code = AtFile(scene, out).end()

@@ -1,4 +1,4 @@
-"""A few kills of the long form, and a kill at the n-th file of a run: resumed, it ends with the same bits."""
+"""A kill of the long form, and a kill at the n-th file of a run: resumed, it ends with the same bits."""
 
 import json
 import os
@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from clsplat.conformance import quick
-from clsplat.data_tools.synthetic import Options, write_dataset
 from tests.torture import __main__ as torture
 from tests.torture import each_file, kills
 
@@ -18,21 +17,21 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reas
 SCRIPT = """
 import json, sys
 from pathlib import Path
-from tests.torture.kills import kills
-*_, tally = kills(Path(sys.argv[1]), Path(sys.argv[2]), 2)
+from tests.torture import kills
+kills.SETTINGS = {"smoke": {"checkpoint.every": 1, "optimize.steps": 8, "init.count": 60}}
+*_, tally = kills.kills(Path(sys.argv[1]), Path(sys.argv[2]), 1)
 print(json.dumps(tally))
 """
 
 
-def test_a_few_kills(tmp_path):
+def test_a_kill_at_a_random_moment(tiny_scene, tmp_path):
     """In a process that has opened no device: one that has cannot be forked."""
-    write_dataset(tmp_path / "scene", Options(size=40, train=8, test=2, seed=0), workers=1)
-    command = [sys.executable, "-c", SCRIPT, tmp_path / "scene", tmp_path / "runs"]
+    command = [sys.executable, "-c", SCRIPT, tiny_scene, tmp_path / "runs"]
     root = Path(__file__).parents[2]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     tally = json.loads(done.stdout.splitlines()[-1])
-    assert tally["killed"] >= 2
+    assert tally["killed"] >= 1
     assert tally["equal"] == tally["finished"] > 0
 
 
@@ -81,7 +80,7 @@ def test_a_row_counts_the_cases_that_its_tests_have_tried(tmp_path):
     assert torture.tested("a", "holds", 7, str(tmp_path / "test_none.py")).cases == 7
 
 
-CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 4  # of each moment; `make torture` tries every file
+CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 1  # of each moment; `make torture` tries every file
 
 
 def test_whichever_file_is_being_written_nothing_is_lost(tiny_scene, tmp_path, record_property):
@@ -90,6 +89,6 @@ def test_whichever_file_is_being_written_nothing_is_lost(tiny_scene, tmp_path, r
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
-    assert len(found) >= 8
+    assert len(found) >= 2
     assert [case for case in found if case[2:] != [True, 0, True]] == []
     record_property("cases", len(found))

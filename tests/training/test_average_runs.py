@@ -38,16 +38,22 @@ stages:
 """
 
 
-@pytest.fixture
-def pipeline(tmp_path):
-    file = tmp_path / "averaged.yaml"
+@pytest.fixture(scope="module")
+def pipeline(tmp_path_factory):
+    file = tmp_path_factory.mktemp("pipeline") / "averaged.yaml"
     file.write_text(AVERAGED)
     return str(file)
 
 
-def test_run_ends_with_the_average_of_the_added_steps(tiny_scene, tmp_path, pipeline):
+@pytest.fixture(scope="module")
+def averaged(tiny_scene, tmp_path_factory, pipeline) -> Run:
+    """A finished run; nothing is changed in it."""
+    return train(tiny_scene, tmp_path_factory.mktemp("averaged") / "run", pipeline=pipeline)
+
+
+def test_run_ends_with_the_average_of_the_added_steps(averaged):
     """Those at 18, 20, ... 28: no edit follows the last step."""
-    run = train(tiny_scene, tmp_path / "run", pipeline=pipeline)
+    run = averaged
     of_step = {int(path.stem.removeprefix("step_")): path for path in checkpoint.saved(run.out)}
     found = read_ply(run.out / "point_cloud.ply").parameters
     for name in PARAMETERS:
@@ -58,8 +64,8 @@ def test_run_ends_with_the_average_of_the_added_steps(tiny_scene, tmp_path, pipe
     assert not [table for table in run.model.gaussians.tables if table.startswith("average/")]
 
 
-def test_it_is_the_same_after_a_stop_and_when_it_is_done_again(tiny_scene, tmp_path, pipeline):
-    whole = train(tiny_scene, tmp_path / "whole", pipeline=pipeline).out
+def test_it_is_the_same_after_a_stop(tiny_scene, tmp_path, pipeline, averaged):
+    whole = averaged.out
     expected = (whole / "point_cloud.ply").read_bytes()
     again = tmp_path / "again"
     shutil.copytree(whole, again)
@@ -74,9 +80,9 @@ def test_it_is_the_same_after_a_stop_and_when_it_is_done_again(tiny_scene, tmp_p
     assert (again / "point_cloud.ply").read_bytes() == expected
 
 
-def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, pipeline):
+def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, pipeline, averaged):
     longer = train(tiny_scene, tmp_path / "longer", "optimize.steps=40", pipeline=pipeline).out
-    run = train(tiny_scene, tmp_path / "run", pipeline=pipeline).out
+    run = shutil.copytree(averaged.out, tmp_path / "run")
     train(tiny_scene, run, "optimize.steps=40", pipeline=pipeline, resume=True)
     assert (run / "point_cloud.ply").read_bytes() == (longer / "point_cloud.ply").read_bytes()
 
@@ -119,13 +125,12 @@ def test_an_average_is_taken_once(tmp_path, name):
         load(str(file))
 
 
-def test_a_trainer_takes_the_average_with_its_last_step(tiny_scene, tmp_path, pipeline):
-    run = train(tiny_scene, tmp_path / "run", pipeline=pipeline)
+def test_a_trainer_takes_the_average_with_its_last_step(tiny_scene, tmp_path, pipeline, averaged):
     trainer = Trainer(tiny_scene, pipeline)
     for _ in range(STEPS):
         trainer.step()
     trainer.model.save(tmp_path / "model.ply")
-    assert (tmp_path / "model.ply").read_bytes() == (run.out / "point_cloud.ply").read_bytes()
+    assert (tmp_path / "model.ply").read_bytes() == (averaged.out / "point_cloud.ply").read_bytes()
     with pytest.raises(StopIteration):
         trainer.step()
 

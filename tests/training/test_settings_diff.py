@@ -72,10 +72,10 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("change", CHANGES)
-def test_a_class_says_what_may_change(change, pipeline):
-    found = kinds(pipeline(TRAINING), pipeline(TRAINING, change))
-    assert set(found.values()) == {CHANGES[change]}, found
+def test_a_class_says_what_may_change(pipeline):
+    found = {change: set(kinds(pipeline(TRAINING), pipeline(TRAINING, change)).values()) for change in CHANGES}
+    faults = [f"{change}: {kind}" for change, kind in found.items() if kind != {CHANGES[change]}]
+    assert not faults, "\n".join(faults)
 
 
 def test_a_stage_of_a_plugin_says_what_of_it_may_change(pipeline, without_plugins):

@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -74,8 +75,13 @@ def made_up(rng: np.random.Generator, views: int, steps: int, noise: float) -> l
     return [(f"view {rng.integers(views)}", float(loss)) for loss in falling]
 
 
-@pytest.mark.parametrize("least", ["auto", 0, 0.4, 1])
-@pytest.mark.parametrize(("views", "noise", "decay"), [(1, 0.1, 0.95), (7, 0.02, 0.95), (7, 0.3, 0.5), (30, 0.1, 0.0)])
+@pytest.mark.parametrize(
+    ("views", "noise", "decay", "least"),
+    [
+        *((1, 0.1, 0.95, "auto"), (7, 0.02, 0.95, "auto"), (7, 0.3, 0.5, "auto"), (30, 0.1, 0.0, "auto")),
+        *((7, 0.3, 0.5, 0), (7, 0.3, 0.5, 0.4), (7, 0.3, 0.5, 1), (1, 0.1, 0.95, 0.4)),
+    ],
+)
 def test_the_rule_is_that_of_plain_sums(rng, least, views, noise, decay):
     skip = Skip(start=0, warm_up=40, decay=decay, least=least)
     visits = made_up(rng, views, 160, noise)
@@ -85,7 +91,7 @@ def test_the_rule_is_that_of_plain_sums(rng, least, views, noise, decay):
     assert any(found) == (least != 1)
 
 
-@pytest.mark.parametrize("least", [0.1, 0.37, 0.5, 0.9])
+@pytest.mark.parametrize("least", [0.1, 0.9])
 def test_the_least_share_of_whole_steps_is_kept_and_used(least):
     """Losses that only fall would all be skipped."""
     visits = [(f"view {step % 9}", 1 / (1 + step)) for step in range(2000)]
@@ -216,7 +222,7 @@ def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatc
 # ---- runs
 
 
-def test_runs_that_skip_resume_and_repeat_to_the_bit(tiny_scene, tmp_path, caplog):
+def test_a_run_that_skips_resumes_to_the_bit(tiny_scene, tmp_path, caplog):
     caplog.set_level(logging.INFO, "clsplat")
     settings = (FROM_5, "optimize.checkpoint.keep=9", "densify.stop=30")
     first = train(tiny_scene, tmp_path / "first", *settings)
@@ -227,11 +233,11 @@ def test_runs_that_skip_resume_and_repeat_to_the_bit(tiny_scene, tmp_path, caplo
     line = f"{told['skipped']} of 45 steps after step 5 were skipped; at least 25.0% were to do the whole work"
     assert caplog.text.count(line) == 1
     whole = digest(first.out)
-    again = train(tiny_scene, tmp_path / "again", *settings)
-    assert digest(again.out) == whole
+    again = shutil.copytree(first.out, tmp_path / "again")
     for step in (30, 40, 50):
-        (again.out / "checkpoints" / f"step_{step:06d}.npz").unlink()
-    (again.out / "point_cloud.ply").unlink()
+        (again / "checkpoints" / f"step_{step:06d}.npz").unlink()
+    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
+        (again / name).unlink()
     resumed = train(tiny_scene, tmp_path / "again", *settings, resume=True)
     assert digest(resumed.out) == whole
     assert resumed.numbers == first.numbers
@@ -240,12 +246,12 @@ def test_runs_that_skip_resume_and_repeat_to_the_bit(tiny_scene, tmp_path, caplo
 
 def test_auto_takes_its_share_from_the_warm_up(tiny_scene, tmp_path):
     """Of forty steps on eight photographs, the first visits at least."""
-    settings = ("optimize.skip={start: 2, warm_up: 40}", "optimize.steps=120", *NO_EDITS)
+    settings = ("optimize.skip={start: 2, warm_up: 40}", "optimize.steps=80", *NO_EDITS)
     run = train(tiny_scene, tmp_path / "run", *settings)
     (told,) = run.records.read("skip")
     assert 8 / 40 <= told["least"] == run.numbers["skip/above"] / 40
-    assert told["steps"] == 118
-    assert 0 < told["skipped"] <= (1 - told["least"]) * 118
+    assert told["steps"] == 78
+    assert 0 < told["skipped"] <= (1 - told["least"]) * 78
 
 
 def test_up_to_the_start_the_bits_are_those_without_it(tiny_scene, few_steps, tmp_path):

@@ -16,13 +16,14 @@ from clsplat.core.resources import full_version
 from clsplat.sweeps.experiment import Job
 from clsplat.training import status as writing
 from clsplat.training.status import StatusFile
-from tests.support.runs import digest, train
+from tests.support.runs import FEW, digest, train
 
 pytestmark = pytest.mark.slow
 
 # statuses of this version have no other keys
 SCHEMA = Draft202012Validator({**clsplat.status_schema(), "additionalProperties": False})
-MATRIX = "name: two\nmatrix:\n  pipelines: [smoke]\n  seeds: [1, 2]\n"
+MATRIX = "name: two\nmatrix:\n  pipelines: [smoke]\n  seeds: [1, 2]\n  steps: 10\n"
+SHORT = {key: int(value) for key, value in (setting.split("=") for setting in FEW)}
 
 
 @pytest.fixture
@@ -63,7 +64,7 @@ def in_order(items: list) -> list:
 
 
 def test_every_status_of_a_run_fits_the_schema(written, tiny_scene, tmp_path):
-    clsplat.run("smoke", tiny_scene, tmp_path / "run")
+    clsplat.run("smoke", tiny_scene, tmp_path / "run", set=SHORT)
     for status in written:
         SCHEMA.validate(status)
     assert in_order([status["state"] for status in written]) == ["starting", "preparing", "running", "done"]
@@ -72,9 +73,9 @@ def test_every_status_of_a_run_fits_the_schema(written, tiny_scene, tmp_path):
     assert {"init", "optimize", "densify", "checkpoint", "evaluate", "export", "render", "report"} <= set(stages)
     training = [s["progress"] for s in written if s.get("stage") == "optimize" and s.get("progress")]
     assert [amount["done"] for amount in training] == sorted(amount["done"] for amount in training)
-    assert {(amount["total"], amount["unit"]) for amount in training} == {(50, "steps")}
+    assert {(amount["total"], amount["unit"]) for amount in training} == {(12, "steps")}
     last = written[-1]
-    assert (last["exit_code"], last["step"], last["steps"], last["stage"]) == (0, 50, 50, "report")
+    assert (last["exit_code"], last["step"], last["steps"], last["stage"]) == (0, 12, 12, "report")
     assert last["device"]
     assert last["version"] == full_version()
     assert "seconds_left" not in last
@@ -91,7 +92,7 @@ def test_run_that_ends_early_names_the_stage_and_fits_the_schema(
 
     monkeypatch.setattr("clsplat.stages.evaluate.measure", fail)
     with pytest.raises(ClsplatError):
-        clsplat.run("smoke", tiny_scene, tmp_path / "run")
+        clsplat.run("smoke", tiny_scene, tmp_path / "run", set=SHORT)
     for status in written:
         SCHEMA.validate(status)
     last = written[-1]
@@ -172,7 +173,7 @@ def test_a_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, capl
 
     monkeypatch.setattr(writing, "write_text", write)
     monkeypatch.setattr(writing, "BEAT", 0.002)
-    clsplat.run("smoke", tiny_scene, tmp_path / "run")
+    clsplat.run("smoke", tiny_scene, tmp_path / "run", set=SHORT)
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "done"
     name = tmp_path / "run" / "status.json"
     assert [m for m in caplog.messages if str(name) in m] == [
@@ -182,9 +183,9 @@ def test_a_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, capl
 
 def test_a_heartbeat_changes_no_bit(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "BEAT", 1000.0)
-    train(tiny_scene, tmp_path / "slow")
+    train(tiny_scene, tmp_path / "slow", *FEW)
     monkeypatch.setattr(writing, "BEAT", 0.0005)
-    train(tiny_scene, tmp_path / "fast")
+    train(tiny_scene, tmp_path / "fast", *FEW)
     assert digest(tmp_path / "slow") == digest(tmp_path / "fast")
 
 

@@ -16,6 +16,7 @@ from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
 from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import DeviceInfo
 from clsplat.photos.photographs import Photographs
 from clsplat.photos.sampling import Sampler
 from clsplat.pipeline.loading import load
@@ -34,6 +35,12 @@ PENALTIES = (
     "above: 2.0, weight: 0.01}]"
 )
 BLUR = "optimize.views.transforms=[{type: blur, sigma: 1.5}]"
+
+
+@pytest.fixture
+def any_device(info: DeviceInfo) -> Device:
+    """A device with the schedule that it would choose."""
+    return Device(info)
 
 
 @pytest.mark.parametrize("overrides", [(), (PENALTIES, BLUR)], ids=["losses", "penalties and a blur"])
@@ -86,17 +93,17 @@ def test_differentiating_updates_nothing(device, rng):
 
 
 @pytest.mark.parametrize("loss", [Loss(), print])
-def test_what_is_neither_image_loss_nor_penalty_is_refused(device, rng, loss):
-    trainer, photograph = trainer_of(device, rng, [L1(), loss])
+def test_what_is_neither_image_loss_nor_penalty_is_refused(any_device, rng, loss):
+    trainer, photograph = trainer_of(any_device, rng, [L1(), loss])
     with pytest.raises(ConfigError, match=r"^the loss \w+: expected a subclass of ImageLoss or of Penalty$"):
         trainer.step(photograph, 1)
 
 
 @pytest.mark.parametrize(("step", "expected"), [(1, 0.3), (9, 0.3), (10, 0.6)])
-def test_rates_and_weights_are_those_of_the_global_step(device, rng, step, expected):
+def test_rates_and_weights_are_those_of_the_global_step(any_device, rng, step, expected):
     """The first update of Adam moves by the rate, and means by the rate times the extent."""
     weight = {"points": [[0, 1.0], [10, 0.25]], "between": "steps"}
-    trainer, photograph = trainer_of(device, rng, [L1(weight=weight)])
+    trainer, photograph = trainer_of(any_device, rng, [L1(weight=weight)])
     trainer.extent = 3.0
     trainer.rates = Rates(means={"points": [[0, 0.1], [10, 0.2]], "between": "steps"}, quats=0.0)
     before = {name: trainer.model.gaussians.get(name) for name in ("means", "quats")}
@@ -109,8 +116,8 @@ def test_rates_and_weights_are_those_of_the_global_step(device, rng, step, expec
     assert view.loss == pytest.approx(full * (0.25 if step >= 10 else 1.0), rel=1e-6)
 
 
-def test_stale_parameters_stay(device, rng):
-    trainer, photograph = trainer_of(device, rng, [L1(), Anisotropy(above=1.0)])
+def test_stale_parameters_stay(any_device, rng):
+    trainer, photograph = trainer_of(any_device, rng, [L1(), Anisotropy(above=1.0)])
     before = {name: trainer.model.gaussians.get(name) for name in ("logit_opacity", "log_scales")}
     view = trainer.step(photograph, 1, stale=["logit_opacity"])
     assert [loss.name for loss in view.losses] == ["l1", "anisotropy"]
@@ -137,8 +144,8 @@ def test_rows_that_no_view_sees_stay(device, rng, losses):
         assert changed[seen].sum() > 15, name
 
 
-def test_what_a_mask_leaves_out_has_no_gradient(device, rng):
-    trainer, photograph = trainer_of(device, rng, [Dssim(), L2()])
+def test_what_a_mask_leaves_out_has_no_gradient(any_device, rng):
+    trainer, photograph = trainer_of(any_device, rng, [Dssim(), L2()])
     comparison = trainer.differentiate(photograph, 1).comparison
     for planes in (comparison.gradient, comparison.image, comparison.photograph):
         assert (planes.get()[:, :30, :13] == 0).all()
@@ -156,12 +163,12 @@ def mean_difference(image: np.ndarray, photograph: np.ndarray) -> tuple[float, n
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 33), (65, 12)])
-def test_a_loss_in_numpy_is_the_one_of_the_device(device, rng, width, height):
+def test_a_loss_in_numpy_is_the_one_of_the_device(any_device, rng, width, height):
     x, y = images(rng, width, height)
     weight = [[0, 0.5], [10, 1.5]]
     found = []
     for loss in (L1(weight=weight), HostLoss(mean_difference, weight)):
-        comparison = comparison_of(device, x, y)
+        comparison = comparison_of(any_device, x, y)
         comparison.step = 5
         value = loss.add(comparison)
         found.append((value.value(), gradient_of(comparison)))
@@ -172,20 +179,20 @@ def test_a_loss_in_numpy_is_the_one_of_the_device(device, rng, width, height):
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])
-def test_a_loss_in_numpy_adds_to_the_others_wherever_it_stands(device, rng, place):
+def test_a_loss_in_numpy_adds_to_the_others_wherever_it_stands(any_device, rng, place):
     x, y = images(rng, 40, 30)
     found = []
     for loss in (L1(weight=0.7), HostLoss(mean_difference, 0.7)):
         losses: list[ImageLoss] = [Dssim(weight=0.2), L2(weight=3.0)]
         losses.insert(place, loss)
-        comparison = comparison_of(device, x, y)
+        comparison = comparison_of(any_device, x, y)
         values = [one.add(comparison).value() for one in losses]
         found.append((sum(values), gradient_of(comparison)))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-6)
     np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-6 * np.abs(found[0][1]).max())
 
 
-def test_a_loss_in_numpy_trains_as_the_one_of_the_device(device, rng):
+def test_a_loss_in_numpy_trains_as_the_one_of_the_device(any_device, rng):
     """With a mask: what it leaves out is black in both images that the function is given."""
     state, tables = rng.bit_generator.state, []
     seen = []
@@ -196,7 +203,7 @@ def test_a_loss_in_numpy_trains_as_the_one_of_the_device(device, rng):
 
     for loss in (L1(), HostLoss(watched)):
         rng.bit_generator.state = state
-        trainer, photograph = trainer_of(device, rng, [loss])
+        trainer, photograph = trainer_of(any_device, rng, [loss])
         for step in range(1, 4):
             trainer.step(photograph, step)
         tables.append(trainer.model.gaussians.get("means"))
@@ -205,20 +212,20 @@ def test_a_loss_in_numpy_trains_as_the_one_of_the_device(device, rng):
     assert seen[0][3] > 0.9
 
 
-def test_a_derivative_of_another_shape_is_refused(device, rng):
+def test_a_derivative_of_another_shape_is_refused(any_device, rng):
     x, y = images(rng, 5, 4)
     loss = HostLoss(lambda image, photograph: (0.0, np.zeros((3, 4, 5), np.float32)))
     with pytest.raises(ValueError, match=r"derivative of \(3, 4, 5\); expected \(4, 5, 3\), as the image"):
-        loss.add(comparison_of(device, x, y))
+        loss.add(comparison_of(any_device, x, y))
 
 
 @pytest.mark.parametrize("found", [None, 0.0, (0.0,), ("much", np.zeros((4, 5, 3))), (0.0, "much"), (0.0, None, 1)])
-def test_a_loss_that_returns_no_value_and_derivative_is_refused(device, rng, found):
+def test_a_loss_that_returns_no_value_and_derivative_is_refused(any_device, rng, found):
     def odd(image, photograph):
         return found
 
     with pytest.raises(ValueError, match=r"^the loss '?(odd)?.* returned .*; expected ") as caught:
-        HostLoss(odd).add(comparison_of(device, *images(rng, 5, 4)))
+        HostLoss(odd).add(comparison_of(any_device, *images(rng, 5, 4)))
     assert "\n" not in str(caught.value)
 
 

