@@ -10,6 +10,9 @@ Names are imported when they are first used, and no device is opened before that
 """
 
 import importlib
+import sys
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_file_location
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,9 +75,19 @@ if TYPE_CHECKING:
     from clsplat.scene.view_selection import Choice as Choice
     from clsplat.scene.view_selection import Split as Split
 
-_HERE = Path(__file__).resolve().parent
-if not (_HERE / "data_tools").is_dir():  # a checkout has clsplat.data_tools next to the package
-    __path__.append(str(_HERE.parent))
+
+class _CheckoutFinder:
+    """Finds clsplat.data_tools in a checkout, which has it next to the package."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        folder = Path(__file__).resolve().parents[1] / "data_tools"
+        if name != "clsplat.data_tools" or not folder.is_dir():
+            return None
+        return spec_from_file_location(name, folder / "__init__.py", submodule_search_locations=[str(folder)])
+
+
+sys.meta_path.append(_CheckoutFinder)
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.commands": "cancel check compare_runs compress_model convert copy_pipeline describe_run evaluate"
     " pipeline_schema pipelines plan_in_blocks resume run run_cell status status_schema"

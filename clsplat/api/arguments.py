@@ -39,9 +39,12 @@ def _plain(value: Any) -> Any:
 
 def load_plugins() -> None:
     """Import the plug-ins of installed packages, once."""
-    from clsplat.pipeline import plugins
+    from importlib.metadata import entry_points
 
-    plugins.load_installed()
+    if entry_points(group="clsplat.plugins"):  # without any, the command line starts without OpenCL and pydantic
+        from clsplat.pipeline import plugins
+
+        plugins.load_installed()
 
 
 def path_of(value: PathLike | None) -> Path | None:

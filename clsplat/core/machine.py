@@ -1,4 +1,4 @@
-"""The folder of what may be lost: kernels that were built, runtimes that were tested."""
+"""This machine: the cache folder, cores, processes and their memory."""
 
 import atexit
 import ctypes

@@ -30,7 +30,7 @@ def full_version() -> str:
     if ".dev" not in __version__:
         return __version__
     commit = _commit(PACKAGE.parent)
-    return f"{__version__}+g{commit}" if commit else f"{__version__}+d{_digest(list_sources())}"
+    return f"{__version__}+g{commit}" if commit else f"{__version__}+d{_digest(_files_of_code())}"
 
 
 def list_sources() -> list[str]:
@@ -46,6 +46,17 @@ def list_sources() -> list[str]:
     ]
 
 
+def _files_of_code() -> list[str]:
+    """Names and hashes of all files of a program: recipes, page templates and made scenes too."""
+    folders = [PACKAGE if name == "clsplat" else resource_dir(name) for name in CODE]
+    return [
+        f"{folder.name}/{path.relative_to(folder).as_posix()} {sha256(path)}"
+        for folder in folders
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.suffix != ".pyc"
+    ]
+
+
 def _commit(root: Path) -> str:
     """The commit of a checkout whose code has no changes, else ""."""
     if not (root / ".git").exists() or _git(root, "status", "--porcelain", "--", *CODE) != "":
@@ -56,7 +67,9 @@ def _commit(root: Path) -> str:
 def _git(root: Path, *words: str) -> str | None:
     """What git prints, None where it fails or is not installed."""
     try:
-        done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, timeout=10, check=True)
+        done = subprocess.run(
+            ["git", "--no-optional-locks", "-C", str(root), *words], capture_output=True, timeout=10, check=True
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.decode("utf-8", "replace").strip()

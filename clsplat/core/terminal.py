@@ -19,7 +19,7 @@ from clsplat.core.errors import OutputError
 from clsplat.core.files import told_as
 from clsplat.core.progress import Progress as TrainingProgress
 from clsplat.core.progress import clock, counts_shown, heard_by
-from clsplat.core.resources import __version__
+from clsplat.core.resources import full_version
 
 LOG = logging.getLogger("clsplat")
 CONSOLE = Console(file=signals.STDOUT, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
@@ -111,7 +111,7 @@ def logging_to(path: Path) -> Iterator[None]:
     if path.exists() and not path.is_file():
         raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or give another folder")
     form = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
-    first = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (__version__,), None)
+    first = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (full_version(),), None)
     with told_as(path):
         with path.open("a", encoding="utf-8") as file:
             file.write(form.format(first) + "\n")

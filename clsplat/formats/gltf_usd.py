@@ -1,4 +1,4 @@
-"""glTF with KHR_gaussian_splatting, in its binary container: points with attributes, one accessor each.
+"""glTF with KHR_gaussian_splatting in its binary container, and OpenUSD as text, which is only written.
 
     POSITION 3 · ROTATION x y z w, unit · SCALE 3, linear · OPACITY in [0, 1] · SH_DEGREE_l_COEF_m 3, in the order and
     with the signs of f_rest · COLOR_0 r g b a, linear, for viewers without the extension

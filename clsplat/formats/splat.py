@@ -1,4 +1,4 @@
-"""`.splat` of antimatter15: 32 bytes a splat, no header, no harmonics.
+"""`.splat` of antimatter15, 32 bytes a splat, and `.ksplat` of GaussianSplats3D, which is only read.
 
     position 3 float32 · linear scale 3 float32 · r g b a uint8: 255 (1/2 + C0 f_dc), 255 opacity
     quaternion w x y z uint8: 128 q + 128, q of unit length

@@ -1,4 +1,4 @@
-"""Relocation: faint Gaussians move to places that are opaque (3DGS-MCMC, Kheradmand et al. 2024)."""
+"""3DGS-MCMC (Kheradmand et al. 2024): relocation of faint Gaussians, and noise on the means."""
 
 from typing import Annotated, ClassVar, Literal
 

@@ -1,4 +1,4 @@
-"""What does not go together with Gaussians that move."""
+"""What settings of a pipeline exclude each other: motion, harmonics on the host, screen filters, a sky."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Rules that remove Gaussians, applied once: behind a training, or between two."""
+"""Stages that make a model smaller: cleanup, crop, fewer Gaussians, fewer harmonics, and what views hide."""
 
 import logging
 from collections.abc import Collection

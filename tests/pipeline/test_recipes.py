@@ -61,7 +61,7 @@ def words(node: Any) -> list[str]:
     )
 
 
-def test_recipes_of_7000_steps_differ_from_their_twins_in_numbers():
+def test_recipes_of_7000_steps_differ_from_twins_in_numbers():
     twins = {name: f"{name}_7k" for name in shipped() if f"{name}_7k" in shipped()}
     made_of = {name: words(load(name).settings.model_dump(mode="json")) for pair in twins.items() for name in pair}
     assert not [name for name, twin in twins.items() if made_of[name] != made_of[twin]]

@@ -16,7 +16,7 @@ def test_no_test_module_imports_another():
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("tests.")
         if (node.module or "").rpartition(".")[2].startswith("test_")
     ]
-    assert not faults, "move what they share to tests/support"
+    assert not faults, "move what they share to tests/support:\n" + "\n".join(faults)
 
 
 def test_names_of_tests_are_short():
@@ -26,4 +26,4 @@ def test_names_of_tests_are_short():
         for node in ast.walk(tree)
         if isinstance(node, ast.FunctionDef) and node.name.startswith("test_") and len(node.name) > MAX_LETTERS
     ]
-    assert not faults, f"more than {MAX_LETTERS} letters"
+    assert not faults, f"more than {MAX_LETTERS} letters:\n" + "\n".join(faults)

@@ -1,4 +1,4 @@
-"""One step of Adam."""
+"""What changes Gaussians between two steps: Adam, penalties, density rules, splitting matrices, k-means."""
 
 from dataclasses import dataclass
 from typing import Any
