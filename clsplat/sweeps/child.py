@@ -27,10 +27,13 @@ PYTHON, FILE, OUT = "{python}", "{pipeline}", "{out}"
 
 
 def run_command(device: str | None, plugins: Sequence[Path] = ()) -> Command:
-    """Return the command of a run on a device, which ends when its standard input does."""
+    """Return the command of a run on a device, which ends when its standard input does.
+
+    -P: nothing of the working folder is imported.
+    """
     loaded = [word for path in plugins for word in ("--plugin", str(path))]
     chosen = ["--device", device] if device else []
-    return [PYTHON, "-m", "clsplat", "--attended", *loaded, "run", FILE, "--out", OUT, "--resume", *chosen]
+    return [PYTHON, "-P", "-m", "clsplat", "--attended", *loaded, "run", FILE, "--out", OUT, "--resume", *chosen]
 
 
 def filled(command: Command, pipeline: Path, out: Path) -> list[str]:

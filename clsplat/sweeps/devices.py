@@ -183,7 +183,7 @@ def _run(device: str) -> str:
         folder = Path(name)
         write_text(folder / "probe.yaml", PIPELINE)
         scene = str(folder / "scene")
-        _call(device, [sys.executable, "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder)
+        _call(device, [sys.executable, "-P", "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder)
         words = filled(run_command(device), folder / "probe.yaml", folder / "run")
         _call(device, [*words, "--scene", scene], folder)
         return sha256(folder / "run" / "point_cloud.ply")[:CLASS]
