@@ -12,10 +12,11 @@ from pydantic import AfterValidator, Field, model_validator
 
 from clsplat.core.errors import NumericError, amount
 from clsplat.core.schedule import AtLeastOne, Bounded, Positive, at_step, places
-from clsplat.core.settings import OneOf
+from clsplat.core.settings import OneOf, variants
 from clsplat.density.budget import Budget, Moment
 from clsplat.density.control import Box, cap_opacity, decay_opacity, densify
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.statistics import Statistic
 from clsplat.density.thresholds import SceneScale
 from clsplat.training import adam
 from clsplat.training.run import Run
@@ -64,6 +65,17 @@ class Densify(Scheduled):
     def tables(self) -> set[str]:
         """Tables of the Gaussians that the rules read beside the parameters."""
         return {name for rule in self.rules for name in rule.tables}
+
+    @model_validator(mode="after")
+    def _with_known_statistics(self) -> "Densify":
+        known = variants(Statistic)
+        for rule in self.rules:
+            if unknown := sorted(rule.statistics - known.keys()):
+                name = getattr(rule, "type", type(rule).__name__)
+                raise ValueError(
+                    f"the rule '{name}' reads an unknown statistic '{unknown[0]}'; expected {', '.join(known)}"
+                )
+        return self
 
     @model_validator(mode="after")
     def _with_an_end(self) -> "Densify":

@@ -176,6 +176,13 @@ def test_entry_points_are_loaded_and_recorded_where_used(tmp_path, monkeypatch):
     sys.modules.pop("installed_rule")
 
 
+def test_rule_with_an_unknown_statistic_is_refused(tmp_path):
+    reads = "    @property\n    def statistics(self) -> set[str]:\n        return {'mean2d_gradient'}\n"
+    plugins.load_file(write(tmp_path, "clone_few", RULE.format(name="clone_few") + reads))
+    with pytest.raises(ConfigError, match=r"densify\.rules.*'clone_few'.*'mean2d_gradient'.*screen_grad"):
+        load("quickstart", ["densify.rules=[clone_few]"])
+
+
 STATISTIC = """
 from typing import Literal
 from clsplat.density.statistics import Statistic
