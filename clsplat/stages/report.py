@@ -25,9 +25,8 @@ from clsplat.scene.scene import SPLITS
 from clsplat.scene.view import View, some_of
 from clsplat.scene.viewpoint import across, closest_point, upward
 from clsplat.training.best_model import Measured
-from clsplat.training.modules.appearance import colours_of
-from clsplat.training.modules.camera_optimizer import refined
-from clsplat.training.modules.exposure import Gain
+from clsplat.training.modules.base import learned_scene
+from clsplat.training.modules.exposure import Gain, colours_of
 from clsplat.training.records import VIEWS, over_views
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
@@ -49,7 +48,7 @@ UNEVEN = 3.0  # times the median gap
 
 def advice(run: Run) -> list[str]:
     """Return sentences, or none where nothing stands out.  Renders at most MOST training views."""
-    views = refined(run.numbers, run.original).downscaled(run.downscale).split("train")
+    views = learned_scene(run).downscaled(run.downscale).split("train")
     chosen = some_of(views, MOST)
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
     found = measure(run.painter(), chosen, run.photographs, colours=Gain(), counted=counted)

@@ -8,7 +8,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import at_step
 from clsplat.photos.appearance import IDENTITY, ViewTable
 from clsplat.pipeline.loading import load
-from clsplat.training.modules.exposure import Affine, Auto, Gain, PhotographColours
+from clsplat.training.modules.exposure import Affine, AutoExposure, ExposureState, Gain
 
 MODELS = pytest.mark.parametrize("model", [Gain(), Affine()], ids=lambda model: model.type)
 
@@ -70,10 +70,11 @@ def test_table_changes_its_views_row_and_keeps_means_at_zero(rng):
 
 
 def test_a_view_has_one_row_at_all_its_sizes():
-    colours, numbers = PhotographColours(Gain(), ("a", "b", "a"), rate=0.01), {}
-    colours.begin(numbers, {})
-    colours.learn(numbers, 2, -IDENTITY, step=1)
-    assert colours.matrix(numbers, 0)[0, 0] == colours.matrix(numbers, 2)[0, 0] > 1 > colours.matrix(numbers, 1)[0, 0]
+    colours = ExposureState(Gain(), ("a", "b", "a"))
+    colours.rate = 0.01
+    colours.begin_with({})
+    colours.learn(2, -IDENTITY, step=1)
+    assert colours.matrix(0)[0, 0] == colours.matrix(2)[0, 0] > 1 > colours.matrix(1)[0, 0]
 
 
 def test_rates_follow_how_often_a_photograph_is_visited():
@@ -103,5 +104,5 @@ def test_the_key_takes_names_and_mappings():
     assert load("smoke").settings.training.colours is None
     assert colours("gain") == Gain()
     assert colours("{type: affine, weight: 0.1}") == Affine(weight=0.1)
-    assert colours("auto") == Auto()
+    assert colours("auto") == AutoExposure()
     assert colours("{type: auto, model: {type: affine}}").model == Affine()

@@ -18,8 +18,7 @@ from clsplat.sweeps.compare.comparison import Comparison
 from clsplat.sweeps.compare.page import main_table
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
-from clsplat.training.modules.appearance import colours_beside, colours_of, settled
-from clsplat.training.modules.exposure import Affine, Auto, Gain
+from clsplat.training.modules.exposure import AutoExposure, colours_beside
 from tests.support.exposed_wall import Wall
 from tests.support.runs import FEW, digest, killed, train
 
@@ -40,17 +39,18 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_gains, tiny_s
     run = train(tiny_scene, out, *GAIN, resume=True)
     again = train(tiny_scene, tmp_path / "again", *GAIN)
     assert digest(out) == digest(with_gains) == digest(tmp_path / "again")
-    assert run.numbers == again.numbers
+    assert run.modules["gain"].numbers == again.modules["gain"].numbers
 
 
 def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *GAIN)
     names = [view.name for view in run.scene.split("train")]
-    updates = [run.numbers.get(f"colours/{name}/exposure/updates", 0) for name in names]
+    numbers = run.modules["gain"].numbers
+    updates = [numbers.get(f"colours/{name}/exposure/updates", 0) for name in names]
     assert sum(updates) == 12
     assert len(set(updates)) > 1, "eight photographs, twelve steps"
     for column in ("exposure", "red", "blue"):
-        values = [run.numbers[f"colours/{name}/{column}"] for name in names]
+        values = [numbers[f"colours/{name}/{column}"] for name in names]
         assert sum(values) == pytest.approx(0, abs=1e-12)
         assert max(map(abs, values)) > 1e-3
     assert digest(tmp_path / "run") != digest(few_steps)
@@ -102,22 +102,9 @@ def test_where_colours_began_is_kept_with_them(rng, tmp_path):
     for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
         (tmp_path / "run" / name).unlink()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("clsplat.training.modules.appearance.exposures_of", lambda run: UNKNOWN)
+        patch.setattr("clsplat.training.modules.exposure.exposures_of", lambda run: UNKNOWN)
         again = train(tmp_path / "scene", tmp_path / "run", *gain, resume=True)
-    assert again.numbers == run.numbers
-
-
-def test_figures_use_the_colors_of_the_training_that_has_begun():
-    def colours(numbers: dict[str, float], *stages: object) -> object:
-        run = SimpleNamespace(
-            numbers=numbers, settings=SimpleNamespace(stages=[SimpleNamespace(colours=one) for one in stages])
-        )
-        return colours_of(run)
-
-    gain, off = {f"colours/a.png/{column}": 0.0 for column in Gain.columns}, Auto().choose("off", "they are alike")
-    assert colours({}, Gain()) is None
-    assert colours(gain, Gain(), Affine()) == Gain(), "the second has not begun"
-    assert colours(gain, Gain(), off) == Gain()
+    assert again.modules["gain"].numbers == run.modules["gain"].numbers
 
 
 def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_path):
@@ -131,9 +118,9 @@ def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_pat
     run = train(tiny_scene, tmp_path / "run", *GAIN, *kept, wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     then, _ = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    assert {name: run.numbers[name] for name in then.numbers} == then.numbers
+    assert run.modules["gain"].numbers == then.modules["gain"]
     (row, *_) = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"].items()
-    assert row[1]["exposure"] == then.numbers[f"colours/{row[0]}/exposure"]
+    assert row[1]["exposure"] == then.modules["gain"][f"colours/{row[0]}/exposure"]
 
 
 def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_path, few_steps):
@@ -176,7 +163,7 @@ def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
 def test_the_reason_says_which_bound_decided(spread, explained, chosen, said):
     exposures = Exposures({"a": np.full(3, spread), "b": np.full(3, -spread)}, "at 9 points", explained)
     run = SimpleNamespace(scene=SimpleNamespace(split=lambda _: []), exposures={(): exposures})
-    found = settled(Auto(), run)
+    found = AutoExposure().settled(run)
     assert (found.chosen, found.reason) == (chosen, exposures.text + said)
 
 

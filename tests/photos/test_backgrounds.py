@@ -12,7 +12,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.runs.describe import describe
 from clsplat.scene.detect import read_scene
 from clsplat.scene.view import load_image
-from clsplat.training.modules.random_background import Backgrounds
+from clsplat.training.modules.random_background import drawn_background
 from tests.support.runs import digest, train
 
 RANDOM = "optimize.background=random"
@@ -20,7 +20,7 @@ RANDOM = "optimize.background=random"
 
 def test_colours_depend_on_the_seed_and_the_step_alone():
     device = Device(choose())
-    drawn = [tuple(Backgrounds(device, seed).at(step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
+    drawn = [tuple(drawn_background(device, seed, step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
     assert len(set(drawn)) == 3
     assert drawn[0] == drawn[3]
 
@@ -28,7 +28,7 @@ def test_colours_depend_on_the_seed_and_the_step_alone():
 def test_photograph_has_the_drawn_color_where_transparent(tiny_scene):
     device, scene = Device(choose()), read_scene(tiny_scene)
     photographs, view = Photographs(device, "white"), scene.split("train")[0]
-    behind = Backgrounds(device, 0).at(3)
+    behind = drawn_background(device, 0, 3)
     height, width = view.camera.height, view.camera.width
 
     def shown() -> np.ndarray:

@@ -17,26 +17,21 @@ from clsplat.conformance.checks.images import camera_of, planes_of
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.schedule import Decay, at_step
 from clsplat.opencl.device import Device
-from clsplat.photos.appearance import bytes_of
 from clsplat.pipeline import plugins
 from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.status import summary
 from clsplat.training import archive, checkpoint, memory
-from clsplat.training.modules import exposure
-from clsplat.training.modules.appearance import colours_beside, photograph_colours
-from clsplat.training.modules.bilateral_grid import Grid
-from clsplat.training.modules.exposure import Auto, Gain
+from clsplat.training.modules.base import attached
+from clsplat.training.modules.bilateral_grid import Grid, bytes_of
+from clsplat.training.modules.exposure import AutoExposure, Gain, colours_beside
 from clsplat.training.run import Run
 from tests.support.runs import FEW, ONE_CORE, digest, killed, train
 
 PLAIN = '''
-from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
-import numpy as np
-from clsplat.training.modules.exposure import IDENTITY, OwnColours
-from clsplat.photos.appearance import ViewColours, Written
+from clsplat.training.modules.exposure import IDENTITY, ColourState, OwnColours, Written
 
 
 class Plain(OwnColours):
@@ -45,39 +40,23 @@ class Plain(OwnColours):
     columns: ClassVar[tuple[str, ...]] = ("steps",)
     type: Literal["plain"] = "plain"
 
-    def of_views(self, views, device, tables):
-        return Views(tuple(views), 0.0)
+    def state(self, run):
+        return Views(self, [view.name for view in run.scene.split("train")])
 
     def fitted(self, image, photograph):
         return IDENTITY
 
 
-@dataclass(frozen=True)
-class Views(ViewColours):
-    views: tuple[str, ...]
-    rate: object
+class Views(ColourState):
+    def begin_with(self, log_gains):
+        self.numbers |= {f"colours/{view}/steps": 0.0 for view in self.views}
 
-    def with_rate(self, rate):
-        return replace(self, rate=rate)
-
-    def begun(self, numbers):
-        return f"colours/{self.views[0]}/steps" in numbers
-
-    def begin(self, numbers, log_gains):
-        numbers |= {f"colours/{view}/steps": 0.0 for view in self.views}
-
-    def written(self, numbers):
-        steps = {view: numbers[f"colours/{view}/steps"] for view in self.views}
+    def written(self):
+        steps = {view: self.numbers[f"colours/{view}/steps"] for view in self.views}
         return Written(dict.fromkeys(self.views, IDENTITY), {"meaning": "none", "type": "plain", "photographs": steps})
 
-    def change(self, workspace, camera, image, numbers, view):
-        return image, lambda: 0.0
-
-    def change_back(self, workspace, camera, image, gradient, numbers, view, step):
-        def learn():
-            numbers[f"colours/{self.views[view]}/steps"] += 1
-
-        return gradient, learn
+    def update(self, step):
+        self.numbers[f"colours/{self.views[step.view]}/steps"] += 1
 '''
 GRID = (*FEW, "optimize.colours={type: grid, cells: [3, 2, 4]}")
 
@@ -126,11 +105,11 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_grids, tiny_s
     files = [(folder / "view_colours.npy").read_bytes() for folder in (out, with_grids)]
     assert files[0] == files[1]
     _, tables = checkpoint.load(out / "checkpoints" / "step_000012.npz")
-    own, _ = archive.split(tables, exposure.FOLDER)
+    own, _ = archive.split(tables, "modules/grid/")
     assert own.keys() == {"values", "moment1", "moment2"}
-    assert all((table == run.colour_grids.tables()[name]).all() for name, table in own.items())
+    assert all((table == run.modules["grid"].tables()[name]).all() for name, table in own.items())
     names = {view.name for view in run.scene.split("train")}
-    assert sum(run.numbers[f"colours/{name}/updates"] for name in names) == 12
+    assert sum(run.modules["grid"].numbers[f"colours/{name}/updates"] for name in names) == 12
 
 
 def bits(device: Device) -> str:
@@ -139,10 +118,10 @@ def bits(device: Device) -> str:
     one, workspace, camera = grids_of(device, rng, (5, 4, 3)), Workspace(device), camera_of(device, 100, 70)
     planes = [planes_of(device, camera, rng.normal(0.5, 0.4, (3, 70, 100))) for _ in range(2)]
     for step in (1, 2):
-        image, _ = one.change(workspace, camera, planes[0], {}, 1)
-        gradient, learn = one.change_back(workspace, camera, *planes, {}, 1, step)
-        learn()
-        for array in (image, gradient, *one.tables.arrays.values()):
+        image, _ = one.changed(workspace, camera, planes[0], 1), one.smoothness(workspace, 1)
+        gradient, by_grid = one.differentiated(workspace, camera, *planes, 1)
+        one.learn(workspace, 1, by_grid, step)
+        for array in (image, gradient, *one.arrays.values()):
             found.update(array.get().tobytes())
     return found.hexdigest()
 
@@ -181,7 +160,7 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
     run = train(tiny_scene, tmp_path / "run", *GRID, *kept, "optimize.evaluate.every=4", wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     _, tables = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    own, _ = archive.split(tables, exposure.FOLDER)
+    own, _ = archive.split(tables, "modules/grid/")
     expected = own["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
     found = np.load(tmp_path / "run" / "view_colours.npy")
     assert (found == expected + np.eye(3, 4, dtype=np.float32)).all()
@@ -191,13 +170,15 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
 @pytest.mark.parametrize("cells", [[1, 1, 1], [2, 3, 4], [4, 3, 2], [6, 1, 4]])
 def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
     """Also with as many of them."""
-    run, colours = copy(ended), ended.settings.training.colours
-    run.numbers = dict(ended.numbers)
-    assert photograph_colours(colours, run, 24).tables is ended.colour_grids
-    other = photograph_colours(Grid(cells=cells), run, 24)
-    assert other.tables is run.colour_grids is not ended.colour_grids
-    assert not run.colour_grids.tables()["values"].any()
-    assert run.numbers[f"colours/{other.names[0]}/updates"] == 0 < ended.numbers[f"colours/{other.names[0]}/updates"]
+    run, before = copy(ended), ended.modules["grid"]
+    run.modules = dict(ended.modules)
+    (same,) = attached(ended.settings.training.modules, run, 24)
+    assert same.numbers == before.numbers
+    assert all((table == before.tables()[name]).all() for name, table in same.tables().items())
+    (other,) = attached([Grid(cells=cells)], run, 24)
+    assert other is run.modules["grid"] is not before
+    assert not other.tables()["values"].any()
+    assert other.numbers[f"colours/{other.names[0]}/updates"] == 0 < before.numbers[f"colours/{other.names[0]}/updates"]
 
 
 @pytest.mark.slow
@@ -215,8 +196,8 @@ def test_memory_counts_them_before_the_first_gaussian(ended):
     more = fixed(wide) - fixed(Gain())
     assert more == bytes_of([16, 16, 8], len(views), height, width * height)
     assert more > 3 * 4 * 12 * 16 * 16 * 8 * len(views)
-    assert fixed(Auto(model=wide)) == fixed(wide), "as long as it is not chosen"
-    assert fixed(Auto(model=wide).choose("off", "they are alike")) == fixed(None) == fixed(Gain())
+    assert fixed(AutoExposure(model=wide)) == fixed(wide), "as long as it is not chosen"
+    assert fixed(AutoExposure(model=wide)._choose("off", "they are alike")) == fixed(None) == fixed(Gain())
 
 
 @pytest.mark.slow
@@ -233,37 +214,33 @@ def test_a_dry_run_checks_them(tiny_scene, tmp_path):
 
 def test_damaged_tables_are_refused():
     good = {name: np.zeros((2, 12, 2, 1, 1), np.float32) for name in ("values", "moment1", "moment2")}
-    exposure.check_tables(good)
-    exposure.check_tables({"values": good["values"]})
-    exposure.check_tables({})
+    rows = {"colours/a/row": 0.0, "colours/b/row": 1.0}
+    Grid.check_saved(rows, good)
+    Grid.check_saved(rows, {"values": good["values"]})
     for damaged in (
         {"values": good["values"][:, :5]},
         {**good, "moment2": good["values"][:1]},
         {**good, "more": good["values"]},
         {"moment1": good["values"]},
         {**good, "moment1": good["values"] + np.float32(np.nan)},
+        {},
     ):
-        with pytest.raises(DataError, match=r"of its grids|other grids"):
-            exposure.check_tables(damaged)
+        with pytest.raises(DataError, match=r"its grids are not|of its Grid is not"):
+            Grid.check_saved(rows, damaged)
+    for damage in ({"colours/b/row": 6.0}, {"colours/a/row": 0.5}, {"colours/c/row": 2.0}):
+        with pytest.raises(DataError, match="grids of the colours of 2 photographs"):
+            Grid.check_saved(rows | damage, good)
 
 
 @pytest.mark.slow
 def test_a_checkpoint_that_lost_its_grids_is_refused(with_grids, tmp_path):
     notes, tables = archive.read(with_grids / "checkpoints" / "step_000012.npz")
-    left = {name: table for name, table in tables.items() if not name.startswith(exposure.FOLDER)}
+    left = {name: table for name, table in tables.items() if not name.startswith("modules/")}
     assert len(left) == len(tables) - 3
     with (tmp_path / "step_000012.npz").open("wb") as file:
         archive.write(file, notes, left.items())
-    with pytest.raises(DataError, match="it has grids of the colours of 0 photographs, and its numbers name 8 rows"):
+    with pytest.raises(DataError, match="its grids are not"):
         checkpoint.load(tmp_path / "step_000012.npz")
-    own, _ = archive.split(tables, exposure.FOLDER)
-    rows = {f"colours/{name}/row": float(row) for row, name in enumerate("abcdefgh")}
-    exposure.require_tables(own, rows)
-    for damage in ({"colours/h/row": 6.0}, {"colours/h/row": 500.0}, {"colours/a/row": 0.5}):
-        with pytest.raises(DataError, match="grids of the colours of 8 photographs"):
-            exposure.require_tables(own, rows | damage)
-    with pytest.raises(DataError, match="its numbers name 0 rows"):
-        exposure.require_tables(own, {})
 
 
 @pytest.mark.slow

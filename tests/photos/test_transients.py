@@ -43,7 +43,7 @@ def test_the_distribution_fades():
 @pytest.mark.slow
 def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *ON)
-    assert sum(run.numbers[key] for key in KEYS) > 40 * 40
+    assert sum(run.modules["transients"].numbers[key] for key in KEYS) > 40 * 40
     assert digest(tmp_path / "run") != digest(few_steps)
     expected = digest(tmp_path / "run")
     (tmp_path / "run" / "checkpoints" / "step_000012.npz").unlink()
@@ -51,8 +51,9 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(tiny_scene, tmp_pa
         (tmp_path / "run" / name).unlink()
     again = train(tiny_scene, tmp_path / "run", *ON, resume=True)
     assert digest(tmp_path / "run") == expected
-    assert again.numbers == run.numbers
-    assert checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])[0].numbers == run.numbers
+    assert again.modules["transients"].numbers == run.modules["transients"].numbers
+    state, _ = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])
+    assert state.modules["transients"] == run.modules["transients"].numbers
 
 
 @pytest.mark.slow
@@ -75,7 +76,7 @@ def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_p
     image = run.rasterizer.forward(run.model, photograph.camera, run.photographs.background).image
     residuals, _ = measure_residuals(workspace, photograph.camera, image, planes.colours, None)
     settings = Transients(start=300, tail=0)
-    threshold = settings.threshold(run.numbers, 301)
+    threshold = settings.threshold(run.modules["transients"].numbers, 301)
     assert threshold is not None
     left_out = settings.mask(workspace, photograph.camera, residuals, threshold).get()[0, :40, :40] == 0
     inside = left_out[12:24, 10:22].copy()

@@ -19,7 +19,9 @@ from clsplat.opencl.device import Array
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import stretched
 from clsplat.runs import opening
-from clsplat.training.modules.skip_backward import Skip
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
+from clsplat.training.modules.skip_backward import Skip, SkipState
 from clsplat.training.run import Run
 from clsplat.training.trainer import Trainer
 from tests.support.runs import FEW, digest, train
@@ -106,13 +108,18 @@ def test_a_loss_that_is_not_finite_changes_nothing():
 
 
 def test_view_has_an_average_per_size_and_none_before_the_start():
-    skip = Skip(start=8)
-    numbers: dict[str, float] = {}
+    state = SkipState(Skip(start=8), [View("a.png", Camera(40, 30, 1, 1, 1, 1), np.eye(3, 4))])
     for step, width in ((8, 40), (9, 40), (10, 20), (11, 40)):
         camera = SimpleNamespace(width=width, height=30)
-        losses = SimpleNamespace(comparison=SimpleNamespace(step=step, camera=camera), loss=float(step))
-        numbers.update(skip.visit("a.png", losses, numbers).numbers)
-    averages = {name: value for name, value in numbers.items() if name.startswith("skip/loss/")}
+        kept: list[Any] = []
+        now = SimpleNamespace(number=step, view=0, camera=camera, loss=float(step), skipped=False)
+        now.keep, now.kept = (
+            (lambda _, visit, kept=kept: kept.append(visit)),
+            (lambda _, kept=kept: (kept or [None])[0]),
+        )
+        state.after_losses(now)
+        state.update(now)
+    averages = {name: value for name, value in state.numbers.items() if name.startswith("skip/loss/")}
     expected = {"skip/loss/40x30/a.png": 0.95 * 9 + 0.05 * 11, "skip/loss/20x30/a.png": 10.0}
     assert averages == pytest.approx(expected)
 
@@ -147,8 +154,7 @@ def state(run: Run) -> dict[str, Any]:
     """All that an update changes."""
     gaussians = run.model.gaussians
     tables = {name: gaussians.get(name).tobytes() for name in gaussians.tables}
-    kept = {name: value for name, value in run.numbers.items() if not name.startswith("skip/")}
-    return {**tables, "updates": dict(run.adam.updates) if run.adam else {}, **kept}
+    return {**tables, "updates": dict(run.adam.updates) if run.adam else {}, **run.numbers}
 
 
 @pytest.mark.parametrize("more", [(), (PENALTY,), (HAAR,)], ids=["losses", "a penalty", "a transform that learns"])
@@ -177,7 +183,7 @@ def test_each_size_of_a_resolution_schedule_has_own_averages(tiny_scene, tmp_pat
     run, steps = begun(tiny_scene, tmp_path, "optimize.skip={start: 2, warm_up: 40}", sizes, *NO_EDITS)
     for _ in range(36):
         next(steps)
-    averages = [name.split("/")[2] for name in run.numbers if name.startswith("skip/loss/")]
+    averages = [name.split("/")[2] for name in run.modules["skip"].numbers if name.startswith("skip/loss/")]
     assert set(averages) == {"20x20", "40x40"}
     assert len(averages) > 8, "photographs"
 
@@ -186,7 +192,7 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
     run, steps = begun(tiny_scene, tmp_path, FROM_5)
     for _ in range(9):
         next(steps)
-    before = state(run), dict(run.numbers)
+    before = state(run), dict(run.modules["skip"].numbers)
 
     def broken(trainer: Trainer, view: ViewLosses) -> ViewGradients:
         raise MemoryError
@@ -194,7 +200,7 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
     monkeypatch.setattr(Trainer, "backward", broken)
     with pytest.raises(MemoryError):
         next(steps)
-    assert (run.step, (state(run), dict(run.numbers))) == (9, before)
+    assert (run.step, (state(run), dict(run.modules["skip"].numbers))) == (9, before)
 
 
 def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatch):
@@ -234,7 +240,7 @@ def test_runs_that_skip_resume_and_repeat_to_the_bit(tiny_scene, tmp_path, caplo
     (again.out / "point_cloud.ply").unlink()
     resumed = train(tiny_scene, tmp_path / "again", *settings, resume=True)
     assert digest(resumed.out) == whole
-    assert resumed.numbers == first.numbers
+    assert resumed.modules["skip"].numbers == first.modules["skip"].numbers
     assert resumed.records.read("skip") == [told]
 
 
@@ -243,7 +249,7 @@ def test_auto_takes_its_share_from_the_warm_up(tiny_scene, tmp_path):
     settings = ("optimize.skip={start: 2, warm_up: 40}", "optimize.steps=120", *NO_EDITS)
     run = train(tiny_scene, tmp_path / "run", *settings)
     (told,) = run.records.read("skip")
-    assert 8 / 40 <= told["least"] == run.numbers["skip/above"] / 40
+    assert 8 / 40 <= told["least"] == run.modules["skip"].numbers["skip/above"] / 40
     assert told["steps"] == 118
     assert 0 < told["skipped"] <= (1 - told["least"]) * 118
 
@@ -252,11 +258,11 @@ def test_up_to_the_start_the_bits_are_those_without_it(tiny_scene, few_steps, tm
     run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.skip.start=12")
     assert digest(run.out) == digest(few_steps)
     assert [line["steps"] for line in run.records.read("skip")] == [0]
-    assert not run.numbers
+    assert not run.modules["skip"].numbers
 
 
 def test_a_run_may_go_on_with_it(tiny_scene, killed_run, caplog):
     run = train(tiny_scene, killed_run, *FEW, "optimize.skip={start: 8, warm_up: 1, least: 0}", resume=True)
     assert caplog.text.count("from here on the bits are not those of a run without a change") == 1
     assert json.loads((killed_run / "metrics.json").read_text())["steps"] == 12
-    assert run.numbers["skip/steps"] == 4
+    assert run.modules["skip"].numbers["skip/steps"] == 4

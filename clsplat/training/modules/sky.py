@@ -13,6 +13,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.photos.photographs import apply_mask
 from clsplat.render.backdrops import Directions
 from clsplat.render.rasterizer import Frame, Rasterizer
+from clsplat.training.modules.base import ModuleState, Step
 
 FOLDER = "sky/"  # before the names of its tables in a checkpoint
 TEXELS, MOMENTS, BIASES, FREE = "texels", ("moment1", "moment2"), "biases", "free"
@@ -67,6 +68,25 @@ class LearnedSky:
         """Change the texels that a view shows by Adam."""
         rate = at_step(self.settings.rate, step)
         rasterizer.skies.update(self.sky, frame.camera, by_texels, self._arrays, rate)
+
+
+class SkyState(ModuleState):
+    """The sky of a model in a step.  The model brings it: no list names it."""
+
+    def __init__(self, sky: LearnedSky) -> None:
+        super().__init__()
+        self.sky = sky
+
+    def before_losses(self, step: Step) -> None:
+        if cover := self.sky.cover(step.rasterizer, step.frame, step.comparison):
+            step.behind, value = cover
+            step.own_losses.append(value)
+
+    def backward(self, step: Step) -> None:
+        step.keep(self, self.sky.by_texels(step.rasterizer, step.frame, step.gradient))
+
+    def update(self, step: Step) -> None:
+        self.sky.update(step.rasterizer, step.frame, step.kept(self), step.number)
 
 
 def check_tables(tables: Tables) -> None:
