@@ -42,8 +42,7 @@ from clsplat.scene.scene import Background, Scene, scene_name
 from clsplat.scene.view import Alpha, View
 from clsplat.stages.export import Export, image_paths
 from clsplat.stages.train_field import ExportField
-from clsplat.training.modules.base import scene_beside
-from clsplat.training.modules.exposure import colours_beside
+from clsplat.training.modules.base import measured_beside, scene_beside
 from clsplat.viewer.video.film import require_motion, times_of
 from clsplat.viewer.video.pictures import LAYERS, Canvas, shown, values
 
@@ -339,7 +338,7 @@ class ModelFile:
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)
         self.background = self.loaded.rendering.background or self.scene.background
-        self.colours = colours_beside(self.source.file)
+        self.colours = measured_beside(self.source.file)
 
     @property
     def gaussians(self) -> Model:

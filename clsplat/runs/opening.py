@@ -236,7 +236,8 @@ def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
     """The pipeline with what its modules and its sky choose."""
 
     def chosen(training: Optimize) -> Optimize:
-        return training.with_modules([module.settled(run) for module in training.modules])
+        modules = [module.settled(run) for module in training.modules]
+        return training if modules == training.modules else training.model_copy(update={"modules": modules})
 
     settings = _with_sky(of_trainings(pipeline.settings, Optimize, chosen), run)
     return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)

@@ -13,8 +13,7 @@ from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
 from clsplat.metrics.views import mean, measure, tell_of_colours
 from clsplat.render.painter import Painter, Splats
 from clsplat.scene.view import some_of
-from clsplat.training.modules.base import learned_scene
-from clsplat.training.modules.exposure import colours_of
+from clsplat.training.modules.base import learned_scene, measured_as
 from clsplat.training.run import Run
 from clsplat.training.stage import CADENCE, Scheduled
 
@@ -94,7 +93,7 @@ class Evaluate(Scheduled):
             views = some_of(found, self.most or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            trained, colours = run.scene.split("train"), colours_of(run)
+            trained, colours = run.scene.split("train"), measured_as(run)
             results = measure(
                 painter, views, photographs, perceptual, colours=colours, counted=counted, trained=trained
             )

@@ -162,7 +162,7 @@ class Viewer(Stage):
 class Cameras(Stage):
     """Write the cameras of the scene, at the photographs' full size, so that a model travels with its views.
 
-    After a training with `poses` they are the learned ones, with the learned focal lengths; see `optimize.poses`."""
+    After a training with `camera_optimizer` they are the learned ones, with the learned focal lengths."""
 
     stage: Literal["cameras"] = "cameras"
     output_keys: ClassVar[frozenset[str]] = frozenset({"formats", "folder"})

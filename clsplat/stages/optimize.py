@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from clsplat.core.errors import ConfigError
 from clsplat.core.progress import Progress
-from clsplat.core.schedule import Probability, place
+from clsplat.core.schedule import place
 from clsplat.core.settings import OneOf
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses, require_symmetric
@@ -23,17 +23,10 @@ from clsplat.stages.init import will_learn_sky
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.best_model import Best, Measured
 from clsplat.training.checkpoint import copied_of, finite_values, put_back
-from clsplat.training.modules.base import ModuleState, TrainingModule, attached
-from clsplat.training.modules.camera_optimizer import CameraOptimizer
+from clsplat.training.modules.base import ModuleState, TrainingModule, attached, check_list
 from clsplat.training.modules.depth_supervision import KnownDepthsState, require_depths
-from clsplat.training.modules.distractors import Distractors
-from clsplat.training.modules.dropout import Dropout
-from clsplat.training.modules.exposure import Colours
 from clsplat.training.modules.learned_transform import LearnedTransformState
-from clsplat.training.modules.random_background import RandomBackground
-from clsplat.training.modules.skip_backward import Skip
 from clsplat.training.modules.sky import SkyState
-from clsplat.training.modules.transients import Transients
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room, place_harmonics
@@ -233,7 +226,7 @@ class Optimize(Keeping):
     stage: Literal["optimize"] = "optimize"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "skip", "dropout", "background"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update"})
 
     rates: Rates = Rates()
     """Learning rates."""
@@ -244,21 +237,10 @@ class Optimize(Keeping):
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
     """Losses and penalties; training minimises their sum."""
-    colours: OneOf[Colours] | None = None
-    """Colours of each photograph, where exposures differ: `gain`, `affine`, `grid`, `auto`; without it, the scene's."""
-    poses: CameraOptimizer | None = None
-    """Places of the cameras that are learned with the model, where poses are not exact; without it, the dataset's."""
-    transients: Transients | None = None
-    """Pixels that are left out, where photographs show what the scene does not have; without it, none."""
-    distractors: Distractors | None = None
-    """Gaussians that each photograph has for itself, for what the scene does not have; without it, none."""
-    dropout: Probability = 0.0
-    """Probability with which a step leaves a Gaussian out, by step, 0.9 at most; for few photographs.  The opacities of
-    the others are divided by 1 less it (DropGaussian, Park et al. 2025).  Pictures and measurements leave none out."""
-    background: Literal["scene", "random", "transparent"] = "scene"
-    """Colour behind all; random: another in each step; transparent: random where photographs are so."""
-    skip: Skip | None = None
-    """Steps that skip the backward pass, where a view has converged; without it, none."""
+    modules: list[OneOf[TrainingModule]] = Field([])
+    """What takes part in a step next to the Gaussians, in the order of the forward pass; each once.  `--set` addresses
+    one by its type: `optimize.modules.TYPE.KEY=…`; `optimize.modules.TYPE={}` adds it at its place, `=null` removes
+    it."""
     during: list[OneOf[Scheduled]] = Field([])
     """Stages that run every so many steps."""
     log_every: Annotated[int, Field(gt=0)] = 100
@@ -271,24 +253,17 @@ class Optimize(Keeping):
             raise ValueError("expected at least one loss that compares images, such as l1")
         return losses
 
+    @field_validator("modules")
+    @classmethod
+    def _in_order(cls, modules: list[TrainingModule]) -> list[TrainingModule]:
+        check_list(modules)
+        return modules
+
     def check(self) -> None:
         require_symmetric(self.losses, self.views.transforms)
         for loss in self.losses:
             self.check_beside(str(getattr(loss, "type", "")))
         super().check()
-
-    @property
-    def modules(self) -> list[TrainingModule]:
-        """What takes part in a step next to the Gaussians, in the order of the forward pass."""
-        drawn = {"random": [RandomBackground()], "transparent": [RandomBackground(where="transparent")]}
-        dropout = [] if self.dropout == 0.0 else [Dropout(probability=self.dropout)]
-        others = (self.poses, self.distractors, self.colours, self.transients, self.skip)
-        return [*drawn.get(self.background, ()), *dropout, *(one for one in others if one is not None)]
-
-    def with_modules(self, modules: Sequence[TrainingModule]) -> "Optimize":
-        """Return it with what its modules have chosen."""
-        colours = next((one for one in modules if isinstance(one, Colours)), None)
-        return self if colours == self.colours else self.model_copy(update={"colours": colours})
 
     def outputs(self, out: Path) -> list[Path]:
         files = [name for module in self.modules for name in module.files]

@@ -25,8 +25,8 @@ from clsplat.scene.scene import SPLITS
 from clsplat.scene.view import View, some_of
 from clsplat.scene.viewpoint import across, closest_point, upward
 from clsplat.training.best_model import Measured
-from clsplat.training.modules.base import learned_scene
-from clsplat.training.modules.exposure import Gain, colours_of
+from clsplat.training.modules.base import learned_scene, measured_as
+from clsplat.training.modules.exposure import Gain
 from clsplat.training.records import VIEWS, over_views
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
@@ -55,7 +55,7 @@ def advice(run: Run) -> list[str]:
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
     return [
-        *of_training_views(found, has_colours=colours_of(run) is not None),
+        *of_training_views(found, has_colours=measured_as(run) is not None),
         *of_test_views(test),
         *of_capture(views, run.original.views),
         *of_sky(run.model_settings.background),
@@ -74,7 +74,7 @@ def of_training_views(found: Sequence[ViewMetrics], has_colours: bool) -> Iterat
     if not has_colours and gained >= GAINED:
         yield (
             f"exposures or colours differ: in their own colours photographs would be {gained:.1f} dB nearer; "
-            "try `--set optimize.colours=gain`"
+            "try `--set optimize.modules.exposure={}`"
         )
 
 

@@ -15,7 +15,7 @@ from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.exposure import Affine, ExposureState, Gain, change_colours
+from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, Gain, change_colours
 from clsplat.training.trainer import Trainer
 from tests.support.figures import hold
 
@@ -48,7 +48,7 @@ class Case:
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         self.trainer = Trainer(*parts, device.upload(BACKGROUND), losses, Rates(), numbers=self.numbers)
         if colours:
-            state, gains = ExposureState(colours, ("a", "b")), np.array([0.3, 0.1, -0.2])
+            state, gains = ExposureState(Exposure(model=colours), ("a", "b")), np.array([0.3, 0.1, -0.2])
             state.rate, state.numbers = 0.01, self.numbers
             state.begin_with({"a": -gains, "b": gains})
             self.trainer.modules = [state]

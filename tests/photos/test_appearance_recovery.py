@@ -18,8 +18,8 @@ from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.bilateral_grid import Grid, GridState
-from clsplat.training.modules.exposure import ColourState, ExposureState, Gain
+from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState
+from clsplat.training.modules.exposure import ColourState, Exposure, ExposureState, Gain
 from clsplat.training.trainer import Trainer
 
 VIEWS, STEPS = 8, 400
@@ -80,7 +80,7 @@ class Capture:
 
     def learned(self, rng: np.random.Generator) -> np.ndarray:
         """Train with gains; return their logarithms, [VIEWS, 3]."""
-        state = ExposureState(Gain(), NAMES)
+        state = ExposureState(Exposure(), NAMES)
         self.trained(rng, state)
         return np.log([np.diag(state.matrix(number)) for number in range(VIEWS)])
 
@@ -137,7 +137,7 @@ def test_grids_find_known_exposures_too(rng, info):
     """By what a grid makes of the whole image; it has 768 numbers for what three say."""
     truth = drawn(rng, 0.25, 0.05)
     capture = Capture(rng, info, truth)
-    trainer = capture.trained(rng, GridState(Grid(), NAMES, capture.rasterizer.device))
+    trainer = capture.trained(rng, GridState(BilateralGrid(), NAMES, capture.rasterizer.device))
     assert capture.fit(trainer) > 45
     found = []
     for number, photograph in enumerate(capture.photographs):
@@ -156,7 +156,7 @@ def test_grids_follow_a_local_tone_mapping_that_gains_cannot(rng, info):
         return ways[number, 0] * (1 - 2 * luminance) + ways[number, 1] * across
 
     capture = Capture(rng, info, np.zeros((VIEWS, 3)), local=local)
-    states = ExposureState(Gain(), NAMES), GridState(Grid(), NAMES, capture.rasterizer.device)
+    states = ExposureState(Exposure(), NAMES), GridState(BilateralGrid(), NAMES, capture.rasterizer.device)
     fits = [capture.fit(capture.trained(rng, state)) for state in states]
     assert fits[0] < 30
     assert fits[1] > fits[0] + 10

@@ -14,8 +14,8 @@ from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.bilateral_grid import Grid, GridState
-from clsplat.training.modules.exposure import Affine, ExposureState, change_back, change_colours
+from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState
+from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, change_back, change_colours
 from clsplat.training.trainer import Trainer
 from tests.support.figures import hold
 
@@ -40,7 +40,7 @@ def test_smoothness_updates_and_the_mean(device, rng, nodes):
 def test_no_change_cuts_white_alone(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
-    grids = GridState(Grid(), ("a",), device)
+    grids = GridState(BilateralGrid(), ("a",), device)
     found = grids.changed(workspace, camera, planes_of(device, camera, image), 0)
     assert (found.get()[:, :18, :33] == np.minimum(image, 1)).all()
     assert not grids.smoothness(workspace, 0).get().any()
@@ -69,7 +69,7 @@ class Case:
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         behind = device.upload(np.array([0.2, 0.5, 0.9], np.float32))
         self.trainer = Trainer(*parts, behind, (L2(),), Rates(), numbers=self.numbers)
-        self.state = GridState(Grid(cells=list(nodes), weight=0.1), ("a", "b"), device)
+        self.state = GridState(BilateralGrid(cells=list(nodes), weight=0.1), ("a", "b"), device)
         self.state.rate, self.trainer.modules = 0.01, [self.state]
         self.state.begin_with({"b": np.array([0.3, 0.1, -0.2])})
         self.values = self.state.tables()["values"]
@@ -114,9 +114,9 @@ def test_the_mean_over_photographs_and_places_stays_at_no_change(device, rng):
 def test_one_matrix_is_the_affine_kind(device, rng):
     """Its image, and the derivatives by both."""
     values = rng.normal(0, 0.2, (2, 12, 1, 1, 1)).astype(np.float32)
-    grids = GridState(Grid(cells=[1, 1, 1]), ("a", "b"), device)
+    grids = GridState(BilateralGrid(cells=[1, 1, 1]), ("a", "b"), device)
     grids.load({}, {"values": values})
-    affine = ExposureState(Affine(weight=0), ("a", "b"))
+    affine = ExposureState(Exposure(model=Affine(weight=0)), ("a", "b"))
     affine.numbers.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
     image, gradient = (planes_of(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))

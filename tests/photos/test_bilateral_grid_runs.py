@@ -23,28 +23,28 @@ from clsplat.render.workspace import Workspace
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.status import summary
 from clsplat.training import archive, checkpoint, memory
-from clsplat.training.modules.base import attached
-from clsplat.training.modules.bilateral_grid import Grid, bytes_of
-from clsplat.training.modules.exposure import AutoExposure, Gain, colours_beside
+from clsplat.training.modules.base import attached, measured_beside
+from clsplat.training.modules.bilateral_grid import BilateralGrid, bytes_of
+from clsplat.training.modules.exposure import Exposure, Gain
 from clsplat.training.run import Run
 from tests.support.runs import FEW, ONE_CORE, digest, killed, train
 
 PLAIN = '''
-from typing import ClassVar, Literal
-from clsplat.training.modules.exposure import IDENTITY, ColourState, OwnColours, Written
+from typing import Literal
+from clsplat.training.modules.exposure import IDENTITY, Appearance, ColourState, Gain, Written
 
 
-class Plain(OwnColours):
+class Plain(Appearance):
     """Colours as they are."""
 
-    columns: ClassVar[tuple[str, ...]] = ("steps",)
     type: Literal["plain"] = "plain"
 
     def state(self, run):
         return Views(self, [view.name for view in run.scene.split("train")])
 
-    def fitted(self, image, photograph):
-        return IDENTITY
+    @property
+    def fit(self):
+        return Gain()
 
 
 class Views(ColourState):
@@ -58,7 +58,7 @@ class Views(ColourState):
     def update(self, step):
         self.numbers[f"colours/{self.views[step.view]}/steps"] += 1
 '''
-GRID = (*FEW, "optimize.colours={type: grid, cells: [3, 2, 4]}")
+GRID = (*FEW, "optimize.modules.bilateral_grid={cells: [3, 2, 4]}")
 
 
 @pytest.fixture(scope="module")
@@ -74,27 +74,27 @@ def with_grids(ended: Run) -> Path:
 
 
 def test_the_key_takes_cells_of_each_axis():
-    def colours(setting: str):
-        return load("smoke", [f"optimize.colours={setting}"]).settings.training.colours
+    def grid(setting: str):
+        return load("smoke", [f"optimize.modules.bilateral_grid={setting}"]).settings.training.modules[0]
 
-    assert colours("grid") == Grid(cells=[4, 4, 4])
-    assert colours("{type: grid, cells: [16, 16, 8]}").cells == [16, 16, 8]
-    assert colours("{type: auto, model: grid}").model == Grid()
+    assert grid("{}") == BilateralGrid(cells=[4, 4, 4])
+    assert grid("{cells: [16, 16, 8]}").cells == [16, 16, 8]
+    assert grid("{when: auto}") == BilateralGrid(when="auto")
     for wrong in ("[4, 4]", "[0, 4, 4]", "[4, 4, 17]", "4"):
-        with pytest.raises(ConfigError, match=r"colours\.grid\.cells|colours\.cells"):
-            colours(f"{{type: grid, cells: {wrong}}}")
+        with pytest.raises(ConfigError, match=r"bilateral_grid.*cells"):
+            grid(f"{{cells: {wrong}}}")
 
 
 def test_rate_warms_up_and_falls_as_unknown_exposures_need():
     for steps, warm_up in ((1500, 150), (30_000, 1000)):
         published = Decay(initial=2e-3, final=2e-5, over=steps)
-        for known, expected in ((True, published), (False, Gain().rate_of(steps, 50, False))):
-            found = Grid().rate_of(steps, 50, known)
+        for known, expected in ((True, published), (False, Exposure().rate_of(steps, 50, False))):
+            found = BilateralGrid().rate_of(steps, 50, known)
             assert at_step(found, 0) == pytest.approx(at_step(expected, 0) / 100)
             for step in range(warm_up, steps + 1, 50):
                 assert at_step(found, step) == pytest.approx(at_step(expected, step), rel=0.03)
-    assert Grid(rate=0.02).rate_of(7000, 50) == 0.02
-    assert at_step(Grid().rate_of(1, 1), 1) > 0
+    assert BilateralGrid(rate=0.02).rate_of(7000, 50) == 0.02
+    assert at_step(BilateralGrid().rate_of(1, 1), 1) > 0
 
 
 @pytest.mark.slow
@@ -105,11 +105,11 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_grids, tiny_s
     files = [(folder / "view_colours.npy").read_bytes() for folder in (out, with_grids)]
     assert files[0] == files[1]
     _, tables = checkpoint.load(out / "checkpoints" / "step_000012.npz")
-    own, _ = archive.split(tables, "modules/grid/")
+    own, _ = archive.split(tables, "modules/bilateral_grid/")
     assert own.keys() == {"values", "moment1", "moment2"}
-    assert all((table == run.modules["grid"].tables()[name]).all() for name, table in own.items())
+    assert all((table == run.modules["bilateral_grid"].tables()[name]).all() for name, table in own.items())
     names = {view.name for view in run.scene.split("train")}
-    assert sum(run.modules["grid"].numbers[f"colours/{name}/updates"] for name in names) == 12
+    assert sum(run.modules["bilateral_grid"].numbers[f"colours/{name}/updates"] for name in names) == 12
 
 
 def bits(device: Device) -> str:
@@ -139,7 +139,7 @@ def test_one_core_gives_the_same_bits(info):
 def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps, tmp_path):
     data = json.loads((with_grids / "view_colours.json").read_text())
     found = np.load(with_grids / data["file"], allow_pickle=False)
-    assert (data["type"], data["cells"]) == ("grid", [3, 2, 4])
+    assert (data["type"], data["cells"]) == ("bilateral_grid", [3, 2, 4])
     assert found.shape == (8, 4, 2, 3, 3, 4)
     assert found.dtype == np.float32
     assert found.mean(axis=(0, 2, 3)) == pytest.approx(np.tile(np.eye(3, 4), (4, 1, 1)), abs=1e-6)
@@ -148,7 +148,7 @@ def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps,
     assert {"view_colours.json", "view_colours.npy"} < json.loads((with_grids / "checksums.json").read_text()).keys()
     measured = json.loads((with_grids / "metrics.json").read_text())["test"]["1"]
     assert measured["psnr_colour"] == pytest.approx(evaluate(with_grids)["test"]["1"]["psnr_colour"], abs=1e-6)
-    assert colours_beside(with_grids / "point_cloud.ply") == Grid()
+    assert measured_beside(with_grids / "point_cloud.ply") == Gain()
     assert digest(with_grids) != digest(few_steps)
     assert f"  colours  {with_grids}/view_colours.json" in summary(with_grids)
 
@@ -160,7 +160,7 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
     run = train(tiny_scene, tmp_path / "run", *GRID, *kept, "optimize.evaluate.every=4", wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     _, tables = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    own, _ = archive.split(tables, "modules/grid/")
+    own, _ = archive.split(tables, "modules/bilateral_grid/")
     expected = own["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
     found = np.load(tmp_path / "run" / "view_colours.npy")
     assert (found == expected + np.eye(3, 4, dtype=np.float32)).all()
@@ -170,13 +170,13 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
 @pytest.mark.parametrize("cells", [[1, 1, 1], [2, 3, 4], [4, 3, 2], [6, 1, 4]])
 def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
     """Also with as many of them."""
-    run, before = copy(ended), ended.modules["grid"]
+    run, before = copy(ended), ended.modules["bilateral_grid"]
     run.modules = dict(ended.modules)
     (same,) = attached(ended.settings.training.modules, run, 24)
     assert same.numbers == before.numbers
     assert all((table == before.tables()[name]).all() for name, table in same.tables().items())
-    (other,) = attached([Grid(cells=cells)], run, 24)
-    assert other is run.modules["grid"] is not before
+    (other,) = attached([BilateralGrid(cells=cells)], run, 24)
+    assert other is run.modules["bilateral_grid"] is not before
     assert not other.tables()["values"].any()
     assert other.numbers[f"colours/{other.names[0]}/updates"] == 0 < before.numbers[f"colours/{other.names[0]}/updates"]
 
@@ -186,24 +186,25 @@ def test_memory_counts_them_before_the_first_gaussian(ended):
     views, tile = ended.scene.split("train"), int(ended.device.tuning["TILE"])
     width, height = (-(-side // tile) * tile for side in (views[0].camera.width, views[0].camera.height))
 
-    def fixed(colours) -> int:
-        run, training = copy(ended), ended.settings.training.model_copy(update={"colours": colours})
+    def fixed(*modules) -> int:
+        run, training = copy(ended), ended.settings.training.model_copy(update={"modules": [*modules]})
         stages = [training if one.stage == "optimize" else one for one in run.settings.stages]
         run.settings = run.settings.model_copy(update={"stages": stages})
         return run.memory_plan(memory.first_tables(0)).fixed
 
-    wide = Grid(cells=[16, 16, 8])
-    more = fixed(wide) - fixed(Gain())
+    wide = BilateralGrid(cells=[16, 16, 8])
+    more = fixed(wide) - fixed(Exposure())
     assert more == bytes_of([16, 16, 8], len(views), height, width * height)
     assert more > 3 * 4 * 12 * 16 * 16 * 8 * len(views)
-    assert fixed(AutoExposure(model=wide)) == fixed(wide), "as long as it is not chosen"
-    assert fixed(AutoExposure(model=wide)._choose("off", "they are alike")) == fixed(None) == fixed(Gain())
+    assert fixed(wide.model_copy(update={"when": "auto"})) == fixed(wide), "as long as it is not chosen"
+    off = wide.model_copy(update={"when": "auto", "chosen": "off"})
+    assert fixed(off) == fixed() == fixed(Exposure())
 
 
 @pytest.mark.slow
 def test_a_dry_run_checks_them(tiny_scene, tmp_path):
     def told(cells: str) -> object:
-        setting = [f"optimize.colours={{type: grid, cells: {cells}}}"]
+        setting = [f"optimize.modules.bilateral_grid={{cells: {cells}}}"]
         return commands.describe_run("smoke", tiny_scene, tmp_path / "run", set=setting)
 
     assert told("[4, 4, 2]")
@@ -215,8 +216,8 @@ def test_a_dry_run_checks_them(tiny_scene, tmp_path):
 def test_damaged_tables_are_refused():
     good = {name: np.zeros((2, 12, 2, 1, 1), np.float32) for name in ("values", "moment1", "moment2")}
     rows = {"colours/a/row": 0.0, "colours/b/row": 1.0}
-    Grid.check_saved(rows, good)
-    Grid.check_saved(rows, {"values": good["values"]})
+    BilateralGrid.check_saved(rows, good)
+    BilateralGrid.check_saved(rows, {"values": good["values"]})
     for damaged in (
         {"values": good["values"][:, :5]},
         {**good, "moment2": good["values"][:1]},
@@ -225,11 +226,11 @@ def test_damaged_tables_are_refused():
         {**good, "moment1": good["values"] + np.float32(np.nan)},
         {},
     ):
-        with pytest.raises(DataError, match=r"its grids are not|of its Grid is not"):
-            Grid.check_saved(rows, damaged)
+        with pytest.raises(DataError, match=r"its grids are not|of its BilateralGrid is not"):
+            BilateralGrid.check_saved(rows, damaged)
     for damage in ({"colours/b/row": 6.0}, {"colours/a/row": 0.5}, {"colours/c/row": 2.0}):
         with pytest.raises(DataError, match="grids of the colours of 2 photographs"):
-            Grid.check_saved(rows | damage, good)
+            BilateralGrid.check_saved(rows | damage, good)
 
 
 @pytest.mark.slow
@@ -249,7 +250,7 @@ def test_a_kind_of_a_plug_in_is_trained_with(tiny_scene, few_steps, tmp_path):
     """It makes what a training has of it; one that changes nothing leaves the bits of none."""
     (tmp_path / "mine.py").write_text(PLAIN)
     plugins.load_file(tmp_path / "mine.py")
-    train(tiny_scene, tmp_path / "run", *FEW, "optimize.colours=plain")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.plain={}")
     data = json.loads((tmp_path / "run" / "view_colours.json").read_text())
     assert data["type"] == "plain"
     assert sum(data["photographs"].values()) == 12

@@ -20,7 +20,7 @@ from clsplat.training.modules.base import Step
 from clsplat.training.modules.distractors import NEAR, Distractors, DistractorsState, first_tables
 from tests.support.runs import FEW, ONE_CORE, digest, killed, train
 
-ON = (*FEW, "optimize.distractors={count: 30, start: 4}")
+ON = (*FEW, "optimize.modules.distractors={count: 30, start: 4}")
 SCALE = 1e-2  # scene units of their first depth, where they are put into a scene
 
 
@@ -124,7 +124,7 @@ def test_what_covers_more_than_it_explains_fades(device, rng):
 
 @pytest.mark.slow
 def test_before_their_start_the_bits_are_those_without(tiny_scene, tmp_path, few_steps):
-    train(tiny_scene, tmp_path / "run", *FEW, "optimize.distractors={count: 30, start: 12}")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.distractors={count: 30, start: 12}")
     assert digest(tmp_path / "run") == digest(few_steps)
 
 
@@ -155,7 +155,11 @@ def test_they_are_in_no_output_and_resumed_runs_keep_their_bits(tiny_scene, tmp_
 @pytest.mark.parametrize(
     "others",
     [
-        ("optimize.transients={start: 4, above: 1, tail: 0}", "optimize.colours=gain", "optimize.poses={start: 4}"),
+        (
+            "optimize.modules.transients={start: 4, above: 1, tail: 0}",
+            "optimize.modules.exposure={}",
+            "optimize.modules.camera_optimizer={start: 4}",
+        ),
         ("model.background=directions", "optimize.update=deferred", "model.screen_filter=box", "scene.levels=2"),
         ("scene.validation=auto", "optimize.keep=best", "optimize.refit=true", "rasterizer.harmonics=host"),
     ],

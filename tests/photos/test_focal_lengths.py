@@ -28,7 +28,7 @@ from clsplat.training.modules.camera_optimizer import (
 from tests.support.camera_rings import FISHEYE, STRONG
 from tests.support.runs import FEW, digest, killed, train
 
-ON = (*FEW, "optimize.poses={start: 2, focal: auto}")
+ON = (*FEW, "optimize.modules.camera_optimizer={start: 2, focal: auto}")
 PARAMS = {  # after focal lengths and middle
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
@@ -99,7 +99,7 @@ def test_rates_follow_the_visits_of_a_camera():
     assert at_step(auto.focal_rate(600, 50), 0) == pytest.approx(1e-3), "at most"
     assert CameraOptimizer(focal=0.5).focal_rate(600, 50) == 0.5
     assert CameraOptimizer().focal_rate(600, 50) == 0.0
-    assert load("smoke", ["optimize.poses={focal: auto}"]).settings.training.poses == auto
+    assert load("smoke", ["optimize.modules.camera_optimizer={focal: auto}"]).settings.training.modules == [auto]
 
 
 def test_device_camera_gets_its_rays_from_its_focal_length(device):
@@ -156,6 +156,6 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
 
 @pytest.mark.slow
 def test_poses_alone_keep_their_files(with_focals, tiny_scene, tmp_path):
-    train(tiny_scene, tmp_path / "run", *FEW, "optimize.poses={start: 2}")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.camera_optimizer={start: 2}")
     assert digest(tmp_path / "run") != digest(with_focals)
     assert "focal_lengths" not in (tmp_path / "run" / "view_poses.json").read_text()

@@ -25,7 +25,7 @@ from clsplat.training.modules.camera_optimizer import (
 from tests.support.oracle import BACKGROUND, general_camera, random_gaussians, to_world
 from tests.support.runs import FEW, digest, killed, train
 
-ON = (*FEW, "optimize.poses={start: 2}")
+ON = (*FEW, "optimize.modules.camera_optimizer={start: 2}")
 STEP = 1e-4  # of five-point differences
 
 
@@ -95,8 +95,8 @@ def test_rates_begin_after_the_start_and_follow_the_visits():
     assert at_step(CameraOptimizer().rates(600, 50)[1], 0) == pytest.approx(2e-3), "at most"
     assert at_step(often[0], 500) == pytest.approx(0.3 * 2e-4)
     assert CameraOptimizer(turn=0.5).rates(30_500, 50)[0] == 0.5
-    assert load("smoke").settings.training.poses is None
-    assert load("smoke", ["optimize.poses={}"]).settings.training.poses == CameraOptimizer()
+    assert load("smoke").settings.training.modules == []
+    assert load("smoke", ["optimize.modules.camera_optimizer={}"]).settings.training.modules == [CameraOptimizer()]
 
 
 def test_cameras_that_were_not_trained_on_move_as_the_others_do(tiny_scene):
@@ -140,7 +140,7 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_poses, tiny_s
 
 @pytest.mark.slow
 def test_before_the_start_the_bits_are_those_without(tiny_scene, tmp_path, few_steps, with_poses):
-    train(tiny_scene, tmp_path / "late", *FEW, "optimize.poses={start: 12}")
+    train(tiny_scene, tmp_path / "late", *FEW, "optimize.modules.camera_optimizer={start: 12}")
     assert digest(tmp_path / "late") == digest(few_steps) != digest(with_poses)
 
 

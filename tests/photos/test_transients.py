@@ -7,7 +7,7 @@ from clsplat.training import checkpoint
 from clsplat.training.modules.transients import BINS, KEYS, Transients, measure_residuals
 from tests.support.runs import FEW, digest, train
 
-ON = (*FEW, "optimize.transients={start: 4, above: 1, tail: 0}")
+ON = (*FEW, "optimize.modules.transients={start: 4, above: 1, tail: 0}")
 
 
 def distribution(**numbers: float) -> dict[str, float]:
@@ -58,7 +58,7 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(tiny_scene, tmp_pa
 
 @pytest.mark.slow
 def test_where_no_pixel_is_left_out_the_bits_are_those_without(tiny_scene, tmp_path, few_steps):
-    train(tiny_scene, tmp_path / "run", *FEW, "optimize.transients={start: 4, tail: 1e9}")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.transients={start: 4, tail: 1e9}")
     assert digest(tmp_path / "run") == digest(few_steps)
 
 
@@ -66,7 +66,11 @@ def test_where_no_pixel_is_left_out_the_bits_are_those_without(tiny_scene, tmp_p
 def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_path):
     """And little else, of a model that has begun to look like the scene."""
     run = train(
-        tiny_scene, tmp_path / "run", "optimize.steps=300", "densify.stop=200", "optimize.transients={start: 300}"
+        tiny_scene,
+        tmp_path / "run",
+        "optimize.steps=300",
+        "densify.stop=200",
+        "optimize.modules.transients={start: 300}",
     )
     photograph = run.photographs.get(run.scene.split("train")[3])
     pixels = photograph.colours.get()

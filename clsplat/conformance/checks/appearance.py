@@ -13,7 +13,7 @@ from clsplat.conformance.reference.appearance import changed_by_grid
 from clsplat.opencl.device import Device
 from clsplat.photos.appearance import IDENTITY, LUMINANCE
 from clsplat.render.workspace import Workspace
-from clsplat.training.modules.bilateral_grid import Grid, GridState, row_length
+from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState, row_length
 from clsplat.training.modules.exposure import change_back, change_colours
 
 CHECKS = Checks()
@@ -31,7 +31,7 @@ CASES = (  # width, height, nodes
 
 def grids_of(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> GridState:
     """The second of three photographs has matrices about no change, and the others have others."""
-    found = GridState(Grid(cells=list(nodes), weight=weight), ("a", "b", "c"), device)
+    found = GridState(BilateralGrid(cells=list(nodes), weight=weight), ("a", "b", "c"), device)
     found.load({}, {"values": rng.normal(0, 0.2, found.shape).astype(np.float32)})
     return found
 

@@ -13,6 +13,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.settings import Settings, variants
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.losses.base import Comparison, Loss, LossValue
+from clsplat.metrics.views import Fitted
 from clsplat.opencl.device import Array
 from clsplat.photos.photographs import Photograph
 from clsplat.photos.transforms import PhotographTransform, Planes
@@ -118,6 +119,11 @@ class ModuleState:
     def finish(self, run: Run) -> None:
         """At the last step, before a better model than that of the last step is put back."""
 
+    @property
+    def measured_as(self) -> Fitted | None:
+        """What images are fitted with to be measured in the colours of their photographs; None: they are not."""
+        return None
+
     def scene(self, scene: Scene) -> Scene:
         """Return a scene, at its full size, with what was learned of its cameras."""
         return scene
@@ -137,6 +143,9 @@ class TrainingModule(Settings):
 
     family: ClassVar[str] = ""  # of those that exclude each other; "": those of the same type
 
+    by_type: ClassVar[bool] = True
+    joins: ClassVar[bool] = False  # a run may go on with it, or without it; bits then no longer compare
+
     type: str
     """Name of the module."""
 
@@ -147,11 +156,6 @@ class TrainingModule(Settings):
 
     def settled(self, run: Run) -> "TrainingModule":
         """Return it with what follows from the photographs."""
-        return self
-
-    @property
-    def in_use(self) -> "TrainingModule | None":
-        """What takes part, once it is settled; None: nothing."""
         return self
 
     def is_active(self, scene: Scene | None = None) -> bool:
@@ -181,6 +185,11 @@ class TrainingModule(Settings):
                 raise DataError(f"{name} of its {cls.__name__} is not of finite numbers")
 
     @classmethod
+    def measured_beside(cls, model: Path) -> Fitted | None:
+        """Return what `measured_as` was where a model was trained, by side files next to it.  Raises DataError."""
+        return None
+
+    @classmethod
     def beside(cls, model: Path, scene: Scene) -> Scene:
         """Return a scene with what lies in side files beside a model."""
         return scene
@@ -202,7 +211,7 @@ def check_list(modules: Sequence[TrainingModule], others: Sequence[str] = ()) ->
 
 def attached(modules: Sequence[TrainingModule], run: Run, last: int) -> list[ModuleState]:
     """Return the states of a training up to a global step, in order: those of its list, and those that act on."""
-    listed = [(one, True) for one in (module.in_use for module in modules) if one and one.is_active(run.scene)]
+    listed = [(one, True) for one in modules if one.is_active(run.scene)]
     kin = {one.kin for one, _ in listed}
     earlier = [one for one in modules_of(run).values() if one.type in run.modules and one.kin not in kin]
     listed += [(one, False) for one in earlier if one.outlasts == "acts"]
@@ -229,8 +238,8 @@ def state_of(module: TrainingModule, run: Run) -> ModuleState:
 def modules_of(run: Run) -> dict[str, TrainingModule]:
     """The modules of a run's trainings so far, by type: the last of each."""
     stages = getattr(run.settings, "stages", ())[: run.cursor + 1]
-    listed = (module.in_use for stage in stages for module in getattr(stage, "modules", ()))
-    return {module.type: module for module in listed if module}
+    listed = (module for stage in stages for module in getattr(stage, "modules", ()))
+    return {module.type: module for module in listed if module.is_active(run.scene)}
 
 
 def restored(run: Run, saved: Mapping[str, tuple[Numbers, Tables]]) -> dict[str, ModuleState]:
@@ -263,3 +272,14 @@ def kind_of(name: str) -> type[TrainingModule]:
     if (kind := variants(TrainingModule).get(name)) is None:
         raise ConfigError(f"the checkpoint has a module '{name}', which is not known; give its --plugin")
     return kind
+
+
+def measured_as(run: Run) -> Fitted | None:
+    """Return what images are fitted with to be measured in the colours of their photographs; None: they are not."""
+    return next((fitted for state in run.modules.values() if (fitted := state.measured_as)), None)
+
+
+def measured_beside(model: Path) -> Fitted | None:
+    """Return the same of a training by its side files next to a model.  Raises DataError where one is damaged."""
+    found = (kind.measured_beside(model) for kind in variants(TrainingModule).values())
+    return next((fitted for fitted in found if fitted), None)

@@ -19,11 +19,11 @@ from clsplat.training.modules.base import Numbers, Step, Tables
 from clsplat.training.modules.exposure import (
     TABLE,
     VIEW_COLOURS,
+    Appearance,
     ColourState,
-    OwnColours,
+    Gain,
     RateOrAuto,
     Written,
-    fitted_gains,
 )
 from clsplat.training.run import Run
 
@@ -39,24 +39,24 @@ GRID_MEANING = (
 ).format(*LUMINANCE)
 
 
-class Grid(OwnColours):
+class BilateralGrid(Appearance):
     """Colours of each photograph by place and luminance: a bilateral grid of affine changes (Wang et al. 2024).
 
-    It follows what a phone does to parts of a photograph, local tone mapping, which the other kinds cannot.  It also
-    follows what the model should learn, so that held-out photographs are often worse with it: try `gain` first.  The
-    mean over photographs and places stays that of no change at each luminance; figures are in colours of `gain`.
+    It follows what a phone does to parts of a photograph, local tone mapping, which `exposure` cannot.  It also follows
+    what the model should learn, so that held-out photographs are often worse with it: try `exposure` first.  The mean
+    over photographs and places stays that of no change at each luminance.  A grid that was fitted in one place says
+    nothing of another, so that figures are in colours of `gain`.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
-    columns: ClassVar[tuple[str, ...]] = ("row",)  # of its grid in the tables of a run
 
-    type: Literal["grid"] = "grid"
+    type: Literal["bilateral_grid"] = "bilateral_grid"
     cells: Annotated[list[Nodes], Field(min_length=3, max_length=3)] = Field([4, 4, 4])
     """Matrices along the width, the height and the luminance, 1 to 16 each.  Between them colours are trilinear; the
     outer ones lie on the edges, at black and at white.  Published are [16, 16, 8]."""
     rate: RateOrAuto = "auto"
     """Learning rate of the matrices, by Adam, by step; auto: 2e-3 to 2e-5 (gsplat), where no tracks tell the exposures
-    that of `gain`; it grows from 1 % of itself in 1000 steps, or a tenth of fewer than 10 000.  At most 0.5."""
+    that of `exposure`; it grows from 1 % of itself in 1000 steps, or a tenth of fewer than 10 000.  At most 0.5."""
     weight: Annotated[float, Field(ge=0)] = 10.0
     """Factor of the loss that makes the grid of the photograph of a step smooth: the sum over the axes of the mean of
     the squared differences of neighbours."""
@@ -67,6 +67,8 @@ class Grid(OwnColours):
         return GridState(self, [view.name for view in run.scene.split("train")], run.device)
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
+        if self.chosen == "off":
+            return 0
         sides = [(-(-view.camera.width // tile) * tile, -(-view.camera.height // tile) * tile) for view in views]
         rows, pixels = max(height for _, height in sides), max(width * height for width, height in sides)
         return bytes_of(self.cells, len({view.name for view in views}), rows, pixels)
@@ -91,17 +93,17 @@ class Grid(OwnColours):
         points = {step: [float(step), at_step(rate, step)] for step in later}
         return Points(points=[[0.0, at_step(rate, 0) / 100], *points.values()])
 
-    def fitted(self, image: Floats, photograph: Floats) -> Floats:
-        """A grid that was fitted in one place says nothing of another: the colours are those of `gain`."""
-        return fitted_gains(image, photograph)
+    @property
+    def fit(self) -> Gain:
+        return Gain()
 
 
 class GridState(ColourState):
     """The grids of all photographs on the device, with Adam's moments: each [photographs, ENTRIES, nz, ny, nx]."""
 
-    settings: Grid
+    settings: BilateralGrid
 
-    def __init__(self, settings: Grid, views: Sequence[str], device: Device) -> None:
+    def __init__(self, settings: BilateralGrid, views: Sequence[str], device: Device) -> None:
         super().__init__(settings, views)
         self.device, self.shape = device, (len(self.names), ENTRIES, *reversed(settings.cells))
         self.arrays: dict[str, Array] = {name: device.zeros(self.shape) for name in TABLES}

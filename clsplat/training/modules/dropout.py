@@ -17,6 +17,7 @@ class Dropout(TrainingModule):
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"probability"})
+    joins: ClassVar[bool] = True
 
     type: Literal["dropout"] = "dropout"
     probability: Probability

@@ -21,7 +21,7 @@ from clsplat.core.errors import DataError, NumericError, quoted
 from clsplat.core.files import atomic, write_text
 from clsplat.core.reading import read_json
 from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, explained
-from clsplat.core.settings import OneOf, variants
+from clsplat.core.settings import OneOf, Settings, variants
 from clsplat.losses.base import LossValue
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import IDENTITY, LUMINANCE, MEANING, Floats, ViewTable
@@ -29,6 +29,7 @@ from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, measured, noted
 from clsplat.photos.photographs import Mask
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
+from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.training.modules.base import ModuleState, Numbers, Step, Tables, TrainingModule
 from clsplat.training.run import Run
@@ -56,16 +57,7 @@ class Written:
     arrays: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # by the names of files of NumPy's
 
 
-class Colours(TrainingModule):
-    """Colours of each photograph, which exclude each other."""
-
-    place: ClassVar[int] = 30  # of what stands before the scene too
-    family: ClassVar[str] = "exposure"
-    conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
-    files: ClassVar[Mapping[str, str]] = {VIEW_COLOURS: "colours"}
-
-
-class OwnColours(Colours):
+class Appearance(TrainingModule):
     """Numbers of each photograph, which are learned with the Gaussians; their mean over the photographs stays 0.
 
     Without that, a change of all of them and the opposite one of the Gaussians would be the same to every loss, and the
@@ -73,13 +65,39 @@ class OwnColours(Colours):
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
-    columns: ClassVar[tuple[str, ...]] = ()  # names of what the numbers of a run have for each photograph
+    output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
+    place: ClassVar[int] = 30  # after what stands in front of the scene
+    family: ClassVar[str] = "appearance"
     outlasts: ClassVar[Literal["numbers"]] = "numbers"
-    fitted_to_a_channel: ClassVar[int] = 1  # numbers that `fitted` finds for each of red, green and blue
+    conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
+    files: ClassVar[Mapping[str, str]] = {VIEW_COLOURS: "colours"}
 
     rate: RateOrAuto = "auto"
     """Learning rate of the numbers, by Adam, by step; auto: 1e-2 to 1e-3, where each photograph is visited 400 times or
     more 2e-3 to 2e-5; where no tracks tell the exposures, as large as a gain of 2.7 needs, up to 5e-2.  At most 0.5."""
+
+    when: Literal["always", "auto"] = "always"
+    """`auto`: where exposures differ, by what the photographs show of the same points.
+
+    The logarithms of the exposures are measured on the tracks of the dataset's points, before training.  Two bounds are
+    to be passed: the standard deviation of the exposures, and their share of what differs between photographs of one
+    point; light that changes with the direction of view is the rest.  Elsewhere the bits are those without it."""
+    above: Annotated[float, Field(ge=0)] = SPREAD
+    """With `when: auto`, standard deviation of the logarithms of the exposures; 0.03 is 3 %."""
+    explained: Annotated[float, Field(ge=0, lt=1)] = EXPLAINED
+    """With `when: auto`, share of the differences."""
+    chosen: Literal["on", "off"] | None = None
+    """Written by a run: what `auto` has chosen."""
+    reason: str = ""
+    """Written by a run: why."""
+
+    @property
+    @abstractmethod
+    def fit(self) -> "ColourModel":
+        """What images are measured with: colours that are fitted to a photograph."""
+
+    def is_active(self, scene: Scene | None = None) -> bool:
+        return self.when == "always" or self.chosen == "on"
 
     def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
         """Return the learning rate by step of a training with so many steps and photographs.
@@ -95,16 +113,50 @@ class OwnColours(Colours):
             initial, final = max(initial, needed), max(final, needed / 10)
         return Decay(initial=initial, final=final, over=steps)
 
+    def settled(self, run: Run) -> "Appearance":
+        """Return it with the choice that follows from the exposures of the photographs; one that is made stays."""
+        if self.when == "always" or self.chosen is not None:
+            return self
+        exposures = exposures_of(run)
+        if not exposures.log_gains:
+            return self._choose("off", exposures.text)
+        few, alike = exposures.spread <= self.above, exposures.explained <= self.explained
+        bounds = [f"{self.above:.1%}", f"{self.explained:.0%} of what differs"]
+        if not few and not alike:
+            return self._choose("on", f"{exposures.text}; more than {bounds[0]}, and than {bounds[1]}")
+        missed = " nor ".join(bound for bound, decides in zip(bounds, (few, alike), strict=True) if decides)
+        return self._choose("off", f"{exposures.text}; not more than {missed}")
+
+    def _choose(self, chosen: Literal["on", "off"], reason: str) -> "Appearance":
+        LOG.info("optimize.modules.%s: %s, since %s", self.type, chosen, reason)
+        return self.model_copy(update={"chosen": chosen, "reason": reason})
+
+    @classmethod
+    def measured_beside(cls, model: Path) -> "ColourModel | None":
+        path = model.with_name(VIEW_COLOURS)
+        if not path.is_file():
+            return None
+        data, known = read_json(path, "colours of photographs"), variants(Appearance)
+        name = data.get("type") if isinstance(data, dict) else None
+        if not isinstance(name, str) or name not in known:
+            names = ", ".join(known)
+            raise DataError(f"{path}: the type of colours is {quoted(name)}; expected one of {names}: write it again")
+        facts = {key: data[key] for key in ("model",) if key in data}
+        return known[name].model_validate(facts).fit if known[name] is cls else None
+
+
+class ColourModel(Settings):
+    """What makes the colours of a scene those of one photograph: one matrix for all its pixels, of a few numbers."""
+
+    columns: ClassVar[tuple[str, ...]] = ()  # names of the numbers of a photograph
+    fitted_to_a_channel: ClassVar[int] = 1  # numbers that `fitted` finds for each of red, green and blue
+
+    type: str
+    """Name of the model."""
+
     @abstractmethod
     def fitted(self, image: Floats, photograph: Floats) -> Floats:
         """Return the matrix, [3, 4], that brings an image nearest to a photograph by least squares, pixels [M, 3]."""
-
-
-class Exposure(OwnColours):
-    """Colours of which a photograph has one matrix for all its pixels."""
-
-    def state(self, run: Run) -> "ExposureState":
-        return ExposureState(self, [view.name for view in run.scene.split("train")])
 
     @abstractmethod
     def matrix(self, row: Floats) -> Floats:
@@ -123,7 +175,7 @@ class Exposure(OwnColours):
         return 0.0, np.zeros_like(row)
 
 
-class Gain(Exposure):
+class Gain(ColourModel):
     """An exposure and a white balance of each photograph.
 
     Channels are multiplied by exp(exposure + (red, green, blue)); green follows from red and blue, so that the
@@ -152,7 +204,7 @@ class Gain(Exposure):
         return fitted_gains(image, photograph)
 
 
-class Affine(Exposure):
+class Affine(ColourModel):
     """An affine change of the colours of each photograph, twelve numbers (Kerbl et al. 2024).
 
     It follows white balance, contrast and haze, and also what is none of these: colours that change with the direction
@@ -190,60 +242,25 @@ class Affine(Exposure):
         return np.asarray(np.linalg.lstsq(squares, products, rcond=None)[0].T, np.float64)
 
 
-class AutoExposure(Colours):
-    """Colours of each photograph where exposures differ, by what the photographs show of the same points.
+class Exposure(Appearance):
+    """Colours of each photograph, where exposures differ: one matrix for all its pixels."""
 
-    The logarithms of the exposures are measured on the tracks of the dataset's points, before training.  Photographs
-    have colours of their own where two bounds are passed: the standard deviation of the exposures, and their share of
-    what differs between photographs of one point; light that changes with the direction of view is the rest.  Elsewhere
-    the bits are those without this key.
-    """
-
-    output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
-
-    type: Literal["auto"] = "auto"
-    model: OneOf[OwnColours] = Gain()
-    """What photographs have, where exposures differ."""
-    above: Annotated[float, Field(ge=0)] = SPREAD
-    """Standard deviation of the logarithms of the exposures above which they do; 0.03 is 3 %."""
-    explained: Annotated[float, Field(ge=0, lt=1)] = EXPLAINED
-    """Share of the differences above which they do."""
-    chosen: Literal["on", "off"] | None = None
-    """Written by a run: whether photographs have colours of their own."""
-    reason: str = ""
-    """Written by a run: why."""
+    type: Literal["exposure"] = "exposure"
+    model: OneOf[ColourModel] = Gain()
+    """What a photograph has: `gain`, an exposure and a white balance, or `affine`."""
 
     @property
-    def in_use(self) -> OwnColours | None:
-        """What photographs have, once it is chosen."""
-        return self.model if self.chosen == "on" else None
+    def fit(self) -> ColourModel:
+        return self.model
 
-    def device_bytes(self, views: Sequence[View], tile: int) -> int:
-        return 0 if self.chosen == "off" else self.model.device_bytes(views, tile)
-
-    def settled(self, run: Run) -> "AutoExposure":
-        """Return it with the choice that follows from the exposures of the photographs; one that is made stays."""
-        if self.chosen is not None:
-            return self
-        exposures = exposures_of(run)
-        if not exposures.log_gains:
-            return self._choose("off", exposures.text)
-        few, alike = exposures.spread <= self.above, exposures.explained <= self.explained
-        bounds = [f"{self.above:.1%}", f"{self.explained:.0%} of what differs"]
-        if not few and not alike:
-            return self._choose("on", f"{exposures.text}; more than {bounds[0]}, and than {bounds[1]}")
-        missed = " nor ".join(bound for bound, decides in zip(bounds, (few, alike), strict=True) if decides)
-        return self._choose("off", f"{exposures.text}; not more than {missed}")
-
-    def _choose(self, chosen: Literal["on", "off"], reason: str) -> "AutoExposure":
-        LOG.info("optimize.colours: %s, since %s", chosen, reason)
-        return self.model_copy(update={"chosen": chosen, "reason": reason})
+    def state(self, run: Run) -> "ExposureState":
+        return ExposureState(self, [view.name for view in run.scene.split("train")])
 
 
 class ColourState(ModuleState):
     """What a training has of the colours of its photographs, of whichever kind."""
 
-    def __init__(self, settings: OwnColours, views: Sequence[str]) -> None:
+    def __init__(self, settings: Appearance, views: Sequence[str]) -> None:
         """views: the names of the training views, by number; one of several sizes has one row."""
         super().__init__()
         self.settings, self.views, self.names = settings, views, tuple(dict.fromkeys(views))
@@ -261,6 +278,10 @@ class ColourState(ModuleState):
     def begin_with(self, log_gains: Mapping[str, Floats]) -> None:
         """Set the first numbers.  log_gains: of red, green and blue by view, where known, [3]."""
 
+    @property
+    def measured_as(self) -> ColourModel:
+        return self.settings.fit
+
     @abstractmethod
     def written(self) -> Written:
         """Return what the run folder gets."""
@@ -269,7 +290,9 @@ class ColourState(ModuleState):
         """Write the colours of each training photograph; log a line.  Raises NumericError where they are not finite."""
         found = self.written()
         if wrong := next((view for view, matrix in found.matrices.items() if not np.isfinite(matrix).all()), None):
-            raise NumericError(f"the colours of {quoted(wrong)} are not finite; lower optimize.colours.rate")
+            raise NumericError(
+                f"the colours of {quoted(wrong)} are not finite; lower optimize.modules.{self.settings.type}.rate"
+            )
         write_text(run.out / VIEW_COLOURS, json.dumps(found.facts, indent=1) + "\n")
         for name, array in found.arrays.items():
             with atomic(run.out / name) as file:
@@ -288,19 +311,20 @@ class ExposureState(ColourState):
 
     @property
     def table(self) -> ViewTable:
-        return ViewTable(TABLE, self.names, self.settings.columns)
+        return ViewTable(TABLE, self.names, self.settings.model.columns)
 
     def takes(self, numbers: Numbers, tables: Tables) -> bool:
         return self.table.begun(numbers)
 
     def begin_with(self, log_gains: Mapping[str, Floats]) -> None:
-        self.table.begin(self.numbers, {view: self.settings.of_gains(gains) for view, gains in log_gains.items()})
+        of_gains = self.settings.model.of_gains
+        self.table.begin(self.numbers, {view: of_gains(gains) for view, gains in log_gains.items()})
 
     def after_render(self, step: Step) -> None:
         if step.view is None:
             return
         row = self.table.row(self.numbers, self.views[step.view])
-        penalty, matrix, image = self.settings.penalty(row)[0], self.settings.matrix(row), step.image
+        penalty, matrix, image = self.settings.model.penalty(row)[0], self.settings.model.matrix(row), step.image
         step.keep(self, (image, matrix, []))
         step.image = change_colours(step.workspace, step.camera, image, matrix)
         step.own_losses.append(LossValue("colours", lambda: penalty))
@@ -319,23 +343,24 @@ class ExposureState(ColourState):
     def learn(self, view: int, by_matrix: Floats, step: int) -> None:
         """Change the numbers of a view; by_matrix: derivatives of the losses by its matrix, [3, 4]."""
         row = self.table.row(self.numbers, self.views[view])
-        gradient = self.settings.gradient(row, by_matrix) + self.settings.penalty(row)[1]
+        gradient = self.settings.model.gradient(row, by_matrix) + self.settings.model.penalty(row)[1]
         self.table.update(self.numbers, self.views[view], gradient, at_step(self.rate, step))
 
     def matrix(self, view: int) -> Floats:
         """Return the matrix of a training view by its number, [3, 4]."""
-        return self.settings.matrix(self.table.row(self.numbers, self.views[view]))
+        return self.settings.model.matrix(self.table.row(self.numbers, self.views[view]))
 
     def written(self) -> Written:
         rows = {view: self.table.row(self.numbers, view) for view in self.table.views}
-        matrices = {view: self.settings.matrix(row) for view, row in rows.items()}
+        matrices = {view: self.settings.model.matrix(row) for view, row in rows.items()}
+        model = self.settings.model
         photographs = {
-            view: {**dict(zip(self.settings.columns, map(float, row), strict=True)), "matrix": matrices[view].tolist()}
+            view: {**dict(zip(model.columns, map(float, row), strict=True)), "matrix": matrices[view].tolist()}
             for view, row in rows.items()
         }
-        kind = getattr(self.settings, "type", type(self.settings).__name__)
         meaning = f"{MEANING}; matrix: the rows of [E | b]"
-        return Written(matrices, {"meaning": meaning, "type": kind, "photographs": photographs})
+        facts = {"meaning": meaning, "type": self.settings.type, "model": model.type, "photographs": photographs}
+        return Written(matrices, facts)
 
 
 def fitted_gains(image: Floats, photograph: Floats) -> Floats:
@@ -397,24 +422,3 @@ def change_back(
 def _arguments(camera: DeviceCamera, image: Array, matrix: Floats) -> dict[str, Any]:
     values: dict[str, Any] = dict(zip(NAMES, map(float, matrix.ravel()), strict=True))
     return {**values, "channels": image.shape[0], **camera.plane_arguments()}
-
-
-def colours_of(run: Run) -> OwnColours | None:
-    """Return what photographs have been given in training, or None."""
-    return next((one.settings for one in run.modules.values() if isinstance(one, ColourState)), None)
-
-
-def colours_beside(model: Path) -> OwnColours | None:
-    """Return what photographs were given where a model was trained, by the table beside its file; None without one.
-
-    Raises DataError where the table is damaged.
-    """
-    path = model.with_name(VIEW_COLOURS)
-    if not path.is_file():
-        return None
-    data, known = read_json(path, "colours of photographs"), variants(OwnColours)
-    name = data.get("type") if isinstance(data, dict) else None
-    if not isinstance(name, str) or name not in known:
-        names = ", ".join(known)
-        raise DataError(f"{path}: the type of colours is {quoted(name)}; expected one of {names}: write it again")
-    return known[name].model_validate({})

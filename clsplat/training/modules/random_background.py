@@ -19,6 +19,7 @@ class RandomBackground(TrainingModule):
     """Draw the colour behind everything in each step: uniform, by the seed and the step alone."""
 
     conflicts: ClassVar[Mapping[str, str]] = {"sky": "it is behind everything, and drawn colours would be too"}
+    joins: ClassVar[bool] = True
 
     type: Literal["random_background"] = "random_background"
     where: Literal["always", "transparent"] = "always"

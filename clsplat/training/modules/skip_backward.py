@@ -43,6 +43,7 @@ class Skip(TrainingModule):
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     place: ClassVar[int] = 99  # it reads the losses of all others
     outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "numbers"
+    joins: ClassVar[bool] = True
 
     type: Literal["skip"] = "skip"
     start: Annotated[int, Field(ge=0)]
