@@ -23,10 +23,7 @@ from clsplat.stages.init import will_learn_sky
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.best_model import Best, Measured
 from clsplat.training.checkpoint import copied_of, finite_values, put_back
-from clsplat.training.modules.base import ModuleState, TrainingModule, attached, check_list
-from clsplat.training.modules.depth_supervision import KnownDepthsState, require_depths
-from clsplat.training.modules.learned_transform import LearnedTransformState
-from clsplat.training.modules.sky import SkyState
+from clsplat.training.modules.base import ModuleState, TrainingModule, attached, brought, check_list
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room, place_harmonics
@@ -275,8 +272,7 @@ class Optimize(Keeping):
 
     def check_in(self, run: Run) -> None:
         super().check_in(run)
-        require_depths(self.losses, run.scene)
-        for module in self.modules:
+        for module in (*brought(run, self), *self.modules):
             module.check_in(run)
         if will_learn_sky(run):
             self.check_beside("sky", run.scene)
@@ -354,8 +350,6 @@ class Optimize(Keeping):
         if run.sky:
             self.check_beside("sky", run.scene)
         states: list[ModuleState] = attached(self.modules, run, last)
-        brought = [*([SkyState(run.sky)] if run.sky else []), *KnownDepthsState.of(self.losses, run)]
-        states = [*brought, *states, LearnedTransformState(run.numbers)]
         trained = self.losses, rates, run.scene.extent, run.numbers, self.update
         return Trainer(*parts, *trained, modules=states)
 

@@ -39,14 +39,11 @@ from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.structs import moment_tables
 from clsplat.losses.base import ViewLosses
 from clsplat.losses.image import psnr
-from clsplat.render.backdrops import Auto, Directions
 from clsplat.training import archive, best_model, field
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.archive import Arrays, split
 from clsplat.training.best_model import Best, Tables, model_tables
-from clsplat.training.modules import sky
 from clsplat.training.modules.base import Numbers, kind_of, modules_of, restored
-from clsplat.training.modules.sky import LearnedSky
 from clsplat.training.run import Run
 from clsplat.training.settings_diff import differences
 from clsplat.training.sh_offload import make_room
@@ -150,27 +147,14 @@ def put_back_modules(run: Run, numbers: Mapping[str, Numbers], tables: Arrays) -
 
 def copied_of(run: Run) -> Tables:
     """Copy what the run's model needs to be rendered, and to be trained from anew, to the host."""
-    own = run.sky.tables() if run.sky else {}
-    behind = {sky.FOLDER + name: table for name, table in own.items()}
-    return {**model_tables(run.model), **behind, **dict(module_tables(run, whole=False))}
+    return {**model_tables(run.model), **dict(module_tables(run, whole=False))}
 
 
 def put_back(run: Run, tables: Tables, best: Best) -> None:
     """Make what was copied the run's model."""
-    own, of_gaussians = split(tables, sky.FOLDER)
-    of_modules, of_gaussians = split(of_gaussians, MODULES)
+    of_modules, of_gaussians = split(tables, MODULES)
     put_back_modules(run, best.modules, of_modules)
     run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), best.degree)
-    restore_sky(run, own)
-
-
-def restore_sky(run: Run, tables: Tables) -> None:
-    """Give a run the sky of its tables, by their own names; without any it has none."""
-    given = run.model_settings.background
-    background = given.model if isinstance(given, Auto) else given
-    run.sky = None
-    if tables and isinstance(background, Directions):
-        run.sky = LearnedSky.of_tables(background, tables, run.device)
 
 
 # The tables of a run in its checkpoint: those of a field, or of Gaussians, what is behind them, and the best model.
@@ -185,7 +169,6 @@ def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
         return
     gaussians = run.model.gaussians
     yield from ((_key(name), gaussians.get(name)) for name in gaussians.tables)
-    yield from ((sky.FOLDER + name, table) for name, table in (run.sky.tables() if run.sky else {}).items())
     yield from module_tables(run)
     yield from ((best_model.FOLDER + name, table) for name, table in run.best_tables.items())
 
@@ -212,10 +195,8 @@ def check_run_tables(state: State, tables: Arrays) -> None:
 
 
 def _gaussians(modules: Mapping[str, Numbers], tables: Arrays) -> Arrays:
-    """Check the tables of the sky and of modules; return the others."""
-    behind, own = split(tables, sky.FOLDER)
-    sky.check_tables(behind)
-    of_modules, own = split(own, MODULES)
+    """Check the tables of modules; return the others."""
+    of_modules, own = split(tables, MODULES)
     check_modules(modules, of_modules)
     return own
 
@@ -229,7 +210,6 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
         run.learned_field.updates = state.updates[UPDATES]
         return
     run.best_tables, tables = split(tables, best_model.FOLDER)
-    behind, tables = split(tables, sky.FOLDER)
     of_modules, tables = split(tables, MODULES)
     saved = {name: (own, split(of_modules, f"{name}/")[0]) for name, own in state.modules.items()}
     run.modules = restored(run, saved)
@@ -246,7 +226,6 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
         if name not in gaussians.tables:
             gaussians.add(name, table.shape[1], zero_fresh=name in state.zero_fresh)
         gaussians.set(name, table)
-    restore_sky(run, behind)
 
 
 def _key(table: str) -> str:

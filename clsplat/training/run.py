@@ -34,6 +34,7 @@ from clsplat.training.records import Records, clocks
 from clsplat.training.status import StatusFile
 
 Item = TypeVar("Item")
+SKY = "sky"  # the type of the module of a model's sky
 
 
 @dataclass
@@ -60,7 +61,6 @@ class Run:
     losses: list[Loss] = field(default_factory=list)  # added from Python, beside those of the pipeline
     adam: Adam | None = None
     stats: SplatStats | None = None
-    sky: Any = None  # of the model, where it has one: a LearnedSky
     modules: dict[str, Any] = field(default_factory=dict)  # states of its trainings' modules, by name
     learned_field: TrainedField | None = None  # in the place of a model
     step: int = 0  # updates done, or in progress
@@ -89,6 +89,11 @@ class Run:
         self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}
+
+    @property
+    def sky(self) -> Any:
+        """The LearnedSky of the model; None where it has none."""
+        return self.modules.get(SKY)
 
     @property
     def model(self) -> DeviceModel:
@@ -138,7 +143,7 @@ class Run:
     def begin_again(self, best: Best) -> None:
         """Come to the beginning of the pipeline, to train again for the steps of the best model."""
         self._model = None
-        self.adam = self.stats = self.sky = None
+        self.adam = self.stats = None
         self.modules = {}
         self.numbers = {}
         self.metrics = {}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.training import checkpoint
-from clsplat.training.modules.transients import BINS, KEYS, Transients, measure_residuals
+from clsplat.training.modules.transients import BINS, KEYS, Transients, mask_transients, measure_residuals
 from tests.support.runs import FEW, digest, train
 
 ON = (*FEW, "optimize.modules.transients={start: 4, above: 1, tail: 0}")
@@ -82,7 +82,8 @@ def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_p
     settings = Transients(start=300, tail=0)
     threshold = settings.threshold(run.modules["transients"].numbers, 301)
     assert threshold is not None
-    left_out = settings.mask(workspace, photograph.camera, residuals, threshold).get()[0, :40, :40] == 0
+    reach = max(1, round(settings.box * 40 / 2))
+    left_out = mask_transients(workspace, photograph.camera, residuals, threshold, reach).get()[0, :40, :40] == 0
     inside = left_out[12:24, 10:22].copy()
     left_out[11:25, 9:23] = False
     assert (inside.mean() > 0.8, left_out.mean() < 0.05) == (True, True), (inside.mean(), left_out.mean())

@@ -16,7 +16,7 @@ from clsplat.render.backdrops import Directions
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.sky import Skies
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.sky import LearnedSky, SkyState
+from clsplat.training.modules.sky import LearnedSky
 from clsplat.training.trainer import Trainer
 from tests.support.figures import hold
 
@@ -55,7 +55,7 @@ class Scene:
         mask = None if share is None else device.upload((rng.random((1, 36, 50)) < share).astype(np.uint8))
         self.photograph = Photograph(camera, device.upload(np.rint(255 * pixels).astype(np.uint8)), mask)
         parts = rasterizer, self.model, Adam(self.model.gaussians), SplatStats(self.model.gaussians, [])
-        self.trainer = Trainer(*parts, black, (L2(),), Rates(), modules=[SkyState(LearnedSky(settings, sky))])
+        self.trainer = Trainer(*parts, black, (L2(),), Rates(), modules=[LearnedSky(settings, sky)])
         sky.texels.set(np.clip(sky.texels.get() + rng.normal(0, 0.01, sky.texels.shape), 0, 1).astype(np.float32))
 
     def loss(self) -> float:

@@ -82,6 +82,7 @@ class ModuleState:
     numbers and tables, so that a failure before it leaves the run at the step before."""
 
     outlasts: str = "no"  # as its module says
+    is_saved: ClassVar[bool] = True  # in checkpoints
 
     def __init__(self) -> None:
         self.numbers: Numbers = {}  # on the host, by name, with their moments
@@ -143,6 +144,7 @@ class TrainingModule(Settings):
 
     family: ClassVar[str] = ""  # of those that exclude each other; "": those of the same type
 
+    brought_as: ClassVar[str] = ""  # its type, where no list names it: the model, a loss or the views bring it
     by_type: ClassVar[bool] = True
     joins: ClassVar[bool] = False  # a run may go on with it, or without it; bits then no longer compare
 
@@ -153,6 +155,11 @@ class TrainingModule(Settings):
     def kin(self) -> str:
         """What modules that exclude each other have in common."""
         return self.family or self.type
+
+    @classmethod
+    def brought(cls, run: Run, stage: Any) -> "TrainingModule | None":
+        """Return it where the model of a run, or a stage, brings it, though no list names it."""
+        return None
 
     def settled(self, run: Run) -> "TrainingModule":
         """Return it with what follows from the photographs."""
@@ -211,7 +218,7 @@ def check_list(modules: Sequence[TrainingModule], others: Sequence[str] = ()) ->
 
 def attached(modules: Sequence[TrainingModule], run: Run, last: int) -> list[ModuleState]:
     """Return the states of a training up to a global step, in order: those of its list, and those that act on."""
-    listed = [(one, True) for one in modules if one.is_active(run.scene)]
+    listed = [(one, True) for one in (*brought(run), *modules) if one.is_active(run.scene)]
     kin = {one.kin for one, _ in listed}
     earlier = [one for one in modules_of(run).values() if one.type in run.modules and one.kin not in kin]
     listed += [(one, False) for one in earlier if one.outlasts == "acts"]
@@ -219,12 +226,13 @@ def attached(modules: Sequence[TrainingModule], run: Run, last: int) -> list[Mod
     run.modules = {one.type: before[one.type] for one in earlier}
     for module, trained in sorted(listed, key=lambda one: one[0].place):
         state, old = state_of(module, run), before.get(module.type)
-        if old and state.takes(old.numbers, tables := old.tables()):
+        if old and old is not state and state.takes(old.numbers, tables := old.tables()):
             state.load(old.numbers, tables)
-        else:
+        elif old is not state:
             state.begin(run)
         state.prepare(run, last, trained)
-        run.modules[module.type] = state
+        if state.is_saved:
+            run.modules[module.type] = state
         states.append(state)
     return states
 
@@ -239,7 +247,18 @@ def modules_of(run: Run) -> dict[str, TrainingModule]:
     """The modules of a run's trainings so far, by type: the last of each."""
     stages = getattr(run.settings, "stages", ())[: run.cursor + 1]
     listed = (module for stage in stages for module in getattr(stage, "modules", ()))
-    return {module.type: module for module in listed if module.is_active(run.scene)}
+    return {module.type: module for module in (*listed, *brought(run)) if module.is_active(run.scene)}
+
+
+def brought(run: Run, stage: Any = None) -> list[TrainingModule]:
+    """Return the modules that no list names, of a stage; None: of that in progress."""
+    stages = getattr(run.settings, "stages", ())
+    stage = stages[run.cursor] if stage is None and run.cursor < len(stages) else stage
+    return [module for kind in _unlisted().values() if (module := kind.brought(run, stage))]
+
+
+def _unlisted() -> dict[str, type[TrainingModule]]:
+    return {one.brought_as: one for one in Settings.defined if issubclass(one, TrainingModule) and one.brought_as}
 
 
 def restored(run: Run, saved: Mapping[str, tuple[Numbers, Tables]]) -> dict[str, ModuleState]:
@@ -269,7 +288,7 @@ def scene_beside(model: Path, scene: Scene) -> Scene:
 
 def kind_of(name: str) -> type[TrainingModule]:
     """Return the class of a checkpoint's module.  Raises ConfigError for one that is not known."""
-    if (kind := variants(TrainingModule).get(name)) is None:
+    if (kind := {**variants(TrainingModule), **_unlisted()}.get(name)) is None:
         raise ConfigError(f"the checkpoint has a module '{name}', which is not known; give its --plugin")
     return kind
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, ClassVar
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.losses.base import Loss
@@ -9,24 +10,42 @@ from clsplat.losses.depth import InverseDepth
 from clsplat.photos.depths import DepthMaps, PointDepths
 from clsplat.scene.quality import within
 from clsplat.scene.scene import Scene
-from clsplat.training.modules.base import ModuleState, Step
+from clsplat.training.modules.base import ModuleState, Step, TrainingModule
 from clsplat.training.run import Run
 
 
-class KnownDepthsState(ModuleState):
-    """The known depths in a step.  The loss brings them: no list names them."""
+class DepthSupervision(TrainingModule):
+    """The depths that a loss reads.  The loss brings it: no list names it."""
 
-    def __init__(self, depths: PointDepths) -> None:
+    brought_as: ClassVar[str] = "depth_supervision"
+    place: ClassVar[int] = -10
+
+    losses: list[Any]
+
+    @classmethod
+    def brought(cls, run: Run, stage: Any) -> "DepthSupervision | None":
+        losses = [loss for loss in getattr(stage, "losses", ()) if isinstance(loss, InverseDepth)]
+        return cls(type=cls.brought_as, losses=losses) if losses else None
+
+    def check_in(self, run: Run) -> None:
+        require_depths(self.losses, run.scene)
+
+    def state(self, run: Run) -> "KnownDepthsState":
+        return KnownDepthsState(known_depths(self.losses, run))
+
+
+class KnownDepthsState(ModuleState):
+    """The known depths in a step."""
+
+    is_saved: ClassVar[bool] = False
+
+    def __init__(self, depths: PointDepths | None) -> None:
         super().__init__()
         self.depths = depths
 
-    @classmethod
-    def of(cls, losses: Sequence[Loss], run: Run) -> "list[KnownDepthsState]":
-        found = known_depths(losses, run)
-        return [cls(found)] if found else []
-
     def before_losses(self, step: Step) -> None:
-        step.comparison.depths = self.depths.at(step.camera)
+        if self.depths:
+            step.comparison.depths = self.depths.at(step.camera)
 
 
 def known_depths(losses: Sequence[Loss], run: Run) -> PointDepths | None:

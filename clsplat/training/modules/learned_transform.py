@@ -1,13 +1,36 @@
 """A transform of the photograph whose numbers are learned.  The views bring it: no list names it."""
 
+from typing import Any, ClassVar
+
 from clsplat.losses.base import LossValue, gradient_by_photograph
 from clsplat.photos.photographs import apply_mask
 from clsplat.photos.transforms import learned_of, name_of
-from clsplat.training.modules.base import ModuleState, Numbers, Step
+from clsplat.training.modules.base import ModuleState, Numbers, Step, TrainingModule
+from clsplat.training.run import Run
+
+
+class TransformModule(TrainingModule):
+    """A transform of the photograph that learns.  The views bring it: no list names it."""
+
+    brought_as: ClassVar[str] = "learned_transform"
+    place: ClassVar[int] = 100
+
+    @classmethod
+    def brought(cls, run: Run, stage: Any) -> "TransformModule | None":
+        transforms = getattr(getattr(stage, "views", None), "transforms", ())
+        return cls(type=cls.brought_as) if learned_of(transforms) else None
+
+    def state(self, run: Run) -> "LearnedTransformState":
+        return LearnedTransformState(run.numbers)
 
 
 class LearnedTransformState(ModuleState):
+    """The transform in a step."""
+
+    is_saved: ClassVar[bool] = False
+
     def __init__(self, numbers: Numbers) -> None:
+        super().__init__()
         self.numbers = numbers  # those of the run
 
     def before_losses(self, step: Step) -> None:
