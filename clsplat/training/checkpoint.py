@@ -262,7 +262,7 @@ def lower_rate(run: Run, broken: Collection[str]) -> str:
     return f"{stage if alone else f'stages.{place}'}.rates.{name}={value:.2g}"
 
 
-FORMAT = 4
+FORMAT = 5
 LOG = logging.getLogger("clsplat")
 
 
@@ -454,9 +454,9 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
     run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
     run.best = state.best
-    restore_tables(run, state, tables)
     if run.is_refit:
         run.divide(run.original.with_fold())
+    restore_tables(run, state, tables)
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 

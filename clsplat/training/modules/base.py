@@ -139,9 +139,8 @@ class TrainingModule(Settings):
     place: ClassVar[int] = 0  # in the list: modules stand in ascending order of it
     outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "no"
     """What outlasts its training: its numbers, for measurements; or it acts in later trainings too."""
-    conflicts: ClassVar[Mapping[str, str]] = {}  # why it does not go with another module, or with a part of the model
-    files: ClassVar[Mapping[str, str]] = {}  # side files in the run folder, and what a summary calls them
-
+    conflicts: ClassVar[Mapping[str, str]] = {}  # why it does not go with another module, a part of the model or a loss
+    files: ClassVar[Mapping[str, str]] = {}  # side files in the run folder, which begin with `view_`, and their titles
     family: ClassVar[str] = ""  # of those that exclude each other; "": those of the same type
 
     brought_as: ClassVar[str] = ""  # its type, where no list names it: the model, a loss or the views bring it
@@ -202,8 +201,8 @@ class TrainingModule(Settings):
         return scene
 
 
-def check_list(modules: Sequence[TrainingModule], others: Sequence[str] = ()) -> None:
-    """Raise ValueError for modules out of order, twice, or that exclude each other.  others: parts of the model."""
+def check_list(modules: Sequence[TrainingModule]) -> None:
+    """Raise ValueError for modules out of order, twice, or that exclude each other."""
     kin = [one.kin for one in modules]
     for before, after in itertools.pairwise(modules):
         if after.place < before.place:
@@ -211,7 +210,7 @@ def check_list(modules: Sequence[TrainingModule], others: Sequence[str] = ()) ->
     for i, one in enumerate(modules):
         if (first := kin.index(one.kin)) < i:
             raise ValueError(f"'{one.type}' and '{modules[first].type}' exclude each other; leave one out")
-        for other in (*kin, *others):
+        for other in kin:
             if one.excludes(other):
                 raise ValueError(f"'{one.type}' does not go with '{other}': {one.conflicts[other]}; leave one out")
 
