@@ -9,22 +9,47 @@ from clsplat.losses.base import (
     Comparison,
     ImageLoss,
     Loss,
+    LossValue,
     Penalty,
     PenaltyInputs,
     ViewGradients,
     ViewLosses,
     content_of,
+    gradient_by_photograph,
     require_symmetric,
     returned,
 )
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.photographs import Photograph, apply_mask, known_gradient
-from clsplat.photos.transforms import PhotographTransform
+from clsplat.photos.transforms import LearnedTransform, PhotographTransform, learned_of, name_of
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.modules.base import ModuleState, Step
+from clsplat.training.modules.base import ModuleState, Numbers, Step
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
+
+
+class _Learning(ModuleState):
+    """The transform of a step's photograph that learns: it takes part as a module does."""
+
+    def __init__(self, transform: LearnedTransform, numbers: Numbers) -> None:
+        super().__init__()
+        self.transform, self.numbers = transform, numbers
+
+    def before_losses(self, step: Step) -> None:
+        """A loss keeps the sums of its last call, so that the gradient by the photograph comes before its value."""
+        gradient = gradient_by_photograph(step.losses_asked, step.comparison)
+        if step.planes.mask is not None:
+            apply_mask(step.workspace, step.camera, gradient, step.planes.mask)
+        of_images = self.transform.backward(step.planes, gradient)
+        value, of_numbers = self.transform.penalty(self.transform.now(self.numbers), step.number)
+        step.own_losses.append(LossValue(name_of(self.transform), lambda: value))
+        step.keep(self, (of_images, of_numbers))
+
+    def update(self, step: Step) -> None:
+        of_images, of_numbers = step.kept(self)
+        gradients = {name: derivative + of_numbers[name] for name, derivative in of_images().items()}
+        self.transform.update(self.numbers, gradients, step.number)
 
 
 @dataclass
@@ -100,7 +125,9 @@ class Trainer:
         require_symmetric(self.losses, transforms)
         workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings
         now = Step(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
-        for module in self.modules:
+        learned = learned_of(transforms)
+        now.modules = [*self.modules, *([_Learning(learned, self.numbers)] if learned else [])]
+        for module in now.modules:
             module.before_render(now)
         camera = now.camera
         now.frame = self.rasterizer.forward(now.model, camera, now.background, content)
@@ -108,7 +135,7 @@ class Trainer:
         backgrounds = self.background, now.background
         now.planes = now.photograph.planes(workspace, transforms, step, self.numbers, backgrounds)
         now.image, now.gradient = now.frame.image, workspace.array("grad_image", now.frame.image.shape)
-        for module in self.modules:
+        for module in now.modules:
             module.after_render(now)
         target, mask = now.planes.colours, now.planes.mask
         now.comparison = comparison = Comparison(workspace, camera, now.image, target, now.gradient, mask, step)
@@ -118,11 +145,11 @@ class Trainer:
         if mask is not None:  # pixels that do not count are black in both images and have no gradient
             apply_mask(workspace, camera, now.image, mask)
             apply_mask(workspace, camera, target, mask)
-        for module in self.modules:
+        for module in now.modules:
             module.before_losses(now)
         now.losses += [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
         now.losses += now.own_losses
-        for module in self.modules:
+        for module in now.modules:
             module.after_losses(now)
         return ViewLosses(now.frame, comparison, now.losses, step=now)
 
@@ -132,23 +159,23 @@ class Trainer:
         mask = now.planes.mask
         if mask is not None:
             apply_mask(workspace, now.camera, now.gradient, mask)
-        for module in reversed(self.modules):
+        for module in reversed(now.modules):
             module.backward(now)
         self.rasterizer.device.timings.section = "statistics"
         texture = known_gradient(workspace, now.camera, now.planes.colours, mask) if count > TEXTURE else None
         now.pixel_sums = self.rasterizer.pixel_sums(now.model, now.frame, now.gradient, count, texture, now.behind)
-        for module in reversed(self.modules):
+        for module in reversed(now.modules):
             module.after_backward(now)
         return ViewGradients(now.frame, now.comparison, now.losses, now.pixel_sums, step=now)
 
     def update(self, view: ViewLosses, stale: Collection[str] = ()) -> None:
         """Apply what `differentiate` returned: change parameters, moments and statistics, and the modules' own."""
         if not isinstance(view, ViewGradients):
-            for module in self.modules:
+            for module in view.step.modules:
                 module.update_skipped(view.step)
             return
         grad_mean2d = self._update(view, stale)
-        for module in reversed(self.modules):  # what the device had ready first is waited for first
+        for module in reversed(view.step.modules):  # what the device had ready first is waited for first
             module.update(view.step)
         self.rasterizer.device.timings.section = "statistics"
         self.stats.add(view, grad_mean2d)

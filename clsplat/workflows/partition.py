@@ -437,7 +437,7 @@ def require_divisible(pipeline: Pipeline) -> None:
         "scene.validation": (settings.scene.validation != 0, "a block has no views to choose by; set it to 0"),
         "scene.extent": (settings.scene.extent, "blocks have that of the whole scene; leave it out"),
         "optimize.modules": (
-            any(one.excludes("blocks") for stage in trainings for one in stage.modules),
+            any("blocks" in one.conflicts for stage in trainings for one in stage.modules),
             "some would differ from block to block; leave them out",
         ),
         "densify.budget": (

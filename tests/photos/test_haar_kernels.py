@@ -19,7 +19,6 @@ from clsplat.photos.transforms import Blur, Planes
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.learned_transform import LearnedTransformState
 from clsplat.training.trainer import Trainer
 from tests.support.figures import hold
 
@@ -115,7 +114,6 @@ def trainer_of(device, rng, losses, masked: bool = True) -> tuple[Trainer, Photo
     model = case.model(device)
     parts = Adam(model.gaussians), SplatStats(model.gaussians), device.zeros(3)
     trainer = Trainer(Rasterizer(device, "radix"), model, *parts, losses, Rates())
-    trainer.modules = [LearnedTransformState(trainer.numbers)]
     colours = rng.integers(0, 256, (3, 30, 41)).astype(np.uint8)
     mask = device.upload((rng.random((1, 30, 41)) < 0.7).astype(np.uint8)) if masked else None
     return trainer, Photograph(case.device_camera(device), device.upload(colours), mask)
@@ -128,7 +126,7 @@ def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked)
     losses = [L1(weight=0.8), Dssim(weight=0.2), L2(weight=3.0), Anisotropy(above=1.0)]
     trainer, photograph = trainer_of(device, rng, losses, masked)
     haar = Haar(learn=learn, weight=0.01)
-    trainer.modules[0].numbers = trainer.numbers = {name: 0.31 + 0.4 * i for i, name in enumerate(haar.first())}
+    trainer.numbers = {name: 0.31 + 0.4 * i for i, name in enumerate(haar.first())}
     before, counted = dict(trainer.numbers), photograph.counted()
     view = trainer.differentiate(photograph, 1, [haar])
     image = view.comparison.image.get()[:, :30, :41].astype(np.float64)
@@ -191,7 +189,6 @@ def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
     sums = view.comparison.image.get()[3].sum(dtype=np.float64)
     assert entropy == pytest.approx(0.3 * sums / (30 * 41), rel=1e-5)
     trainer.losses, trainer.numbers = [WeightEntropy()], {}
-    trainer.modules[0].numbers = trainer.numbers
     trainer.step(photograph, 2, [Haar(weight=0.05)])
     assert trainer.numbers["haar/scale/moment1"] / 0.1 == pytest.approx(-0.2), "its own loss alone"
 

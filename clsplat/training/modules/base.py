@@ -49,6 +49,7 @@ class Step:
     own_losses: list[LossValue] = field(default_factory=list)  # of modules
     pixel_sums: Array = field(init=False)
     skipped: bool = False
+    modules: "Sequence[ModuleState]" = ()  # that take part: forward in this order, backward in reverse
     _kept: dict[int, Any] = field(default_factory=dict)
 
     @property

@@ -20,6 +20,7 @@ class RandomBackground(TrainingModule):
 
     conflicts: ClassVar[Mapping[str, str]] = {"sky": "it is behind everything, and drawn colours would be too"}
     joins: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"where"})
 
     type: Literal["random_background"] = "random_background"
     where: Literal["always", "transparent"] = "always"

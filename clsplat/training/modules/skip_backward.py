@@ -44,6 +44,7 @@ class Skip(TrainingModule):
     place: ClassVar[int] = 99  # it reads the losses of all others
     outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "numbers"
     joins: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"start", "decay", "warm_up", "least"})
 
     type: Literal["skip"] = "skip"
     start: Annotated[int, Field(ge=0)]
