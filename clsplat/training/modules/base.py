@@ -161,6 +161,11 @@ class TrainingModule(Settings):
         """Return it where the model of a run, or a stage, brings it, though no list names it."""
         return None
 
+    @classmethod
+    def saved(cls, run: Run) -> "TrainingModule | None":
+        """Return it for a run whose checkpoint holds its state, where it is brought."""
+        return None
+
     def settled(self, run: Run) -> "TrainingModule":
         """Return it with what follows from the photographs."""
         return self
@@ -265,8 +270,8 @@ def restored(run: Run, saved: Mapping[str, tuple[Numbers, Tables]]) -> dict[str,
     """Return the states of a checkpoint, by type."""
     modules, found = modules_of(run), dict[str, ModuleState]()
     for name, (numbers, tables) in saved.items():
-        if name in modules:
-            found[name] = state_of(modules[name], run)
+        if module := modules.get(name, kind_of(name).saved(run)):
+            found[name] = state_of(module, run)
             found[name].load(numbers, tables)
     return found
 

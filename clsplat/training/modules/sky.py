@@ -29,6 +29,10 @@ class SkyModule(TrainingModule):
 
     @classmethod
     def brought(cls, run: Run, stage: Any) -> "SkyModule | None":
+        return cls(type=SKY) if run.sky else None
+
+    @classmethod
+    def saved(cls, run: Run) -> "SkyModule | None":
         return cls(type=SKY) if _background(run) else None
 
     def state(self, run: Run) -> "LearnedSky":
