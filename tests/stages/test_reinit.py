@@ -86,7 +86,7 @@ def test_its_colors_are_the_models_where_photographs_have_own(tiny_scene, tmp_pa
     grey = opened(tiny_scene, plane(), tmp_path / "model")
     stages = [
         {"init": {"source": "model", "file": str(tmp_path / "model.ply")}},
-        {"optimize": {"steps": 2, "losses": ["l1"], "colours": "gain", "update": "seen"}},
+        {"optimize": {"steps": 2, "losses": ["l1"], "modules": ["exposure"], "update": "seen"}},
         {"reinit_from_depth": {"opacity": 0.2}},
         "export",
     ]
