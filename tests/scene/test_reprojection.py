@@ -101,7 +101,7 @@ def test_the_recipe_for_photographs_learns_poses_from_a_pixel_on(error, learned)
     exposure = Exposure(when="auto", **({} if learned else {"above": 0.2}))
     assert chosen.training.modules == [*([CameraOptimizer(start=500)] if learned else []), exposure]
     if not learned:
-        assert chosen.training.model_copy(update={"colours": None}) == load("fast").settings.training
+        assert chosen.training.model_copy(update={"modules": []}) == load("fast").settings.training
     (told,) = [one.told for one in chosen.choices if "optimize.modules.camera_optimizer" in one.keys]
     assert f"{error:g} px are between a point and where photographs show it" in told
     without = choose(settings, {"photographs": 60})
