@@ -34,6 +34,8 @@ from clsplat.scene.images import inside, require_files
 from clsplat.scene.reader import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.view import View
+from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule
+from clsplat.training.modules.base import Step as TrainingStep
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage, path_in_run
 
@@ -57,7 +59,9 @@ __all__ = [
     "LearnedTransform",
     "LossValue",
     "MemoryLimitError",
+    "ModuleState",
     "NonNegative",
+    "Numbers",
     "NumericError",
     "OneOf",
     "Order",
@@ -79,6 +83,9 @@ __all__ = [
     "Stage",
     "Statistic",
     "Step",
+    "Tables",
+    "TrainingModule",
+    "TrainingStep",
     "View",
     "ViewGradients",
     "ViewPool",

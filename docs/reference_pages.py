@@ -17,7 +17,8 @@ HEADINGS = {
     "losses": "Losses and penalties",
     "rules": "Density rules",
     "prepare": "Prepare steps",
-    "views": "Orders, transforms and colours",
+    "modules": "Training modules",
+    "views": "Orders and transforms",
     "filters": "Filters and backgrounds",
 }
 INTRODUCTIONS = {
@@ -26,8 +27,10 @@ INTRODUCTIONS = {
     "rules": "`densify.rules` is a list. All rules act as one rearrangement of the Gaussians.",
     "statistics": "A [growing rule](rules.md#grow) acts where the mean of its `statistic` is large. Only the "
     "statistics that a rule names are summed and cost time.",
-    "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`, and "
-    "`optimize.colours`.",
+    "modules": "`optimize.modules` is a list: what takes part in a training step next to the Gaussians, each once, in "
+    "the order of the forward pass. `--set` addresses one by its type: `optimize.modules.TYPE.KEY=…`; "
+    "`optimize.modules.TYPE={}` adds it at its place, `optimize.modules.TYPE=null` removes it.",
+    "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`.",
     "filters": "Keys of `model`: the two low-pass filters, one in the scene and one on the screen, and the background.",
     "prepare": "`prepare` is a list: what makes a scene of photographs, once, on the host.",
 }

@@ -246,13 +246,11 @@ UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
 SEAMS = "seams"
-VIEW_COLOURS = "view_colours.json"
-VIEW_GRIDS = "view_colours.npy"
-VIEW_POSES = "view_poses.json"
+MODULE_FILES = "view_"  # what the side files of modules begin with
 RESERVED = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
-        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, SEAMS, "cameras.json", VIEW_COLOURS, VIEW_GRIDS, VIEW_POSES),
+        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, SEAMS, "cameras.json"),
     }
 )
 BEFORE_A_RUN = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml
@@ -290,7 +288,7 @@ def fault_of_output(text: str) -> str | None:
     parts = PureWindowsPath(text).parts
     if not is_inside(text):
         return "it is not inside"
-    if parts[0].casefold() in RESERVED:
+    if parts[0].casefold() in RESERVED or parts[0].casefold().startswith(MODULE_FILES):
         return f"'{parts[0]}' is written by the run itself"
     if any(part.startswith(".") for part in parts):
         return "names with a dot in front are for temporary files"

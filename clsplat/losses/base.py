@@ -14,7 +14,6 @@ from clsplat.opencl.device import Array
 from clsplat.photos.depths import KnownDepths
 from clsplat.photos.transforms import PhotographTransform, learned_of, name_of
 from clsplat.render.camera import DeviceCamera
-from clsplat.render.overlay import Layer
 from clsplat.render.rasterizer import Content, Frame
 from clsplat.render.workspace import Workspace
 
@@ -73,14 +72,7 @@ class ViewLosses:
     frame: Frame
     comparison: Comparison
     losses: list[LossValue]
-    learning: Sequence[Callable[[], None]] = field(default=(), kw_only=True)  # each changes numbers that are learned
-    behind: Array | None = field(default=None, kw_only=True)  # T dL/dT, [rows, stride], of what the splats leave
-    layer: Layer | None = field(default=None, kw_only=True)  # before the model's image, of the photograph alone
-
-    @property
-    def rendered(self) -> Array:
-        """The image before the photograph's colours, [3 or 4, rows, stride]: of the model, and of a layer before it."""
-        return self.layer.image if self.layer else self.frame.image
+    step: Any = field(default=None, kw_only=True)  # the Step of a trainer that it is of
 
     @property
     def loss(self) -> float:

@@ -3,19 +3,18 @@
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, NumericError
+from clsplat.core.errors import DataError, NumericError, amount
 from clsplat.formats.splats import inverse_opacities
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison
 from clsplat.losses.image import ssim_maps
 from clsplat.metrics.images import Mask, psnr, ssim, to_8_bits
 from clsplat.metrics.perceptual import Image, Perceptual
-from clsplat.photos.appearance import OwnColours
 from clsplat.photos.photographs import Photograph, Photographs, unpack
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.painter import Painter
@@ -129,14 +128,25 @@ def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
 
 # PSNR of a rendered image in the colours of its photograph, which no training has seen.
 
+GUESSED = 1.0  # dB by which figures in the photographs' colours are better, from which on the log says why
+
 LEAST = 1e-3  # slope of a regression, below which there is nothing to divide by
 # Usable pixels for each number that is fitted to a channel: p numbers of n independent errors add p / n of their
 # variance to what is measured elsewhere, here 1 / 64, which is 0.07 dB.
 PIXELS = 64
 
 
+class Fitted(Protocol):
+    """Colours of photographs that can be fitted to one."""
+
+    fitted_to_a_channel: ClassVar[int]  # numbers that `fitted` finds for each of red, green and blue
+
+    def fitted(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the matrix, [3, 4], that brings an image nearest to a photograph, pixels [M, 3]."""
+
+
 def colour_figures(
-    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: OwnColours
+    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: Fitted
 ) -> dict[str, float]:
     """Return `psnr_colour` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
 
@@ -165,7 +175,7 @@ def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
 
 
 def in_colours_of(
-    image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: OwnColours
+    image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: Fitted
 ) -> NDArray[np.float64] | None:
     """Return the image with each half, left and right, in the colours that the other half of the photograph asks for.
 
@@ -203,6 +213,24 @@ def corrected_by_regression(
         if abs(slope) > LEAST:
             corrected[..., channel] = (image[..., channel] - (y.mean() - slope * x.mean())) / slope
     return np.clip(corrected, 0, 1)
+
+
+def tell_of_colours(averages: dict[str, Any]) -> None:
+    """Log the figures of a split in the photographs' colours, where there are any."""
+    if "psnr_colour" not in averages:
+        return
+    figure, reason = averages["psnr_colour"], averages.get("psnr_colour_reason")
+    if figure is None:
+        LOG.warning("no PSNR in the photographs' colours: %s", reason)
+    elif reason:
+        LOG.warning(
+            "in the photographs' colours: PSNR %.2f dB, the mean of %s: %s",
+            *(figure, amount(averages["psnr_colour_views"], "view"), reason),
+        )
+    else:
+        differ = figure - averages["psnr"] > GUESSED
+        why = "; exposures of these photographs differ, which PSNR counts as errors" if differ else ""
+        LOG.info("in the photographs' colours: PSNR %.2f dB%s", figure, why)
 
 
 # PSNR of a scene that moves, apart for moments that training has seen and for those that it has not.
@@ -287,7 +315,7 @@ def measure(
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
     finite: bool = False,
-    colours: OwnColours | None = None,
+    colours: Fitted | None = None,
     counted: Iterable[View] | None = None,
     trained: Sequence[View] = (),
 ) -> list[ViewMetrics]:

@@ -124,4 +124,4 @@ def check_sky(settings: PipelineFile) -> None:
     if isinstance(asked.model.background, Directions):
         for stage in asked.stages:
             if isinstance(stage, Optimize):
-                stage.check_beside_a_sky(drawn=stage.background == "random")
+                stage.check_beside("sky")

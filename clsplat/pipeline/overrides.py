@@ -2,6 +2,7 @@
 
 optimize.steps=500              a stage by its name, also one inside `during` if its name is unique
 optimize.losses.0.weight=0.5    an item of a list by its number, from 0; losses[0] is the same
+optimize.modules.exposure={}    an item of `modules` by its type: added at its place, or changed; null removes it
 stages.1.steps=500              a stage by its number, where several have the same name
 """
 
@@ -15,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from clsplat.core.errors import ConfigError, OverrideError, quoted, shortened
-from clsplat.core.settings import TAGS, Variants, descriptions
+from clsplat.core.settings import TAGS, Variants, descriptions, variants
 from clsplat.pipeline.explanation import annotations, bases, inside_list, model_of, with_tags
 from clsplat.pipeline.yaml_file import Place, parse_value
 
@@ -48,6 +49,9 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
     except ConfigError as error:
         raise OverrideError(text, f"the value cannot be read: {error}") from error
     node, last = _found(data, text, root)
+    if isinstance(node.data, list) and node.is_by_type(last):
+        node.put(last, parsed, text)
+        return (*node.place, last)
     if isinstance(node.data, list):
         i = node.number(last, text)
         node.data[i] = with_tags(parsed, node.inside)
@@ -63,6 +67,8 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
 def value_at(data: dict[str, Any], place: str, root: type[BaseModel]) -> Any:
     """Return the value at a place, in the notation of --set; None where the data have none.  Raises OverrideError."""
     node, last = _found(data, f"{place}=", root)
+    if isinstance(node.data, list) and node.is_by_type(last):
+        return next((one for one in node.data if one["type"] == last), None)
     if isinstance(node.data, list):
         return node.data[node.number(last, place)]
     return node.data.get(last) if isinstance(node.data, dict) else None
@@ -90,6 +96,11 @@ class _Node:
 
     def child(self, name: str, text: str) -> "_Node":
         """Return the node of a key; a missing key is made from its default.  Raises OverrideError."""
+        if isinstance(self.data, list) and self.is_by_type(name):
+            if all(one["type"] != name for one in self.data):
+                self.put(name, {}, text)
+            item = next(one for one in self.data if one["type"] == name)
+            return _Node(item, self.inside, (*self.place, name))
         if isinstance(self.data, list):
             return self._item(self.number(name, text))
         if not isinstance(self.data, dict):
@@ -100,8 +111,37 @@ class _Node:
             if not self.place and name not in self._fields:
                 raise NoSuchKey(text, f"no {quoted(name)} in this pipeline")
             default = self._fields[name].get_default(call_default_factory=True) if name in self._fields else None
-            self.data[name] = _as_written(default) if isinstance(default, BaseModel) else {}
+            is_list = isinstance(default, list)
+            self.data[name] = _as_written(default) if isinstance(default, BaseModel) else [] if is_list else {}
         return self._key(name)
+
+    def is_by_type(self, name: str) -> bool:
+        """Whether the name is a type of items that are addressed by it, and not a number."""
+        by_type = any(base.by_type for base in bases(self.inside))
+        return by_type and not name.isdigit() and all(isinstance(one, dict) and "type" in one for one in self.data)
+
+    def put(self, name: str, value: Any, text: str) -> None:
+        """Put an item of a type at its place in a list, or in place of the one that is there; None removes that.
+
+        Raises OverrideError.
+        """
+        kinds: dict[str, Any] = {key: kind for base in bases(self.inside) for key, kind in variants(base).items()}
+        if name not in kinds:
+            near = difflib.get_close_matches(name, kinds, n=1)
+            meant = f"; did you mean {near[0]}?" if near else ""
+            raise OverrideError(text, f"no {quoted(name)}; expected one of {', '.join(kinds)}{meant}")
+        if value is not None and not isinstance(value, dict):
+            raise OverrideError(text, "expected a mapping of its keys, such as {}, or null")
+        places = [one["type"] for one in self.data]
+        at = places.index(name) if name in places else None
+        if at is not None:
+            del self.data[at]
+        if value is None:
+            return
+        if at is None:
+            at = sum(getattr(kinds.get(one), "place", 0) <= kinds[name].place for one in places)
+        item = {"type": name, **{key: one for key, one in value.items() if key != "type"}}
+        self.data.insert(at, with_tags(item, self.inside))
 
     def number(self, name: str, text: str) -> int:
         """Return the index that a name holds.  Raises OverrideError."""
@@ -211,7 +251,8 @@ def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[
             yield from _keys(value, f"{prefix}{name}.", addresses)
         elif items is not None:
             for i, item in enumerate(items):
-                yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{i}") + ".", addresses)
+                own = item.type if getattr(item, "by_type", False) else i
+                yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{own}") + ".", addresses)
         else:
             yield Key(prefix + name, plain.get(name), texts.get(name, ""))
 

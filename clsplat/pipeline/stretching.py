@@ -146,6 +146,8 @@ def _stretched(value: Any, axis: Axis) -> Any:
     if isinstance(value, list):
         is_points = bool(value) and all(isinstance(item, list) for item in value)
         return _points(value, axis) if is_points else [_stretched(item, axis) for item in value]
+    if isinstance(value, dict):
+        return {key: _stretched(one, axis) for key, one in value.items()}
     if isinstance(value, CaptureChoice):  # whose rows begin with what is measured, and not with steps
         rows = [[bound, *(_stretched(one, axis) for one in row)] for bound, *row in value.values]
         given = {key: _stretched(one, axis) for key, one in value.given.items()}

@@ -43,7 +43,7 @@ from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import HOLDOUT, Background, Scene
 from clsplat.scene.view import NO_FILE, View
 from clsplat.scene.viewpoint import Stand
-from clsplat.training.modules.camera_optimizer import poses_beside
+from clsplat.training.modules.base import scene_beside
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import BUDGET, Page, Which, described, is_viewer
 from clsplat.viewer.video import camera_path
@@ -273,4 +273,4 @@ def _cameras_read(folder: Path) -> Scene:
     if not has_pipeline(folder):
         return read_scene(folder, HOLDOUT)
     source = Source.of(folder, None)
-    return poses_beside(source.file, read_scene(source.folder, source.settings.split))
+    return scene_beside(source.file, read_scene(source.folder, source.settings.split))

@@ -42,8 +42,7 @@ from clsplat.scene.scene import Background, Scene, scene_name
 from clsplat.scene.view import Alpha, View
 from clsplat.stages.export import Export, image_paths
 from clsplat.stages.train_field import ExportField
-from clsplat.training.modules.appearance import colours_beside
-from clsplat.training.modules.camera_optimizer import poses_beside
+from clsplat.training.modules.base import measured_beside, scene_beside
 from clsplat.viewer.video.film import require_motion, times_of
 from clsplat.viewer.video.pictures import LAYERS, Canvas, shown, values
 
@@ -335,11 +334,11 @@ class ModelFile:
         self.loaded = read(self.source.file)
         self.device = open_correct(device)
         found = self.source.scene(self.loaded)
-        self.photographs = poses_beside(self.source.file, found) if scene is None else found
+        self.photographs = scene_beside(self.source.file, found) if scene is None else found
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)
         self.background = self.loaded.rendering.background or self.scene.background
-        self.colours = colours_beside(self.source.file)
+        self.colours = measured_beside(self.source.file)
 
     @property
     def gaussians(self) -> Model:

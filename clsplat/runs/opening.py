@@ -30,9 +30,6 @@ from clsplat.scene.scene import SPLITS, Background, Scene
 from clsplat.stages.init import settled as settled_sky
 from clsplat.stages.init import share_with_sky
 from clsplat.stages.optimize import Optimize
-from clsplat.training.modules.appearance import settled
-from clsplat.training.modules.exposure import Auto
-from clsplat.training.modules.random_background import is_drawn
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
@@ -187,9 +184,6 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
 
 # Choices that follow from the photographs, made before the first step and written into the run's pipeline.
 
-WITH_POSES = "optimize.poses are learned, which a sky does not go with"
-WITH_DRAWN = "optimize.background is drawn, which a sky does not go with"
-
 
 def settle(pipeline: Pipeline, run: Run, tell: Callable[[str], None] = LOG.info) -> Pipeline:
     """Return the pipeline with what its `choices` and its keys `auto` choose by the photographs of a run, which takes
@@ -198,7 +192,7 @@ def settle(pipeline: Pipeline, run: Run, tell: Callable[[str], None] = LOG.info)
     Choices that are made already stay.
     """
     with run.status.stage("choose"):
-        settled_pipeline = _taken(_with_colours(_by_capture(pipeline, run, tell), run), run)
+        settled_pipeline = _taken(_with_modules(_by_capture(pipeline, run, tell), run), run)
         if any(isinstance(stage, Optimize) for stage in pipeline.stages):
             _warn_of_near(settled_pipeline.settings.model.near, nearest_points(run.scene))
         return settled_pipeline
@@ -238,21 +232,15 @@ def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
     return pipeline
 
 
-def _with_colours(pipeline: Pipeline, run: Run) -> Pipeline:
-    """The pipeline with what its keys `auto` choose."""
-    open_ones = [one.colours for one in pipeline.stages if isinstance(one, Optimize) and isinstance(one.colours, Auto)]
-    background = pipeline.settings.model.background
-    if all(colours.chosen for colours in open_ones) and (getattr(background, "chosen", "") is not None):
-        return pipeline
+def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
+    """The pipeline with what its modules and its sky choose."""
 
     def chosen(training: Optimize) -> Optimize:
-        if not isinstance(training.colours, Auto):
-            return training
-        colours = settled(training.colours, run)
-        LOG.info("optimize.colours: %s, since %s", colours.chosen, colours.reason)
-        return training.model_copy(update={"colours": colours})
+        modules = [module.settled(run) for module in training.modules]
+        return training if modules == training.modules else training.model_copy(update={"modules": modules})
 
-    return replace(pipeline, settings=_with_sky(of_trainings(pipeline.settings, Optimize, chosen), run))
+    settings = _with_sky(of_trainings(pipeline.settings, Optimize, chosen), run)
+    return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)
 
 
 def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
@@ -269,7 +257,6 @@ def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
 
 def _against_a_sky(settings: PipelineFile, run: Run) -> str:
     """What a sky does not go with, of what the trainings do; "" where there is nothing."""
-    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-    if any(one.poses for one in trainings):
-        return WITH_POSES
-    return WITH_DRAWN if any(is_drawn(one.background, run.scene) for one in trainings) else ""
+    modules = [one for stage in settings.stages if isinstance(stage, Optimize) for one in stage.modules]
+    excluding = next((one for one in modules if one.excludes("sky", run.scene)), None)
+    return f"'{excluding.type}' does not go with sky: {excluding.conflicts['sky']}" if excluding else ""

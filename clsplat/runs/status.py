@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.core.errors import DataError, in_shell, one_line
-from clsplat.core.files import END_STATES, METRICS, PIPELINE, SILENT, STATUS, VIEW_COLOURS, VIEW_POSES
+from clsplat.core.files import END_STATES, METRICS, PIPELINE, SILENT, STATUS
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json
+from clsplat.core.settings import variants
 from clsplat.prepare.steps import photographs_text, size_text
 from clsplat.runs.results import read_metrics
 from clsplat.training import checkpoint
+from clsplat.training.modules.base import TrainingModule
 from clsplat.training.records import Records
 from clsplat.training.status import read_status, status_of
 
@@ -138,7 +140,6 @@ def _place(status: dict[str, Any]) -> str:
 
 # of what these stages write; others give their own names
 TITLES = {"export": "model", "export_field": "field", "render": "renders", "optimize": "pictures"}
-OF_FILES = {VIEW_COLOURS: "colours", VIEW_POSES: "poses"}  # whichever stage writes them
 BEFORE_FILES = {"export": "point_cloud.ply", "render": "renders", "viewer": "viewer.html", "report": "report.html"}
 SHORTEST = 0.5  # seconds of a stage that is told
 
@@ -168,7 +169,10 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     if scene := metrics.get("scene"):
         yield f"  scene    {scene}" + (f"; {placed}" if placed else "")
     files = {stage: folder / name for stage, name in metrics.get("files", BEFORE_FILES).items()}
-    told = {OF_FILES.get(file.name) or TITLES.get(stage, stage): file for stage, file in files.items() if file.exists()}
+    of_modules = {file: what for kind in variants(TrainingModule).values() for file, what in kind.files.items()}
+    told = {
+        of_modules.get(file.name) or TITLES.get(stage, stage): file for stage, file in files.items() if file.exists()
+    }
     for name, file in told.items():
         yield f"  {name:<{max(8, *map(len, told))}} {file}"
     steps = {name: found.get("seconds", 0) for name, found in metrics.get("preparation", {}).items()}

@@ -10,11 +10,10 @@ from clsplat.core.files import fault_of_output
 from clsplat.core.settings import ReadPath
 from clsplat.gaussians.model import load
 from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
-from clsplat.metrics.views import mean, measure
+from clsplat.metrics.views import mean, measure, tell_of_colours
 from clsplat.render.painter import Painter, Splats
 from clsplat.scene.view import some_of
-from clsplat.training.modules.appearance import colours_of, tell_of_colours
-from clsplat.training.modules.camera_optimizer import refined
+from clsplat.training.modules.base import learned_scene, measured_as
 from clsplat.training.run import Run
 from clsplat.training.stage import CADENCE, Scheduled
 
@@ -90,11 +89,11 @@ class Evaluate(Scheduled):
             return
         perceptual, painter = self._perceptual(), self._painter(run)
         for downscale in self.downscales or [run.downscale]:
-            found = refined(run.numbers, run.original).downscaled(downscale).split(self.split)
+            found = learned_scene(run).downscaled(downscale).split(self.split)
             views = some_of(found, self.most or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            trained, colours = run.scene.split("train"), colours_of(run)
+            trained, colours = run.scene.split("train"), measured_as(run)
             results = measure(
                 painter, views, photographs, perceptual, colours=colours, counted=counted, trained=trained
             )

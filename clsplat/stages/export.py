@@ -26,7 +26,7 @@ from clsplat.scene.images import image_size, is_image, write_image
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Stand
 from clsplat.training import checkpoint
-from clsplat.training.modules.camera_optimizer import refined
+from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model
 from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
 from clsplat.viewer.packing import pack
@@ -131,7 +131,7 @@ class Viewer(Stage):
     def run(self, run: Run) -> None:
         path, model = run.out / self.file, host_model(run)
         shown = with_sky_splats(model)
-        scene, name = refined(run.numbers, run.original).downscaled(run.downscale), run.photographs.background_name
+        scene, name = learned_scene(run).downscaled(run.downscale), run.photographs.background_name
 
         def read(view: View) -> NDArray[np.uint8]:
             return run.photographs.get(view).image()
@@ -162,7 +162,7 @@ class Viewer(Stage):
 class Cameras(Stage):
     """Write the cameras of the scene, at the photographs' full size, so that a model travels with its views.
 
-    After a training with `poses` they are the learned ones, with the learned focal lengths; see `optimize.poses`."""
+    After a training with `camera_optimizer` they are the learned ones, with the learned focal lengths."""
 
     stage: Literal["cameras"] = "cameras"
     output_keys: ClassVar[frozenset[str]] = frozenset({"formats", "folder"})
@@ -178,7 +178,7 @@ class Cameras(Stage):
 
     def run(self, run: Run) -> None:
         for name in self.formats:
-            for path in write_cameras(refined(run.numbers, run.original), run.out / self.folder, name, over=True):
+            for path in write_cameras(learned_scene(run), run.out / self.folder, name, over=True):
                 LOG.info("cameras written to %s", path)
 
     def verify(self, run: Run) -> None:
@@ -228,7 +228,7 @@ class Render(Stage):
 
     def _views(self, run: Run) -> dict[Path, View]:
         """The views of the split, by the file of their render."""
-        views = refined(run.numbers, run.original).downscaled(run.downscale).split(self.split)
+        views = learned_scene(run).downscaled(run.downscale).split(self.split)
         return dict(zip(image_paths(run.out / self.folder, [view.name for view in views]), views, strict=True))
 
     def run(self, run: Run) -> None:

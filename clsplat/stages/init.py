@@ -28,7 +28,7 @@ from clsplat.scene.visual_hull import hull_points
 from clsplat.stages.init_motion import moving, require_times, with_motion
 from clsplat.training.memory import first_tables, last_place
 from clsplat.training.modules.sky import LearnedSky
-from clsplat.training.run import Run
+from clsplat.training.run import SKY, Run
 from clsplat.training.sh_offload import more_room
 from clsplat.training.stage import Stage
 
@@ -105,7 +105,7 @@ def begin_sky(run: Run, own: Sky | None = None) -> None:
     settings = settled(run.model_settings.background, run)
     background = settings.in_use if isinstance(settings, Auto) else settings
     if not isinstance(background, Directions):
-        run.sky = None
+        run.modules.pop(SKY, None)
         if own:
             LOG.warning("the sky of the model is left out; model.background: directions keeps it")
         return
@@ -116,7 +116,7 @@ def begin_sky(run: Run, own: Sky | None = None) -> None:
         )
     texels, free = _first(run, background.side)
     sky = own if own and own.side == background.side else Sky(texels)
-    run.sky = LearnedSky(background, sky.upload(run.device), free)
+    run.modules[SKY] = LearnedSky(background, sky.upload(run.device), free)
     LOG.info("sky: %d of %d x %d colours by direction are learned", free.sum(), background.side, background.side)
 
 

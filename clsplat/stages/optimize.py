@@ -9,35 +9,21 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, field_validator, model_validator
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.files import VIEW_POSES
 from clsplat.core.progress import Progress
-from clsplat.core.schedule import Probability, place
+from clsplat.core.schedule import place
 from clsplat.core.settings import OneOf
 from clsplat.density.statistics import SplatStats
-from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
+from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses, require_symmetric
 from clsplat.metrics.views import distribution
-from clsplat.photos.appearance import Colours
 from clsplat.photos.sampling import Sampler, ViewSettings
-from clsplat.render.rasterizer import Rasterizer
+from clsplat.scene.scene import Scene
 from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.init import will_learn_sky
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.best_model import Best, Measured
 from clsplat.training.checkpoint import copied_of, finite_values, put_back
-from clsplat.training.modules.appearance import photograph_colours, write_view_colours
-from clsplat.training.modules.camera_optimizer import (
-    Poses,
-    photograph_poses,
-    poses_beside_a_sky,
-    require_zoom,
-    write_view_poses,
-)
-from clsplat.training.modules.depth_supervision import known_depths, require_depths
-from clsplat.training.modules.distractors import Distractors, OwnGaussians, PhotographDistractors, first_tables
-from clsplat.training.modules.random_background import Behind, drawn_backgrounds, drawn_beside_a_sky, is_drawn
-from clsplat.training.modules.skip_backward import Skip, Visit
-from clsplat.training.modules.transients import Transients
+from clsplat.training.modules.base import ModuleState, TrainingModule, attached, brought, check_list
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room, place_harmonics
@@ -155,6 +141,7 @@ class Keeping(Training):
             degree=run.model.degree,
             metrics=copied,
             numbers=dict(run.numbers),
+            modules={name: dict(one.numbers) for name, one in run.modules.items() if one.outlasts != "no"},
             evaluations=evaluations,
             since=0,
             apart=apart,
@@ -176,7 +163,7 @@ class Keeping(Training):
             return
         with run.changing():
             if best.found.step != run.step:
-                put_back(run, run.best_tables, best.degree)
+                put_back(run, run.best_tables, best)
                 run.adam = run.stats = None
                 run.numbers.update(best.numbers)
             run.metrics.update(best.metrics)
@@ -223,25 +210,6 @@ def report(
     run.show(Progress(run.step, forecast.last_step, loss, forecast.psnr, count, ms, left, known))
 
 
-# What photographs have for themselves in a run: where a training begins.
-
-
-def photograph_distractors(settings: Distractors | None, run: Run) -> PhotographDistractors | None:
-    """Return the distractors of a training, or None where it has none; a resumed run has its Gaussians."""
-    if settings is None:
-        run.distractors = None
-        return None
-    views = run.scene.split("train")
-    if run.distractors is None:
-        photographs = list({view.name: view for view in reversed(views)}.values())[::-1]
-        counted = run.status.counted(photographs, "photographs", len(photographs))
-        pixels = [(view, run.photographs.get(view).image()) for view in counted]
-        run.distractors = OwnGaussians(run.device, first_tables(settings.count, pixels))
-    sort, budget = run.rasterizer.tiler.sort, run.rasterizer.budget
-    own = Rasterizer(run.device, "radix" if sort == "auto" else sort, budget)
-    return PhotographDistractors(settings, views, own, run.distractors)
-
-
 DISTRIBUTION_INTERVAL, READ_AHEAD = 5, 4  # reports; photographs
 
 
@@ -255,7 +223,7 @@ class Optimize(Keeping):
     stage: Literal["optimize"] = "optimize"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "skip", "dropout", "background"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update"})
 
     rates: Rates = Rates()
     """Learning rates."""
@@ -266,21 +234,10 @@ class Optimize(Keeping):
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
     """Losses and penalties; training minimises their sum."""
-    colours: OneOf[Colours] | None = None
-    """Colours of each photograph, where exposures differ: `gain`, `affine`, `grid`, `auto`; without it, the scene's."""
-    poses: Poses | None = None
-    """Places of the cameras that are learned with the model, where poses are not exact; without it, the dataset's."""
-    transients: Transients | None = None
-    """Pixels that are left out, where photographs show what the scene does not have; without it, none."""
-    distractors: Distractors | None = None
-    """Gaussians that each photograph has for itself, for what the scene does not have; without it, none."""
-    dropout: Probability = 0.0
-    """Probability with which a step leaves a Gaussian out, by step, 0.9 at most; for few photographs.  The opacities of
-    the others are divided by 1 less it (DropGaussian, Park et al. 2025).  Pictures and measurements leave none out."""
-    background: Behind = "scene"
-    """Colour behind all; random: another in each step; transparent: random where photographs are so."""
-    skip: Skip | None = None
-    """Steps that skip the backward pass, where a view has converged; without it, none."""
+    modules: list[OneOf[TrainingModule]] = Field([])
+    """What takes part in a step next to the Gaussians, in the order of the forward pass; each once.  `--set` addresses
+    one by its type: `optimize.modules.TYPE.KEY=…`; `optimize.modules.TYPE={}` adds it at its place, `=null` removes
+    it."""
     during: list[OneOf[Scheduled]] = Field([])
     """Stages that run every so many steps."""
     log_every: Annotated[int, Field(gt=0)] = 100
@@ -293,13 +250,21 @@ class Optimize(Keeping):
             raise ValueError("expected at least one loss that compares images, such as l1")
         return losses
 
+    @field_validator("modules")
+    @classmethod
+    def _in_order(cls, modules: list[TrainingModule]) -> list[TrainingModule]:
+        check_list(modules)
+        return modules
+
     def check(self) -> None:
         require_symmetric(self.losses, self.views.transforms)
+        for loss in self.losses:
+            self.check_beside(str(getattr(loss, "type", "")))
         super().check()
 
     def outputs(self, out: Path) -> list[Path]:
-        own = [*(self.colours.files if self.colours else ()), *([VIEW_POSES] if self.poses else [])]
-        return [*super().outputs(out), *(out / name for name in own)]
+        files = [name for module in self.modules for name in module.files]
+        return [*super().outputs(out), *(out / name for name in dict.fromkeys(files))]
 
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
@@ -307,18 +272,20 @@ class Optimize(Keeping):
 
     def check_in(self, run: Run) -> None:
         super().check_in(run)
-        require_depths(self.losses, run.scene, poses=bool(self.poses))
-        if self.poses and self.poses.focal:
-            require_zoom(run.original)
+        for module in (*brought(run, self), *self.modules):
+            module.check_in(run)
         if will_learn_sky(run):
-            self.check_beside_a_sky(drawn=is_drawn(self.background, run.scene))
+            self.check_beside("sky", run.scene)
 
-    def check_beside_a_sky(self, drawn: bool) -> None:
-        """Raise ConfigError for what does not go with a sky; drawn: whether steps draw what is behind everything."""
-        if self.poses:
-            raise poses_beside_a_sky()
-        if drawn:
-            raise drawn_beside_a_sky()
+    def check_beside(self, part: str, scene: Scene | None = None) -> None:
+        """Raise ConfigError for modules that do not go with a part of the model, or with a loss; without a scene, in
+        any scene."""
+        for module in self.modules:
+            if module.excludes(part, scene):
+                raise ConfigError(
+                    f"optimize.modules: '{module.type}' does not go with {part}: {module.conflicts[part]}; leave one "
+                    "of them out"
+                )
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
@@ -342,15 +309,15 @@ class Optimize(Keeping):
             loss, psnr = finite_values(run, sampler.at(run.step).view.name, view) if is_reported else (0.0, 0.0)
             seconds.append(run.add_training_time(start))
             if is_reported:
-                if self.skip and run.step == last_step:
-                    self.skip.tell(run)
+                for module in trainer.modules if run.step == last_step else ():
+                    module.finish(run)
                 report(run, forecast, (loss, psnr), seconds, DISTRIBUTION_INTERVAL * self.log_every)
                 seconds.clear()
             self.end_step(run)
             yield view
         self.leave(run)  # a resumed run may have no step left
-        write_view_colours(run, trainer.colours)
-        write_view_poses(run, trainer.poses)
+        for module in trainer.modules:
+            module.write(run)
 
     @property
     def statistics(self) -> set[str]:
@@ -379,13 +346,12 @@ class Optimize(Keeping):
         place_harmonics(run)
         run.adam = run.adam or Adam(gaussians)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
-        rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
-        poses = photograph_poses(self.poses, run, last)
-        own = colours, self.transients, run.sky, self.dropout, run.seed
-        behind, depths = drawn_backgrounds(self.background, run), known_depths(self.losses, run, poses)
+        rates = self.rates.settled(views.full_size(last))
+        if run.sky:
+            self.check_beside("sky", run.scene)
+        states: list[ModuleState] = attached(self.modules, run, last)
         trained = self.losses, rates, run.scene.extent, run.numbers, self.update
-        layers = photograph_distractors(self.distractors, run)
-        return Trainer(*parts, *trained, *own, poses=poses, backgrounds=behind, depths=depths, distractors=layers)
+        return Trainer(*parts, *trained, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the step before."""
@@ -402,21 +368,19 @@ class Optimize(Keeping):
         run.step += 1
         run.stage_step += 1
         try:
-            view, stale, visit = self._differentiate(run, trainer, sampler)
+            view, stale = self._differentiate(run, trainer, sampler)
         except BaseException:  # a second Ctrl-C too
             run.step, run.stage_step = run.step - 1, run.stage_step - 1
             run.device.timings.sampling = False
             raise
         with run.changing():
-            run.numbers.update(visit.numbers)
-            if isinstance(view, ViewGradients):
-                trainer.update(view, stale)
+            trainer.update(view, stale)
             run.acted, run.edited = 0, False
         run.device.timings.sampling = False
         run.status.note(step=run.step)
         return view
 
-    def _differentiate(self, run: Run, trainer: Trainer, sampler: Sampler) -> tuple[ViewLosses, set[str], Visit]:
+    def _differentiate(self, run: Run, trainer: Trainer, sampler: Sampler) -> tuple[ViewLosses, set[str]]:
         """The losses of one view, with gradients unless it is skipped, and the parameters that they do not update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)
@@ -425,7 +389,5 @@ class Optimize(Keeping):
         run.photographs.announce(sampler.at(run.step + number).view for number in ahead)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         trainer.losses = [*self.losses, *run.losses]
-        view = trainer.compare(photograph, run.step, sample.transforms)
-        visit = self.skip.visit(sample.view.name, view, run.numbers) if self.skip else Visit()
-        stale = set() if run.stage_step == self.steps else stale
-        return view if visit.skipped else trainer.backward(view), stale, visit
+        view = trainer.differentiate(photograph, run.step, sample.transforms)
+        return view, set() if run.stage_step == self.steps else stale

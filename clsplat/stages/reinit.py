@@ -16,8 +16,7 @@ from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View
 from clsplat.stages.init import from_points
 from clsplat.training.memory import first_tables, last_place
-from clsplat.training.modules.appearance import colours_of
-from clsplat.training.modules.camera_optimizer import refined
+from clsplat.training.modules.base import learned_scene, measured_as
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room
 from clsplat.training.stage import Stage
@@ -91,8 +90,8 @@ class ReinitFromDepth(Stage):
     @staticmethod
     def _drawn(run: Run, count: int) -> list[Drawn]:
         """What is drawn of each training photograph; random numbers are of the seed, the step and its place."""
-        views = refined(run.numbers, run.original).downscaled(run.downscale).split("train")
-        painter, found, own_colours = run.painter(), list[Drawn](), colours_of(run) is not None
+        views = learned_scene(run).downscaled(run.downscale).split("train")
+        painter, found, own_colours = run.painter(), list[Drawn](), measured_as(run) is not None
         for number, view in enumerate(run.status.counted(views, "photographs", len(views))):
             photograph = run.photographs.get(view)
             layers = painter.layers(photograph.camera, depth=True)

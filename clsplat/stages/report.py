@@ -25,8 +25,7 @@ from clsplat.scene.scene import SPLITS
 from clsplat.scene.view import View, some_of
 from clsplat.scene.viewpoint import across, closest_point, upward
 from clsplat.training.best_model import Measured
-from clsplat.training.modules.appearance import colours_of
-from clsplat.training.modules.camera_optimizer import refined
+from clsplat.training.modules.base import learned_scene, measured_as
 from clsplat.training.modules.exposure import Gain
 from clsplat.training.records import VIEWS, over_views
 from clsplat.training.run import Run
@@ -49,14 +48,14 @@ UNEVEN = 3.0  # times the median gap
 
 def advice(run: Run) -> list[str]:
     """Return sentences, or none where nothing stands out.  Renders at most MOST training views."""
-    views = refined(run.numbers, run.original).downscaled(run.downscale).split("train")
+    views = learned_scene(run).downscaled(run.downscale).split("train")
     chosen = some_of(views, MOST)
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
     found = measure(run.painter(), chosen, run.photographs, colours=Gain(), counted=counted)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
     return [
-        *of_training_views(found, has_colours=colours_of(run) is not None),
+        *of_training_views(found, has_colours=measured_as(run) is not None),
         *of_test_views(test),
         *of_capture(views, run.original.views),
         *of_sky(run.model_settings.background),
@@ -75,7 +74,7 @@ def of_training_views(found: Sequence[ViewMetrics], has_colours: bool) -> Iterat
     if not has_colours and gained >= GAINED:
         yield (
             f"exposures or colours differ: in their own colours photographs would be {gained:.1f} dB nearer; "
-            "try `--set optimize.colours=gain`"
+            "try `--set optimize.modules.exposure={}`"
         )
 
 

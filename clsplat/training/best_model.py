@@ -10,8 +10,6 @@ from clsplat.core.errors import DataError
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel
 from clsplat.gaussians.model import WIDTHS
-from clsplat.training.archive import split
-from clsplat.training.modules import exposure, sky
 
 FOLDER = "best/"  # before the names of its tables in a checkpoint
 APART = 6.0  # dB: a model that is so much better where it was trained has learnt its photographs by heart (ours)
@@ -56,7 +54,9 @@ class Best(BaseModel):
     metrics: dict[str, dict[str, Any]]
     """Its averages, by split and downscale."""
     numbers: dict[str, float] = {}
-    """What parts of the run kept at its step, such as the colours of photographs."""
+    """What parts of the run kept at its step."""
+    modules: dict[str, dict[str, float]] = {}
+    """The numbers of its modules, by name."""
     evaluations: Count
     """Number of measurements so far."""
     since: Count
@@ -103,16 +103,11 @@ def model_tables(model: DeviceModel) -> Tables:
 
 
 def check(best: Best | None, tables: Tables) -> None:
-    """Raise DataError for tables that are not those of a best model."""
+    """Raise DataError for tables that are not those of the Gaussians of a best model."""
     if best is None or best.taken is not None:
         if tables:
             raise DataError("it holds a best model that it says nothing of")
         return
-    behind, tables = split(tables, sky.FOLDER)
-    sky.check_tables(behind)
-    of_colours, tables = split(tables, exposure.FOLDER)
-    exposure.check_tables(of_colours)
-    exposure.require_tables(of_colours, best.numbers)
     if missing := [name for name in (*PARAMETERS, "filter_variance") if name not in tables]:
         raise DataError(f"its best model lacks {', '.join(missing)}")
     count = len(tables["means"])

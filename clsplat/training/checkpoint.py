@@ -8,7 +8,7 @@ import logging
 import math
 import re
 import time
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -39,13 +39,11 @@ from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.structs import moment_tables
 from clsplat.losses.base import ViewLosses
 from clsplat.losses.image import psnr
-from clsplat.render.backdrops import Auto, Directions
 from clsplat.training import archive, best_model, field
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.archive import Arrays, split
 from clsplat.training.best_model import Best, Tables, model_tables
-from clsplat.training.modules import distractors, exposure, sky
-from clsplat.training.modules.sky import LearnedSky
+from clsplat.training.modules.base import Numbers, kind_of, modules_of, restored
 from clsplat.training.run import Run
 from clsplat.training.settings_diff import differences
 from clsplat.training.sh_offload import make_room
@@ -72,6 +70,7 @@ class State(BaseModel):
     zero_fresh: list[str]
     updates: dict[str, Count]
     numbers: dict[str, float]  # that parts of the run keep
+    modules: dict[str, dict[str, float]]  # the same of its modules, by name
     best: Best | None  # what validation has found
     train_seconds: float
     cpu_seconds: float  # in the same time
@@ -115,35 +114,47 @@ def check_tables(state: State, tables: Arrays) -> None:
         raise DataError("it counts updates of other parameters")
 
 
+# The tables of a run's modules in a checkpoint, and in the best model.
+
+MODULES = "modules/"  # before the names of modules, before those of their tables
+
+
+def module_tables(run: Run, whole: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    """Yield the tables by their keys in the file.  whole: with what only training needs."""
+    for module, state in run.modules.items():
+        if whole or state.outlasts != "no":
+            yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(whole).items())
+
+
+def check_modules(numbers: Mapping[str, Numbers], tables: Arrays) -> None:
+    """Raise DataError for tables that are not those of modules.  tables: without MODULES."""
+    for name in numbers:
+        own, tables = split(tables, f"{name}/")
+        kind_of(name).check_saved(numbers[name], own)
+    if tables:
+        raise DataError(f"it has tables of modules that it says nothing of: {', '.join(tables)}")
+
+
+def put_back_modules(run: Run, numbers: Mapping[str, Numbers], tables: Arrays) -> None:
+    """Give the modules of a run what was copied of them at another step."""
+    for name, own in numbers.items():
+        if name in run.modules and name in modules_of(run):
+            run.modules[name].load(own, split(tables, f"{name}/")[0])
+
+
 # The tables of the best model of a run: copied to the host, and put back.
 
 
 def copied_of(run: Run) -> Tables:
     """Copy what the run's model needs to be rendered, and to be trained from anew, to the host."""
-    own = run.sky.tables() if run.sky else {}
-    behind = {sky.FOLDER + name: table for name, table in own.items()}
-    of_colours = run.colour_grids.tables(["values"]) if run.colour_grids else {}
-    photographs = {exposure.FOLDER + name: table for name, table in of_colours.items()}
-    return {**model_tables(run.model), **behind, **photographs}
+    return {**model_tables(run.model), **dict(module_tables(run, whole=False))}
 
 
-def put_back(run: Run, tables: Tables, degree: int) -> None:
+def put_back(run: Run, tables: Tables, best: Best) -> None:
     """Make what was copied the run's model."""
-    own, of_gaussians = split(tables, sky.FOLDER)
-    of_colours, of_gaussians = split(of_gaussians, exposure.FOLDER)
-    if of_colours and run.colour_grids:
-        run.colour_grids.set(of_colours)
-    run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), degree)
-    restore_sky(run, own)
-
-
-def restore_sky(run: Run, tables: Tables) -> None:
-    """Give a run the sky of its tables, by their own names; without any it has none."""
-    given = run.model_settings.background
-    background = given.model if isinstance(given, Auto) else given
-    run.sky = None
-    if tables and isinstance(background, Directions):
-        run.sky = LearnedSky.of_tables(background, tables, run.device)
+    of_modules, of_gaussians = split(tables, MODULES)
+    put_back_modules(run, best.modules, of_modules)
+    run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), best.degree)
 
 
 # The tables of a run in its checkpoint: those of a field, or of Gaussians, what is behind them, and the best model.
@@ -158,11 +169,7 @@ def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
         return
     gaussians = run.model.gaussians
     yield from ((_key(name), gaussians.get(name)) for name in gaussians.tables)
-    yield from ((sky.FOLDER + name, table) for name, table in (run.sky.tables() if run.sky else {}).items())
-    of_colours = run.colour_grids.tables() if run.colour_grids else {}
-    yield from ((exposure.FOLDER + name, table) for name, table in of_colours.items())
-    of_photographs = run.distractors.tables() if run.distractors else {}
-    yield from ((distractors.FOLDER + name, table) for name, table in of_photographs.items())
+    yield from module_tables(run)
     yield from ((best_model.FOLDER + name, table) for name, table in run.best_tables.items())
 
 
@@ -182,15 +189,16 @@ def check_run_tables(state: State, tables: Arrays) -> None:
         kind.check_tables(state.field["shape"], *split(tables, field.FOLDER))
         return
     best, own = split(tables, best_model.FOLDER)
-    best_model.check(state.best, best)
-    behind, own = split(own, sky.FOLDER)
-    sky.check_tables(behind)
-    of_colours, own = split(own, exposure.FOLDER)
-    exposure.check_tables(of_colours)
-    exposure.require_tables(of_colours, state.numbers)
-    of_photographs, own = split(own, distractors.FOLDER)
-    distractors.check_tables(of_photographs)
+    best_model.check(state.best, _gaussians(state.best.modules if state.best else {}, best))
+    own = _gaussians(state.modules, own)
     check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
+
+
+def _gaussians(modules: Mapping[str, Numbers], tables: Arrays) -> Arrays:
+    """Check the tables of modules; return the others."""
+    of_modules, own = split(tables, MODULES)
+    check_modules(modules, of_modules)
+    return own
 
 
 def restore_tables(run: Run, state: State, tables: Arrays) -> None:
@@ -202,11 +210,9 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
         run.learned_field.updates = state.updates[UPDATES]
         return
     run.best_tables, tables = split(tables, best_model.FOLDER)
-    behind, tables = split(tables, sky.FOLDER)
-    of_colours, tables = split(tables, exposure.FOLDER)
-    run.colour_grids = exposure.restored(of_colours, run.device)
-    of_photographs, tables = split(tables, distractors.FOLDER)
-    run.distractors = distractors.restored(of_photographs, run.device)
+    of_modules, tables = split(tables, MODULES)
+    saved = {name: (own, split(of_modules, f"{name}/")[0]) for name, own in state.modules.items()}
+    run.modules = restored(run, saved)
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
     run.model = run.model_settings.model(gaussians, state.degree)
     if state.updates:
@@ -220,7 +226,6 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
         if name not in gaussians.tables:
             gaussians.add(name, table.shape[1], zero_fresh=name in state.zero_fresh)
         gaussians.set(name, table)
-    restore_sky(run, behind)
 
 
 def _key(table: str) -> str:
@@ -257,7 +262,7 @@ def lower_rate(run: Run, broken: Collection[str]) -> str:
     return f"{stage if alone else f'stages.{place}'}.rates.{name}={value:.2g}"
 
 
-FORMAT = 4
+FORMAT = 5
 LOG = logging.getLogger("clsplat")
 
 
@@ -397,6 +402,7 @@ def _write(run: Run, kind: str) -> Path:
         zero_fresh=[] if run.learned_field else run.model.gaussians.zero_fresh,
         updates=updates_of(run),
         numbers=run.numbers,
+        modules={name: one.numbers for name, one in run.modules.items()},
         best=run.best,
         train_seconds=run.train_seconds,
         cpu_seconds=run.cpu_seconds,
@@ -448,9 +454,9 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
     run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
     run.best = state.best
-    restore_tables(run, state, tables)
     if run.is_refit:
         run.divide(run.original.with_fold())
+    restore_tables(run, state, tables)
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 

@@ -19,7 +19,6 @@ from clsplat.gaussians.gaussians import HIDDEN, INTERVAL2, DeviceModel
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
-from clsplat.photos.appearance import GridTables
 from clsplat.photos.exposure_estimate import Exposures
 from clsplat.photos.photographs import Photographs, texture_quantile
 from clsplat.render.filters import FilterViews, ModelSettings, measure_intervals
@@ -31,13 +30,11 @@ from clsplat.training.adam import Adam
 from clsplat.training.best_model import Best, Tables
 from clsplat.training.field import TrainedField
 from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, plan
-from clsplat.training.modules.distractors import OwnGaussians, distractor_bytes
-from clsplat.training.modules.exposure import bytes_needed
-from clsplat.training.modules.sky import LearnedSky
 from clsplat.training.records import Records, clocks
 from clsplat.training.status import StatusFile
 
 Item = TypeVar("Item")
+SKY = "sky"  # the type of the module of a model's sky
 
 
 @dataclass
@@ -64,9 +61,7 @@ class Run:
     losses: list[Loss] = field(default_factory=list)  # added from Python, beside those of the pipeline
     adam: Adam | None = None
     stats: SplatStats | None = None
-    sky: LearnedSky | None = None  # of the model, where it has one
-    colour_grids: GridTables | None = None  # of the photographs' colours, where they have such
-    distractors: OwnGaussians | None = None  # of the photographs, while a training has such
+    modules: dict[str, Any] = field(default_factory=dict)  # states of its trainings' modules, by name
     learned_field: TrainedField | None = None  # in the place of a model
     step: int = 0  # updates done, or in progress
     cursor: int = 0  # stage in progress
@@ -94,6 +89,11 @@ class Run:
         self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}
+
+    @property
+    def sky(self) -> Any:
+        """The LearnedSky of the model; None where it has none."""
+        return self.modules.get(SKY)
 
     @property
     def model(self) -> DeviceModel:
@@ -124,7 +124,8 @@ class Run:
 
     def next_stage(self, cursor: int) -> None:
         """Come to the beginning of a stage."""
-        self.cursor, self.stage_step, self.acted, self.edited, self.distractors = cursor, 0, 0, False, None
+        self.cursor, self.stage_step, self.acted, self.edited = cursor, 0, 0, False
+        self.modules = {name: one for name, one in self.modules.items() if one.outlasts != "no"}
         if self._model is not None:
             self.model.gaussians.tables.pop(HIDDEN, None)  # which a training has for itself
 
@@ -142,7 +143,8 @@ class Run:
     def begin_again(self, best: Best) -> None:
         """Come to the beginning of the pipeline, to train again for the steps of the best model."""
         self._model = None
-        self.adam = self.stats = self.sky = self.colour_grids = None
+        self.adam = self.stats = None
+        self.modules = {}
         self.numbers = {}
         self.metrics = {}
         self.written = {}
@@ -216,7 +218,8 @@ class Run:
         components = components or self.model.gaussians.components
         views, tile = self.scene.split("train"), int(self.device.tuning["TILE"])
         bytes_held = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
-        bytes_held += bytes_needed(self.settings, views, tile) + distractor_bytes(self.settings, views, tile)
+        lists = [getattr(stage, "modules", ()) for stage in getattr(self.settings, "stages", ())]
+        bytes_held += max((sum(one.device_bytes(views, tile) for one in modules) for modules in lists), default=0)
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
         return plan(self.device.info, components, bytes_held, pixels, pixel_sums, harmonics, seen)

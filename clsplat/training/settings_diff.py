@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 from clsplat.core.errors import shortened
-from clsplat.core.settings import TAGS, Settings, resumable
+from clsplat.core.settings import TAGS, Settings, resumable, tag_of
 
 Kind = Literal["output", "training"] | None
 
@@ -43,12 +43,25 @@ def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind:
             inner, of = _inside(settings, key)
             where = f"{place}.{key}" if place else str(key)
             yield from differences(old.get(key), new.get(key), inner, where, kind or of)
+    elif isinstance(old, list) and isinstance(new, list) and (kinds := _kinds([*old, *new])):
+        before, after = ({one["type"]: one for one in items} for items in (old, new))
+        now = {one.type: one for one in settings or ()}
+        for name in dict.fromkeys([*before, *after]):
+            own = kind or ("training" if kinds[name].joins and not {name} <= before.keys() & after.keys() else None)
+            yield from differences(before.get(name), after.get(name), now.get(name), f"{place}.{name}", own)
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for i, (before, after) in enumerate(zip(old, new, strict=True)):
             inner = settings[i] if isinstance(settings, list) else None
             yield from differences(before, after, inner, f"{place}[{i}]", kind)
     elif old != new:
         yield Difference(place, old, new, kind)
+
+
+def _kinds(items: list[Any]) -> dict[str, Any]:
+    """The classes of a list's items by their types, where each is addressed by its type."""
+    known = {tag[1]: kind for kind in Settings.defined if kind.by_type and (tag := tag_of(kind))}
+    named = [str(one.get("type")) if isinstance(one, dict) else "" for one in items]
+    return {name: known[name] for name in named} if all(name in known for name in named) else {}
 
 
 def first_difference(old: Any, new: Any) -> Difference | None:

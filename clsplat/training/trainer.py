@@ -1,11 +1,10 @@
 """One training step: render a view, compare it with its photograph, differentiate, update, count."""
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 
-from clsplat.core.schedule import Schedule, at_step
 from clsplat.density.statistics import SplatStats
-from clsplat.gaussians.gaussians import DeviceModel, Dropout
+from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.losses.base import (
     Comparison,
     ImageLoss,
@@ -21,20 +20,36 @@ from clsplat.losses.base import (
     returned,
 )
 from clsplat.opencl.device import Array, constants
-from clsplat.photos.appearance import ViewColours
-from clsplat.photos.depths import PointDepths
 from clsplat.photos.photographs import Photograph, apply_mask, known_gradient
-from clsplat.photos.transforms import LearnedTransform, PhotographTransform, Planes, learned_of, name_of
-from clsplat.render.camera import DeviceCamera
+from clsplat.photos.transforms import LearnedTransform, PhotographTransform, learned_of, name_of
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.modules.camera_optimizer import PhotographPoses
-from clsplat.training.modules.distractors import PhotographDistractors
-from clsplat.training.modules.random_background import Backgrounds
-from clsplat.training.modules.sky import LearnedSky
-from clsplat.training.modules.transients import Transients, without_transients
+from clsplat.training.modules.base import ModuleState, Numbers, Step
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
+
+
+class _Learning(ModuleState):
+    """The transform of a step's photograph that learns: it takes part as a module does."""
+
+    def __init__(self, transform: LearnedTransform, numbers: Numbers) -> None:
+        super().__init__()
+        self.transform, self.numbers = transform, numbers
+
+    def before_losses(self, step: Step) -> None:
+        """A loss keeps the sums of its last call, so that the gradient by the photograph comes before its value."""
+        gradient = gradient_by_photograph(step.losses_asked, step.comparison)
+        if step.planes.mask is not None:
+            apply_mask(step.workspace, step.camera, gradient, step.planes.mask)
+        of_images = self.transform.backward(step.planes, gradient)
+        value, of_numbers = self.transform.penalty(self.transform.now(self.numbers), step.number)
+        step.own_losses.append(LossValue(name_of(self.transform), lambda: value))
+        step.keep(self, (of_images, of_numbers))
+
+    def update(self, step: Step) -> None:
+        of_images, of_numbers = step.kept(self)
+        gradients = {name: derivative + of_numbers[name] for name, derivative in of_images().items()}
+        self.transform.update(self.numbers, gradients, step.number)
 
 
 @dataclass
@@ -73,15 +88,7 @@ class Trainer:
     extent: float = 1.0  # scene units
     numbers: dict[str, float] = field(default_factory=dict)  # of a transform that learns, by name; a step changes them
     rows: Rows = "all"  # Gaussians that a step changes
-    colours: ViewColours | None = None  # of the photographs, where they have colours of their own
-    transients: Transients | None = None  # which pixels are left out; None: none
-    sky: LearnedSky | None = None  # of the model, where it has one
-    dropout: Schedule = 0.0  # probability with which a step leaves a Gaussian out, by step
-    seed: int = 0  # of what is drawn
-    poses: PhotographPoses | None = None  # of the cameras, where they are learned
-    backgrounds: Backgrounds | None = None  # by step, in the place of `background`
-    depths: PointDepths | None = None  # that are known, where a loss reads them
-    distractors: PhotographDistractors | None = None  # of the photographs, where they have Gaussians of their own
+    modules: Sequence[ModuleState] = ()  # that take part in a step: forward in this order, backward in reverse
 
     def step(
         self,
@@ -89,10 +96,10 @@ class Trainer:
         step: int,
         transforms: Sequence[PhotographTransform] = (),
         stale: Collection[str] = (),
-    ) -> ViewGradients:
+    ) -> ViewLosses:
         """Train on one view at a global step; parameters named in `stale` are not updated.
 
-        Returns the view's losses and gradients, which are valid until the next step.
+        Returns the view's losses and, unless a module skips the step, its gradients, valid until the next step.
         """
         view = self.differentiate(photograph, step, transforms)
         self.update(view, stale)
@@ -100,12 +107,13 @@ class Trainer:
 
     def differentiate(
         self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()
-    ) -> ViewGradients:
+    ) -> ViewLosses:
         """Return the derivative of the losses at one view, as sums over pixels; nothing is updated.
 
         Raises ConfigError as `compare` does.
         """
-        return self.backward(self.compare(photograph, step, transforms))
+        view = self.compare(photograph, step, transforms)
+        return view if view.step.skipped else self.backward(view)
 
     def compare(self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()) -> ViewLosses:
         """Render one view and compare it with its photograph; nothing is updated.
@@ -115,111 +123,60 @@ class Trainer:
         """
         content = content_of(self.losses, step)
         require_symmetric(self.losses, transforms)
-        photograph = self.poses.place(photograph, self.numbers, step) if self.poses else photograph
-        workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
-        background = self.backgrounds.at(step) if self.backgrounds else self.background
-        frame = self.rasterizer.forward(self._drawn(step), camera, background, content)
-        timings.section = "loss"
-        planes = photograph.planes(workspace, transforms, step, self.numbers, (self.background, background))
-        gradient = workspace.array("grad_image", frame.image.shape)
-        layer = self.distractors.before(self.model, camera, frame.image, step) if self.distractors else None
-        image, own = self._coloured(camera, layer.image if layer else frame.image)
-        own += [LossValue("distractors", layer.loss)] if layer else []
-        learning: list[Callable[[], None]] = []
-        if self.transients:
-            planes, learning = without_transients(self.transients, planes, image, self.numbers, step)
-        comparison = Comparison(workspace, camera, image, planes.colours, gradient, planes.mask, step)
-        comparison.depths = self.depths.at(camera) if self.depths else None
-        if content != "colour":  # losses of colours overwrite three planes alone
-            gradient.fill(0)
-            comparison.accumulate = True
-        if planes.mask is not None:  # pixels that do not count are black in both images and have no gradient
-            apply_mask(workspace, camera, image, planes.mask)
-            apply_mask(workspace, camera, planes.colours, planes.mask)
+        workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings
+        now = Step(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
         learned = learned_of(transforms)
-        of_transform, learn = self._learn(learned, planes, comparison) if learned else ([], [])
-        values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
-        behind = None
-        if self.sky and (cover := self.sky.cover(self.rasterizer, frame, comparison)):
-            behind, value = cover
-            own.append(value)
-        losses = [*values, *of_transform, *own]
-        return ViewLosses(frame, comparison, losses, learning=[*learning, *learn], behind=behind, layer=layer)
+        now.modules = [*self.modules, *([_Learning(learned, self.numbers)] if learned else [])]
+        for module in now.modules:
+            module.before_render(now)
+        camera = now.camera
+        now.frame = self.rasterizer.forward(now.model, camera, now.background, content)
+        timings.section = "loss"
+        backgrounds = self.background, now.background
+        now.planes = now.photograph.planes(workspace, transforms, step, self.numbers, backgrounds)
+        now.image, now.gradient = now.frame.image, workspace.array("grad_image", now.frame.image.shape)
+        for module in now.modules:
+            module.after_render(now)
+        target, mask = now.planes.colours, now.planes.mask
+        now.comparison = comparison = Comparison(workspace, camera, now.image, target, now.gradient, mask, step)
+        if content != "colour":  # losses of colours overwrite three planes alone
+            now.gradient.fill(0)
+            comparison.accumulate = True
+        if mask is not None:  # pixels that do not count are black in both images and have no gradient
+            apply_mask(workspace, camera, now.image, mask)
+            apply_mask(workspace, camera, target, mask)
+        for module in now.modules:
+            module.before_losses(now)
+        now.losses += [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
+        now.losses += now.own_losses
+        for module in now.modules:
+            module.after_losses(now)
+        return ViewLosses(now.frame, comparison, now.losses, step=now)
 
     def backward(self, view: ViewLosses) -> ViewGradients:
         """Return the derivative of the losses that `compare` returned, as sums over pixels."""
-        comparison, workspace, camera = view.comparison, self.rasterizer.workspace, view.comparison.camera
-        photograph, gradient, mask = comparison.photograph, comparison.gradient, comparison.mask
+        now, workspace, count = view.step, self.rasterizer.workspace, self.stats.pixel_sums
+        mask = now.planes.mask
         if mask is not None:
-            apply_mask(workspace, camera, gradient, mask)
-        gradient, learning = self._uncoloured(view, gradient)
-        if self.distractors and view.layer and comparison.camera.view is not None:
-            learning = [self.distractors.learning(view.layer, gradient, comparison.camera.view), *learning]
-        learning = [*self._of_sky(view, gradient), *learning]
-        count = self.stats.pixel_sums
+            apply_mask(workspace, now.camera, now.gradient, mask)
+        for module in reversed(now.modules):
+            module.backward(now)
         self.rasterizer.device.timings.section = "statistics"
-        texture = known_gradient(workspace, camera, photograph, mask) if count > TEXTURE else None
-        model = self._drawn(comparison.step)
-        pixel_sums = self.rasterizer.pixel_sums(model, view.frame, gradient, count, texture, view.behind)
-        if self.poses and (learn := self.poses.learning(workspace, model, view.frame, pixel_sums, comparison.step)):
-            learning.append(lambda: learn(self.numbers))
-        return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=learning)
+        texture = known_gradient(workspace, now.camera, now.planes.colours, mask) if count > TEXTURE else None
+        now.pixel_sums = self.rasterizer.pixel_sums(now.model, now.frame, now.gradient, count, texture, now.behind)
+        for module in reversed(now.modules):
+            module.after_backward(now)
+        return ViewGradients(now.frame, now.comparison, now.losses, now.pixel_sums, step=now)
 
-    def _drawn(self, step: int) -> DeviceModel:
-        """The model as a step draws it."""
-        probability = at_step(self.dropout, step)
-        return replace(self.model, dropout=Dropout(probability, self.seed, step)) if probability else self.model
-
-    def _coloured(self, camera: DeviceCamera, image: Array) -> tuple[Array, list[LossValue]]:
-        """The image in the colours of its photograph, where that has its own, and the loss of their numbers."""
-        if self.colours is None or camera.view is None:
-            return image, []
-        changed, penalty = self.colours.change(self.rasterizer.workspace, camera, image, self.numbers, camera.view)
-        return changed, [LossValue("colours", penalty)]
-
-    def _uncoloured(self, view: ViewLosses, gradient: Array) -> tuple[Array, Sequence[Callable[[], None]]]:
-        """The gradient by the image as it was rendered, and what changes the numbers of transforms and photographs."""
-        colours, comparison, learning = self.colours, view.comparison, view.learning
-        camera, number = comparison.camera, comparison.camera.view
-        if colours is None or number is None:
-            return gradient, learning
-        workspace, numbers = self.rasterizer.workspace, self.numbers
-        gradient, learn = colours.change_back(
-            workspace, camera, view.rendered, gradient, numbers, number, comparison.step
-        )
-        return gradient, [*learning, learn]
-
-    def _of_sky(self, view: ViewLosses, gradient: Array) -> list[Callable[[], None]]:
-        """What changes the sky after the Gaussians.  gradient: by the image as it was rendered."""
-        if (sky := self.sky) is None:
-            return []
-        by_texels = sky.by_texels(self.rasterizer, view.frame, gradient)
-        return [lambda: sky.update(self.rasterizer, view.frame, by_texels, view.comparison.step)]
-
-    def _learn(
-        self, transform: LearnedTransform, planes: Planes, comparison: Comparison
-    ) -> tuple[list[LossValue], list[Callable[[], None]]]:
-        """Begin the derivatives by the transform's numbers; return its own loss, and what changes the numbers.
-
-        The host waits for them after all of the step is enqueued, so that the device does not wait for the host.
-        """
-        gradient = gradient_by_photograph(self.losses, comparison)
-        if planes.mask is not None:
-            apply_mask(planes.workspace, planes.camera, gradient, planes.mask)
-        of_images = transform.backward(planes, gradient)
-        value, of_numbers = transform.penalty(transform.now(self.numbers), comparison.step)
-
-        def learn() -> None:
-            gradients = {name: derivative + of_numbers[name] for name, derivative in of_images().items()}
-            transform.update(self.numbers, gradients, comparison.step)
-
-        return [LossValue(name_of(transform), lambda: value)], [learn]
-
-    def update(self, view: ViewGradients, stale: Collection[str] = ()) -> None:
-        """Apply what `differentiate` returned: change parameters, moments and statistics."""
+    def update(self, view: ViewLosses, stale: Collection[str] = ()) -> None:
+        """Apply what `differentiate` returned: change parameters, moments and statistics, and the modules' own."""
+        if not isinstance(view, ViewGradients):
+            for module in view.step.modules:
+                module.update_skipped(view.step)
+            return
         grad_mean2d = self._update(view, stale)
-        for learn in view.learning:
-            learn()
+        for module in reversed(view.step.modules):  # what the device had ready first is waited for first
+            module.update(view.step)
         self.rasterizer.device.timings.section = "statistics"
         self.stats.add(view, grad_mean2d)
 

@@ -436,8 +436,10 @@ def require_divisible(pipeline: Pipeline) -> None:
         "scene.train": (settings.scene.train, "blocks choose their views; leave it out"),
         "scene.validation": (settings.scene.validation != 0, "a block has no views to choose by; set it to 0"),
         "scene.extent": (settings.scene.extent, "blocks have that of the whole scene; leave it out"),
-        "optimize.colours": (any(stage.colours for stage in trainings), "those of blocks would differ; leave it out"),
-        "optimize.poses": (any(stage.poses for stage in trainings), "those of blocks would differ; leave it out"),
+        "optimize.modules": (
+            any("blocks" in one.conflicts for stage in trainings for one in stage.modules),
+            "some would differ from block to block; leave them out",
+        ),
         "densify.budget": (
             any(getattr(one.budget, "gaussians", None) for one in _densities(pipeline.stages)),
             "it counts the Gaussians of the whole; give densify.max_gaussians, which blocks share",

@@ -16,6 +16,7 @@ from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import Tracks
 from clsplat.training.adam import Adam, Rates
+from clsplat.training.modules.depth_supervision import KnownDepthsState
 from clsplat.training.trainer import Trainer
 from tests.support.devices import on_one_setting
 
@@ -47,7 +48,8 @@ def error_after(device, weight: float) -> float:
     model.gaussians.set("means", begun)
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians), black
     trainer = Trainer(*parts, [L1(weight=0.8), InverseDepth(weight=weight)], RATES)
-    trainer.depths = PointDepths(device, Tracks(points, {name: np.arange(len(points)) for name in NAMES}), NAMES, 2.0)
+    tracks = Tracks(points, {name: np.arange(len(points)) for name in NAMES})
+    trainer.modules = [KnownDepthsState(PointDepths(device, tracks, NAMES, 2.0))]
     for step in range(1, STEPS + 1):
         trainer.step(photographs[step % len(NAMES)], step)
     return float(np.median(np.abs(model.gaussians.get("means")[plain, 2] - DEPTH)))

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from clsplat.metrics.images import MAX_PSNR, psnr, to_8_bits
-from clsplat.metrics.views import PIXELS, colour_figures, corrected_by_regression, in_colours_of, mean_figures
+from clsplat.metrics.views import (
+    PIXELS,
+    colour_figures,
+    corrected_by_regression,
+    in_colours_of,
+    mean_figures,
+    tell_of_colours,
+)
 from clsplat.stages.optimize import compared
-from clsplat.training.modules.appearance import tell_of_colours
 from clsplat.training.modules.exposure import Affine, Gain
 
 GAINS = np.array([1.3, 0.9, 1.1])

@@ -8,7 +8,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import at_step
 from clsplat.photos.appearance import IDENTITY, ViewTable
 from clsplat.pipeline.loading import load
-from clsplat.training.modules.exposure import Affine, Auto, Gain, PhotographColours
+from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, Gain
 
 MODELS = pytest.mark.parametrize("model", [Gain(), Affine()], ids=lambda model: model.type)
 
@@ -70,38 +70,38 @@ def test_table_changes_its_views_row_and_keeps_means_at_zero(rng):
 
 
 def test_a_view_has_one_row_at_all_its_sizes():
-    colours, numbers = PhotographColours(Gain(), ("a", "b", "a"), rate=0.01), {}
-    colours.begin(numbers, {})
-    colours.learn(numbers, 2, -IDENTITY, step=1)
-    assert colours.matrix(numbers, 0)[0, 0] == colours.matrix(numbers, 2)[0, 0] > 1 > colours.matrix(numbers, 1)[0, 0]
+    colours = ExposureState(Exposure(), ("a", "b", "a"))
+    colours.rate = 0.01
+    colours.begin_with({})
+    colours.learn(2, -IDENTITY, step=1)
+    assert colours.matrix(0)[0, 0] == colours.matrix(2)[0, 0] > 1 > colours.matrix(1)[0, 0]
 
 
 def test_rates_follow_how_often_a_photograph_is_visited():
-    few, many = Gain().rate_of(7000, 50), Gain().rate_of(30_000, 50)
+    few, many = Exposure().rate_of(7000, 50), Exposure().rate_of(30_000, 50)
     assert [at_step(few, step) for step in (0, 7000)] == pytest.approx([1e-2, 1e-3])
     assert [at_step(many, step) for step in (0, 30_000)] == pytest.approx([2e-3, 2e-5])
-    unknown = [Gain().rate_of(steps, 50, known=False) for steps in (500, 7000, 30_000)]
+    unknown = [Exposure().rate_of(steps, 50, known=False) for steps in (500, 7000, 30_000)]
     assert [at_step(rate, 0) for rate in unknown] == pytest.approx([0.05, 0.0183, 0.00426], rel=0.01)
     reach = [
         sum(at_step(rate, step) for step in range(1, steps, 50))
         for steps, rate in zip((7000, 30_000), unknown[1:], strict=True)
     ]
     assert reach == pytest.approx([1, 1], rel=0.05), "as far as a gain of e"
-    assert Gain(rate=0.5).rate_of(7000, 50) == 0.5
+    assert Exposure(rate=0.5).rate_of(7000, 50) == 0.5
 
 
 @pytest.mark.parametrize("rate", ["1000", "{initial: 0.1, final: 2, over: 9}", "-1"])
 def test_a_rate_that_ends_in_no_numbers_is_refused(rate):
     with pytest.raises(ConfigError, match=r"expected values (of at most 0\.5|at least 0)"):
-        load("smoke", [f"optimize.colours={{type: gain, rate: {rate}}}"])
+        load("smoke", [f"optimize.modules.exposure={{rate: {rate}}}"])
 
 
 def test_the_key_takes_names_and_mappings():
-    def colours(setting: str):
-        return load("smoke", [f"optimize.colours={setting}"]).settings.training.colours
+    def modules(setting: str):
+        return load("smoke", [f"optimize.modules.exposure={setting}"]).settings.training.modules
 
-    assert load("smoke").settings.training.colours is None
-    assert colours("gain") == Gain()
-    assert colours("{type: affine, weight: 0.1}") == Affine(weight=0.1)
-    assert colours("auto") == Auto()
-    assert colours("{type: auto, model: {type: affine}}").model == Affine()
+    assert load("smoke").settings.training.modules == []
+    assert modules("{}") == [Exposure()] == [Exposure(model=Gain())]
+    assert modules("{model: {type: affine, weight: 0.1}}") == [Exposure(model=Affine(weight=0.1))]
+    assert modules("{when: auto, model: affine}") == [Exposure(when="auto", model=Affine())]

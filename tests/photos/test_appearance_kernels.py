@@ -15,7 +15,7 @@ from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.exposure import Affine, Gain, PhotographColours, change_colours
+from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, Gain, change_colours
 from clsplat.training.trainer import Trainer
 from tests.support.devices import on_devices, on_one_setting, product
 from tests.support.figures import hold
@@ -49,14 +49,15 @@ class Case:
         self.photograph = Photograph(camera, device.upload(pixels), mask)
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         self.trainer = Trainer(*parts, device.upload(BACKGROUND), losses, Rates(), numbers=self.numbers)
-        self.trainer.colours = colours and PhotographColours(colours, ("a", "b"), rate=0.01)
         if colours:
-            gains = np.array([0.3, 0.1, -0.2])
-            self.trainer.colours.begin(self.numbers, {"a": -gains, "b": gains})
+            state, gains = ExposureState(Exposure(model=colours), ("a", "b")), np.array([0.3, 0.1, -0.2])
+            state.rate, state.numbers = 0.01, self.numbers
+            state.begin_with({"a": -gains, "b": gains})
+            self.trainer.modules = [state]
 
     def loss(self, key: str, change: float) -> float:
         """The loss with one number changed."""
-        self.trainer.numbers = {**self.numbers, key: self.numbers[key] + change}
+        self.trainer.modules[0].numbers = {**self.numbers, key: self.numbers[key] + change}
         return self.trainer.compare(self.photograph, 1).loss
 
 
@@ -64,9 +65,9 @@ class Case:
 def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, monkeypatch, colours, share):
     """By finite differences of the loss; l2 is smooth."""
     case, found = Case(device, rng, colours, share=share), []
-    table, step = case.trainer.colours.table, 2e-3
+    table, step = case.trainer.modules[0].table, 2e-3
     numeric = [(case.loss(key, step) - case.loss(key, -step)) / (2 * step) for key in table.keys("b")]
-    case.trainer.numbers = case.numbers
+    case.trainer.modules[0].numbers = case.numbers
     monkeypatch.setattr(ViewTable, "update", lambda self, numbers, view, gradient, rate: found.append((view, gradient)))
     case.trainer.step(case.photograph, 1)
     ((view, gradient),) = found
@@ -101,7 +102,7 @@ def test_numbers_of_no_change_give_the_gradients_of_none(device, rng, monkeypatc
 def test_a_mask_hides_pixels_whatever_their_colours_become(device, rng):
     """An offset makes black pixels bright."""
     case = Case(device, rng, Affine(), share=0.5)
-    case.numbers.update({key: 0.2 for key in case.trainer.colours.table.keys("b") if key.endswith("1")})
+    case.numbers.update({key: 0.2 for key in case.trainer.modules[0].table.keys("b") if key.endswith("1")})
     image = case.trainer.compare(case.photograph, 1).comparison.image.get()[:, :36, :50]
     hidden = ~case.photograph.counted()
     assert (image[:, hidden] == 0).all()

@@ -13,17 +13,17 @@ from clsplat.metrics.images import psnr
 from clsplat.metrics.views import render_floats
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo
-from clsplat.photos.appearance import OwnColours
 from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.bilateral_grid import Grid
-from clsplat.training.modules.exposure import Gain
+from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState
+from clsplat.training.modules.exposure import ColourState, Exposure, ExposureState, Gain
 from clsplat.training.trainer import Trainer
 
 VIEWS, STEPS = 8, 240
+NAMES = [str(number) for number in range(VIEWS)]
 RATES = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=2e-2, sh_rest=0)  # the colours alone are unknown
 LUMINANCE = np.array([0.299, 0.587, 0.114])
 
@@ -66,23 +66,23 @@ class Capture:
         """The share of values that are white."""
         return float(np.mean([photograph.image() == 255 for photograph in self.photographs]))
 
-    def trained(self, rng: np.random.Generator, model: OwnColours) -> Trainer:
-        """Train from other colours; return the trainer, whose `colours` are of that model."""
-        gaussians, numbers = self.model.gaussians, dict[str, float]()
+    def trained(self, rng: np.random.Generator, state: ColourState) -> Trainer:
+        """Train from other colours; return the trainer, whose module is the state."""
+        gaussians = self.model.gaussians
         gaussians.set("sh_base", self.colours + rng.normal(0, 0.3, self.colours.shape).astype(np.float32))
-        names, rate = [str(number) for number in range(VIEWS)], model.rate_of(STEPS, VIEWS, False)
-        colours = model.of_views(names, self.rasterizer.device, None).with_rate(rate)
-        colours.begin(numbers, {})
+        state.rate = state.settings.rate_of(STEPS, VIEWS, False)
+        state.begin_with({})
         parts = self.rasterizer, self.model, Adam(gaussians), SplatStats(gaussians, []), self.background
-        trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), RATES, numbers=numbers, colours=colours)
+        trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), RATES, modules=[state])
         for step in range(1, STEPS + 1):
             trainer.step(self.photographs[(step * 3) % VIEWS], step)
         return trainer
 
     def learned(self, rng: np.random.Generator) -> np.ndarray:
         """Train with gains; return their logarithms, [VIEWS, 3]."""
-        trainer = self.trained(rng, Gain())
-        return np.log([np.diag(trainer.colours.matrix(trainer.numbers, number)) for number in range(VIEWS)])
+        state = ExposureState(Exposure(), NAMES)
+        self.trained(rng, state)
+        return np.log([np.diag(state.matrix(number)) for number in range(VIEWS)])
 
     def shown(self, trainer: Trainer, number: int) -> np.ndarray:
         """The image of a training view in the colours of its photograph, [H, W, 3]."""
@@ -137,7 +137,7 @@ def test_grids_find_known_exposures_too(rng, info):
     """By what a grid makes of the whole image; it has 768 numbers for what three say."""
     truth = drawn(rng, 0.25, 0.05)
     capture = Capture(rng, info, truth)
-    trainer = capture.trained(rng, Grid())
+    trainer = capture.trained(rng, GridState(BilateralGrid(), NAMES, capture.rasterizer.device))
     assert capture.fit(trainer) > 45
     found = []
     for number, photograph in enumerate(capture.photographs):
@@ -156,6 +156,7 @@ def test_grids_follow_a_local_tone_mapping_that_gains_cannot(rng, info):
         return ways[number, 0] * (1 - 2 * luminance) + ways[number, 1] * across
 
     capture = Capture(rng, info, np.zeros((VIEWS, 3)), local=local)
-    fits = [capture.fit(capture.trained(rng, model)) for model in (Gain(), Grid())]
+    states = ExposureState(Exposure(), NAMES), GridState(BilateralGrid(), NAMES, capture.rasterizer.device)
+    fits = [capture.fit(capture.trained(rng, state)) for state in states]
     assert fits[0] < 30
     assert fits[1] > fits[0] + 10

@@ -18,13 +18,13 @@ from clsplat.sweeps.compare.comparison import Comparison
 from clsplat.sweeps.compare.page import main_table
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
-from clsplat.training.modules.appearance import colours_beside, colours_of, settled
-from clsplat.training.modules.exposure import Affine, Auto, Gain
+from clsplat.training.modules.base import measured_beside
+from clsplat.training.modules.exposure import Exposure
 from tests.support.exposed_wall import Wall
 from tests.support.runs import FEW, digest, killed, train
 
 pytestmark = pytest.mark.slow
-GAIN = (*FEW, "optimize.colours=gain")
+GAIN = (*FEW, "optimize.modules.exposure={}")
 
 
 @pytest.fixture(scope="module")
@@ -39,17 +39,18 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_gains, tiny_s
     out = killed(with_gains, tmp_path / "run")
     run = train(tiny_scene, out, *GAIN, resume=True)
     assert digest(out) == digest(with_gains)
-    assert run.numbers == checkpoint.load(checkpoint.saved(with_gains)[-1])[0].numbers
+    assert run.modules["exposure"].numbers == checkpoint.load(checkpoint.saved(with_gains)[-1])[0].modules["exposure"]
 
 
 def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *GAIN)
     names = [view.name for view in run.scene.split("train")]
-    updates = [run.numbers.get(f"colours/{name}/exposure/updates", 0) for name in names]
+    numbers = run.modules["exposure"].numbers
+    updates = [numbers.get(f"colours/{name}/exposure/updates", 0) for name in names]
     assert sum(updates) == 12
     assert len(set(updates)) > 1, "eight photographs, twelve steps"
     for column in ("exposure", "red", "blue"):
-        values = [run.numbers[f"colours/{name}/{column}"] for name in names]
+        values = [numbers[f"colours/{name}/{column}"] for name in names]
         assert sum(values) == pytest.approx(0, abs=1e-12)
         assert max(map(abs, values)) > 1e-3
     assert digest(tmp_path / "run") != digest(few_steps)
@@ -57,7 +58,7 @@ def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp
 
 def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few_steps):
     data = json.loads((with_gains / "view_colours.json").read_text())
-    assert data["type"] == "gain"
+    assert (data["type"], data["model"]) == ("exposure", "gain")
     assert len(data["photographs"]) == 8
     for row in data["photographs"].values():
         luminance = np.log(np.diag(row["matrix"])) @ [0.299, 0.587, 0.114]
@@ -86,37 +87,24 @@ def test_a_run_folder_is_measured_in_the_photographs_colours_too(with_gains, few
     assert "psnr_colour" not in evaluate(few_steps)["test"]["1"]
     for damage in ("[]", '{"type": "lens"}'):
         (tmp_path / "view_colours.json").write_text(damage)
-        with pytest.raises(DataError, match=r"the type of colours is .* expected one of \w+, \w+"):
-            colours_beside(tmp_path / "point_cloud.ply")
+        with pytest.raises(DataError, match=r"the type of colours is .* expected one of \w+"):
+            measured_beside(tmp_path / "point_cloud.ply")
 
 
 def test_where_colours_began_is_kept_with_them(rng, tmp_path):
     """The rate depends on it, also where the file that told it is gone."""
     wall = Wall(rng)
     wall.write(tmp_path / "scene")
-    gain = (*FEW, "scene.holdout=0", "optimize.colours=gain")
+    gain = (*FEW, "scene.holdout=0", "optimize.modules.exposure={}")
     run = train(tmp_path / "scene", tmp_path / "run", *gain)
     last = tmp_path / "run" / "checkpoints" / "step_000012.npz"
     last.unlink()
     for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
         (tmp_path / "run" / name).unlink()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("clsplat.training.modules.appearance.exposures_of", lambda run: UNKNOWN)
+        patch.setattr("clsplat.training.modules.exposure.exposures_of", lambda run: UNKNOWN)
         again = train(tmp_path / "scene", tmp_path / "run", *gain, resume=True)
-    assert again.numbers == run.numbers
-
-
-def test_figures_use_the_colors_of_the_training_that_has_begun():
-    def colours(numbers: dict[str, float], *stages: object) -> object:
-        run = SimpleNamespace(
-            numbers=numbers, settings=SimpleNamespace(stages=[SimpleNamespace(colours=one) for one in stages])
-        )
-        return colours_of(run)
-
-    gain, off = {f"colours/a.png/{column}": 0.0 for column in Gain.columns}, Auto().choose("off", "they are alike")
-    assert colours({}, Gain()) is None
-    assert colours(gain, Gain(), Affine()) == Gain(), "the second has not begun"
-    assert colours(gain, Gain(), off) == Gain()
+    assert again.modules["exposure"].numbers == run.modules["exposure"].numbers
 
 
 def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_path):
@@ -130,19 +118,19 @@ def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_pat
     run = train(tiny_scene, tmp_path / "run", *GAIN, *kept, wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     then, _ = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    assert {name: run.numbers[name] for name in then.numbers} == then.numbers
+    assert run.modules["exposure"].numbers == then.modules["exposure"]
     (row, *_) = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"].items()
-    assert row[1]["exposure"] == then.numbers[f"colours/{row[0]}/exposure"]
+    assert row[1]["exposure"] == then.modules["exposure"][f"colours/{row[0]}/exposure"]
 
 
 def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_path, few_steps):
     """The synthetic scene has points without tracks."""
-    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "optimize.colours=auto"])
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "optimize.modules.exposure.when=auto"])
     run_pipeline(asked, tmp_path / "run", None, "new")
-    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.colours
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
     assert found.chosen == "off"
     assert found.reason == "neither tracks of points nor cameras tell the exposures"
-    assert f"optimize.colours: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
+    assert f"optimize.modules.exposure: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
     assert digest(tmp_path / "run") == digest(few_steps)
     assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
 
@@ -150,9 +138,9 @@ def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_pa
 def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
     wall = Wall(rng)
     wall.write(tmp_path / "scene")
-    settings = [f"scene.path='{tmp_path / 'scene'}'", "scene.holdout=0", *FEW, "optimize.colours=auto"]
+    settings = [f"scene.path='{tmp_path / 'scene'}'", "scene.holdout=0", *FEW, "optimize.modules.exposure.when=auto"]
     run_pipeline(load("smoke", settings), tmp_path / "run", None, "new")
-    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.colours
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
     assert found.chosen == "on"
     assert "exposures of 8 photographs differ by" in found.reason
     photographs = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"]
@@ -160,7 +148,7 @@ def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
     assert gains == pytest.approx(wall.log_gains, abs=0.06), "twelve steps do not move them far"
     with run_folder.opened(tmp_path / "run", "resume", step=0) as status:
         run = opening.open_run(load(str(tmp_path / "run" / "pipeline.yaml")), tmp_path / "run", None, "resume", status)
-    assert run.settings.training.colours == found, "who goes on takes the choice"
+    assert run.settings.training.modules == [found], "who goes on takes the choice"
 
 
 @pytest.mark.parametrize(
@@ -175,13 +163,13 @@ def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
 def test_the_reason_says_which_bound_decided(spread, explained, chosen, said):
     exposures = Exposures({"a": np.full(3, spread), "b": np.full(3, -spread)}, "at 9 points", explained)
     run = SimpleNamespace(scene=SimpleNamespace(split=lambda _: []), exposures={(): exposures})
-    found = settled(Auto(), run)
+    found = Exposure(when="auto").settled(run)
     assert (found.chosen, found.reason) == (chosen, exposures.text + said)
 
 
 def test_what_a_run_chose_is_no_setting_of_its_pipeline():
-    asked = load("smoke", ["optimize.colours=auto"]).resolved()
-    chosen = load("smoke", ["optimize.colours={type: auto, chosen: on, reason: they differ}"]).resolved()
+    asked = load("smoke", ["optimize.modules.exposure.when=auto"]).resolved()
+    chosen = load("smoke", ["optimize.modules.exposure={when: auto, chosen: on, reason: they differ}"]).resolved()
     assert asked != chosen
     assert without_choices(asked) == without_choices(chosen)
     assert without_choices(asked) != without_choices(load("smoke").resolved())

@@ -12,15 +12,15 @@ from clsplat.render.workspace import Workspace
 from clsplat.runs.describe import describe
 from clsplat.scene.detect import read_scene
 from clsplat.scene.view import load_image
-from clsplat.training.modules.random_background import Backgrounds
+from clsplat.training.modules.random_background import drawn_background
 from tests.support.runs import digest, train
 
-RANDOM = "optimize.background=random"
+RANDOM = "optimize.modules.random_background={}"
 
 
 def test_colours_depend_on_the_seed_and_the_step_alone():
     device = Device(choose())
-    drawn = [tuple(Backgrounds(device, seed).at(step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
+    drawn = [tuple(drawn_background(device, seed, step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
     assert len(set(drawn)) == 3
     assert drawn[0] == drawn[3]
 
@@ -28,7 +28,7 @@ def test_colours_depend_on_the_seed_and_the_step_alone():
 def test_photograph_has_the_drawn_color_where_transparent(tiny_scene):
     device, scene = Device(choose()), read_scene(tiny_scene)
     photographs, view = Photographs(device, "white"), scene.split("train")[0]
-    behind = Backgrounds(device, 0).at(3)
+    behind = drawn_background(device, 0, 3)
     height, width = view.camera.height, view.camera.width
 
     def shown() -> np.ndarray:
@@ -54,25 +54,36 @@ def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, tmp_path):
     train(tiny_scene, again, *steps, RANDOM, resume=True)
     assert digest(again) == whole
     assert digest(train(tiny_scene, tmp_path / "scene", *steps).out) != whole
-    found = train(tiny_scene, tmp_path / "transparent", *steps, "optimize.background=transparent").out
+    found = train(
+        tiny_scene, tmp_path / "transparent", *steps, "optimize.modules.random_background.where=transparent"
+    ).out
     assert digest(found) == whole
     opaque = [
         digest(
             train(
-                tiny_scene, tmp_path / f"opaque {name}", *steps, "scene.alpha=mask", f"optimize.background={name}"
+                tiny_scene,
+                tmp_path / f"opaque {name}",
+                *steps,
+                "scene.alpha=mask",
+                f"optimize.modules.random_background={value}",
             ).out
         )
-        for name in ("transparent", "scene")
+        for name, value in (("transparent", "{where: transparent}"), ("scene", "null"))
     ]
     assert opaque[0] == opaque[1]
 
 
 @pytest.mark.slow
 def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
-    with pytest.raises(ConfigError, match="models without a sky"):
+    with pytest.raises(ConfigError, match="does not go with sky"):
         train(tiny_scene, tmp_path / "run", RANDOM, "model.background=directions", "optimize.steps=2")
     asked = load(
-        "smoke", [f"scene.path='{tiny_scene}'", "optimize.background=transparent", "model.background=directions"]
+        "smoke",
+        [
+            f"scene.path='{tiny_scene}'",
+            "optimize.modules.random_background.where=transparent",
+            "model.background=directions",
+        ],
     )
-    with pytest.raises(ConfigError, match="models without a sky"):
+    with pytest.raises(ConfigError, match="does not go with sky"):
         describe(asked, tmp_path / "other", None, "new")

@@ -10,13 +10,12 @@ from clsplat.conformance.checks.images import camera_of, planes_of
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.image import L2
-from clsplat.photos.appearance import GridTables
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.bilateral_grid import Grid, PhotographGrids
-from clsplat.training.modules.exposure import Affine, PhotographColours
+from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState
+from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, change_back, change_colours
 from clsplat.training.trainer import Trainer
 from tests.support.devices import on_devices, on_one_setting, product
 from tests.support.figures import hold
@@ -42,11 +41,11 @@ def test_smoothness_updates_and_the_mean(device, rng, nodes):
 @on_one_setting
 def test_no_change_cuts_white_alone(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
-    camera, tables = camera_of(device, 33, 18), GridTables(device, 1, (4, 4, 4))
-    grids = PhotographGrids(Grid(), ("a",), 0.01, tables)
-    found, smoothness = grids.change(Workspace(device), camera, planes_of(device, camera, image), {}, 0)
+    camera, workspace = camera_of(device, 33, 18), Workspace(device)
+    grids = GridState(BilateralGrid(), ("a",), device)
+    found = grids.changed(workspace, camera, planes_of(device, camera, image), 0)
     assert (found.get()[:, :18, :33] == np.minimum(image, 1)).all()
-    assert smoothness() == 0
+    assert not grids.smoothness(workspace, 0).get().any()
 
 
 def test_an_image_of_one_luminance_reads_the_levels_about_it(device):
@@ -54,10 +53,10 @@ def test_an_image_of_one_luminance_reads_the_levels_about_it(device):
     camera, grids = camera_of(device, 20, 5), grids_of(device, np.random.default_rng(0), (2, 2, 3))
     values = np.zeros((3, 3, 4, 3, 2, 2), np.float32)
     values[1, range(3), 3] = np.array([0.1, 0.3, 0.2], np.float32)[:, None, None]  # added at each level
-    grids.tables.set({"values": values.reshape(grids.tables.shape)})
+    grids.load({}, {"values": values.reshape(grids.shape)})
     for grey, expected in ((-0.2, 0.1), (0.0, 0.1), (0.25, 0.2), (0.5, 0.3), (0.6, 0.28)):
         planes = planes_of(device, camera, np.full((3, 5, 20), grey, np.float32))
-        found = grids.change(Workspace(device), camera, planes, {}, 1)[0].get()[:, :5, :20]
+        found = grids.changed(Workspace(device), camera, planes, 1).get()[:, :5, :20]
         assert found == pytest.approx(grey + expected, abs=1e-6), grey
 
 
@@ -72,16 +71,16 @@ class Case:
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         behind = device.upload(np.array([0.2, 0.5, 0.9], np.float32))
         self.trainer = Trainer(*parts, behind, (L2(),), Rates(), numbers=self.numbers)
-        self.tables = GridTables(device, 2, nodes)
-        self.trainer.colours = PhotographGrids(Grid(cells=list(nodes), weight=0.1), ("a", "b"), 0.01, self.tables)
-        self.trainer.colours.begin(self.numbers, {"b": np.array([0.3, 0.1, -0.2])})
-        self.values = self.tables.tables()["values"]
+        self.state = GridState(BilateralGrid(cells=list(nodes), weight=0.1), ("a", "b"), device)
+        self.state.rate, self.trainer.modules = 0.01, [self.state]
+        self.state.begin_with({"b": np.array([0.3, 0.1, -0.2])})
+        self.values = self.state.tables()["values"]
 
     def loss(self, at: int, change: float) -> float:
         """The loss with one value of the grid changed."""
         values = self.values.copy()
         values[1].reshape(-1)[at] += change
-        self.tables.set({"values": values})
+        self.state.load(self.state.numbers, {"values": values})
         return self.trainer.compare(self.photograph, 1).loss
 
 
@@ -91,12 +90,12 @@ def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, share):
     case, step = Case(device, rng, share=share), 2e-3
     places = rng.choice(case.values[1].size, 24, replace=False)
     numeric = [(case.loss(at, step) - case.loss(at, -step)) / (2 * step) for at in places]
-    case.tables.set({"values": case.values})
+    case.state.load(case.state.numbers, {"values": case.values})
     case.trainer.step(case.photograph, 1)
-    found = case.tables.tables()
+    found = case.state.tables()
     assert found["moment1"][1].ravel()[places] == pytest.approx(0.1 * np.array(numeric), rel=0.02, abs=2e-6)
     assert not found["moment1"][0].any(), "the other photograph has no update"
-    assert case.numbers["colours/b/updates"] == 1
+    assert case.state.numbers["colours/b/updates"] == 1
 
 
 @on_one_setting
@@ -104,7 +103,7 @@ def test_the_mean_over_photographs_and_places_stays_at_no_change(device, rng):
     case = Case(device, rng)
     for step in (1, 2, 3):
         case.trainer.step(case.photograph, step)
-    values = case.tables.tables()["values"].reshape(2, 12, 4, 6).astype(np.float64)
+    values = case.state.tables()["values"].reshape(2, 12, 4, 6).astype(np.float64)
     largest = np.float32(np.abs(values).max())
     assert largest > 0.1
     # a value is rounded in 5 + 1 additions, their mean in a division, its difference from that once: half an ulp of the
@@ -118,23 +117,21 @@ def test_the_mean_over_photographs_and_places_stays_at_no_change(device, rng):
 @on_one_setting
 def test_one_matrix_is_the_affine_kind(device, rng):
     """Its image, and the derivatives by both."""
-    numbers, values = {}, rng.normal(0, 0.2, (2, 12, 1, 1, 1)).astype(np.float32)
-    grids = PhotographGrids(Grid(cells=[1, 1, 1]), ("a", "b"), 0.01, GridTables(device, 2, [1, 1, 1]))
-    grids.tables.set({"values": values})
-    affine = PhotographColours(Affine(weight=0), ("a", "b"), 0.01)
-    numbers.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
+    values = rng.normal(0, 0.2, (2, 12, 1, 1, 1)).astype(np.float32)
+    grids = GridState(BilateralGrid(cells=[1, 1, 1]), ("a", "b"), device)
+    grids.load({}, {"values": values})
+    affine = ExposureState(Exposure(model=Affine(weight=0)), ("a", "b"))
+    affine.numbers.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
     image, gradient = (planes_of(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))
-    found, expected = (one.change(workspace, camera, image, numbers, 1)[0].get() for one in (grids, affine))
+    found = grids.changed(workspace, camera, image, 1).get()
+    expected = change_colours(workspace, camera, image, affine.matrix(1)).get()
     assert found == pytest.approx(expected, abs=1e-6)
     passed, by_grid = grids.differentiated(workspace, camera, image, gradient, 1)
     passed, by_grid = passed.get(), by_grid.get()
-    caught = []
-    object.__setattr__(affine, "learn", lambda numbers, view, by_matrix, step: caught.append(by_matrix))
-    through, learn = affine.change_back(workspace, camera, image, gradient, numbers, 1, 1)
-    learn()
+    through, by_matrix = change_back(workspace, camera, image, affine.matrix(1), gradient)
     assert passed == pytest.approx(through.get(), abs=1e-5)
-    assert by_grid == pytest.approx(caught[0].ravel(), rel=1e-4, abs=1e-4)
+    assert by_grid == pytest.approx(by_matrix().ravel(), rel=1e-4, abs=1e-4)
 
 
 @on_one_setting
@@ -142,7 +139,7 @@ def test_a_mask_hides_pixels_whatever_their_colours_become(device, rng):
     case = Case(device, rng, share=0.5)
     values = case.values.copy().reshape(2, 12, -1)
     values[1, [3, 7, 11]] = 0.2  # added to black
-    case.tables.set({"values": values.reshape(case.tables.shape)})
+    case.state.load({}, {"values": values.reshape(case.state.shape)})
     image = case.trainer.compare(case.photograph, 1).comparison.image.get()[:, :HEIGHT, :WIDTH]
     hidden = ~case.photograph.counted()
     assert (image[:, hidden] == 0).all()

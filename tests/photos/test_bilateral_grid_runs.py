@@ -17,69 +17,48 @@ from clsplat.conformance.checks.images import camera_of, planes_of
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.schedule import Decay, at_step
 from clsplat.opencl.device import Device
-from clsplat.photos.appearance import bytes_of
 from clsplat.pipeline import plugins
 from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.status import summary
 from clsplat.training import archive, checkpoint, memory
-from clsplat.training.modules import exposure
-from clsplat.training.modules.appearance import colours_beside, photograph_colours
-from clsplat.training.modules.bilateral_grid import Grid
-from clsplat.training.modules.exposure import Auto, Gain
+from clsplat.training.modules.base import attached, measured_beside
+from clsplat.training.modules.bilateral_grid import BilateralGrid, bytes_of
+from clsplat.training.modules.exposure import Exposure, Gain
 from clsplat.training.run import Run
 from tests.support.runs import FEW, ONE_CORE, digest, killed, train
 
 PLAIN = '''
-from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
-import numpy as np
-from clsplat.training.modules.exposure import IDENTITY, OwnColours
-from clsplat.photos.appearance import ViewColours, Written
+from typing import Literal
+from clsplat.training.modules.exposure import IDENTITY, Appearance, ColourState, Gain, Written
 
 
-class Plain(OwnColours):
+class Plain(Appearance):
     """Colours as they are."""
 
-    columns: ClassVar[tuple[str, ...]] = ("steps",)
     type: Literal["plain"] = "plain"
 
-    def of_views(self, views, device, tables):
-        return Views(tuple(views), 0.0)
+    def state(self, run):
+        return Views(self, [view.name for view in run.scene.split("train")])
 
-    def fitted(self, image, photograph):
-        return IDENTITY
+    @property
+    def fit(self):
+        return Gain()
 
 
-@dataclass(frozen=True)
-class Views(ViewColours):
-    views: tuple[str, ...]
-    rate: object
+class Views(ColourState):
+    def begin_with(self, log_gains):
+        self.numbers |= {f"colours/{view}/steps": 0.0 for view in self.views}
 
-    def with_rate(self, rate):
-        return replace(self, rate=rate)
-
-    def begun(self, numbers):
-        return f"colours/{self.views[0]}/steps" in numbers
-
-    def begin(self, numbers, log_gains):
-        numbers |= {f"colours/{view}/steps": 0.0 for view in self.views}
-
-    def written(self, numbers):
-        steps = {view: numbers[f"colours/{view}/steps"] for view in self.views}
+    def written(self):
+        steps = {view: self.numbers[f"colours/{view}/steps"] for view in self.views}
         return Written(dict.fromkeys(self.views, IDENTITY), {"meaning": "none", "type": "plain", "photographs": steps})
 
-    def change(self, workspace, camera, image, numbers, view):
-        return image, lambda: 0.0
-
-    def change_back(self, workspace, camera, image, gradient, numbers, view, step):
-        def learn():
-            numbers[f"colours/{self.views[view]}/steps"] += 1
-
-        return gradient, learn
+    def update(self, step):
+        self.numbers[f"colours/{self.views[step.view]}/steps"] += 1
 '''
-GRID = (*FEW, "optimize.colours={type: grid, cells: [3, 2, 4]}")
+GRID = (*FEW, "optimize.modules.bilateral_grid={cells: [3, 2, 4]}")
 
 
 @pytest.fixture(scope="module")
@@ -95,27 +74,27 @@ def with_grids(ended: Run) -> Path:
 
 
 def test_the_key_takes_cells_of_each_axis():
-    def colours(setting: str):
-        return load("smoke", [f"optimize.colours={setting}"]).settings.training.colours
+    def grid(setting: str):
+        return load("smoke", [f"optimize.modules.bilateral_grid={setting}"]).settings.training.modules[0]
 
-    assert colours("grid") == Grid(cells=[4, 4, 4])
-    assert colours("{type: grid, cells: [16, 16, 8]}").cells == [16, 16, 8]
-    assert colours("{type: auto, model: grid}").model == Grid()
+    assert grid("{}") == BilateralGrid(cells=[4, 4, 4])
+    assert grid("{cells: [16, 16, 8]}").cells == [16, 16, 8]
+    assert grid("{when: auto}") == BilateralGrid(when="auto")
     for wrong in ("[4, 4]", "[0, 4, 4]", "[4, 4, 17]", "4"):
-        with pytest.raises(ConfigError, match=r"colours\.grid\.cells|colours\.cells"):
-            colours(f"{{type: grid, cells: {wrong}}}")
+        with pytest.raises(ConfigError, match=r"bilateral_grid.*cells"):
+            grid(f"{{cells: {wrong}}}")
 
 
 def test_rate_warms_up_and_falls_as_unknown_exposures_need():
     for steps, warm_up in ((1500, 150), (30_000, 1000)):
         published = Decay(initial=2e-3, final=2e-5, over=steps)
-        for known, expected in ((True, published), (False, Gain().rate_of(steps, 50, False))):
-            found = Grid().rate_of(steps, 50, known)
+        for known, expected in ((True, published), (False, Exposure().rate_of(steps, 50, False))):
+            found = BilateralGrid().rate_of(steps, 50, known)
             assert at_step(found, 0) == pytest.approx(at_step(expected, 0) / 100)
             for step in range(warm_up, steps + 1, 50):
                 assert at_step(found, step) == pytest.approx(at_step(expected, step), rel=0.03)
-    assert Grid(rate=0.02).rate_of(7000, 50) == 0.02
-    assert at_step(Grid().rate_of(1, 1), 1) > 0
+    assert BilateralGrid(rate=0.02).rate_of(7000, 50) == 0.02
+    assert at_step(BilateralGrid().rate_of(1, 1), 1) > 0
 
 
 @pytest.mark.slow
@@ -126,11 +105,11 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_grids, tiny_s
     files = [(folder / "view_colours.npy").read_bytes() for folder in (out, with_grids)]
     assert files[0] == files[1]
     _, tables = checkpoint.load(out / "checkpoints" / "step_000012.npz")
-    own, _ = archive.split(tables, exposure.FOLDER)
+    own, _ = archive.split(tables, "modules/bilateral_grid/")
     assert own.keys() == {"values", "moment1", "moment2"}
-    assert all((table == run.colour_grids.tables()[name]).all() for name, table in own.items())
+    assert all((table == run.modules["bilateral_grid"].tables()[name]).all() for name, table in own.items())
     names = {view.name for view in run.scene.split("train")}
-    assert sum(run.numbers[f"colours/{name}/updates"] for name in names) == 12
+    assert sum(run.modules["bilateral_grid"].numbers[f"colours/{name}/updates"] for name in names) == 12
 
 
 def bits(device: Device) -> str:
@@ -139,10 +118,10 @@ def bits(device: Device) -> str:
     one, workspace, camera = grids_of(device, rng, (5, 4, 3)), Workspace(device), camera_of(device, 100, 70)
     planes = [planes_of(device, camera, rng.normal(0.5, 0.4, (3, 70, 100))) for _ in range(2)]
     for step in (1, 2):
-        image, _ = one.change(workspace, camera, planes[0], {}, 1)
-        gradient, learn = one.change_back(workspace, camera, *planes, {}, 1, step)
-        learn()
-        for array in (image, gradient, *one.tables.arrays.values()):
+        image, _ = one.changed(workspace, camera, planes[0], 1), one.smoothness(workspace, 1)
+        gradient, by_grid = one.differentiated(workspace, camera, *planes, 1)
+        one.learn(workspace, 1, by_grid, step)
+        for array in (image, gradient, *one.arrays.values()):
             found.update(array.get().tobytes())
     return found.hexdigest()
 
@@ -160,7 +139,7 @@ def test_one_core_gives_the_same_bits(info):
 def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps, tmp_path):
     data = json.loads((with_grids / "view_colours.json").read_text())
     found = np.load(with_grids / data["file"], allow_pickle=False)
-    assert (data["type"], data["cells"]) == ("grid", [3, 2, 4])
+    assert (data["type"], data["cells"]) == ("bilateral_grid", [3, 2, 4])
     assert found.shape == (8, 4, 2, 3, 3, 4)
     assert found.dtype == np.float32
     assert found.mean(axis=(0, 2, 3)) == pytest.approx(np.tile(np.eye(3, 4), (4, 1, 1)), abs=1e-6)
@@ -169,7 +148,7 @@ def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps,
     assert {"view_colours.json", "view_colours.npy"} < json.loads((with_grids / "checksums.json").read_text()).keys()
     measured = json.loads((with_grids / "metrics.json").read_text())["test"]["1"]
     assert measured["psnr_colour"] == pytest.approx(evaluate(with_grids)["test"]["1"]["psnr_colour"], abs=1e-6)
-    assert colours_beside(with_grids / "point_cloud.ply") == Grid()
+    assert measured_beside(with_grids / "point_cloud.ply") == Gain()
     assert digest(with_grids) != digest(few_steps)
     assert f"  colours  {with_grids}/view_colours.json" in summary(with_grids)
 
@@ -181,7 +160,7 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
     run = train(tiny_scene, tmp_path / "run", *GRID, *kept, "optimize.evaluate.every=4", wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     _, tables = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    own, _ = archive.split(tables, exposure.FOLDER)
+    own, _ = archive.split(tables, "modules/bilateral_grid/")
     expected = own["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
     found = np.load(tmp_path / "run" / "view_colours.npy")
     assert (found == expected + np.eye(3, 4, dtype=np.float32)).all()
@@ -191,13 +170,15 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
 @pytest.mark.parametrize("cells", [[1, 1, 1], [4, 3, 2]])
 def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
     """Also with as many of them."""
-    run, colours = copy(ended), ended.settings.training.colours
-    run.numbers = dict(ended.numbers)
-    assert photograph_colours(colours, run, 24).tables is ended.colour_grids
-    other = photograph_colours(Grid(cells=cells), run, 24)
-    assert other.tables is run.colour_grids is not ended.colour_grids
-    assert not run.colour_grids.tables()["values"].any()
-    assert run.numbers[f"colours/{other.names[0]}/updates"] == 0 < ended.numbers[f"colours/{other.names[0]}/updates"]
+    run, before = copy(ended), ended.modules["bilateral_grid"]
+    run.modules = dict(ended.modules)
+    (same,) = attached(ended.settings.training.modules, run, 24)
+    assert same.numbers == before.numbers
+    assert all((table == before.tables()[name]).all() for name, table in same.tables().items())
+    (other,) = attached([BilateralGrid(cells=cells)], run, 24)
+    assert other is run.modules["bilateral_grid"] is not before
+    assert not other.tables()["values"].any()
+    assert other.numbers[f"colours/{other.names[0]}/updates"] == 0 < before.numbers[f"colours/{other.names[0]}/updates"]
 
 
 @pytest.mark.slow
@@ -205,24 +186,25 @@ def test_memory_counts_them_before_the_first_gaussian(ended):
     views, tile = ended.scene.split("train"), int(ended.device.tuning["TILE"])
     width, height = (-(-side // tile) * tile for side in (views[0].camera.width, views[0].camera.height))
 
-    def fixed(colours) -> int:
-        run, training = copy(ended), ended.settings.training.model_copy(update={"colours": colours})
+    def fixed(*modules) -> int:
+        run, training = copy(ended), ended.settings.training.model_copy(update={"modules": [*modules]})
         stages = [training if one.stage == "optimize" else one for one in run.settings.stages]
         run.settings = run.settings.model_copy(update={"stages": stages})
         return run.memory_plan(memory.first_tables(0)).fixed
 
-    wide = Grid(cells=[16, 16, 8])
-    more = fixed(wide) - fixed(Gain())
+    wide = BilateralGrid(cells=[16, 16, 8])
+    more = fixed(wide) - fixed(Exposure())
     assert more == bytes_of([16, 16, 8], len(views), height, width * height)
     assert more > 3 * 4 * 12 * 16 * 16 * 8 * len(views)
-    assert fixed(Auto(model=wide)) == fixed(wide), "as long as it is not chosen"
-    assert fixed(Auto(model=wide).choose("off", "they are alike")) == fixed(None) == fixed(Gain())
+    assert fixed(wide.model_copy(update={"when": "auto"})) == fixed(wide), "as long as it is not chosen"
+    off = wide.model_copy(update={"when": "auto", "chosen": "off"})
+    assert fixed(off) == fixed() == fixed(Exposure())
 
 
 @pytest.mark.slow
 def test_a_dry_run_checks_them(tiny_scene, tmp_path):
     def told(cells: str) -> object:
-        setting = [f"optimize.colours={{type: grid, cells: {cells}}}"]
+        setting = [f"optimize.modules.bilateral_grid={{cells: {cells}}}"]
         return commands.describe_run("smoke", tiny_scene, tmp_path / "run", set=setting)
 
     assert told("[4, 4, 2]")
@@ -233,37 +215,33 @@ def test_a_dry_run_checks_them(tiny_scene, tmp_path):
 
 def test_damaged_tables_are_refused():
     good = {name: np.zeros((2, 12, 2, 1, 1), np.float32) for name in ("values", "moment1", "moment2")}
-    exposure.check_tables(good)
-    exposure.check_tables({"values": good["values"]})
-    exposure.check_tables({})
+    rows = {"colours/a/row": 0.0, "colours/b/row": 1.0}
+    BilateralGrid.check_saved(rows, good)
+    BilateralGrid.check_saved(rows, {"values": good["values"]})
     for damaged in (
         {"values": good["values"][:, :5]},
         {**good, "moment2": good["values"][:1]},
         {**good, "more": good["values"]},
         {"moment1": good["values"]},
         {**good, "moment1": good["values"] + np.float32(np.nan)},
+        {},
     ):
-        with pytest.raises(DataError, match=r"of its grids|other grids"):
-            exposure.check_tables(damaged)
+        with pytest.raises(DataError, match=r"its grids are not|of its BilateralGrid is not"):
+            BilateralGrid.check_saved(rows, damaged)
+    for damage in ({"colours/b/row": 6.0}, {"colours/a/row": 0.5}, {"colours/c/row": 2.0}):
+        with pytest.raises(DataError, match="grids of the colours of 2 photographs"):
+            BilateralGrid.check_saved(rows | damage, good)
 
 
 @pytest.mark.slow
 def test_a_checkpoint_that_lost_its_grids_is_refused(with_grids, tmp_path):
     notes, tables = archive.read(with_grids / "checkpoints" / "step_000012.npz")
-    left = {name: table for name, table in tables.items() if not name.startswith(exposure.FOLDER)}
+    left = {name: table for name, table in tables.items() if not name.startswith("modules/")}
     assert len(left) == len(tables) - 3
     with (tmp_path / "step_000012.npz").open("wb") as file:
         archive.write(file, notes, left.items())
-    with pytest.raises(DataError, match="it has grids of the colours of 0 photographs, and its numbers name 8 rows"):
+    with pytest.raises(DataError, match="its grids are not"):
         checkpoint.load(tmp_path / "step_000012.npz")
-    own, _ = archive.split(tables, exposure.FOLDER)
-    rows = {f"colours/{name}/row": float(row) for row, name in enumerate("abcdefgh")}
-    exposure.require_tables(own, rows)
-    for damage in ({"colours/h/row": 6.0}, {"colours/h/row": 500.0}, {"colours/a/row": 0.5}):
-        with pytest.raises(DataError, match="grids of the colours of 8 photographs"):
-            exposure.require_tables(own, rows | damage)
-    with pytest.raises(DataError, match="its numbers name 0 rows"):
-        exposure.require_tables(own, {})
 
 
 @pytest.mark.slow
@@ -272,7 +250,7 @@ def test_a_kind_of_a_plug_in_is_trained_with(tiny_scene, few_steps, tmp_path):
     """It makes what a training has of it; one that changes nothing leaves the bits of none."""
     (tmp_path / "mine.py").write_text(PLAIN)
     plugins.load_file(tmp_path / "mine.py")
-    train(tiny_scene, tmp_path / "run", *FEW, "optimize.colours=plain")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.plain={}")
     data = json.loads((tmp_path / "run" / "view_colours.json").read_text())
     assert data["type"] == "plain"
     assert sum(data["photographs"].values()) == 12

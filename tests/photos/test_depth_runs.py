@@ -38,8 +38,14 @@ def test_a_scene_must_tell_which_photographs_show_a_point(tiny_scene, tmp_path):
 
 
 def test_poses_are_not_learned_beside_it(rng, tmp_path):
-    with pytest.raises(ConfigError, match=r"the loss 'inverse_depth' does not go with optimize\.poses"):
-        train(Yard(rng).write(tmp_path / "scene"), tmp_path / "run", *TWO_DOZEN, LOSSES, "optimize.poses={start: 5}")
+    with pytest.raises(ConfigError, match="'camera_optimizer' does not go with inverse_depth"):
+        train(
+            Yard(rng).write(tmp_path / "scene"),
+            tmp_path / "run",
+            *TWO_DOZEN,
+            LOSSES,
+            "optimize.modules.camera_optimizer={start: 5}",
+        )
 
 
 def test_photographs_showing_points_elsewhere_give_no_depths(rng, tmp_path):

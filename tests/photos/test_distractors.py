@@ -12,14 +12,15 @@ from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import DataError
 from clsplat.formats.table import read as read_model
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
+from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
-from clsplat.training.modules import distractors
-from clsplat.training.modules.distractors import NEAR, Distractors, OwnGaussians, PhotographDistractors, first_tables
+from clsplat.training.modules.base import Step
+from clsplat.training.modules.distractors import NEAR, Distractors, DistractorsState, first_tables
 from tests.support.runs import FEW, ONE_CORE, digest, killed, train
 
-ON = (*FEW, "optimize.distractors={count: 30, start: 4}")
+ON = (*FEW, "optimize.modules.distractors={count: 30, start: 4}")
 SCALE = 1e-2  # scene units of their first depth, where they are put into a scene
 
 
@@ -35,19 +36,23 @@ class Pair:
         self.tables["sh_base"] = rng.normal(0, 0.7, (40, 3)).astype(np.float32)
         self.tables["log_scales"] += rng.normal(0, 0.3, (40, 3)).astype(np.float32)
         self.tables["means"] *= rng.uniform(0.8, 1.5, (40, 1)).astype(np.float32)  # depths apart: an order of their own
-        self.own = OwnGaussians(device, self.tables)
-        settings = Distractors(cover=cover)
-        self.distractors = PhotographDistractors(settings, self.views, Rasterizer(device, "radix"), self.own)
+        self.own = DistractorsState(Distractors(cover=cover), self.views, Rasterizer(device, "radix"))
+        self.own.load({}, self.tables)
         self.model, self.rasterizer = self.case.model(device), Rasterizer(device, "radix")
         self.black = device.zeros(3)
 
     def camera(self, number):
         return replace(self.case.device_camera(self.device), view=number)
 
-    def layer(self, number):
+    def layer(self, number, at=1):
+        """The step with what the photograph has in front of it."""
         camera = self.camera(number)
-        frame = self.rasterizer.forward(self.model, camera, self.black)
-        return frame, self.distractors.before(self.model, camera, frame.image, 1)
+        pixels = self.device.upload(np.zeros((3, 36, 50), np.uint8))
+        step = Step(at, self.rasterizer, Photograph(camera, pixels), self.model, self.black, (), ())
+        step.frame = self.rasterizer.forward(self.model, camera, self.black)
+        step.image = step.frame.image
+        self.own.after_render(step)
+        return step
 
     def joined(self) -> DeviceModel:
         """One model of the scene's Gaussians, and those of the first photograph just before its camera."""
@@ -68,47 +73,50 @@ class Pair:
 def test_a_layer_is_what_its_gaussians_would_be_before_the_scene(device, rng, cover):
     """The image and the derivatives of both are those of one model with all of them."""
     pair = Pair(device, rng, cover)
-    frame, layer = pair.layer(0)
+    step = pair.layer(0)
     joined = pair.joined()
     expected = Rasterizer(device, "radix").forward(joined, pair.camera(None), pair.black)
-    np.testing.assert_allclose(layer.image.get(), expected.image.get(), atol=2e-5)
-    gradient = rng.normal(size=frame.image.shape).astype(np.float32)
+    np.testing.assert_allclose(step.image.get(), expected.image.get(), atol=2e-5)
+    gradient = rng.normal(size=step.image.shape).astype(np.float32)
     gradient[:, 36:], gradient[:, :, 50:] = 0, 0
     by_both, whole = device.upload(gradient), Rasterizer(device, "radix")
     expected = whole.forward(joined, pair.camera(None), pair.black)
     sums = whole.pixel_sums(joined, expected, by_both).get()
     means = {number: adam.gaussians.get("means") for number, adam in enumerate(pair.own.adams)}
-    learn = pair.distractors.learning(layer, by_both, 0)
-    of_scene = pair.rasterizer.pixel_sums(pair.model, frame, by_both).get()
+    step.gradient = by_both
+    pair.own.backward(step)
+    of_scene = pair.rasterizer.pixel_sums(pair.model, step.frame, by_both).get()
     expected_scene, largest = sums[:PIXEL_SUMS, 20:60], np.abs(sums[:PIXEL_SUMS, 20:60]).max(axis=1, keepdims=True)
     assert (np.abs(of_scene[:PIXEL_SUMS, :40] - expected_scene) / largest).max() < 2e-3
     if cover == 0:
-        of_layer = pair.distractors.rasterizer.workspace.array("pixel_sums", (PIXEL_SUMS, 64)).get()[:, :20]
+        of_layer = pair.own.rasterizer.workspace.array("pixel_sums", (PIXEL_SUMS, 64)).get()[:, :20]
         largest = np.abs(sums[:PIXEL_SUMS, :20]).max(axis=1, keepdims=True)
         assert (np.abs(of_layer - sums[:PIXEL_SUMS, :20]) / largest).max() < 2e-3
-    learn()
+    pair.own.update(step)
     assert (pair.own.adams[0].gaussians.get("means") != means[0]).any()
     np.testing.assert_array_equal(pair.own.adams[1].gaussians.get("means"), means[1])
 
 
 def test_they_are_in_their_photograph_alone(device, rng):
     pair = Pair(device, rng)
-    images = [pair.layer(number)[1].image.get() for number in (0, 1)]
+    images = [pair.layer(number).image.get() for number in (0, 1)]
     assert (images[0] != images[1]).any()
     pair.own.adams[1].gaussians.set("sh_base", np.zeros((20, 3), np.float32))
-    assert (pair.layer(1)[1].image.get() != images[1]).any()
-    np.testing.assert_array_equal(pair.layer(0)[1].image.get(), images[0])
-    assert pair.layer(None)[1] is None, "another picture"
-    assert pair.distractors.before(pair.model, pair.camera(0), pair.black, 0) is None, "before their start"
+    assert (pair.layer(1).image.get() != images[1]).any()
+    np.testing.assert_array_equal(pair.layer(0).image.get(), images[0])
+    for step in (pair.layer(None), pair.layer(0, at=0)):  # another picture; before their start
+        assert step.image is step.frame.image
 
 
 def test_what_covers_more_than_it_explains_fades(device, rng):
     pair = Pair(device, rng, cover=1.0)
     before = pair.tables["logit_opacity"][:20]
     for _ in range(3):
-        _, layer = pair.layer(0)
-        assert 0 < layer.loss() < 1
-        pair.distractors.learning(layer, device.zeros(layer.image.shape), 0)()
+        step = pair.layer(0)
+        assert 0 < step.own_losses[0].value() < 1
+        step.gradient = device.zeros(step.image.shape)
+        pair.own.backward(step)
+        pair.own.update(step)
     seen = pair.own.adams[0].gaussians.get("logit_opacity")
     assert (seen <= before).all()
     assert (seen < before).mean() > 0.8
@@ -116,7 +124,7 @@ def test_what_covers_more_than_it_explains_fades(device, rng):
 
 @pytest.mark.slow
 def test_before_their_start_the_bits_are_those_without(tiny_scene, tmp_path, few_steps):
-    train(tiny_scene, tmp_path / "run", *FEW, "optimize.distractors={count: 30, start: 12}")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.distractors={count: 30, start: 12}")
     assert digest(tmp_path / "run") == digest(few_steps)
 
 
@@ -125,7 +133,7 @@ def test_they_are_in_no_output_and_resumed_runs_keep_their_bits(tiny_scene, tmp_
     run = train(tiny_scene, tmp_path / "run", *ON)
     expected = digest(tmp_path / "run")
     assert expected != digest(few_steps)
-    assert run.distractors is None
+    assert "distractors" not in run.modules
     model = read_model(tmp_path / "run" / "point_cloud.ply")
     assert len(model.parameters["means"]) == run.model.gaussians.count == run.records.read("densify")[-1]["after"]
     command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene)]
@@ -134,43 +142,46 @@ def test_they_are_in_no_output_and_resumed_runs_keep_their_bits(tiny_scene, tmp_
     assert digest(tmp_path / "one") == expected
     again = train(tiny_scene, killed(tmp_path / "run", tmp_path / "killed").resolve(), *ON, resume=True)
     assert digest(tmp_path / "killed") == expected
-    assert again.distractors is None
+    assert "distractors" not in again.modules
     (one, two) = (checkpoint.load(checkpoint.saved(tmp_path / name)[-1])[1] for name in ("one", "killed"))
-    own = split(one, distractors.FOLDER)[0]
+    own = split(one, "modules/distractors/")[0]
     assert own["means"].shape == (8 * 30, 3)
     assert own["updates"].sum() == 12 - 4
     for name, table in own.items():
-        np.testing.assert_array_equal(table, split(two, distractors.FOLDER)[0][name])
+        np.testing.assert_array_equal(table, split(two, "modules/distractors/")[0][name])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "others",
     [
-        ("optimize.transients={start: 4, above: 1, tail: 0}", "optimize.colours=gain", "optimize.poses={start: 4}"),
+        (
+            "optimize.modules.transients={start: 4, above: 1, tail: 0}",
+            "optimize.modules.exposure={}",
+            "optimize.modules.camera_optimizer={start: 4}",
+        ),
         ("model.background=directions", "optimize.update=deferred", "model.screen_filter=box", "scene.levels=2"),
         ("scene.validation=auto", "optimize.keep=best", "optimize.refit=true", "rasterizer.harmonics=host"),
     ],
 )
 def test_they_go_with_other_parts_of_a_training(tiny_scene, tmp_path, others):
     run = train(tiny_scene, tmp_path / "run", *ON, *others)
-    assert run.distractors is None
+    assert "distractors" not in run.modules
     assert not run.not_finite()
     tables = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])[1]
-    assert split(tables, distractors.FOLDER)[0]["updates"].sum() == 12 - 4
+    assert split(tables, "modules/distractors/")[0]["updates"].sum() == 12 - 4
 
 
 def test_tables_that_are_not_theirs_are_refused(device, rng):
     tables = Pair(device, rng).own.tables()
-    distractors.check_tables(tables)
-    distractors.check_tables({})
+    Distractors.check_saved({}, tables)
     damaged = [
         ({"means": tables["means"][:-1]}, "as many for each photograph"),
         ({"updates": tables["updates"][:0]}, "as many for each photograph"),
-        ({"sh_base": tables["sh_base"][:, :2]}, r"sh_base of its distractors is not \[rows, 3\]"),
-        ({"quats": np.full_like(tables["quats"], np.nan)}, "quats of its distractors is not of finite"),
-        ({"sh_rest": tables["means"]}, "other distractors"),
+        ({"sh_base": tables["sh_base"][:, :2]}, "as many for each photograph"),
+        ({"quats": np.full_like(tables["quats"], np.nan)}, "quats of its Distractors is not of finite"),
+        ({"sh_rest": tables["means"]}, "as many for each photograph"),
     ]
     for change, message in damaged:
         with pytest.raises(DataError, match=message):
-            distractors.check_tables({**tables, **change})
+            Distractors.check_saved({}, {**tables, **change})

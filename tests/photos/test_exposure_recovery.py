@@ -22,7 +22,7 @@ FEW = (
     "init.count=4000",
     "optimize.rates.means=2.0e-4",
 )
-GAIN = "optimize.colours=gain"
+GAIN = "optimize.modules.exposure={}"
 
 
 @pytest.fixture(scope="module")

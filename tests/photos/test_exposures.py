@@ -13,7 +13,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import CameraExposure, write_exposures
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View, load_image
-from clsplat.training.modules.appearance import exposures_of
+from clsplat.training.modules.exposure import exposures_of
 from tests.support.exposed_wall import POINTS, SIZE, Wall
 
 

@@ -18,18 +18,17 @@ from clsplat.scene.camera_files import posed
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import DEGREES, View, zoomed
+from clsplat.training.modules.base import attached, learned_scene
 from clsplat.training.modules.camera_optimizer import (
-    FocalLengths,
-    Poses,
-    photograph_poses,
+    CameraOptimizer,
+    CameraState,
     poses_beside,
-    refined,
     require_zoom,
 )
 from tests.support.camera_rings import FISHEYE, STRONG
 from tests.support.runs import FEW, digest, killed, train
 
-ON = (*FEW, "optimize.poses={start: 2, focal: auto}")
+ON = (*FEW, "optimize.modules.camera_optimizer={start: 2, focal: auto}")
 PARAMS = {  # after focal lengths and middle
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
@@ -61,7 +60,7 @@ def test_a_fisheye_has_no_other_focal_length():
 
 def test_focal_length_that_cannot_be_written_is_not_learned(tiny_scene):
     scene = read_scene(tiny_scene)
-    with pytest.raises(DataError, match=r"optimize\.poses\.focal: the lens of .*OPENCV_FISHEYE.*undistort"):
+    with pytest.raises(DataError, match=r"camera_optimizer\.focal: the lens of .*OPENCV_FISHEYE.*undistort"):
         require_zoom(replace(scene, views=(replace(scene.views[0], lens=FISHEYE),)))
 
 
@@ -80,27 +79,27 @@ def _scene_of(views: list[View]) -> Scene:
 def test_photographs_of_one_camera_share_a_number():
     one, other = Camera(64, 48, 50, 51, 32, 24), Camera(48, 64, 50, 51, 24, 32)
     views = [View(name, camera, np.eye(3, 4)) for name, camera in (("a", one), ("b", other), ("c", one))]
-    focals = FocalLengths.of([*views, View("d", one, np.eye(3, 4), lens=STRONG)], 0.01)
-    assert focals.cameras == {"a": "a", "b": "b", "c": "a", "d": "d"}
-    numbers: dict[str, float] = {}
-    assert [focals.factor(numbers, name) for name in "abcd"] == [1, 1, 1, 1]
-    focals.update(numbers, "c", 5.0, 1)
-    assert focals.factor(numbers, "a") == focals.factor(numbers, "c") == pytest.approx(np.exp(-0.01))
-    assert [focals.factor(numbers, name) for name in "bd"] == [1, 1]
-    assert focals.learned(numbers) == ["a"]
-    replace(focals, rate=0.0).update(numbers, "b", 5.0, 2)
-    assert focals.learned(numbers) == ["a"]
+    views.append(View("d", one, np.eye(3, 4), lens=STRONG))
+    state = CameraState(CameraOptimizer(focal=0.01), views, views)
+    assert state.cameras == {"a": "a", "b": "b", "c": "a", "d": "d"}
+    assert [state.factor(name) for name in "abcd"] == [1, 1, 1, 1]
+    state.zoom("c", 5.0, 0.01)
+    assert state.factor("a") == state.factor("c") == pytest.approx(np.exp(-0.01))
+    assert [state.factor(name) for name in "bd"] == [1, 1]
+    assert state.zoomed == ["a"]
+    state.zoom("b", 5.0, 0.0)
+    assert state.zoomed == ["a"]
 
 
 def test_rates_follow_the_visits_of_a_camera():
-    auto = Poses(focal="auto")
+    auto = CameraOptimizer(focal="auto")
     assert [at_step(auto.focal_rate(30_500, 1), step) for step in (0, 500, 30_500)] == pytest.approx([1e-4, 1e-4, 1e-6])
     seldom = auto.focal_rate(2500, 1)
     assert sum(at_step(seldom, step) for step in range(500, 2500)) == pytest.approx(0.2, rel=0.01)
     assert at_step(auto.focal_rate(600, 50), 0) == pytest.approx(1e-3), "at most"
-    assert Poses(focal=0.5).focal_rate(600, 50) == 0.5
-    assert Poses().focal_rate(600, 50) == 0.0
-    assert load("smoke", ["optimize.poses={focal: auto}"]).settings.training.poses == auto
+    assert CameraOptimizer(focal=0.5).focal_rate(600, 50) == 0.5
+    assert CameraOptimizer().focal_rate(600, 50) == 0.0
+    assert load("smoke", ["optimize.modules.camera_optimizer={focal: auto}"]).settings.training.modules == [auto]
 
 
 def test_device_camera_gets_its_rays_from_its_focal_length(device):
@@ -125,15 +124,15 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_focals, tiny_
     out = killed(with_focals, tmp_path / "run")
     run = train(tiny_scene, out, *ON, resume=True)
     assert digest(out) == digest(with_focals)
-    (key,) = [name for name in run.numbers if name.startswith("focal_lengths/") and name.endswith("/log")]
-    assert run.numbers[f"{key}/updates"] == 12 - 2
-    assert abs(run.numbers[key]) > 1e-4
-    found = refined(run.numbers, run.original)
+    state = run.modules["camera_optimizer"]
+    (key,) = [name for name in state.numbers if name.startswith("focal_lengths/") and name.endswith("/log")]
+    assert state.numbers[f"{key}/updates"] == 12 - 2
+    assert abs(state.numbers[key]) > 1e-4
+    found = learned_scene(run)
     factors = [after.camera.fx / view.camera.fx for view, after in zip(run.original.views, found.views, strict=True)]
-    assert factors == pytest.approx([np.exp(run.numbers[key])] * len(factors)), "also those of test views"
-    later = photograph_poses(None, run, 24)
-    assert later is not None
-    assert later.focals.factor(run.numbers, run.original.views[0].name) != 1, "it stays"
+    assert factors == pytest.approx([np.exp(state.numbers[key])] * len(factors)), "also those of test views"
+    (later,) = attached([], run, 24)
+    assert later.factor(run.original.views[0].name) != 1, "it stays"
 
 
 @pytest.mark.slow
@@ -157,6 +156,6 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
 
 @pytest.mark.slow
 def test_poses_alone_keep_their_files(with_focals, tiny_scene, tmp_path):
-    train(tiny_scene, tmp_path / "run", *FEW, "optimize.poses={start: 2}")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.camera_optimizer={start: 2}")
     assert digest(tmp_path / "run") != digest(with_focals)
     assert "focal_lengths" not in (tmp_path / "run" / "view_poses.json").read_text()

@@ -24,7 +24,7 @@ def test_both_cameras_are_trained_on_afresh_and_compared_alike(rng, tmp_path, mo
     yard = Yard(rng)
     yard.views = [replace(view, name=f"a walk/view {view.name}") for view in yard.views]
     yard.write(Path("my_scene"))
-    asked = "--set", "optimize.poses={start: 2}", "--set", "scene.holdout=0"
+    asked = "--set", "optimize.modules.camera_optimizer={start: 2}", "--set", "scene.holdout=0"
     command("run", "splat_7k", "--scene", "my_scene", *asked, *FEW, "--out", "runs/learned")
     command("data", "cameras", "runs/learned", "learned_scene", "--format", "nerfstudio", "--images", "copy")
     command("run", RECIPE, *FEW)
@@ -34,7 +34,7 @@ def test_both_cameras_are_trained_on_afresh_and_compared_alike(rng, tmp_path, mo
         rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
         tested.append({row["view"].removeprefix("images/") for row in rows if row["kind"] == "view"})
         settings = load(str(out / "pipeline.yaml")).settings
-        assert settings.training.poses is None
+        assert not settings.training.modules
         bits.add((out / "point_cloud.ply").read_bytes())
     assert tested[0] == tested[1] == {"a walk/view 0.png", "a walk/view 6.png"}
     assert len(bits) == 2, "of other cameras"

@@ -16,8 +16,8 @@ from tests.support.runs import train
 
 PHOTOGRAPHS, SHARE, AREA = 14, 0.4, 0.1  # of them with a rectangle, of which a rectangle covers
 MAGENTA = 255, 0, 255, 255
-TRANSIENTS = "optimize.transients={start: 100, tail: 3, above: 2}"
-DISTRACTORS = "optimize.distractors={start: 30}"
+TRANSIENTS = "optimize.modules.transients={start: 100, tail: 3, above: 2}"
+DISTRACTORS = "optimize.modules.distractors={start: 30}"
 ONE_END = "optimize.evaluate.every=1000", "checkpoint.every=1000", "reset_opacity.stop=1"
 LONG = "optimize.steps=400", "optimize.rates.means.over=400", "densify.every=50", "densify.start=50", "densify.stop=250"
 SHORT = "optimize.steps=250", "optimize.rates.means.over=250", "densify.stop=16"

@@ -18,7 +18,7 @@ from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.camera_optimizer import FocalLengths, Move, PhotographPoses, Poses
+from clsplat.training.modules.camera_optimizer import DEPTHS, CameraOptimizer, CameraState, Move
 from clsplat.training.trainer import Trainer
 
 VIEWS, STEPS, ANGLE, DEPTH = 6, 300, np.radians(0.3), 3.0
@@ -60,19 +60,20 @@ def learned(
         values = np.clip(render_floats(Splats(rasterizer, model, background), upload_camera(device, view)), 0, 1)
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
         photographs.append(Photograph(replace(upload_camera(device, given), view=number), device.upload(pixels)))
-    numbers = dict[str, float]()
     rate = Decay(initial=2e-3, final=2e-5, over=STEPS)
-    settings = Poses(start=0, turn=rate, shift=rate, focal="auto")
-    focals = FocalLengths.of(views, settings.focal_rate(STEPS, 1))
-    poses = PhotographPoses(views, 0, *settings.rates(STEPS, VIEWS), focals)
-    poses.begin(numbers, dict.fromkeys((view.name for view in views), DEPTH))
+    settings = CameraOptimizer(start=0, turn=rate, shift=rate, focal="auto")
+    poses = CameraState(settings, views, views)
+    poses.rates = *settings.rates(STEPS, VIEWS), settings.focal_rate(STEPS, 1)
+    for table in poses.tables_of:
+        table.begin(poses.numbers, {})
+    poses.numbers |= {f"{DEPTHS}/{view.name}": DEPTH for view in views}
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians, []), background
-    trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), STILL, numbers=numbers, poses=poses)
+    trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), STILL, modules=[poses])
     for step in range(1, STEPS + 1):
         trainer.step(photographs[step % VIEWS], step)
     given = [view.world_to_camera for view in views]
-    found = [poses.pose(numbers, number) for number in range(VIEWS)]
-    return errors(truth, given), errors(truth, found), zoom * poses.focals.factor(numbers, views[-1].name)
+    found = [poses.pose(number) for number in range(VIEWS)]
+    return errors(truth, given), errors(truth, found), zoom * poses.factor(views[-1].name)
 
 
 def test_exact_cameras_stay(rng, info):

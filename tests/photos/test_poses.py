@@ -15,18 +15,18 @@ from clsplat.runs import film
 from clsplat.runs.model_file import evaluate
 from clsplat.scene.detect import read_scene
 from clsplat.training import checkpoint
+from clsplat.training.modules.base import attached
 from clsplat.training.modules.camera_optimizer import (
+    DEPTHS,
+    CameraOptimizer,
+    CameraState,
     Move,
-    PhotographPoses,
-    Poses,
-    photograph_poses,
     poses_beside,
-    refined,
 )
 from tests.support.oracle import BACKGROUND, general_camera, random_gaussians, to_world
 from tests.support.runs import FEW, digest, killed, train
 
-ON = (*FEW, "optimize.poses={start: 2}")
+ON = (*FEW, "optimize.modules.camera_optimizer={start: 2}")
 STEP = 1e-4  # of five-point differences
 
 
@@ -89,28 +89,28 @@ def test_derivatives_by_numbers_are_those_of_the_moved_scene(rng, depth):
 
 
 def test_rates_begin_after_the_start_and_follow_the_visits():
-    often, seldom = Poses().rates(30_500, 50), Poses().rates(2500, 50)
+    often, seldom = CameraOptimizer().rates(30_500, 50), CameraOptimizer().rates(2500, 50)
     assert [at_step(often[1], step) for step in (0, 500, 30_500)] == pytest.approx([2e-4, 2e-4, 2e-6])
     assert at_step(seldom[1], 500) == pytest.approx(1.16e-3, rel=0.01)
     assert sum(at_step(seldom[1], step) for step in range(500, 2500, 50)) == pytest.approx(0.01, rel=0.1)
-    assert at_step(Poses().rates(600, 50)[1], 0) == pytest.approx(2e-3), "at most"
+    assert at_step(CameraOptimizer().rates(600, 50)[1], 0) == pytest.approx(2e-3), "at most"
     assert at_step(often[0], 500) == pytest.approx(0.3 * 2e-4)
-    assert Poses(turn=0.5).rates(30_500, 50)[0] == 0.5
-    assert load("smoke").settings.training.poses is None
-    assert load("smoke", ["optimize.poses={}"]).settings.training.poses == Poses()
+    assert CameraOptimizer(turn=0.5).rates(30_500, 50)[0] == 0.5
+    assert load("smoke").settings.training.modules == []
+    assert load("smoke", ["optimize.modules.camera_optimizer={}"]).settings.training.modules == [CameraOptimizer()]
 
 
 def test_cameras_that_were_not_trained_on_move_as_the_others_do(tiny_scene):
     scene = read_scene(tiny_scene, 5)
-    numbers: dict[str, float] = {}
-    assert refined(numbers, scene) is scene
-    poses = PhotographPoses(scene.split("train"))
-    poses.begin(numbers, dict.fromkeys((view.name for view in poses.views), 0.0))
-    for view, other in zip(scene.views, refined(numbers, scene).views, strict=True):
+    poses = CameraState(CameraOptimizer(), scene.split("train"), scene.views)
+    for table in poses.tables_of:
+        table.begin(poses.numbers, {})
+    poses.numbers |= {f"{DEPTHS}/{view.name}": 0.0 for view in poses.views}
+    for view, other in zip(scene.views, poses.scene(scene).views, strict=True):
         assert other.world_to_camera == pytest.approx(view.world_to_camera, abs=1e-12)
     middle = np.mean([view.position for view in poses.views], axis=0)
-    poses.tables[1].begin(numbers, {view.name: 0.1 * (view.position - middle) for view in poses.views})
-    for view, other in zip(scene.views, refined(numbers, scene).views, strict=True):
+    poses.tables_of[1].begin(poses.numbers, {view.name: 0.1 * (view.position - middle) for view in poses.views})
+    for view, other in zip(scene.views, poses.scene(scene).views, strict=True):
         assert other.position == pytest.approx(middle + 1.1 * (view.position - middle))
         assert other.world_to_camera[:, :3] == pytest.approx(view.world_to_camera[:, :3])
 
@@ -128,18 +128,19 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_poses, tiny_s
     out = killed(with_poses, tmp_path / "run")
     run = train(tiny_scene, out, *ON, resume=True)
     assert digest(out) == digest(with_poses)
-    assert run.numbers == checkpoint.load(checkpoint.saved(with_poses)[-1])[0].numbers
-    assert sum(value for name, value in run.numbers.items() if name.endswith("x/updates")) == 2 * (12 - 2)
-    assert photograph_poses(None, run, 24).move(run.numbers, run.scene.split("train")[0].name).shift.any(), "they stay"
-    for table in PhotographPoses(run.scene.split("train")).tables:
-        rows = np.array([table.row(run.numbers, view) for view in table.views])
+    numbers = run.modules["camera_optimizer"].numbers
+    assert numbers == checkpoint.load(checkpoint.saved(with_poses)[-1])[0].modules["camera_optimizer"]
+    assert sum(value for name, value in numbers.items() if name.endswith("x/updates")) == 2 * (12 - 2)
+    assert attached([], run, 24)[0].move(run.scene.split("train")[0].name).shift.any(), "they stay"
+    for table in run.modules["camera_optimizer"].tables_of:
+        rows = np.array([table.row(numbers, view) for view in table.views])
         assert rows.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-12)
         assert np.abs(rows).max() > 1e-4
 
 
 @pytest.mark.slow
 def test_before_the_start_the_bits_are_those_without(tiny_scene, tmp_path, few_steps, with_poses):
-    train(tiny_scene, tmp_path / "late", *FEW, "optimize.poses={start: 12}")
+    train(tiny_scene, tmp_path / "late", *FEW, "optimize.modules.camera_optimizer={start: 12}")
     assert digest(tmp_path / "late") == digest(few_steps) != digest(with_poses)
 
 
@@ -165,5 +166,5 @@ def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tin
 
 @pytest.mark.slow
 def test_a_sky_is_refused(tiny_scene, tmp_path):
-    with pytest.raises(ConfigError, match=r"optimize\.poses: the model has a sky.*set optimize\.poses to null"):
+    with pytest.raises(ConfigError, match=r"'camera_optimizer' does not go with sky"):
         train(tiny_scene, tmp_path / "run", *ON, "model.background=directions")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from clsplat.training import checkpoint
-from clsplat.training.modules.transients import BINS, KEYS, Transients, measure_residuals
+from clsplat.training.modules.transients import BINS, KEYS, Transients, mask_transients, measure_residuals
 from tests.support.runs import FEW, digest, train
 
-ON = (*FEW, "optimize.transients={start: 4, above: 1, tail: 0}")
+ON = (*FEW, "optimize.modules.transients={start: 4, above: 1, tail: 0}")
 
 
 def distribution(**numbers: float) -> dict[str, float]:
@@ -43,7 +43,7 @@ def test_the_distribution_fades():
 @pytest.mark.slow
 def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *ON)
-    assert sum(run.numbers[key] for key in KEYS) > 40 * 40
+    assert sum(run.modules["transients"].numbers[key] for key in KEYS) > 40 * 40
     assert digest(tmp_path / "run") != digest(few_steps)
     expected = digest(tmp_path / "run")
     (tmp_path / "run" / "checkpoints" / "step_000012.npz").unlink()
@@ -51,13 +51,14 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(tiny_scene, tmp_pa
         (tmp_path / "run" / name).unlink()
     again = train(tiny_scene, tmp_path / "run", *ON, resume=True)
     assert digest(tmp_path / "run") == expected
-    assert again.numbers == run.numbers
-    assert checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])[0].numbers == run.numbers
+    assert again.modules["transients"].numbers == run.modules["transients"].numbers
+    state, _ = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])
+    assert state.modules["transients"] == run.modules["transients"].numbers
 
 
 @pytest.mark.slow
 def test_where_no_pixel_is_left_out_the_bits_are_those_without(tiny_scene, tmp_path, few_steps):
-    train(tiny_scene, tmp_path / "run", *FEW, "optimize.transients={start: 4, tail: 1e9}")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.transients={start: 4, tail: 1e9}")
     assert digest(tmp_path / "run") == digest(few_steps)
 
 
@@ -65,7 +66,11 @@ def test_where_no_pixel_is_left_out_the_bits_are_those_without(tiny_scene, tmp_p
 def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_path):
     """And little else, of a model that has begun to look like the scene."""
     run = train(
-        tiny_scene, tmp_path / "run", "optimize.steps=300", "densify.stop=200", "optimize.transients={start: 300}"
+        tiny_scene,
+        tmp_path / "run",
+        "optimize.steps=300",
+        "densify.stop=200",
+        "optimize.modules.transients={start: 300}",
     )
     photograph = run.photographs.get(run.scene.split("train")[3])
     pixels = photograph.colours.get()
@@ -75,9 +80,10 @@ def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_p
     image = run.rasterizer.forward(run.model, photograph.camera, run.photographs.background).image
     residuals, _ = measure_residuals(workspace, photograph.camera, image, planes.colours, None)
     settings = Transients(start=300, tail=0)
-    threshold = settings.threshold(run.numbers, 301)
+    threshold = settings.threshold(run.modules["transients"].numbers, 301)
     assert threshold is not None
-    left_out = settings.mask(workspace, photograph.camera, residuals, threshold).get()[0, :40, :40] == 0
+    reach = max(1, round(settings.box * 40 / 2))
+    left_out = mask_transients(workspace, photograph.camera, residuals, threshold, reach).get()[0, :40, :40] == 0
     inside = left_out[12:24, 10:22].copy()
     left_out[11:25, 9:23] = False
     assert (inside.mean() > 0.8, left_out.mean() < 0.05) == (True, True), (inside.mean(), left_out.mean())

@@ -105,14 +105,15 @@ def test_a_choice_that_cannot_be_made_is_refused_before_a_run(choices, complaint
 
 
 def test_in_fewer_steps_schedules_end_earlier_and_bounds_stay():
-    schedule = "{keys: [optimize.dropout], by: photographs, values: [[0, [[0, 0.0], [50, 0.2]]], [24, 0]], since: few}"
+    values = "[[0, {probability: [[0, 0.0], [50, 0.2]]}], [24, null]]"
+    schedule = f"{{keys: [optimize.modules.dropout], by: photographs, values: {values}, since: few}}"
     settings = load("smoke", [f"choices=[{schedule}, {RESET}]"]).settings
     dropout, reset = in_steps(settings, settings.training.steps // 2).choices
-    assert dropout.values == [[0, [[0, 0.0], [25, 0.2]]], [24, 0]]
+    assert dropout.values == [[0, {"probability": [[0, 0.0], [25, 0.2]]}], [24, None]]
     assert reset == settings.choices[1]
     chosen = in_steps(choose(settings, {"photographs": 3}), settings.training.steps // 2)
-    assert chosen.choices[0].chosen == [chosen.training.dropout]
-    assert (chosen.choices[0].instead_of, settings.choices[0].chosen) == ([settings.training.dropout], None)
+    assert chosen.choices[0].chosen == [{"probability": chosen.training.modules[0].probability}]
+    assert (chosen.choices[0].instead_of, settings.choices[0].chosen) == ([None], None)
 
 
 def test_what_is_measured_of_a_scene(tiny_scene):
@@ -276,22 +277,24 @@ def test_photos_recipe_chooses_by_their_number_and_the_sky(photographs, sky, dro
     settings = load("photos").settings
     chosen = choose(settings, {"photographs": photographs, **({} if sky is None else {"sky": sky})})
     training = chosen.training
-    assert at_step(training.dropout, training.steps) == dropout
+    probabilities = [at_step(one.probability, training.steps) for one in training.modules if one.type == "dropout"]
+    assert probabilities == ([dropout] if dropout else [])
     assert (training.keep, chosen.scene.validation) == ("last", 0)
     assert (chosen.model.background is not None) == (12 <= photographs < 40), "what is far away"
     growing = [stage for stage in training.during if isinstance(stage, Densify)]
     assert [one.per_pixel for one in growing] == [most, None]
-    assert settings.training.colours.above == 0.2, "of a dataset that does not tell how good its cameras are"
+    assert settings.training.modules[0].above == 0.2, "of a dataset that does not tell how good its cameras are"
     many, fast = choose(settings, {"photographs": 200, "sky": 1, "reprojection_error": 0.3}), load("fast").settings
-    assert (many.training.poses, many.training.colours.above) == (None, 0.2)
+    assert [getattr(one, "above", None) for one in many.training.modules] == [0.2]
     init, training, *others = many.stages
-    alike = [init, training.model_copy(update={"colours": None}), *others]
+    alike = [init, training.model_copy(update={"modules": []}), *others]
     assert (alike, many.model) == (fast.stages, fast.model), "nothing is lost where there are many"
 
 
 def test_photos_recipe_learns_poses_where_cameras_miss_points():
     training = choose(load("photos").settings, {"photographs": 20, "reprojection_error": 1}).training
-    assert (training.poses.start, training.colours.above) == (500, 0.03)
+    cameras, exposure = (one for one in training.modules if one.type in ("camera_optimizer", "exposure"))
+    assert (cameras.start, exposure.above) == (500, 0.03)
 
 
 SKY = "{keys: [model.sh_degree], by: [photographs, sky], values: [[[0, 0], 0], [[0, 0.5], 1], [[20, 0], 2]], since: x}"
@@ -434,11 +437,11 @@ def test_a_choice_given_no_mapping_is_told_beside_an_override(tmp_path):
 
 
 def test_an_override_inside_of_one_that_was_given_wins(tmp_path):
-    chosen = choose(load("photos", ["optimize.poses={start: 3}"]).settings, {"photographs": 20})
+    chosen = choose(load("photos", ["optimize.modules.camera_optimizer={start: 3}"]).settings, {"photographs": 20})
     file = tmp_path / "pipeline.yaml"
     file.write_text(yaml_text(replace(load("photos"), settings=chosen).resolved()))
-    settings = load(str(file), ["optimize.poses.start=10"]).settings
-    assert settings.training.poses.start == 10
+    settings = load(str(file), ["optimize.modules.camera_optimizer.start=10"]).settings
+    assert [one.start for one in settings.training.modules if one.type == "camera_optimizer"] == [10]
     assert [one.given for one in settings.choices] == [{}] * 5
 
 

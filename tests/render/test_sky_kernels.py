@@ -47,7 +47,7 @@ class Scene:
         mask = None if share is None else device.upload((rng.random((1, 36, 50)) < share).astype(np.uint8))
         self.photograph = Photograph(camera, device.upload(np.rint(255 * pixels).astype(np.uint8)), mask)
         parts = rasterizer, self.model, Adam(self.model.gaussians), SplatStats(self.model.gaussians, [])
-        self.trainer = Trainer(*parts, black, (L2(),), Rates(), sky=LearnedSky(settings, sky))
+        self.trainer = Trainer(*parts, black, (L2(),), Rates(), modules=[LearnedSky(settings, sky)])
         sky.texels.set(np.clip(sky.texels.get() + rng.normal(0, 0.01, sky.texels.shape), 0, 1).astype(np.float32))
 
     def loss(self) -> float:
@@ -84,7 +84,7 @@ def test_the_gradient_by_the_sky_is_that_of_the_losses(device, rng, share):
 def test_masked_pixels_are_not_asked_to_show_the_sky(device, rng):
     scene = Scene(device, rng, Directions(side=8, cover=0.5, difference=0.5), 0.7)
     view = scene.trainer.compare(scene.photograph, 1)
-    behind, mask = view.behind.get(), view.comparison.mask.get()
+    behind, mask = view.step.behind.get(), view.comparison.mask.get()
     assert behind.shape == mask.shape
     assert np.abs(behind[mask > 0]).max() > 0
     assert np.abs(behind[mask == 0]).max() == 0

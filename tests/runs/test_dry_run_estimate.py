@@ -146,11 +146,15 @@ def test_files_that_are_left_out_are_told_once(photos, caplog):
 
 
 def test_dry_run_says_what_can_be_chosen_before_preparation(photos):
-    asked = load("photos", [f"scene.path='{photos}'", "optimize.dropout=0.1"])
+    asked = load("photos", [f"scene.path='{photos}'", "optimize.modules.dropout={probability: 0.1}"])
     lines = [line.strip() for line in describe(asked, photos.parent / "runs" / "a", None, "new").splitlines()]
     fixed = [line for line in lines if ", since 20 training photographs; " in line]
-    assert [line.partition("=")[0] for line in fixed] == ["init.transparent", "optimize.dropout", "model.background"]
-    assert fixed[1].startswith("optimize.dropout=0.1, ")
+    assert [line.partition("=")[0] for line in fixed] == [
+        "init.transparent",
+        "optimize.modules.dropout",
+        "model.background",
+    ]
+    assert fixed[1].startswith("optimize.modules.dropout=")
     growth = "stages.1.during.1.per_pixel"
     assert f"{growth}=0.6; 0.3 if at least 25% {SKY}; 0.1 if at least 50% {SKY}" in lines
     assert "choices        if all 23 photographs are placed:" in lines

@@ -18,7 +18,8 @@ from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
 
 READ = {  # text that is read, or compared, and never the name of something that is written
-    "Auto.reason", "CaptureChoice.given", "CaptureChoice.reason", "CaptureChoice.since", "CaptureChoice.keys",
+    "Auto.reason", "Appearance.reason", "BilateralGrid.reason", "Exposure.reason",
+    "CaptureChoice.given", "CaptureChoice.reason", "CaptureChoice.since", "CaptureChoice.keys",
     "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
     "SceneSettings.masks", "InverseDepth.folder",
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",

@@ -15,7 +15,8 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.stages.reinit import ReinitFromDepth, drawn_of
 from clsplat.training import checkpoint
-from clsplat.training.modules.camera_optimizer import SHIFTS, PhotographPoses, refined
+from clsplat.training.modules.base import learned_scene
+from clsplat.training.modules.camera_optimizer import DEPTHS, SHIFTS, CameraOptimizer, CameraState
 from clsplat.training.run import Run
 from tests.support.runs import digest, train
 
@@ -85,7 +86,7 @@ def test_its_colors_are_the_models_where_photographs_have_own(tiny_scene, tmp_pa
     grey = opened(tiny_scene, plane(), tmp_path / "model")
     stages = [
         {"init": {"source": "model", "file": str(tmp_path / "model.ply")}},
-        {"optimize": {"steps": 2, "losses": ["l1"], "colours": "gain", "update": "seen"}},
+        {"optimize": {"steps": 2, "losses": ["l1"], "modules": ["exposure"], "update": "seen"}},
         {"reinit_from_depth": {"opacity": 0.2}},
         "export",
     ]
@@ -99,11 +100,11 @@ def test_its_colors_are_the_models_where_photographs_have_own(tiny_scene, tmp_pa
 def test_they_lie_where_the_cameras_were_learnt_to_be(tiny_scene, tmp_path):
     """All cameras were learnt to be a shift beside their places; the depths that they see are those of the model."""
     run, moved = opened(tiny_scene, plane(), tmp_path / "run"), opened(tiny_scene, plane(), tmp_path / "moved")
-    poses = PhotographPoses(moved.scene.split("train"))
-    poses.begin(moved.numbers, {view.name: 1.0 for view in poses.views})
-    for view in poses.views:
-        moved.numbers[f"{SHIFTS}/{view.name}/z"] = 0.3
-    expected = [view.position for view in refined(moved.numbers, moved.original).split("train")]
+    poses = CameraState(CameraOptimizer(), moved.scene.split("train"), moved.original.views)
+    poses.numbers |= {f"{DEPTHS}/{view.name}": 1.0 for view in poses.views}
+    poses.numbers |= {f"{SHIFTS}/{view.name}/z": 0.3 for view in poses.views}
+    moved.modules = {"camera_optimizer": poses}
+    expected = [view.position for view in learned_scene(moved).split("train")]
     assert np.abs(np.array(expected) - [view.position for view in run.scene.split("train")]).max() > 0.1
     for one in (run, moved):
         ReinitFromDepth(stage="reinit_from_depth").act(one)

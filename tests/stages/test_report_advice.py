@@ -46,7 +46,7 @@ def test_training_photographs_that_disagree_are_named():
 def test_colours_that_differ_are_said_where_none_are_trained(gained, has_colours, said):
     texts = [*of_training_views(measured([30, 30, 31], gained), has_colours)]
     assert len(texts) == said
-    assert all("1.5 dB nearer" in text and "optimize.colours=gain" in text for text in texts)
+    assert all("1.5 dB nearer" in text and "optimize.modules.exposure={}" in text for text in texts)
 
 
 def test_photographs_whose_colors_cannot_be_fitted_are_ignored():

@@ -46,8 +46,9 @@ FISHEYE: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -
 DEPTHS = "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: inverse_depth, weight: 0.5}]"
 BEST = "optimize.keep=best", "scene.validation=2", "optimize.rates.means=[[40, 1.6e-4], [41, 0.3]]"  # not the last one
 MANY = (
-    "optimize.colours=affine", "optimize.poses={start: 4}", "optimize.distractors={count: 30, start: 4}",
-    "optimize.dropout=0.1", "rasterizer.harmonics=host",
+    "optimize.modules.exposure.model=affine", "optimize.modules.camera_optimizer={start: 4}",
+    "optimize.modules.distractors={count: 30, start: 4}",
+    "optimize.modules.dropout.probability=0.1", "rasterizer.harmonics=host",
 )  # fmt: skip
 
 
@@ -81,9 +82,9 @@ def sets(*settings: str, **others: Any) -> Case:
 
 NAMED = {
     "alpha_as_mask": sets("scene.alpha=mask"),
-    "affine": sets("optimize.colours=affine"),
-    "background_random": sets("optimize.background=random"),
-    "background_transparent": sets("optimize.background=transparent", same_as="background_random"),
+    "affine": sets("optimize.modules.exposure.model=affine"),
+    "background_random": sets("optimize.modules.random_background={}"),
+    "background_transparent": sets("optimize.modules.random_background.where=transparent", same_as="background_random"),
     "blocks_command": Case(
         command=("blocks", "{blocks}", "--scene", "{still}", "--coarse", "{model}", "--blocks", "3", "--out", "{out}")
     ),
@@ -97,16 +98,16 @@ NAMED = {
     "convert_splat": Case(command=("convert", "{model}", "{out}.splat")),
     "convert_spz": Case(command=("convert", "{model}", "{out}.spz")),
     "deferred": sets("optimize.update=deferred", same_as="splat_7k"),
-    "distractors": sets("optimize.distractors={count: 30, start: 4}"),
+    "distractors": sets("optimize.modules.distractors={count: 30, start: 4}"),
     "downscale": sets("scene.downscale=2"),
-    "dropout": sets("optimize.dropout=0.3"),
+    "dropout": sets("optimize.modules.dropout.probability=0.3"),
     "entropy": sets(
         "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: opacity_entropy, weight: 0.01}]",
         plugin="opacity_entropy.py",
     ),
     "fisheye": sets(scene="fisheye"),
-    "gain": sets("optimize.colours=gain"),
-    "grid": sets("optimize.colours={type: grid, cells: [3, 2, 4]}"),
+    "gain": sets("optimize.modules.exposure={}"),
+    "grid": sets("optimize.modules.bilateral_grid={cells: [3, 2, 4]}"),
     "haar": sets("optimize.views.transforms=[{type: haar, learn: filter}]"),
     "harmonics_on_host": sets("rasterizer.harmonics=host", same_as="splat_7k"),
     "inside": sets("stages.1.during.1.inside={low: [0, null, null]}"),
@@ -135,19 +136,19 @@ NAMED = {
     "plugin_blur": sets(
         "optimize.views={transforms: [{type: box_blur, reach: [[0, 3], [40, 0]]}]}", plugin="box_blur.py"
     ),
-    "poses": sets("optimize.poses={start: 4}"),
+    "poses": sets("optimize.modules.camera_optimizer={start: 4}"),
     "random_points": sets("init.source=random", "init.count=3000"),
     "resolution": sets("optimize.views.resolution=[[0, 2], [20, 1]]"),
     "schedule_simt": sets("rasterizer.schedule=simt"),
     "seen": sets("optimize.update=seen"),
-    "skip": sets("optimize.skip={start: 8, warm_up: 1, least: 0}"),
+    "skip": sets("optimize.modules.skip={start: 8, warm_up: 1, least: 0}"),
     "sky": sets("model.background=directions"),
     "sky_as_splats": sets("model.background={type: directions, side: 8}", "export.sky=splats"),
     "sweep": sets("init.source=points+sweep", scene="lens"),
     "threads_1": Case(environment=ONE_THREAD, same_as="splat_7k"),
     "threads_1_with_many": sets(*MANY, environment=ONE_THREAD, same_as="many"),
     "threads_2": Case(environment=TWO_THREADS, same_as="splat_7k"),
-    "transients": sets("optimize.transients={start: 4, above: 1, tail: 0}"),
+    "transients": sets("optimize.modules.transients={start: 4, above: 1, tail: 0}"),
 }
 
 

@@ -20,14 +20,18 @@ from clsplat.opencl.device import Array
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import stretched
 from clsplat.runs import opening
-from clsplat.training.modules.skip_backward import Skip
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
+from clsplat.training.modules.skip_backward import Skip, SkipState
 from clsplat.training.run import Run
 from clsplat.training.trainer import Trainer
 from tests.support.runs import FEW, digest, train
 
 pytestmark = pytest.mark.slow
 
-FROM_5 = "optimize.skip={start: 5, warm_up: 12, least: 0.25}"  # of the fifty steps of smoke, on eight photographs
+FROM_5 = (
+    "optimize.modules.skip={start: 5, warm_up: 12, least: 0.25}"  # of the fifty steps of smoke, on eight photographs
+)
 HAAR = "optimize.views.transforms=[{type: haar, learn: filter}]"
 PENALTY = "optimize.losses=[l1, {type: dssim, weight: 0.3}, {type: anisotropy, above: 2.0, weight: 0.01}]"
 NO_EDITS = ("densify.every=1000", "raise_sh.every=1000", "reset_opacity.every=1000", "optimize.evaluate.every=1000")
@@ -112,13 +116,18 @@ def test_a_loss_that_is_not_finite_changes_nothing():
 
 
 def test_view_has_an_average_per_size_and_none_before_the_start():
-    skip = Skip(start=8)
-    numbers: dict[str, float] = {}
+    state = SkipState(Skip(start=8), [View("a.png", Camera(40, 30, 1, 1, 1, 1), np.eye(3, 4))])
     for step, width in ((8, 40), (9, 40), (10, 20), (11, 40)):
         camera = SimpleNamespace(width=width, height=30)
-        losses = SimpleNamespace(comparison=SimpleNamespace(step=step, camera=camera), loss=float(step))
-        numbers.update(skip.visit("a.png", losses, numbers).numbers)
-    averages = {name: value for name, value in numbers.items() if name.startswith("skip/loss/")}
+        kept: list[Any] = []
+        now = SimpleNamespace(number=step, view=0, camera=camera, loss=float(step), skipped=False)
+        now.keep, now.kept = (
+            (lambda _, visit, kept=kept: kept.append(visit)),
+            (lambda _, kept=kept: (kept or [None])[0]),
+        )
+        state.after_losses(now)
+        state.update(now)
+    averages = {name: value for name, value in state.numbers.items() if name.startswith("skip/loss/")}
     expected = {"skip/loss/40x30/a.png": 0.95 * 9 + 0.05 * 11, "skip/loss/20x30/a.png": 10.0}
     assert averages == pytest.approx(expected)
 
@@ -128,14 +137,14 @@ def test_view_has_an_average_per_size_and_none_before_the_start():
 
 @pytest.mark.parametrize("least", ["2", "-0.1", "much", "[1]", "null"])
 def test_a_share_that_is_none_is_refused(least):
-    with pytest.raises(ConfigError, match=r"optimize\.skip\.least=.*: expected 'auto' or a share from 0 to 1"):
-        load("smoke", ["optimize.skip.start=9", f"optimize.skip.least={least}"])
+    with pytest.raises(ConfigError, match=r"optimize\.modules\.skip\.least=.*: expected 'auto' or a share from 0 to 1"):
+        load("smoke", ["optimize.modules.skip.start=9", f"optimize.modules.skip.least={least}"])
 
 
 def test_stretched_recipe_skips_later_with_the_same_warm_up():
-    skip = stretched(load("splat_7k", ["optimize.skip.start=4000"]).settings, 2.0).training.skip
+    skip = stretched(load("splat_7k", ["optimize.modules.skip.start=4000"]).settings, 2.0).training.modules[0]
     assert skip == Skip(start=8000, decay=0.95, warm_up=500, least="auto")
-    assert load("splat_7k").settings.training.skip is None
+    assert load("splat_7k").settings.training.modules == []
 
 
 # ---- steps
@@ -153,8 +162,7 @@ def state(run: Run) -> dict[str, Any]:
     """All that an update changes."""
     gaussians = run.model.gaussians
     tables = {name: gaussians.get(name).tobytes() for name in gaussians.tables}
-    kept = {name: value for name, value in run.numbers.items() if not name.startswith("skip/")}
-    return {**tables, "updates": dict(run.adam.updates) if run.adam else {}, **kept}
+    return {**tables, "updates": dict(run.adam.updates) if run.adam else {}, **run.numbers}
 
 
 @pytest.mark.parametrize("more", [(), (PENALTY,), (HAAR,)], ids=["losses", "a penalty", "a transform that learns"])
@@ -180,10 +188,10 @@ def test_a_skipped_step_leaves_all_as_it_was(tiny_scene, tmp_path, more):
 def test_each_size_of_a_resolution_schedule_has_own_averages(tiny_scene, tmp_path):
     """Photographs are half as large up to step 19."""
     sizes = "optimize.views.resolution={points: [[0, 2], [20, 1]], between: steps}"
-    run, steps = begun(tiny_scene, tmp_path, "optimize.skip={start: 2, warm_up: 40}", sizes, *NO_EDITS)
+    run, steps = begun(tiny_scene, tmp_path, "optimize.modules.skip={start: 2, warm_up: 40}", sizes, *NO_EDITS)
     for _ in range(36):
         next(steps)
-    averages = [name.split("/")[2] for name in run.numbers if name.startswith("skip/loss/")]
+    averages = [name.split("/")[2] for name in run.modules["skip"].numbers if name.startswith("skip/loss/")]
     assert set(averages) == {"20x20", "40x40"}
     assert len(averages) > 8, "photographs"
 
@@ -192,7 +200,7 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
     run, steps = begun(tiny_scene, tmp_path, FROM_5)
     for _ in range(9):
         next(steps)
-    before = state(run), dict(run.numbers)
+    before = state(run), dict(run.modules["skip"].numbers)
 
     def broken(trainer: Trainer, view: ViewLosses) -> ViewGradients:
         raise MemoryError
@@ -200,7 +208,7 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
     monkeypatch.setattr(Trainer, "backward", broken)
     with pytest.raises(MemoryError):
         next(steps)
-    assert (run.step, (state(run), dict(run.numbers))) == (9, before)
+    assert (run.step, (state(run), dict(run.modules["skip"].numbers))) == (9, before)
 
 
 def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatch):
@@ -212,7 +220,7 @@ def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatc
         return get(array)
 
     monkeypatch.setattr(Array, "get", counted)
-    for name, settings in {"none": (), "later": ("optimize.skip.start=9",), "from 5": (FROM_5,)}.items():
+    for name, settings in {"none": (), "later": ("optimize.modules.skip.start=9",), "from 5": (FROM_5,)}.items():
         _, steps = begun(tiny_scene, tmp_path / name, *settings, *NO_EDITS)
         for _ in range(9):
             next(steps)
@@ -240,29 +248,29 @@ def test_a_run_that_skips_resumes_to_the_bit(tiny_scene, tmp_path, caplog):
         (again / name).unlink()
     resumed = train(tiny_scene, tmp_path / "again", *settings, resume=True)
     assert digest(resumed.out) == whole
-    assert resumed.numbers == first.numbers
+    assert resumed.modules["skip"].numbers == first.modules["skip"].numbers
     assert resumed.records.read("skip") == [told]
 
 
 def test_auto_takes_its_share_from_the_warm_up(tiny_scene, tmp_path):
     """Of forty steps on eight photographs, the first visits at least."""
-    settings = ("optimize.skip={start: 2, warm_up: 40}", "optimize.steps=80", *NO_EDITS)
+    settings = ("optimize.modules.skip={start: 2, warm_up: 40}", "optimize.steps=80", *NO_EDITS)
     run = train(tiny_scene, tmp_path / "run", *settings)
     (told,) = run.records.read("skip")
-    assert 8 / 40 <= told["least"] == run.numbers["skip/above"] / 40
+    assert 8 / 40 <= told["least"] == run.modules["skip"].numbers["skip/above"] / 40
     assert told["steps"] == 78
     assert 0 < told["skipped"] <= (1 - told["least"]) * 78
 
 
 def test_up_to_the_start_the_bits_are_those_without_it(tiny_scene, few_steps, tmp_path):
-    run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.skip.start=12")
+    run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.skip.start=12")
     assert digest(run.out) == digest(few_steps)
     assert [line["steps"] for line in run.records.read("skip")] == [0]
-    assert not run.numbers
+    assert not run.modules["skip"].numbers
 
 
 def test_a_run_may_go_on_with_it(tiny_scene, killed_run, caplog):
-    run = train(tiny_scene, killed_run, *FEW, "optimize.skip={start: 8, warm_up: 1, least: 0}", resume=True)
+    run = train(tiny_scene, killed_run, *FEW, "optimize.modules.skip={start: 8, warm_up: 1, least: 0}", resume=True)
     assert caplog.text.count("from here on the bits are not those of a run without a change") == 1
     assert json.loads((killed_run / "metrics.json").read_text())["steps"] == 12
-    assert run.numbers["skip/steps"] == 4
+    assert run.modules["skip"].numbers["skip/steps"] == 4

@@ -28,7 +28,7 @@ from clsplat.scene.view import View
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
-from clsplat.training.modules.sky import FOLDER, check_tables
+from clsplat.training.modules.sky import check_tables
 from tests.support.outdoor_scene import Yard, painted
 from tests.support.runs import FEW, digest, train
 
@@ -216,7 +216,7 @@ def test_the_best_model_is_left_with_the_sky_of_its_step(tiny_scene, tmp_path):
     run = train(tiny_scene, tmp_path / "run", *FEW, *kept, wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     _, then = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    np.testing.assert_array_equal(sky_beside(tmp_path / "run" / "point_cloud.ply").texels, then["sky/texels"])
+    np.testing.assert_array_equal(sky_beside(tmp_path / "run" / "point_cloud.ply").texels, then["modules/sky/texels"])
 
 
 # ---- where it goes
@@ -317,7 +317,7 @@ def test_a_damaged_sky_is_refused(tmp_path, damage):
 
 def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
     _, tables = checkpoint.archive.read(with_sky / "checkpoints" / "step_000012.npz")
-    behind, _ = split(tables, FOLDER)
+    behind, _ = split(tables, "modules/sky/")
     check_tables(behind)
     for name, table in {"texels": behind["texels"][:-1], "biases": behind["moment1"]}.items():
         with pytest.raises(DataError, match=f"{name} of its sky"):

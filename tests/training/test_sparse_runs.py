@@ -19,7 +19,7 @@ from tests.support.runs import digest, train
 
 pytestmark = pytest.mark.slow
 
-DROPOUT = "optimize.dropout=[[0, 0.0], [6, 0.4]]"
+DROPOUT = "optimize.modules.dropout.probability=[[0, 0.0], [6, 0.4]]"
 PIPELINE = """
 name: sparse
 stages:
@@ -53,7 +53,7 @@ def test_a_run_resumes_to_the_bit(tiny_scene, tmp_path, pipeline):
         digest(train(tiny_scene, tmp_path / n, *s, pipeline=pipeline).out)
         for n, s in (
             ("plain", ()),
-            ("never", ("optimize.dropout=[[0, 0], [9, 0]]",)),
+            ("never", ("optimize.modules.dropout.probability=[[0, 0], [9, 0]]",)),
         )
     ]
     assert len(set(without)) == 1
@@ -93,4 +93,4 @@ def test_a_gaussian_that_is_left_out_counts_as_not_seen(rng):
 @pytest.mark.parametrize("wrong", ["1", "-0.1", "[[0, 0.2], [9, 2]]"])
 def test_a_probability_that_leaves_nothing_is_refused(pipeline, wrong):
     with pytest.raises(ConfigError, match=r"expected values (of at most 0\.9|at least 0)"):
-        load(pipeline, [f"optimize.dropout={wrong}"])
+        load(pipeline, [f"optimize.modules.dropout.probability={wrong}"])

@@ -271,7 +271,7 @@ def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):
     [
         ("model.background={type: directions}", "model.background is not for blocks: each block would learn its own"),
         ("model.time={degree: 1}", "model.time is not for blocks: a cell holds Gaussians at their own time"),
-        ("optimize.colours={type: gain}", "optimize.colours is not for blocks: those of blocks would differ"),
+        ("optimize.modules.exposure={}", "optimize.modules is not for blocks: some would differ"),
         ("scene.validation=4", "scene.validation is not for blocks: a block has no views to choose by"),
         ("densify.inside={low: [0, null, null]}", "densify.inside is not for blocks: blocks set it; leave it out"),
         (

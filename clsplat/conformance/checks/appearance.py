@@ -11,9 +11,9 @@ from clsplat.conformance.check import SUM, Checks, Figure, Note, by_element, equ
 from clsplat.conformance.checks.images import SIZES, camera_of, outside, planes_of
 from clsplat.conformance.reference.appearance import changed_by_grid
 from clsplat.opencl.device import Device
-from clsplat.photos.appearance import IDENTITY, LUMINANCE, GridTables, row_length
+from clsplat.photos.appearance import IDENTITY, LUMINANCE
 from clsplat.render.workspace import Workspace
-from clsplat.training.modules.bilateral_grid import Grid, PhotographGrids
+from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState, row_length
 from clsplat.training.modules.exposure import change_back, change_colours
 
 CHECKS = Checks()
@@ -29,16 +29,16 @@ CASES = (  # width, height, nodes
 )
 
 
-def grids_of(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> PhotographGrids:
+def grids_of(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> GridState:
     """The second of three photographs has matrices about no change, and the others have others."""
-    model, tables = Grid(cells=list(nodes), weight=weight), GridTables(device, 3, nodes)
-    tables.set({"values": rng.normal(0, 0.2, tables.shape).astype(np.float32)})
-    return PhotographGrids(model, ("a", "b", "c"), 0.01, tables)
+    found = GridState(BilateralGrid(cells=list(nodes), weight=weight), ("a", "b", "c"), device)
+    found.load({}, {"values": rng.normal(0, 0.2, found.shape).astype(np.float32)})
+    return found
 
 
-def of_photograph(grids: PhotographGrids, values: NDArray[Any]) -> NDArray[Any]:
+def of_photograph(grids: GridState, values: NDArray[Any]) -> NDArray[Any]:
     """The grid of a photograph, of so many values, as [3, 4, nz, ny, nx] in double."""
-    return values.reshape(3, 4, *grids.tables.shape[2:]).astype(np.float64)
+    return values.reshape(3, 4, *grids.shape[2:]).astype(np.float64)
 
 
 def picture_of(rng: np.random.Generator, grid: NDArray[Any], width: int, height: int, channels: int) -> NDArray[Any]:
@@ -60,7 +60,7 @@ def grid_figures(
     """Compare an image, its gradient, and that by the grid."""
     what = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
     grids = grids_of(device, rng, nodes)
-    grid = of_photograph(grids, grids.tables.tables()["values"][1])
+    grid = of_photograph(grids, grids.tables()["values"][1])
     image = picture_of(rng, grid, width, height, channels)
     gradient = rng.normal(size=image.shape).astype(np.float32)
     camera, workspace = camera_of(device, width, height), Workspace(device)
@@ -68,7 +68,7 @@ def grid_figures(
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
     exact = image[:3].astype(np.float64)
-    found = grids.change(workspace, camera, planes, {}, 1)[0].get()
+    found = grids.changed(workspace, camera, planes, 1).get()
     expected = ref.gridded(exact, grid)
     yield by_element("colour_grid_forward", f"colours, {what}", found[:3, :height, :width], expected, 3e-6, floor=1.0)
     yield equal("colour_grid_forward", f"pixels outside the image, {what}", outside(camera, found[:3]), 0.0)
@@ -93,28 +93,27 @@ def grid_figures(
 def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Iterator[Figure]:
     """Compare the smoothness of a grid, three updates of it, and what they leave of the others."""
     what, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
-    grids, workspace, numbers = grids_of(device, rng, nodes, weight), Workspace(device), dict[str, float]()
-    expected = grids.tables.tables()["values"].astype(np.float64).reshape(3, -1)
+    grids, workspace = grids_of(device, rng, nodes, weight), Workspace(device)
+    expected = grids.tables()["values"].astype(np.float64).reshape(3, -1)
     moment1, moment2 = np.zeros((2, row_length(nodes)))
-    camera = camera_of(device, 5, 3)
-    image = planes_of(device, camera, np.zeros((3, 3, 5)))
-    rate = 0.01
+    grids.rate = rate = 0.01
     for step in range(1, 4):
-        _, value = grids.change(workspace, camera, image, numbers, 1)
+        shares = grids.smoothness(workspace, 1)
         by_smoothness = workspace.array("grid smoothness", row_length(nodes)).get()
         smooth, slope = ref.grid_smoothness(of_photograph(grids, expected[1]))
-        found, wanted, kernel = np.array([value()]), np.array([weight * smooth]), "colour_grid_smoothness"
+        found, wanted = np.array([shares.get().sum(dtype=np.float64)]), np.array([weight * smooth])
+        kernel = "colour_grid_smoothness"
         yield by_element(kernel, f"value, {what}", found, wanted, SUM, floor=1e-2)
         found, wanted = of_photograph(grids, by_smoothness), weight * slope
         largest = max(float(np.abs(wanted).max()), 1e-6)
         yield by_element(kernel, f"derivatives, {what}", found, wanted, 2e-5, floor=largest)
         gradient = rng.normal(0, 0.1, row_length(nodes)).astype(np.float32)
-        grids.learn(workspace, numbers, 1, device.upload(gradient), step)
+        grids.learn(workspace, 1, device.upload(gradient), step)
         whole = gradient.astype(np.float64) + by_smoothness
         expected[1], moment1, moment2 = ref.adam_step(expected[1], whole, moment1, moment2, step, rate)
         own = np.stack([of_photograph(grids, one) for one in expected])
         expected = ref.centred_grids(own).reshape(expected.shape)
-    tables = {name: table.reshape(3, -1) for name, table in grids.tables.tables().items()}
+    tables = {name: table.reshape(3, -1) for name, table in grids.tables().items()}
     for kernel in ("colour_grid_update", "colour_grid_centre"):
         yield by_element(kernel, f"grids, {what}", tables["values"], expected, 2e-6, floor=1.0)
     for name, moment, bound in (("moment1", moment1, SUM), ("moment2", moment2, 3 * SUM)):

@@ -62,7 +62,8 @@ MIN_VIEWS = 10  # for training
 MIN_POINTS = 100
 MAX_SHARE_LEFT_OUT = 0.1  # share of the photographs that a model may leave out without a warning
 MAX_ERROR = 2.0  # px of mean reprojection error; COLMAP drops observations above 4
-POSES_ERROR, POSES = 1.0, "optimize.poses={start: 500}"  # px from which pipelines/photos.yaml learns poses
+POSES_ERROR = 1.0  # px from which pipelines/photos.yaml learns poses
+POSES = "optimize.modules.camera_optimizer={start: 500}"
 MAX_SHARE_BEHIND, MIN_SHARE_IN_TWO = 0.1, 0.5  # shares of points
 MIN_SHARE_KEPT = 0.6  # share of a photograph
 FOCAL_RANGE = (0.2, 20.0)  # focal length by image width: 136 to 3 degrees
@@ -163,11 +164,11 @@ def _looks(facts: Facts) -> Iterator[Finding]:
     if jumps:
         named = _listed([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
         fault = f"the exposure jumps by more than a stop {amount(len(jumps), 'time')} ({named})"
-        yield Finding("note", fault, "--set optimize.colours=gain gives each photograph its own")
+        yield Finding("note", fault, "--set optimize.modules.exposure={} gives each photograph its own")
     if steps := facts.looks.steps:
         named = _listed([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
         fault = f"{_are(len(steps), 'photograph')} more than twice as bright or dark as the one before ({named})"
-        remedy = "EXIF does not tell both exposures; if these changed, --set optimize.colours=gain gives each its own"
+        remedy = "EXIF does not tell both; if exposures changed, --set optimize.modules.exposure={} gives each its own"
         yield Finding("note", fault, remedy)
     if (padded := facts.looks.padded) and not facts.photos.masks:
         where = ", ".join(f"{px} px {edge}" for edge, px in padded.items())

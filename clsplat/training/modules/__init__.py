@@ -1,1 +1,5 @@
-"""What a training step learns or knows of each photograph besides the Gaussians, a file each."""
+"""What takes part in a training step next to the Gaussians: one file a module, with its settings and its state."""
+
+from clsplat.core.settings import import_modules
+
+import_modules(__name__, __path__)

@@ -1,35 +1,35 @@
-"""Colour grids: how a pipeline file names them, and what a training does with them (cl_kernels/colour_grid.cl)."""
+"""Colours of each photograph by place and luminance: bilateral grids (cl_kernels/colour_grid.cl)."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from clsplat.core.files import VIEW_COLOURS, VIEW_GRIDS
+from clsplat.core.errors import DataError
 from clsplat.core.schedule import Decay, Points, Schedule, at_step
+from clsplat.losses.base import LossValue
 from clsplat.opencl.device import Array, Device, constants
-from clsplat.photos.appearance import (
-    ADAM,
-    ENTRIES,
-    IDENTITY,
-    LUMINANCE,
-    MEANING,
-    TABLE,
-    Floats,
-    GridTables,
-    OwnColours,
-    RateOrAuto,
-    ViewColours,
-    Written,
-    bytes_of,
-    fitted_gains,
-    row_length,
-)
+from clsplat.photos.appearance import ADAM, IDENTITY, LUMINANCE, MEANING, Floats
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
+from clsplat.scene.view import View
+from clsplat.training.modules.base import Numbers, Step, Tables
+from clsplat.training.modules.exposure import (
+    TABLE,
+    VIEW_COLOURS,
+    Appearance,
+    ColourState,
+    Gain,
+    RateOrAuto,
+    Written,
+)
+from clsplat.training.run import Run
 
+VIEW_GRIDS = "view_colours.npy"
+ENTRIES = int(constants("colour_grid.h")["ENTRIES"])
+TABLES = ("values", "moment1", "moment2")
 WARM_UP = 1000  # steps in which the rate of grids grows from 1 % of itself (gsplat); a tenth of shorter trainings
 Nodes = Annotated[int, Field(ge=1, le=int(constants("colour_grid.h")["MOST_NODES"]))]
 GRID_MEANING = (
@@ -39,40 +39,49 @@ GRID_MEANING = (
 ).format(*LUMINANCE)
 
 
-class Grid(OwnColours):
+class BilateralGrid(Appearance):
     """Colours of each photograph by place and luminance: a bilateral grid of affine changes (Wang et al. 2024).
 
-    It follows what a phone does to parts of a photograph, local tone mapping, which the other kinds cannot.  It also
-    follows what the model should learn, so that held-out photographs are often worse with it: try `gain` first.  The
-    mean over photographs and places stays that of no change at each luminance; figures are in colours of `gain`.
+    It follows what a phone does to parts of a photograph, local tone mapping, which `exposure` cannot.  It also follows
+    what the model should learn, so that held-out photographs are often worse with it: try `exposure` first.  The mean
+    over photographs and places stays that of no change at each luminance.  A grid that was fitted in one place says
+    nothing of another, so that figures are in colours of `gain`.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
-    columns: ClassVar[tuple[str, ...]] = ("row",)  # of its grid in the tables of a run
 
-    type: Literal["grid"] = "grid"
+    type: Literal["bilateral_grid"] = "bilateral_grid"
     cells: Annotated[list[Nodes], Field(min_length=3, max_length=3)] = Field([4, 4, 4])
     """Matrices along the width, the height and the luminance, 1 to 16 each.  Between them colours are trilinear; the
     outer ones lie on the edges, at black and at white.  Published are [16, 16, 8]."""
     rate: RateOrAuto = "auto"
     """Learning rate of the matrices, by Adam, by step; auto: 2e-3 to 2e-5 (gsplat), where no tracks tell the exposures
-    that of `gain`; it grows from 1 % of itself in 1000 steps, or a tenth of fewer than 10 000.  At most 0.5."""
+    that of `exposure`; it grows from 1 % of itself in 1000 steps, or a tenth of fewer than 10 000.  At most 0.5."""
     weight: Annotated[float, Field(ge=0)] = 10.0
     """Factor of the loss that makes the grid of the photograph of a step smooth: the sum over the axes of the mean of
     the squared differences of neighbours."""
 
-    @property
-    def files(self) -> tuple[str, ...]:
-        return VIEW_COLOURS, VIEW_GRIDS
+    files: ClassVar[Mapping[str, str]] = {VIEW_COLOURS: "colours", VIEW_GRIDS: "colour grids"}
 
-    def of_views(self, views: Sequence[str], device: Device, tables: GridTables | None) -> ViewColours:
-        photographs = len(set(views))
-        if tables is None or not tables.fit(photographs, self.cells):
-            tables = GridTables(device, photographs, self.cells)
-        return PhotographGrids(self, views, 0.0, tables)
+    def state(self, run: Run) -> "GridState":
+        return GridState(self, [view.name for view in run.scene.split("train")], run.device)
 
-    def device_bytes(self, photographs: int, rows: int, pixels: int) -> int:
-        return bytes_of(self.cells, photographs, rows, pixels)
+    def device_bytes(self, views: Sequence[View], tile: int) -> int:
+        if self.chosen == "off":
+            return 0
+        sides = [(-(-view.camera.width // tile) * tile, -(-view.camera.height // tile) * tile) for view in views]
+        rows, pixels = max(height for _, height in sides), max(width * height for width, height in sides)
+        return bytes_of(self.cells, len({view.name for view in views}), rows, pixels)
+
+    @classmethod
+    def check_saved(cls, numbers: Numbers, tables: Tables) -> None:
+        super().check_saved(numbers, tables)
+        shapes = {table.shape for table in tables.values()}
+        if tables.keys() not in ({*TABLES}, {*TABLES[:1]}) or len(shapes) != 1 or shapes.pop()[1:2] != (ENTRIES,):
+            raise DataError(f"its grids are not [photographs, {ENTRIES}, nz, ny, nx]")
+        named, held = sorted(row for key, row in numbers.items() if key.endswith("/row")), len(tables["values"])
+        if named != list(range(held)):
+            raise DataError(f"it has grids of the colours of {held} photographs, and its numbers name other rows")
 
     def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
         if self.rate != "auto":
@@ -84,99 +93,95 @@ class Grid(OwnColours):
         points = {step: [float(step), at_step(rate, step)] for step in later}
         return Points(points=[[0.0, at_step(rate, 0) / 100], *points.values()])
 
-    def fitted(self, image: Floats, photograph: Floats) -> Floats:
-        """A grid that was fitted in one place says nothing of another: the colours are those of `gain`."""
-        return fitted_gains(image, photograph)
-
-
-@dataclass(frozen=True)
-class PhotographGrids(ViewColours):
-    """The grids, and what the numbers of a run have of them: the row of each photograph and its updates."""
-
-    model: "Grid"
-    views: Sequence[str]  # names of the training views, by number; one of several sizes has one row
-    rate: Schedule
-    tables: GridTables
-
     @property
-    def names(self) -> list[str]:
-        """The names of the photographs, by row."""
-        return list(dict.fromkeys(self.views))
+    def fit(self) -> Gain:
+        return Gain()
 
-    @property
-    def device_tables(self) -> GridTables:
-        return self.tables
 
-    def with_rate(self, rate: Schedule) -> "PhotographGrids":
-        return replace(self, rate=rate)
+class GridState(ColourState):
+    """The grids of all photographs on the device, with Adam's moments: each [photographs, ENTRIES, nz, ny, nx]."""
 
-    def begun(self, numbers: Mapping[str, float]) -> bool:
-        return all(numbers.get(f"{TABLE}/{view}/row") == row for row, view in enumerate(self.names))
+    settings: BilateralGrid
 
-    def begin(self, numbers: dict[str, float], log_gains: Mapping[str, Floats]) -> None:
+    def __init__(self, settings: BilateralGrid, views: Sequence[str], device: Device) -> None:
+        super().__init__(settings, views)
+        self.device, self.shape = device, (len(self.names), ENTRIES, *reversed(settings.cells))
+        self.arrays: dict[str, Array] = {name: device.zeros(self.shape) for name in TABLES}
+
+    def tables(self, whole: bool = True) -> Tables:
+        return {name: self.arrays[name].get() for name in (TABLES if whole else TABLES[:1])}
+
+    def takes(self, numbers: Numbers, tables: Tables) -> bool:
+        return "values" in tables and tables["values"].shape == self.shape
+
+    def load(self, numbers: Numbers, tables: Tables) -> None:
+        """Those that are not given become 0."""
+        super().load(numbers, tables)
+        for name, array in self.arrays.items():
+            array.set(np.ascontiguousarray(tables.get(name, np.zeros(self.shape, np.float32))))
+
+    def begin_with(self, log_gains: Mapping[str, Floats]) -> None:
         matrices = np.zeros((len(self.names), 3, 4))
         for row, view in enumerate(self.names):
             matrices[row, range(3), range(3)] = np.expm1(log_gains.get(view, np.zeros(3)))
-            numbers |= {f"{TABLE}/{view}/row": float(row), f"{TABLE}/{view}/updates": 0.0}
+            self.numbers |= {f"{TABLE}/{view}/row": float(row), f"{TABLE}/{view}/updates": 0.0}
         values = matrices.reshape(len(matrices), ENTRIES, 1, 1, 1).astype(np.float32)
-        self.tables.set({"values": np.broadcast_to(values, self.tables.shape)})
-        self.tables.centre()
-
-    def written(self, numbers: Mapping[str, float]) -> Written:
-        values = self.tables.tables(["values"])["values"]
-        grids = values.reshape(-1, 3, 4, *values.shape[2:]).transpose(0, 3, 4, 5, 1, 2) + IDENTITY.astype(np.float32)
-        means = {view: one.mean(axis=(0, 1, 2), dtype=np.float64) for view, one in zip(self.names, grids, strict=True)}
-        rows = {view: {"row": row, "matrix": means[view].tolist()} for row, view in enumerate(self.names)}
-        facts = {
-            "meaning": GRID_MEANING,
-            "type": self.model.type,
-            "cells": list(self.model.cells),
-            "file": VIEW_GRIDS,
-            "photographs": rows,
-        }
-        return Written(means, facts, {VIEW_GRIDS: np.ascontiguousarray(grids, np.float32)})
+        self.load(self.numbers, {"values": np.broadcast_to(values, self.shape)})
+        self._centre()
 
     def row(self, view: int) -> int:
         """Return the row of a training view by its number."""
         return self.names.index(self.views[view])
 
-    def change(
-        self, workspace: Workspace, camera: DeviceCamera, image: Array, numbers: Mapping[str, float], view: int
-    ) -> tuple[Array, Callable[[], float]]:
-        found = self._changed(workspace, camera, image, view)
-        shares = self._smoothness(workspace, view)
-        return found, lambda: float(shares.get().sum(dtype=np.float64))
+    def after_render(self, step: Step) -> None:
+        if step.view is None:
+            return
+        image = step.image
+        step.image = self.changed(step.workspace, step.camera, image, step.view)
+        shares = self.smoothness(step.workspace, step.view)
+        step.own_losses.append(LossValue("colours", lambda: float(shares.get().sum(dtype=np.float64))))
+        step.keep(self, (image, []))
 
-    def change_back(
-        self,
-        workspace: Workspace,
-        camera: DeviceCamera,
-        image: Array,
-        gradient: Array,
-        numbers: dict[str, float],
-        view: int,
-        step: int,
-    ) -> tuple[Array, Callable[[], None]]:
-        found, by_grid = self.differentiated(workspace, camera, image, gradient, view)
-        return found, lambda: self.learn(workspace, numbers, view, by_grid, step)
+    def backward(self, step: Step) -> None:
+        if (kept := step.kept(self)) and step.view is not None:
+            step.gradient, by_grid = self.differentiated(step.workspace, step.camera, kept[0], step.gradient, step.view)
+            kept[1].append(by_grid)
 
-    def _changed(self, workspace: Workspace, camera: DeviceCamera, image: Array, view: int) -> Array:
+    def update(self, step: Step) -> None:
+        if (kept := step.kept(self)) and step.view is not None:
+            self.learn(step.workspace, step.view, kept[1][0], step.number)
+
+    def written(self) -> Written:
+        values = self.arrays["values"].get()
+        grids = values.reshape(-1, 3, 4, *values.shape[2:]).transpose(0, 3, 4, 5, 1, 2) + IDENTITY.astype(np.float32)
+        means = {view: one.mean(axis=(0, 1, 2), dtype=np.float64) for view, one in zip(self.names, grids, strict=True)}
+        rows = {view: {"row": row, "matrix": means[view].tolist()} for row, view in enumerate(self.names)}
+        facts = {
+            "meaning": GRID_MEANING,
+            "type": self.settings.type,
+            "cells": list(self.settings.cells),
+            "file": VIEW_GRIDS,
+            "photographs": rows,
+        }
+        return Written(means, facts, {VIEW_GRIDS: np.ascontiguousarray(grids, np.float32)})
+
+    def changed(self, workspace: Workspace, camera: DeviceCamera, image: Array, view: int) -> Array:
         found = workspace.array("coloured", image.shape)
         workspace.device.program("colour_grid.cl").colour_grid_forward(
             groups=(1, camera.rows), image=image, coloured=found, **self._arguments(camera, image, view)
         )
         return found
 
-    def _smoothness(self, workspace: Workspace, view: int) -> Array:
+    def smoothness(self, workspace: Workspace, view: int) -> Array:
         """Write the derivatives of the smoothness; return its shares, whose sum it is."""
-        nodes, row = dict(zip("xyz", self.model.cells, strict=True)), row_length(self.model.cells)
+        nodes, row = dict(zip("xyz", self.settings.cells, strict=True)), row_length(self.settings.cells)
         sizes: dict[str, Any] = {f"n{axis}": n for axis, n in nodes.items()}
         by_smoothness, shares = (workspace.array(f"grid {name}", row) for name in ("smoothness", "shares"))
         differences = {axis: row // n * (n - 1) for axis, n in nodes.items()}
-        sizes |= {f"weight_{axis}": self.model.weight / max(number, 1) for axis, number in differences.items()}
+        sizes |= {f"weight_{axis}": self.settings.weight / max(number, 1) for axis, number in differences.items()}
         workspace.device.program("colour_grid_table.cl").colour_grid_smoothness(
             items=row,
-            values=self.tables.arrays["values"],
+            values=self.arrays["values"],
             by_smoothness=by_smoothness,
             shares=shares,
             first=self.row(view) * row,
@@ -188,8 +193,8 @@ class PhotographGrids(ViewColours):
     def differentiated(
         self, workspace: Workspace, camera: DeviceCamera, image: Array, gradient: Array, view: int
     ) -> tuple[Array, Array]:
-        """Return the gradient by an image from that by what `change` made of it, and that by the grid, [row]."""
-        (nx, _, nz), row = self.model.cells, row_length(self.model.cells)
+        """Return the gradient by an image from that by what `changed` made of it, and that by the grid, [row]."""
+        (nx, _, nz), row = self.settings.cells, row_length(self.settings.cells)
         found = workspace.array("grad_coloured", image.shape)
         passed = workspace.array("grid passed", (3, *image.shape[1:]))
         sums, by_grid = (
@@ -214,14 +219,25 @@ class PhotographGrids(ViewColours):
         )
         return found, by_grid
 
-    def learn(self, workspace: Workspace, numbers: dict[str, float], view: int, by_grid: Array, step: int) -> None:
+    def _arguments(self, camera: DeviceCamera, image: Array, view: int) -> dict[str, Any]:
+        nx, ny, nz = self.settings.cells
+        return {
+            "values": self.arrays["values"],
+            "first": self.row(view) * row_length(self.settings.cells),
+            **{"nx": nx, "ny": ny, "nz": nz, "channels": image.shape[0]},
+            "per_column": (nx - 1) / camera.width,
+            "per_row": (ny - 1) / camera.height,
+            **camera.plane_arguments(),
+        }
+
+    def learn(self, workspace: Workspace, view: int, by_grid: Array, step: int) -> None:
         """Change the grid of a view by Adam, with a count of updates of its own, then centre all.
 
-        by_grid: derivatives of the losses of the image, [row]; those of the smoothness are as `change` left them.
+        by_grid: derivatives of the losses of the image, [row]; those of the smoothness are as `smoothness` left them.
         """
-        key, row = f"{TABLE}/{self.views[view]}/updates", row_length(self.model.cells)
-        numbers[key] = updates = numbers.get(key, 0.0) + 1
-        arguments: dict[str, Any] = dict(self.tables.arrays)
+        key, row = f"{TABLE}/{self.views[view]}/updates", row_length(self.settings.cells)
+        self.numbers[key] = updates = self.numbers.get(key, 0.0) + 1
+        arguments: dict[str, Any] = dict(self.arrays)
         workspace.device.program("colour_grid_table.cl").colour_grid_update(
             items=row,
             by_grid=by_grid,
@@ -232,15 +248,25 @@ class PhotographGrids(ViewColours):
             correction2=1 / (1 - ADAM["BETA2"] ** updates),
             count=row,
         )
-        self.tables.centre()
+        self._centre()
 
-    def _arguments(self, camera: DeviceCamera, image: Array, view: int) -> dict[str, Any]:
-        nx, ny, nz = self.model.cells
-        return {
-            "values": self.tables.arrays["values"],
-            "first": self.row(view) * row_length(self.model.cells),
-            **{"nx": nx, "ny": ny, "nz": nz, "channels": image.shape[0]},
-            "per_column": (nx - 1) / camera.width,
-            "per_row": (ny - 1) / camera.height,
-            **camera.plane_arguments(),
-        }
+    def _centre(self) -> None:
+        """Subtract the mean over photographs and places at each level of luminance."""
+        photographs, _, levels, rows, columns = self.shape
+        self.device.program("colour_grid_table.cl").colour_grid_centre(
+            groups=ENTRIES * levels,
+            values=self.arrays["values"],
+            places=rows * columns,
+            photographs=photographs,
+        )
+
+
+def row_length(cells: Sequence[int]) -> int:
+    """Return the values of one photograph."""
+    return ENTRIES * math.prod(cells)
+
+
+def bytes_of(cells: Sequence[int], photographs: int, rows: int, pixels: int) -> int:
+    """Return what grids take on the device.  rows, pixels: of the largest view, whole tiles."""
+    row, columns = row_length(cells), ENTRIES * cells[0] * cells[2]
+    return 4 * (len(TABLES) * photographs * row + 3 * row + columns * rows + 3 * pixels)

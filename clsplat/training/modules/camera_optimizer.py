@@ -1,11 +1,10 @@
-"""The places and focal lengths of the cameras in a run: where a training begins and ends, and where it is measured."""
+"""The places and focal lengths of the cameras, learned with the model, where poses are not exact."""
 
 import json
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -14,42 +13,45 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.core.errors import ConfigError, DataError, PoseError, amount, quoted
-from clsplat.core.files import VIEW_POSES, write_text
+from clsplat.core.errors import DataError, PoseError, amount, quoted
+from clsplat.core.files import write_text
 from clsplat.core.reading import read_json
 from clsplat.core.schedule import Decay, NonNegative, Schedule, at_step, explained
-from clsplat.core.settings import Settings
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import ViewTable, adam_step
-from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import moved_camera
 from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.render.workspace import Workspace
 from clsplat.scene.quality import with_cameras
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, zooms
+from clsplat.training.modules.base import ModuleState, Numbers, Step, TrainingModule
 from clsplat.training.run import Run
 
-# How the places and focal lengths of the cameras are learned with the model, and how a pipeline file says so.
-
 Floats = NDArray[np.float64]
+VIEW_POSES = "view_poses.json"
+TURNS, SHIFTS, DEPTHS, FOCALS, AXES = "turns", "shifts", "depths", "focal_lengths", ("x", "y", "z")
+SUMS, GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 RATE, MOST = 2e-4, 2e-3  # learning rates at the start
 FALL = 100  # from the first rate to the last
 TURN_SHARE = 0.3  # ours: what a turn about that point does in the image is little, and so mostly noise
 REACH = 0.01  # shares of the depth: what a photograph's visits must be enough for
 FOCAL_RATE, FOCAL_MOST = 1e-4, 1e-3  # the same of the logarithms of focal lengths
 FOCAL_REACH = 0.2  # of them: noise takes most of the way to a change of a few hundredths
+FEWEST, POINTS = 10, 10_000  # of the points that tell a depth
+MOST_ZOOM = 10.0  # times a focal length, or a tenth: far beyond what is learned of one
+LOG = logging.getLogger("clsplat")
 
 
-class Poses(Settings):
+class CameraOptimizer(TrainingModule):
     """Turn and shift the camera of each photograph a little, learned with the model, where poses are not exact.
 
     A photograph has a rotation vector and a shift in the axes of the world, by Adam, all 0 at first.  The camera turns
     about the point of its axis at the median depth of the dataset's points; without points, at the extent.  A step
     changes those of its photograph; then their means over the photographs are subtracted: what moves all cameras alike
     would be the same to every loss if the Gaussians moved too.  The world filter, rules that compare the model with
-    photographs, and the extent are those of the dataset's cameras.  A sky cannot be learned with it.
+    photographs, and the extent are those of the dataset's cameras.
 
     With `focal`, photographs that share a camera in the dataset share a factor of both of its focal lengths.  It has no
     mean to subtract: a single camera may change.  What stays with poses stays with it too, and so does the principal
@@ -61,7 +63,15 @@ class Poses(Settings):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"turn", "shift", "focal", "start"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
+    outlasts: ClassVar[Literal["acts"]] = "acts"
+    conflicts: ClassVar[Mapping[str, str]] = {
+        "sky": "the model has a sky, which is not learned together with poses",
+        "inverse_depth": "the loss would not move them",
+        "blocks": "those of blocks would differ",
+    }
+    files: ClassVar[Mapping[str, str]] = {VIEW_POSES: "poses"}
 
+    type: Literal["camera_optimizer"] = "camera_optimizer"
     turn: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = "auto"
     """Learning rate of the rotations in rad, by step; auto: 0.3 times the automatic one of the shifts."""
     shift: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = "auto"
@@ -93,6 +103,17 @@ class Poses(Settings):
         needed = reach * math.log(FALL) * FALL / (FALL - 1) / visits
         initial = min(max(bounds[0], needed), bounds[1])
         return Decay(initial=initial, final=initial / FALL, over=steps, start=self.start)
+
+    def check_in(self, run: Run) -> None:
+        if self.focal:
+            require_zoom(run.original)
+
+    def state(self, run: Run) -> "CameraState":
+        return CameraState(self, run.scene.split("train"), run.original.views)
+
+    @classmethod
+    def beside(cls, model: Path, scene: Scene) -> Scene:
+        return poses_beside(model, scene)
 
 
 @dataclass(frozen=True)
@@ -132,117 +153,171 @@ def _by_vector(turn: Floats, by_turn: Floats) -> Floats:
     return np.asarray(by_turn + first * cross @ by_turn + second * cross @ cross @ by_turn)
 
 
-# Focal lengths that are learned with the model: a factor for each camera, which photographs of that camera share.
+class CameraState(ModuleState):
+    """What is added to the poses of the training views, and the factors of their cameras' focal lengths.
 
-FOCALS = "focal_lengths"
-
-
-@dataclass(frozen=True)
-class FocalLengths:
-    """The cameras of a dataset's views, and the rate at which the logarithms of their factors are learned.
-
-    A factor is of both focal lengths.  Its logarithm lies among the numbers that a run keeps, as
-    focal_lengths/CAMERA/log with its moments, and is 0 before the first step.
+    A view of several sizes has one row.  A factor is of both focal lengths; equal lenses, or equal pinhole cameras, of
+    the dataset as it was read, are one camera, by the name of the first view that has it.
     """
 
-    cameras: Mapping[str, str]  # names of cameras, that of the first view with the same one, by those of other views
-    rate: Schedule = 0.0
-
-    @classmethod
-    def of(cls, views: Sequence[View], rate: Schedule = 0.0) -> "FocalLengths":
-        """Return those of all views of a dataset, as it was read: equal lenses, or equal pinhole cameras, are one."""
+    def __init__(self, settings: CameraOptimizer, views: Sequence[View], originals: Sequence[View]) -> None:
+        super().__init__()
+        self.settings, self.views = settings, views
+        names = tuple(dict.fromkeys(view.name for view in views))
+        self.tables_of = ViewTable(TURNS, names, AXES), ViewTable(SHIFTS, names, AXES)
         first: dict[object, str] = {}
-        return cls({view.name: first.setdefault(view.lens or view.camera, view.name) for view in views}, rate)
+        self.cameras = {view.name: first.setdefault(view.lens or view.camera, view.name) for view in originals}
+        self.rates: tuple[Schedule, Schedule, Schedule] = 0.0, 0.0, 0.0
+
+    def takes(self, numbers: Numbers, tables: Any) -> bool:
+        return self.tables_of[0].begun(numbers)
+
+    def begin(self, run: Run) -> None:
+        for table in self.tables_of:
+            table.begin(self.numbers, {})
+        self.numbers |= {f"{DEPTHS}/{view.name}": depth_of(view, run.scene) for view in self.views}
+
+    def prepare(self, run: Run, last: int, trained: bool = True) -> None:
+        if not trained:
+            return
+        names = {view.name for view in self.views}
+        focal = self.settings.focal_rate(last, len({self.cameras[name] for name in names}))
+        self.rates = *self.settings.rates(last, len(names)), focal
+        if focal:
+            require_zoom(run.original)
+
+    def before_render(self, step: Step) -> None:
+        if step.view is not None and step.number > self.settings.start:
+            zoom, pose = self.factor(self.views[step.view].name), self.pose(step.view)
+            step.photograph = replace(step.photograph, camera=moved_camera(step.camera, pose, zoom))
+
+    def after_backward(self, step: Step) -> None:
+        if step.view is not None and step.number > self.settings.start:
+            step.keep(self, pose_gradient(step.workspace, step.model, step.frame, step.pixel_sums))
+
+    def update(self, step: Step) -> None:
+        if not (wait := step.kept(self)) or step.view is None:
+            return
+        sums, name, (turns, shifts), number = wait(), self.views[step.view].name, self.tables_of, step.number
+        move, (turn, shift, focal) = self.move(name), self.rates
+        by_turn, by_shift = move.gradients(self.pose(step.view), sums[:3], sums[3:6])
+        turns.update(self.numbers, name, by_turn, at_step(turn, number))
+        shifts.update(self.numbers, name, by_shift, move.depth * at_step(shift, number))
+        self.zoom(name, float(sums[6]), at_step(focal, number))
+
+    def zoom(self, view: str, by_log: float, rate: float) -> None:
+        """Change the focal lengths of a view's camera by Adam; by_log: the derivative by the logarithm of a factor."""
+        if rate:
+            key = self._key(view)
+            adam_step(self.numbers, {key: self.numbers.get(key, 0.0)}, {key: by_log}, rate)
+
+    @property
+    def zoomed(self) -> list[str]:
+        """The cameras whose focal lengths have been learned."""
+        return [one for one in dict.fromkeys(self.cameras.values()) if self._key(one) in self.numbers]
+
+    def move(self, view: str) -> Move:
+        """Return how far the camera of a view has moved."""
+        turn, shift = (table.row(self.numbers, view) for table in self.tables_of)
+        return Move(turn, shift, self.numbers[f"{DEPTHS}/{view}"])
+
+    def pose(self, view: int) -> Floats:
+        """Return the pose, [3, 4], of a training view by its number."""
+        move = self.move(self.views[view].name)
+        pose: Floats = np.asarray(self.views[view].world_to_camera, np.float64)
+        return move.of(pose) if move.turn.any() or move.shift.any() else pose
+
+    def factor(self, view: str) -> float:
+        """Return what the focal lengths of a view are multiplied by."""
+        return math.exp(self.numbers.get(self._key(view), 0.0))
 
     def _key(self, view: str) -> str:
         return f"{FOCALS}/{self.cameras.get(view, view)}/log"
 
-    def factor(self, numbers: Mapping[str, float], view: str) -> float:
-        """Return what the focal lengths of a view are multiplied by: 1 where nothing has been learned of its camera."""
-        return math.exp(numbers.get(self._key(view), 0.0))
+    def scene(self, scene: Scene) -> Scene:
+        """Return a scene with the learned cameras.
 
-    def learned(self, numbers: Mapping[str, float]) -> list[str]:
-        """Return the names of the cameras that have a number."""
-        return [camera for camera in dict.fromkeys(self.cameras.values()) if self._key(camera) in numbers]
+        Views that were not trained on have the focal lengths of their camera; they are moved as those of the training
+        views are as a whole: about their mean, by the scale between the centres before and after.  Their rotations
+        stay, as the mean of the learned ones does.
+        """
+        if not self.views:
+            return scene
+        learned = {view.name: self.pose(number) for number, view in enumerate(self.views)}
+        before = np.array([view.position for view in self.views])
+        after = np.array([_centre(learned[view.name]) for view in self.views])
+        middle, moved_middle = before.mean(axis=0), after.mean(axis=0)
+        around = before - middle
+        spread = float((around**2).sum())
+        scale = float((around * (after - moved_middle)).sum()) / spread if spread > 0 else 1.0
 
-    def update(self, numbers: dict[str, float], view: str, derivative: float, step: int) -> None:
-        """Change the number of a view's camera by Adam; derivative: by the logarithm of the factor."""
-        if rate := at_step(self.rate, step):
-            key = self._key(view)
-            adam_step(numbers, {key: numbers.get(key, 0.0)}, {key: derivative}, rate)
+        def pose(view: View) -> Floats:
+            if view.name in learned:
+                return learned[view.name]
+            rotation = view.world_to_camera[:, :3]
+            return np.column_stack([rotation, -rotation @ (moved_middle + scale * (view.position - middle))])
+
+        def found(view: View) -> View:
+            camera = view.camera.zoomed(self.factor(view.name))
+            return replace(view, world_to_camera=pose(view), camera=camera)
+
+        return with_cameras(scene, list(map(found, scene.views)))
+
+    def write(self, run: Run) -> None:
+        """Write the poses that each photograph has for the model; log how far they have moved."""
+        views, names = self.scene(run.original).views, {view.name for view in self.views}
+        cameras = self.zoomed
+        data = {
+            "meaning": "poses in which the model shows each photograph, rows of [R | t] from the world to the camera; "
+            "learned: those of training photographs; others have moved with them as a whole"
+            + ("; focal_lengths: in x and y, px, at the full size of the undistorted photographs" if cameras else ""),
+            "photographs": {
+                view.name: {
+                    "learned": view.name in names,
+                    "world_to_camera": view.world_to_camera.tolist(),
+                    **({"focal_lengths": [view.camera.fx, view.camera.fy]} if cameras else {}),
+                }
+                for view in views
+            },
+        }
+        write_text(run.out / VIEW_POSES, json.dumps(data, indent=1) + "\n")
+        moves = [self.move(view) for view in self.tables_of[0].views]
+        turns, shifts = (
+            [math.hypot(*move.turn) for move in moves],
+            [math.hypot(*move.shift) / move.depth for move in moves],
+        )
+        LOG.info(
+            "poses of %d photographs in %s: turned by up to %.3f°, shifted by up to %.2g of the depth; "
+            "medians %.3f°, %.2g",
+            *(len(names), VIEW_POSES, math.degrees(max(turns)), max(shifts)),
+            *(math.degrees(float(np.median(turns))), float(np.median(shifts))),
+        )
+        if cameras:
+            factors = [self.factor(camera) for camera in cameras]
+            LOG.info(
+                "focal lengths of %s: times %s", amount(len(cameras), "camera"), _range(min(factors), max(factors))
+            )
 
 
-NO_FOCALS = FocalLengths({})
+def require_zoom(scene: Scene) -> None:
+    """Raise DataError where a view has a lens that cannot be written with another focal length."""
+    for view in scene.views:
+        if view.lens is not None and not zooms(view.lens):
+            raise DataError(
+                f"{scene.path}: camera_optimizer.focal: the lens of {quoted(view.name)}, {view.lens.model}, cannot be "
+                "written with another focal length; `clsplat data undistort` first, or leave out camera_optimizer.focal"
+            )
 
 
-# The places and focal lengths of the photographs' cameras while a model is trained, and their derivatives.
-
-TURNS, SHIFTS, DEPTHS, AXES = "pose_turns", "pose_shifts", "pose_depths", ("x", "y", "z")
-SUMS, GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
-
-
-@dataclass(frozen=True)
-class PhotographPoses:
-    """The training views, and the tables of what is added to their poses; a view of several sizes has one row."""
-
-    views: Sequence[View]  # by number
-    start: int = 0  # global step after which they are learned
-    turn_rate: Schedule = 0.0  # rad
-    shift_rate: Schedule = 0.0  # shares of the depth
-    focals: FocalLengths = NO_FOCALS
-
-    @cached_property
-    def tables(self) -> tuple[ViewTable, ViewTable]:
-        """The tables of rotation vectors in rad and of shifts in scene units, in the axes of the world."""
-        names = tuple(dict.fromkeys(view.name for view in self.views))
-        return ViewTable(TURNS, names, AXES), ViewTable(SHIFTS, names, AXES)
-
-    def begun(self, numbers: Mapping[str, float]) -> bool:
-        """Whether the numbers hold the tables."""
-        return self.tables[0].begun(numbers)
-
-    def begin(self, numbers: dict[str, float], depths: Mapping[str, float]) -> None:
-        """Set the numbers before the first step.  depths: by view, scene units; see Move."""
-        for table in self.tables:
-            table.begin(numbers, {})
-        numbers.update({f"{DEPTHS}/{view}": depths[view] for view in self.tables[0].views})
-
-    def move(self, numbers: Mapping[str, float], view: str) -> Move:
-        """Return how far the camera of a view has moved."""
-        turn, shift = (table.row(numbers, view) for table in self.tables)
-        return Move(turn, shift, numbers[f"{DEPTHS}/{view}"])
-
-    def pose(self, numbers: Mapping[str, float], view: int) -> Floats:
-        """Return the pose, [3, 4], of a training view by its number."""
-        move = self.move(numbers, self.views[view].name)
-        pose: Floats = np.asarray(self.views[view].world_to_camera, np.float64)
-        return move.of(pose) if move.turn.any() or move.shift.any() else pose
-
-    def place(self, photograph: Photograph, numbers: Mapping[str, float], step: int) -> Photograph:
-        """Return a photograph with its camera as it is at a global step."""
-        number = photograph.camera.view
-        if number is None or step <= self.start:
-            return photograph
-        zoom = self.focals.factor(numbers, self.views[number].name)
-        return replace(photograph, camera=moved_camera(photograph.camera, self.pose(numbers, number), zoom))
-
-    def learning(
-        self, workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array, step: int
-    ) -> Callable[[dict[str, float]], None] | None:
-        """Begin the derivatives by the camera of a frame; return what changes the numbers, or None where they stay."""
-        number = frame.camera.view
-        if number is None or step <= self.start:
-            return None
-        waiting = pose_gradient(workspace, model, frame, pixel_sums)
-        return lambda numbers: self._learn(numbers, number, waiting(), step)
-
-    def _learn(self, numbers: dict[str, float], number: int, sums: Floats, step: int) -> None:
-        name, (turns, shifts) = self.views[number].name, self.tables
-        move = self.move(numbers, name)
-        by_turn, by_shift = move.gradients(self.pose(numbers, number), sums[:3], sums[3:6])
-        turns.update(numbers, name, by_turn, at_step(self.turn_rate, step))
-        shifts.update(numbers, name, by_shift, move.depth * at_step(self.shift_rate, step))
-        self.focals.update(numbers, name, float(sums[6]), step)
+def depth_of(view: View, scene: Scene) -> float:
+    """Return the median depth of the scene's points that a view may show; the extent where they are too few."""
+    points = np.zeros((0, 3)) if scene.points is None else scene.points.positions
+    points = np.asarray(points[:: 1 + len(points) // POINTS], np.float64)
+    x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]
+    z = np.where(z > 0, z, np.inf)
+    column, row = (view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy)
+    inside = np.isfinite(z) & (column >= 0) & (column < view.camera.width) & (row >= 0) & (row < view.camera.height)
+    return float(np.median(z[inside])) if np.count_nonzero(inside) >= FEWEST else float(scene.extent)
 
 
 def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Callable[[], Floats]:
@@ -259,128 +334,8 @@ def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_
     return lambda: np.cumsum(copied(), axis=1, dtype=np.float64)[:, -1]
 
 
-FEWEST, POINTS = 10, 10_000  # of the points that tell a depth
-MOST_ZOOM = 10.0  # times a focal length, or a tenth: far beyond what is learned of one
-LOG = logging.getLogger("clsplat")
-
-
-def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPoses | None:
-    """Return the poses of a training whose last global step is given, or None where they are the dataset's:
-    those that a training before has learned stay.
-
-    The numbers of a run that begins are set; a resumed run has them.  Raises ConfigError where the model has a sky,
-    DataError where a lens has no form with another focal length.
-    """
-    views, focals = run.scene.split("train"), FocalLengths.of(run.original.views)
-    if poses is None:
-        learned = PhotographPoses(views, focals=focals)  # by a training before, whose model this one goes on with
-        return learned if learned.begun(run.numbers) else None
-    if run.sky:
-        raise poses_beside_a_sky()
-    rates = poses.rates(last, len({view.name for view in views}))
-    cameras = len({focals.cameras[view.name] for view in views})
-    found = PhotographPoses(views, poses.start, *rates, replace(focals, rate=poses.focal_rate(last, cameras)))
-    if found.focals.rate:
-        require_zoom(run.original)
-    if not found.begun(run.numbers):
-        found.begin(run.numbers, {view.name: depth_of(view, run.scene) for view in views})
-    return found
-
-
-def poses_beside_a_sky() -> ConfigError:
-    """The error of poses that are to be learned with a model that has a sky."""
-    return ConfigError(
-        "optimize.poses: the model has a sky, which is not learned together with poses; set optimize.poses to null, "
-        "or leave model.background out"
-    )
-
-
-def require_zoom(scene: Scene) -> None:
-    """Raise DataError where a view has a lens that cannot be written with another focal length."""
-    for view in scene.views:
-        if view.lens is not None and not zooms(view.lens):
-            raise DataError(
-                f"{scene.path}: optimize.poses.focal: the lens of {quoted(view.name)}, {view.lens.model}, cannot be "
-                "written with another focal length; `clsplat data undistort` first, or leave out poses.focal"
-            )
-
-
-def depth_of(view: View, scene: Scene) -> float:
-    """Return the median depth of the scene's points that a view may show; the extent where they are too few."""
-    points = np.zeros((0, 3)) if scene.points is None else scene.points.positions
-    points = np.asarray(points[:: 1 + len(points) // POINTS], np.float64)
-    x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]
-    z = np.where(z > 0, z, np.inf)
-    column, row = (view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy)
-    inside = np.isfinite(z) & (column >= 0) & (column < view.camera.width) & (row >= 0) & (row < view.camera.height)
-    return float(np.median(z[inside])) if np.count_nonzero(inside) >= FEWEST else float(scene.extent)
-
-
-def refined(numbers: Mapping[str, float], scene: Scene) -> Scene:
-    """Return the scene of a run, at its full size, with what it has learned of cameras; the same one where it has
-    learned nothing.  Views that were not trained on have the focal lengths of their camera.
-
-    The other cameras are moved as those of the training views are as a whole: about their mean, by the scale between
-    the centres before and after.  Their rotations stay, as the mean of the learned ones does.
-    """
-    training, focals = PhotographPoses(scene.split("train")), FocalLengths.of(scene.views)
-    if not training.views or not training.begun(numbers):
-        return scene
-    learned = {view.name: training.pose(numbers, number) for number, view in enumerate(training.views)}
-    before = np.array([view.position for view in training.views])
-    after = np.array([_centre(learned[view.name]) for view in training.views])
-    middle, moved_middle = before.mean(axis=0), after.mean(axis=0)
-    around = before - middle
-    spread = float((around**2).sum())
-    scale = float((around * (after - moved_middle)).sum()) / spread if spread > 0 else 1.0
-
-    def pose(view: View) -> Floats:
-        if view.name in learned:
-            return learned[view.name]
-        rotation = view.world_to_camera[:, :3]
-        return np.column_stack([rotation, -rotation @ (moved_middle + scale * (view.position - middle))])
-
-    def found(view: View) -> View:
-        camera = view.camera.zoomed(focals.factor(numbers, view.name))
-        return replace(view, world_to_camera=pose(view), camera=camera)
-
-    return with_cameras(scene, list(map(found, scene.views)))
-
-
 def _centre(pose: Floats) -> Floats:
     return np.asarray(-pose[:, :3].T @ pose[:, 3])
-
-
-def write_view_poses(run: Run, poses: PhotographPoses | None) -> None:
-    """Write the poses that each photograph has for the model into the run folder; log how far they have moved."""
-    if poses is None:
-        return
-    views, names = refined(run.numbers, run.original).views, {view.name for view in poses.views}
-    cameras = poses.focals.learned(run.numbers)
-    data = {
-        "meaning": "poses in which the model shows each photograph, rows of [R | t] from the world to the camera; "
-        "learned: those of training photographs; others have moved with them as a whole"
-        + ("; focal_lengths: in x and y, px, at the full size of the undistorted photographs" if cameras else ""),
-        "photographs": {
-            view.name: {
-                "learned": view.name in names,
-                "world_to_camera": view.world_to_camera.tolist(),
-                **({"focal_lengths": [view.camera.fx, view.camera.fy]} if cameras else {}),
-            }
-            for view in views
-        },
-    }
-    write_text(run.out / VIEW_POSES, json.dumps(data, indent=1) + "\n")
-    moves = [poses.move(run.numbers, view) for view in poses.tables[0].views]
-    turns, shifts = [math.hypot(*move.turn) for move in moves], [math.hypot(*move.shift) / move.depth for move in moves]
-    LOG.info(
-        "poses of %d photographs in %s: turned by up to %.3f°, shifted by up to %.2g of the depth; medians %.3f°, %.2g",
-        *(len(names), VIEW_POSES, math.degrees(max(turns)), max(shifts)),
-        *(math.degrees(float(np.median(turns))), float(np.median(shifts))),
-    )
-    if cameras:
-        factors = [poses.focals.factor(run.numbers, camera) for camera in cameras]
-        LOG.info("focal lengths of %s: times %s", amount(len(cameras), "camera"), _range(min(factors), max(factors)))
 
 
 def _range(low: float, high: float) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, ClassVar
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.losses.base import Loss
@@ -9,16 +10,50 @@ from clsplat.losses.depth import InverseDepth
 from clsplat.photos.depths import DepthMaps, PointDepths
 from clsplat.scene.quality import within
 from clsplat.scene.scene import Scene
-from clsplat.training.modules.camera_optimizer import PhotographPoses
+from clsplat.training.modules.base import ModuleState, Step, TrainingModule
 from clsplat.training.run import Run
 
 
-def known_depths(losses: Sequence[Loss], run: Run, poses: PhotographPoses | None) -> PointDepths | None:
+class DepthSupervision(TrainingModule):
+    """The depths that a loss reads.  The loss brings it: no list names it."""
+
+    brought_as: ClassVar[str] = "depth_supervision"
+    place: ClassVar[int] = -10
+
+    losses: list[Any]
+
+    @classmethod
+    def brought(cls, run: Run, stage: Any) -> "DepthSupervision | None":
+        losses = [loss for loss in getattr(stage, "losses", ()) if isinstance(loss, InverseDepth)]
+        return cls(type=cls.brought_as, losses=losses) if losses else None
+
+    def check_in(self, run: Run) -> None:
+        require_depths(self.losses, run.scene)
+
+    def state(self, run: Run) -> "KnownDepthsState":
+        return KnownDepthsState(known_depths(self.losses, run))
+
+
+class KnownDepthsState(ModuleState):
+    """The known depths in a step."""
+
+    is_saved: ClassVar[bool] = False
+
+    def __init__(self, depths: PointDepths | None) -> None:
+        super().__init__()
+        self.depths = depths
+
+    def before_losses(self, step: Step) -> None:
+        if self.depths:
+            step.comparison.depths = self.depths.at(step.camera)
+
+
+def known_depths(losses: Sequence[Loss], run: Run) -> PointDepths | None:
     """Return the depths of the points that each training photograph shows; None where no loss reads them.
 
     Raises what `require_depths` raises.
     """
-    require_depths(losses, run.scene, poses=bool(poses))
+    require_depths(losses, run.scene)
     folders = _folders(losses)
     if not folders or run.scene.tracks is None:
         return None
@@ -27,18 +62,14 @@ def known_depths(losses: Sequence[Loss], run: Run, poses: PhotographPoses | None
     return PointDepths(run.device, tracks, names, run.scene.extent, _maps(folders))
 
 
-def require_depths(losses: Sequence[Loss], scene: Scene, poses: bool) -> None:
+def require_depths(losses: Sequence[Loss], scene: Scene) -> None:
     """Raise DataError where nothing tells which photographs show a point, or one has no depth map, ConfigError where
-    poses are learned, or where two losses name different folders; nothing where no loss reads depths."""
+    two losses name different folders; nothing where no loss reads depths."""
     folders = _folders(losses)
     if not folders:
         return
     if len(folders) > 1:
         raise ConfigError("the loss 'inverse_depth' is given with two folders; expected one loss of it, or one folder")
-    if poses:
-        raise ConfigError(
-            "the loss 'inverse_depth' does not go with optimize.poses, which it would not move; leave one of them out"
-        )
     if scene.tracks is None:
         raise DataError(
             f"{scene.path}: nothing tells which photographs show a point, which the loss 'inverse_depth' needs; "

@@ -1,12 +1,12 @@
-"""The Gaussians that each photograph has for itself while a model is trained, in the space of its camera.
+"""What each photograph has before the scene: people, cars and whatever else no other photograph shows there.
 
 They are no rows of the model: nothing that grows, measures or writes it ever sees them.  Their unit of length is their
 first depth, so that they are the same in every scene.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,39 +14,19 @@ from pydantic import Field
 
 from clsplat.core.errors import DataError
 from clsplat.core.schedule import NonNegative, at_step
-from clsplat.core.settings import Settings
 from clsplat.formats.splats import SH_C0
-from clsplat.gaussians.gaussians import DeviceModel, Gaussians
+from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import moment_tables
-from clsplat.opencl.device import Array, Device
-from clsplat.render.camera import DeviceCamera, moved_camera
-from clsplat.render.overlay import Layer, lay_over, look_behind
+from clsplat.losses.base import LossValue
+from clsplat.opencl.device import Device
+from clsplat.render.camera import moved_camera
+from clsplat.render.overlay import lay_over, look_behind
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
 from clsplat.training.adam import Adam, Rates
+from clsplat.training.modules.base import ModuleState, Numbers, Step, Tables, TrainingModule
+from clsplat.training.run import Run
 
-# What each photograph has before the scene: people, cars and whatever else no other photograph shows there.
-
-
-class Distractors(Settings):
-    """Give each photograph Gaussians of its own, just before its camera (DeSplat, Wang et al. 2024).
-
-    They take up what the scene does not have, and are in no other picture, no measurement and no file.  Their number
-    stays.  Those that cover more than they explain fade.
-    """
-
-    training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
-    step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
-
-    count: Annotated[int, Field(gt=0, le=10_000)] = 200
-    """Number of them for each photograph."""
-    start: Annotated[int, Field(ge=0)] = 0
-    """Global step after which they are there."""
-    cover: NonNegative = 0.1
-    """Weight of the mean of what they cover of a photograph, from 0 to 1, among the losses; by step."""
-
-
-FOLDER = "distractors/"  # before the names of their tables in a checkpoint
 UPDATES = "updates"
 WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}  # of tables that change
 NEAR = 0.2  # of their first depth
@@ -55,60 +35,99 @@ GOLDEN = (5**0.5 - 1) / 2
 # A photograph has a few dozen steps in a short training: larger rates than the scene's (ours)
 RATES = Rates(means=2e-3, quats=2e-3, log_scales=2e-2, logit_opacity=0.1, sh_base=2e-2, sh_rest=0.0).at(0, 1.0)
 PLANES = 12  # of a view's size, which rendering and comparing them take, at most
-Tables = dict[str, NDArray[np.float32]]
 
 
-class OwnGaussians:
+class Distractors(TrainingModule):
+    """Give each photograph Gaussians of its own, just before its camera (DeSplat, Wang et al. 2024).
+
+    They take up what the scene does not have, and are in no other picture, no measurement and no file.  Their number
+    stays.  Those that cover more than they explain fade.
+    """
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
+    step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
+    place: ClassVar[int] = 20  # in the colours of the scene
+
+    type: Literal["distractors"] = "distractors"
+    count: Annotated[int, Field(gt=0, le=10_000)] = 200
+    """Number of them for each photograph."""
+    start: Annotated[int, Field(ge=0)] = 0
+    """Global step after which they are there."""
+    cover: NonNegative = 0.1
+    """Weight of the mean of what they cover of a photograph, from 0 to 1, among the losses; by step."""
+
+    def state(self, run: Run) -> "DistractorsState":
+        sort, budget = run.rasterizer.tiler.sort, run.rasterizer.budget
+        own = Rasterizer(run.device, "radix" if sort == "auto" else sort, budget)
+        return DistractorsState(self, run.scene.split("train"), own)
+
+    def device_bytes(self, views: Sequence[View], tile: int) -> int:
+        tiles = max(-(-one.camera.width // tile) * -(-one.camera.height // tile) for one in views)
+        rows = len({view.name for view in views}) * (self.count + 64)  # whole groups
+        return 4 * (rows * (3 * sum(WIDTHS.values()) + 1) + PLANES * tiles * tile**2)
+
+    @classmethod
+    def check_saved(cls, numbers: Numbers, tables: Tables) -> None:
+        super().check_saved(numbers, tables)
+        widths = {name: width for one, width in WIDTHS.items() for name in (one, *moment_tables(one))} | {UPDATES: 1}
+        photographs, rows = len(tables.get(UPDATES, ())), len(tables.get("means", ()))
+        shapes = {name: (photographs if name == UPDATES else rows, width) for name, width in widths.items()}
+        if not photographs or not rows or rows % photographs or {n: t.shape for n, t in tables.items()} != shapes:
+            raise DataError("its distractors are not as many for each photograph")
+
+
+class DistractorsState(ModuleState):
     """The Gaussians of each photograph on the device, as many for each, with its own Adam."""
 
-    def __init__(self, device: Device, tables: Mapping[str, NDArray[np.float32]]) -> None:
-        """tables: as `first_tables` or `tables` returns them."""
-        self.adams = [_adam(device, tables, number) for number in range(len(tables[UPDATES]))]
+    def __init__(self, settings: Distractors, views: Sequence[View], rasterizer: Rasterizer) -> None:
+        """views: of the training; rasterizer: for these Gaussians alone."""
+        super().__init__()
+        self.settings, self.rasterizer, self.adams = settings, rasterizer, list[Adam]()
+        self._names = list(dict.fromkeys(view.name for view in views))
+        self._rows = [self._names.index(view.name) for view in views]
+        self._black = rasterizer.device.zeros(3)
 
-    def tables(self) -> Tables:
-        """Copy parameters and moments to the host, [photographs * count, components] each, and the numbers of updates,
-        [photographs, 1]."""
+    def begin(self, run: Run) -> None:
+        views = run.scene.split("train")
+        photographs = list({view.name: view for view in reversed(views)}.values())[::-1]
+        counted = run.status.counted(photographs, "photographs", len(photographs))
+        self.load({}, first_tables(self.settings.count, [(v, run.photographs.get(v).image()) for v in counted]))
+
+    def takes(self, numbers: Numbers, tables: Tables) -> bool:
+        return len(tables[UPDATES]) == len(self._names)
+
+    def load(self, numbers: Numbers, tables: Tables) -> None:
+        self.adams = [_adam(self.rasterizer.device, tables, row) for row in range(len(tables[UPDATES]))]
+
+    def tables(self, whole: bool = True) -> Tables:
         names = [name for one in WIDTHS for name in (one, *moment_tables(one))]
         found = {name: np.concatenate([adam.gaussians.get(name) for adam in self.adams]) for name in names}
         return {**found, UPDATES: np.array([[adam.updates["means"]] for adam in self.adams], np.float32)}
 
-
-class PhotographDistractors:
-    """What photographs have before the scene in a training: each step renders and changes that of its photograph."""
-
-    def __init__(self, settings: Distractors, views: Sequence[View], rasterizer: Rasterizer, own: OwnGaussians) -> None:
-        """views: of the training; rasterizer: for these Gaussians alone."""
-        names = list(dict.fromkeys(view.name for view in views))
-        self.settings, self.rasterizer = settings, rasterizer
-        self._adams = [own.adams[names.index(view.name)] for view in views]
-        self._black = rasterizer.device.zeros(3)
-
-    def before(self, model: DeviceModel, camera: DeviceCamera, image: Array, step: int) -> Layer | None:
-        """Return what the photograph of a camera has before an image of the model, [3 or 4, rows, stride], with both.
-
-        None where that is nothing.
-        """
-        if camera.view is None or step <= self.settings.start:
-            return None
-        gaussians = self._adams[camera.view].gaussians
-        own = replace(model, gaussians=gaussians, degree=0, near=NEAR, sky=None, dropout=None)
+    def after_render(self, step: Step) -> None:
+        if step.view is None or step.number <= self.settings.start:
+            return
+        camera, gaussians = step.camera, self.adams[self._rows[step.view]].gaussians
+        own = replace(step.model, gaussians=gaussians, degree=0, near=NEAR, sky=None, dropout=None)
         frame = self.rasterizer.forward(own, moved_camera(camera, np.eye(3, 4)), self._black)
-        scale = at_step(self.settings.cover, step) / (camera.width * camera.height)
-        return lay_over(self.rasterizer.workspace, frame, image, scale)
+        scale = at_step(self.settings.cover, step.number) / (camera.width * camera.height)
+        layer = lay_over(step.workspace, frame, step.image, scale)
+        step.image = layer.image
+        step.own_losses.append(LossValue("distractors", layer.loss))
+        step.keep(self, (layer, []))
 
-    def learning(self, layer: Layer, gradient: Array, view: int) -> Callable[[], None]:
-        """Return what changes the Gaussians of a view.
-
-        gradient: by the colours of both, [3 or 4, rows, stride]; it becomes that by the image behind.
-        """
+    def backward(self, step: Step) -> None:
+        if not (kept := step.kept(self)):
+            return
+        layer, sums = kept
         frame = replace(layer.frame, image=layer.image)  # blending is differentiated from the colours of all
-        pixel_sums = self.rasterizer.pixel_sums(frame.drawn, frame, gradient, behind=layer.behind)
-        look_behind(self.rasterizer.workspace, frame, gradient)
+        sums += [frame, self.rasterizer.pixel_sums(frame.drawn, frame, step.gradient, behind=layer.behind)]
+        look_behind(step.workspace, frame, step.gradient)
 
-        def learn() -> None:
-            self._adams[view].update(frame.drawn, frame, pixel_sums, RATES)
-
-        return learn
+    def update(self, step: Step) -> None:
+        if (kept := step.kept(self)) and step.view is not None:
+            frame, pixel_sums = kept[1]
+            self.adams[self._rows[step.view]].update(frame.drawn, frame, pixel_sums, RATES)
 
 
 def first_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint8]]]) -> Tables:
@@ -135,7 +154,7 @@ def _spread(count: int, view: View, pixels: NDArray[np.uint8]) -> dict[str, NDAr
     }
 
 
-def _adam(device: Device, tables: Mapping[str, NDArray[np.float32]], number: int) -> Adam:
+def _adam(device: Device, tables: Tables, number: int) -> Adam:
     """The Gaussians of one photograph, with their moments."""
     count = len(tables["means"]) // len(tables[UPDATES])
     rows = slice(number * count, (number + 1) * count)
@@ -145,36 +164,3 @@ def _adam(device: Device, tables: Mapping[str, NDArray[np.float32]], number: int
         adam.gaussians.set(moment, tables[moment][rows])
     adam.updates = dict.fromkeys(adam.updates, int(tables[UPDATES][number, 0]))
     return adam
-
-
-def check_tables(tables: Mapping[str, NDArray[np.float32]]) -> None:
-    """Raise DataError for tables that are not those of distractors; there may be none."""
-    if not tables:
-        return
-    widths = {name: width for one, width in WIDTHS.items() for name in (one, *moment_tables(one))}
-    if tables.keys() != {*widths, UPDATES}:
-        raise DataError("it has other distractors than those of its own tables")
-    photographs, rows = len(tables[UPDATES]), len(tables["means"])
-    if not photographs or not rows or rows % photographs or tables[UPDATES].shape != (photographs, 1):
-        raise DataError("its distractors are not as many for each photograph")
-    for name, width in {**widths, UPDATES: 1}.items():
-        if tables[name].shape != (photographs if name == UPDATES else rows, width):
-            raise DataError(f"{name} of its distractors is not [rows, {width}]")
-        if tables[name].dtype != np.float32 or not np.isfinite(tables[name]).all():
-            raise DataError(f"{name} of its distractors is not of finite numbers")
-
-
-def restored(tables: Mapping[str, NDArray[np.float32]], device: Device) -> OwnGaussians | None:
-    """Return the Gaussians of a checkpoint's tables, by their own names; None without any."""
-    return OwnGaussians(device, tables) if tables else None
-
-
-def distractor_bytes(settings: Any, views: Sequence[View], tile: int) -> int:
-    """Return what the distractors of a pipeline's trainings take on the device, at most.  tile: px of its sides."""
-    stages = [getattr(stage, "distractors", None) for stage in getattr(settings, "stages", ())]
-    counts = [int(stage.count) for stage in stages if stage is not None]
-    if not counts:
-        return 0
-    tiles = max(-(-one.camera.width // tile) * -(-one.camera.height // tile) for one in views)
-    rows = len({view.name for view in views}) * (max(counts) + 64)  # whole groups
-    return 4 * (rows * (3 * sum(WIDTHS.values()) + 1) + PLANES * tiles * tile**2)

@@ -1,47 +1,162 @@
-"""The colours of the photographs while a model is trained: between the rendered image and the losses."""
+"""Colours of each photograph, where exposures differ: between the rendered image and the losses.
 
+A photograph has its numbers, all 0 where its colours are the scene's.  They make a matrix [E | b], and a pixel c of the
+rendered image becomes min(1, E c + b) before every loss (cl_kernels/colours.cl).
+"""
+
+import json
+import logging
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
 
-from clsplat.core.errors import DataError
-from clsplat.core.schedule import Schedule, at_step
-from clsplat.core.settings import OneOf
-from clsplat.opencl.device import Array, Device, constants
-from clsplat.photos.appearance import (
-    ENTRIES,
-    GRID_NAMES,
-    IDENTITY,
-    LUMINANCE,
-    MEANING,
-    TABLE,
-    Colours,
-    Floats,
-    GridTables,
-    OwnColours,
-    Tables,
-    ViewColours,
-    ViewTable,
-    Written,
-    fitted_gains,
-)
+from clsplat.core.errors import DataError, NumericError, quoted
+from clsplat.core.files import atomic, write_text
+from clsplat.core.reading import read_json
+from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, explained
+from clsplat.core.settings import OneOf, Settings, variants
+from clsplat.losses.base import LossValue
+from clsplat.opencl.device import Array, constants
+from clsplat.photos.appearance import IDENTITY, LUMINANCE, MEANING, Floats, ViewTable
+from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, measured, noted, with_noted
+from clsplat.photos.photographs import Mask
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
+from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
+from clsplat.training.modules.base import ModuleState, Numbers, Step, Tables, TrainingModule
+from clsplat.training.run import Run
 
+LOG = logging.getLogger("clsplat")
+VIEW_COLOURS = "view_colours.json"
+TABLE, KNOWN = "colours", "known exposures"  # KNOWN: whether the numbers began with exposures that were measured
 SUMS = int(constants("colours.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
+FEW_VISITS = 400  # of a photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
+MOST = 5e-2  # learning rate
+Rate = Annotated[Schedule, AfterValidator(Bounded(0, most=0.5))]  # Adam's steps are as long: a gain of 1.6 in each
+RateOrAuto = Annotated[Literal["auto"] | Rate, explained(", or auto")]
+SPREAD = 0.03  # of the exposures: smaller ones are within what tracks measure
+# Of the differences: 17 to 31 % in three captures as they are, 40 to 71 % in the same with exposures changed by 25 %.
+EXPLAINED = 1 / 3
 
 
-class ColourModel(OwnColours):
-    """Colours of which a photograph has one matrix for all its pixels."""
+@dataclass(frozen=True)
+class Written:
+    """What a training leaves of the colours of its photographs."""
 
-    def of_views(self, views: Sequence[str], device: Device, tables: GridTables | None) -> ViewColours:
-        return PhotographColours(self, views, 0.0)
+    matrices: dict[str, Floats]  # of each photograph, the mean where it has several, [3, 4]
+    facts: dict[str, Any]  # for JSON: at least `meaning` and `type`, the name of the kind
+    arrays: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # by the names of files of NumPy's
+
+
+class Appearance(TrainingModule):
+    """Numbers of each photograph, which are learned with the Gaussians; their mean over the photographs stays 0.
+
+    Without that, a change of all of them and the opposite one of the Gaussians would be the same to every loss, and the
+    colours of the model would drift.
+    """
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
+    place: ClassVar[int] = 30  # after what stands in front of the scene
+    family: ClassVar[str] = "appearance"
+    outlasts: ClassVar[Literal["numbers"]] = "numbers"
+    conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
+    files: ClassVar[Mapping[str, str]] = {VIEW_COLOURS: "colours"}
+
+    rate: RateOrAuto = "auto"
+    """Learning rate of the numbers, by Adam, by step; auto: 1e-2 to 1e-3, where each photograph is visited 400 times or
+    more 2e-3 to 2e-5; where no tracks tell the exposures, as large as a gain of 2.7 needs, up to 5e-2.  At most 0.5."""
+
+    when: Literal["always", "auto"] = "always"
+    """`auto`: where exposures differ, by what the photographs show of the same points.
+
+    The logarithms of the exposures are measured on the tracks of the dataset's points, before training.  Two bounds are
+    to be passed: the standard deviation of the exposures, and their share of what differs between photographs of one
+    point; light that changes with the direction of view is the rest.  Elsewhere the bits are those without it."""
+    above: Annotated[float, Field(ge=0)] = SPREAD
+    """With `when: auto`, standard deviation of the logarithms of the exposures; 0.03 is 3 %."""
+    explained: Annotated[float, Field(ge=0, lt=1)] = EXPLAINED
+    """With `when: auto`, share of the differences."""
+    chosen: Literal["on", "off"] | None = None
+    """Written by a run: what `auto` has chosen."""
+    reason: str = ""
+    """Written by a run: why."""
+
+    @property
+    @abstractmethod
+    def fit(self) -> "ColourModel":
+        """What images are measured with: colours that are fitted to a photograph."""
+
+    def is_active(self, scene: Scene | None = None) -> bool:
+        return self.when == "always" or self.chosen == "on"
+
+    def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
+        """Return the learning rate by step of a training with so many steps and photographs.
+
+        known: whether the numbers begin near those of the photographs.
+        """
+        if self.rate != "auto":
+            return self.rate
+        visits = steps / photographs
+        initial, final = (1e-2, 1e-3) if visits < FEW_VISITS else (2e-3, 2e-5)
+        if not known:
+            needed = min(math.log(10) / (0.9 * visits), MOST)  # the sum of rates that fall to a tenth is 1
+            initial, final = max(initial, needed), max(final, needed / 10)
+        return Decay(initial=initial, final=final, over=steps)
+
+    def settled(self, run: Run) -> "Appearance":
+        """Return it with the choice that follows from the exposures of the photographs; one that is made stays."""
+        if self.when == "always" or self.chosen is not None:
+            return self
+        exposures = exposures_of(run)
+        if not exposures.log_gains:
+            return self._choose("off", exposures.text)
+        few, alike = exposures.spread <= self.above, exposures.explained <= self.explained
+        bounds = [f"{self.above:.1%}", f"{self.explained:.0%} of what differs"]
+        if not few and not alike:
+            return self._choose("on", f"{exposures.text}; more than {bounds[0]}, and than {bounds[1]}")
+        missed = " nor ".join(bound for bound, decides in zip(bounds, (few, alike), strict=True) if decides)
+        return self._choose("off", f"{exposures.text}; not more than {missed}")
+
+    def _choose(self, chosen: Literal["on", "off"], reason: str) -> "Appearance":
+        LOG.info("optimize.modules.%s: %s, since %s", self.type, chosen, reason)
+        return self.model_copy(update={"chosen": chosen, "reason": reason})
+
+    @classmethod
+    def measured_beside(cls, model: Path) -> "ColourModel | None":
+        path = model.with_name(VIEW_COLOURS)
+        if not path.is_file():
+            return None
+        data, known = read_json(path, "colours of photographs"), variants(Appearance)
+        name = data.get("type") if isinstance(data, dict) else None
+        if not isinstance(name, str) or name not in known:
+            names = ", ".join(known)
+            raise DataError(f"{path}: the type of colours is {quoted(name)}; expected one of {names}: write it again")
+        facts = {key: data[key] for key in ("model",) if key in data}
+        return known[name].model_validate(facts).fit if known[name] is cls else None
+
+
+class ColourModel(Settings):
+    """What makes the colours of a scene those of one photograph: one matrix for all its pixels, of a few numbers."""
+
+    columns: ClassVar[tuple[str, ...]] = ()  # names of the numbers of a photograph
+    fitted_to_a_channel: ClassVar[int] = 1  # numbers that `fitted` finds for each of red, green and blue
+
+    type: str
+    """Name of the model."""
+
+    @abstractmethod
+    def fitted(self, image: Floats, photograph: Floats) -> Floats:
+        """Return the matrix, [3, 4], that brings an image nearest to a photograph by least squares, pixels [M, 3]."""
 
     @abstractmethod
     def matrix(self, row: Floats) -> Floats:
@@ -58,115 +173,6 @@ class ColourModel(OwnColours):
     def penalty(self, row: Floats) -> tuple[float, Floats]:
         """Return a loss of a photograph's numbers alone, and its derivatives."""
         return 0.0, np.zeros_like(row)
-
-
-@dataclass(frozen=True)
-class PhotographColours(ViewColours):
-    """A model of colours, and the table with its numbers for each photograph."""
-
-    model: ColourModel
-    views: Sequence[str]  # names of the training views, by number; one of several sizes has one row
-    rate: Schedule
-
-    @property
-    def table(self) -> ViewTable:
-        """The table of the numbers."""
-        return ViewTable(TABLE, tuple(dict.fromkeys(self.views)), self.model.columns)
-
-    def with_rate(self, rate: Schedule) -> "PhotographColours":
-        return replace(self, rate=rate)
-
-    def begun(self, numbers: Mapping[str, float]) -> bool:
-        return self.table.begun(numbers)
-
-    def begin(self, numbers: dict[str, float], log_gains: Mapping[str, Floats]) -> None:
-        self.table.begin(numbers, {view: self.model.of_gains(gains) for view, gains in log_gains.items()})
-
-    def written(self, numbers: Mapping[str, float]) -> Written:
-        rows = {view: self.table.row(numbers, view) for view in self.table.views}
-        matrices = {view: self.model.matrix(row) for view, row in rows.items()}
-        photographs = {
-            view: {**dict(zip(self.model.columns, map(float, row), strict=True)), "matrix": matrices[view].tolist()}
-            for view, row in rows.items()
-        }
-        kind = getattr(self.model, "type", type(self.model).__name__)
-        meaning = f"{MEANING}; matrix: the rows of [E | b]"
-        return Written(matrices, {"meaning": meaning, "type": kind, "photographs": photographs})
-
-    def matrix(self, numbers: Mapping[str, float], view: int) -> Floats:
-        """Return the matrix of a training view by its number, [3, 4]."""
-        return self.model.matrix(self.table.row(numbers, self.views[view]))
-
-    def penalty(self, numbers: Mapping[str, float], view: int) -> float:
-        """Return the loss of a view's numbers alone."""
-        return self.model.penalty(self.table.row(numbers, self.views[view]))[0]
-
-    def change(
-        self, workspace: Workspace, camera: DeviceCamera, image: Array, numbers: Mapping[str, float], view: int
-    ) -> tuple[Array, Callable[[], float]]:
-        penalty = self.penalty(numbers, view)
-        return change_colours(workspace, camera, image, self.matrix(numbers, view)), lambda: penalty
-
-    def change_back(
-        self,
-        workspace: Workspace,
-        camera: DeviceCamera,
-        image: Array,
-        gradient: Array,
-        numbers: dict[str, float],
-        view: int,
-        step: int,
-    ) -> tuple[Array, Callable[[], None]]:
-        found, by_matrix = change_back(workspace, camera, image, self.matrix(numbers, view), gradient)
-        return found, lambda: self.learn(numbers, view, by_matrix(), step)
-
-    def learn(self, numbers: dict[str, float], view: int, by_matrix: Floats, step: int) -> None:
-        """Change the numbers of a view; by_matrix: derivatives of the losses by its matrix, [3, 4]."""
-        table, name = self.table, self.views[view]
-        row = table.row(numbers, name)
-        gradient = self.model.gradient(row, by_matrix) + self.model.penalty(row)[1]
-        table.update(numbers, name, gradient, at_step(self.rate, step))
-
-
-def change_colours(workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats) -> Array:
-    """Return an image, [3 or 4, rows, stride], with the colours that a matrix [3, 4] makes of its own."""
-    found = workspace.array("coloured", image.shape)
-    workspace.device.program("colours.cl").colours_forward(
-        groups=(1, camera.rows), image=image, coloured=found, **_arguments(camera, image, matrix)
-    )
-    return found
-
-
-def change_back(
-    workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats, gradient: Array
-) -> tuple[Array, Callable[[], Floats]]:
-    """Return the gradient by an image from that by what `change_colours` made of it, and a wait for that by the matrix.
-
-    The sums of each row are added in double, in the order of rows.
-    """
-    found, sums = workspace.array("grad_coloured", image.shape), workspace.array("colour sums", (SUMS, camera.rows))
-    workspace.device.program("colours.cl").colours_backward(
-        groups=(1, camera.rows),
-        image=image,
-        gradient=gradient,
-        grad_image=found,
-        row_sums=sums,
-        **_arguments(camera, image, matrix),
-    )
-    copied = sums.get_later()
-    return found, lambda: np.cumsum(copied(), axis=1, dtype=np.float64)[:, -1].reshape(3, 4)
-
-
-def _arguments(camera: DeviceCamera, image: Array, matrix: Floats) -> dict[str, Any]:
-    values: dict[str, Any] = dict(zip(NAMES, map(float, matrix.ravel()), strict=True))
-    return {**values, "channels": image.shape[0], **camera.plane_arguments()}
-
-
-# What makes the colours of a scene those of one photograph, and how a pipeline file names it.
-
-SPREAD = 0.03  # of the exposures: smaller ones are within what tracks measure
-# Of the differences: 17 to 31 % in three captures as they are, 40 to 71 % in the same with exposures changed by 25 %.
-EXPLAINED = 1 / 3
 
 
 class Gain(ColourModel):
@@ -236,87 +242,183 @@ class Affine(ColourModel):
         return np.asarray(np.linalg.lstsq(squares, products, rcond=None)[0].T, np.float64)
 
 
-class Auto(Colours):
-    """Colours of each photograph where exposures differ, by what the photographs show of the same points.
+class Exposure(Appearance):
+    """Colours of each photograph, where exposures differ: one matrix for all its pixels."""
 
-    The logarithms of the exposures are measured on the tracks of the dataset's points, before training.  Photographs
-    have colours of their own where two bounds are passed: the standard deviation of the exposures, and their share of
-    what differs between photographs of one point; light that changes with the direction of view is the rest.  Elsewhere
-    the bits are those without this key.
+    type: Literal["exposure"] = "exposure"
+    model: OneOf[ColourModel] = Gain()
+    """What a photograph has: `gain`, an exposure and a white balance, or `affine`."""
+
+    @property
+    def fit(self) -> ColourModel:
+        return self.model
+
+    def state(self, run: Run) -> "ExposureState":
+        return ExposureState(self, [view.name for view in run.scene.split("train")])
+
+
+class ColourState(ModuleState):
+    """What a training has of the colours of its photographs, of whichever kind."""
+
+    def __init__(self, settings: Appearance, views: Sequence[str]) -> None:
+        """views: the names of the training views, by number; one of several sizes has one row."""
+        super().__init__()
+        self.settings, self.views, self.names = settings, views, tuple(dict.fromkeys(views))
+        self.rate: Schedule = 0.0
+
+    def begin(self, run: Run) -> None:
+        exposures = exposures_of(run)
+        self.begin_with(exposures.log_gains)
+        self.numbers[KNOWN] = float(bool(exposures.log_gains))
+        LOG.info("colours of photographs: %s", exposures.text)
+
+    def prepare(self, run: Run, last: int, trained: bool = True) -> None:
+        self.rate = self.settings.rate_of(last, len(self.names), self.numbers.get(KNOWN, 1.0) > 0)
+
+    def begin_with(self, log_gains: Mapping[str, Floats]) -> None:
+        """Set the first numbers.  log_gains: of red, green and blue by view, where known, [3]."""
+
+    @property
+    def measured_as(self) -> ColourModel:
+        return self.settings.fit
+
+    @abstractmethod
+    def written(self) -> Written:
+        """Return what the run folder gets."""
+
+    def write(self, run: Run) -> None:
+        """Write the colours of each training photograph; log a line.  Raises NumericError where they are not finite."""
+        found = self.written()
+        if wrong := next((view for view, matrix in found.matrices.items() if not np.isfinite(matrix).all()), None):
+            raise NumericError(
+                f"the colours of {quoted(wrong)} are not finite; lower optimize.modules.{self.settings.type}.rate"
+            )
+        write_text(run.out / VIEW_COLOURS, json.dumps(found.facts, indent=1) + "\n")
+        for name, array in found.arrays.items():
+            with atomic(run.out / name) as file:
+                np.save(file, array, allow_pickle=False)
+        greens = [matrix[1, 1] for matrix in found.matrices.values()]
+        LOG.info(
+            "colours of %d photographs in %s: green is multiplied by %.2f to %.2f",
+            *(len(greens), VIEW_COLOURS, min(greens), max(greens)),
+        )
+
+
+class ExposureState(ColourState):
+    """The numbers of one matrix for each photograph."""
+
+    settings: Exposure
+
+    @property
+    def table(self) -> ViewTable:
+        return ViewTable(TABLE, self.names, self.settings.model.columns)
+
+    def takes(self, numbers: Numbers, tables: Tables) -> bool:
+        return self.table.begun(numbers)
+
+    def begin_with(self, log_gains: Mapping[str, Floats]) -> None:
+        of_gains = self.settings.model.of_gains
+        self.table.begin(self.numbers, {view: of_gains(gains) for view, gains in log_gains.items()})
+
+    def after_render(self, step: Step) -> None:
+        if step.view is None:
+            return
+        row = self.table.row(self.numbers, self.views[step.view])
+        penalty, matrix, image = self.settings.model.penalty(row)[0], self.settings.model.matrix(row), step.image
+        step.keep(self, (image, matrix, []))
+        step.image = change_colours(step.workspace, step.camera, image, matrix)
+        step.own_losses.append(LossValue("colours", lambda: penalty))
+
+    def backward(self, step: Step) -> None:
+        if kept := step.kept(self):
+            image, matrix, waits = kept
+            step.gradient, wait = change_back(step.workspace, step.camera, image, matrix, step.gradient)
+            waits.append(wait)
+
+    def update(self, step: Step) -> None:
+        if not (kept := step.kept(self)) or step.view is None:
+            return
+        self.learn(step.view, kept[2][0](), step.number)
+
+    def learn(self, view: int, by_matrix: Floats, step: int) -> None:
+        """Change the numbers of a view; by_matrix: derivatives of the losses by its matrix, [3, 4]."""
+        row = self.table.row(self.numbers, self.views[view])
+        gradient = self.settings.model.gradient(row, by_matrix) + self.settings.model.penalty(row)[1]
+        self.table.update(self.numbers, self.views[view], gradient, at_step(self.rate, step))
+
+    def matrix(self, view: int) -> Floats:
+        """Return the matrix of a training view by its number, [3, 4]."""
+        return self.settings.model.matrix(self.table.row(self.numbers, self.views[view]))
+
+    def written(self) -> Written:
+        rows = {view: self.table.row(self.numbers, view) for view in self.table.views}
+        matrices = {view: self.settings.model.matrix(row) for view, row in rows.items()}
+        model = self.settings.model
+        photographs = {
+            view: {**dict(zip(model.columns, map(float, row), strict=True)), "matrix": matrices[view].tolist()}
+            for view, row in rows.items()
+        }
+        meaning = f"{MEANING}; matrix: the rows of [E | b]"
+        facts = {"meaning": meaning, "type": self.settings.type, "model": model.type, "photographs": photographs}
+        return Written(matrices, facts)
+
+
+def fitted_gains(image: Floats, photograph: Floats) -> Floats:
+    """Return the matrix, [3, 4], of the gains of red, green and blue that bring an image nearest to a photograph.
+
+    By least squares; both are pixels, [M, 3].
     """
-
-    output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
-
-    type: Literal["auto"] = "auto"
-    model: OneOf[OwnColours] = Gain()
-    """What photographs have, where exposures differ."""
-    above: Annotated[float, Field(ge=0)] = SPREAD
-    """Standard deviation of the logarithms of the exposures above which they do; 0.03 is 3 %."""
-    explained: Annotated[float, Field(ge=0, lt=1)] = EXPLAINED
-    """Share of the differences above which they do."""
-    chosen: Literal["on", "off"] | None = None
-    """Written by a run: whether photographs have colours of their own."""
-    reason: str = ""
-    """Written by a run: why."""
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        return self.model.files
-
-    @property
-    def in_use(self) -> OwnColours | None:
-        """What photographs have, once it is chosen."""
-        return self.model if self.chosen == "on" else None
-
-    def choose(self, chosen: Literal["on", "off"], reason: str) -> "Auto":
-        """Return it with a choice."""
-        return self.model_copy(update={"chosen": chosen, "reason": reason})
+    squares, products = (image * image).sum(axis=0), (image * photograph).sum(axis=0)
+    gains = np.where((squares > 0) & (products > 0), products / np.where(squares > 0, squares, 1), 1.0)
+    return np.column_stack([np.diag(gains), np.zeros(3)])
 
 
-# The grids of the photographs in a run: their tables in a checkpoint, and their memory on the device.
+def exposures_of(run: Run) -> Exposures:
+    """Return what the training photographs show of their exposures, or else what their cameras noted; measured once."""
+    views = run.scene.split("train")
+    names = tuple(view.name for view in views)
+    if names not in run.exposures:
 
-FOLDER = "colour_grids/"  # before the names of their tables in a checkpoint
+        def read(view: View) -> tuple[NDArray[np.uint8], Mask | None]:
+            photograph = run.photographs.get(view)
+            return photograph.image(), photograph.counted()
 
-
-def check_tables(tables: Tables) -> None:
-    """Raise DataError for tables that are not those of grids; there may be none, or the values alone."""
-    if not tables:
-        return
-    if tables.keys() not in (set(GRID_NAMES), {GRID_NAMES[0]}):
-        raise DataError("it has other grids than those of its own tables")
-    shape = tables[GRID_NAMES[0]].shape
-    for name, table in tables.items():
-        is_one = table.dtype == np.float32 and table.shape == shape and len(shape) == 5 and 0 not in shape
-        if not is_one or shape[1] != ENTRIES:
-            raise DataError(f"{name} of its grids is not [photographs, {ENTRIES}, nz, ny, nx] of float32")
-        if not np.isfinite(table).all():
-            raise DataError(f"{name} of its grids holds values that are not finite")
+        counted = run.status.counted(views, "photographs", len(views))
+        shown = measured(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
+        told = len(shown.log_gains) == len(set(names))
+        run.exposures[names] = shown if told else with_noted(shown, noted(views))
+    return run.exposures[names]
 
 
-def require_tables(tables: Tables, numbers: Mapping[str, float]) -> None:
-    """Raise DataError where the rows that the numbers of a run name are not those of its grids."""
-    named = sorted(row for key, row in numbers.items() if key.startswith(f"{TABLE}/") and key.endswith("/row"))
-    held = len(tables[GRID_NAMES[0]]) if tables else 0
-    if named != list(range(held)):
-        raise DataError(f"it has grids of the colours of {held} photographs, and its numbers name {len(named)} rows")
-
-
-def restored(tables: Tables, device: Device) -> GridTables | None:
-    """Return the grids of a checkpoint's tables, by their own names; None without any."""
-    if not tables:
-        return None
-    photographs, _, *cells = tables[GRID_NAMES[0]].shape
-    found = GridTables(device, photographs, cells[::-1])
-    found.set(tables)
+def change_colours(workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats) -> Array:
+    """Return an image, [3 or 4, rows, stride], with the colours that a matrix [3, 4] makes of its own."""
+    found = workspace.array("coloured", image.shape)
+    workspace.device.program("colours.cl").colours_forward(
+        groups=(1, camera.rows), image=image, coloured=found, **_arguments(camera, image, matrix)
+    )
     return found
 
 
-def bytes_needed(settings: Any, views: Sequence[View], tile: int) -> int:
-    """Return what the colours of a pipeline's trainings take on the device, at most.  tile: px of its sides."""
-    kinds = [getattr(stage, "colours", None) for stage in getattr(settings, "stages", ())]
-    models = [kind.model if isinstance(kind, Auto) and kind.chosen != "off" else kind for kind in kinds]
-    sides = [(-(-view.camera.width // tile) * tile, -(-view.camera.height // tile) * tile) for view in views]
-    rows, pixels = max(height for _, height in sides), max(width * height for width, height in sides)
-    photographs = len({view.name for view in views})
-    own = [one for one in models if isinstance(one, OwnColours)]
-    return max((one.device_bytes(photographs, rows, pixels) for one in own), default=0)
+def change_back(
+    workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats, gradient: Array
+) -> tuple[Array, Callable[[], Floats]]:
+    """Return the gradient by an image from that by what `change_colours` made of it, and a wait for that by the matrix.
+
+    The sums of each row are added in double, in the order of rows.
+    """
+    found, sums = workspace.array("grad_coloured", image.shape), workspace.array("colour sums", (SUMS, camera.rows))
+    workspace.device.program("colours.cl").colours_backward(
+        groups=(1, camera.rows),
+        image=image,
+        gradient=gradient,
+        grad_image=found,
+        row_sums=sums,
+        **_arguments(camera, image, matrix),
+    )
+    copied = sums.get_later()
+    return found, lambda: np.cumsum(copied(), axis=1, dtype=np.float64)[:, -1].reshape(3, 4)
+
+
+def _arguments(camera: DeviceCamera, image: Array, matrix: Floats) -> dict[str, Any]:
+    values: dict[str, Any] = dict(zip(NAMES, map(float, matrix.ravel()), strict=True))
+    return {**values, "channels": image.shape[0], **camera.plane_arguments()}

@@ -2,14 +2,15 @@
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from clsplat.core.settings import Settings, in_one_sentence
-from clsplat.losses.base import ViewLosses
+from clsplat.core.settings import in_one_sentence
+from clsplat.scene.view import View
+from clsplat.training.modules.base import ModuleState, Step, TrainingModule
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -24,7 +25,7 @@ class Visit:
     numbers: Mapping[str, float] = field(default_factory=dict)  # those that change when the step is done
 
 
-class Skip(Settings):
+class Skip(TrainingModule):
     """Skip the backward pass and the update where a view has converged (SkipGS, Li et al. 2026).
 
     Every step after `start` renders its view, compares it, and adds the loss to the moving average of the view's
@@ -40,7 +41,12 @@ class Skip(Settings):
     """
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
+    place: ClassVar[int] = 99  # it reads the losses of all others
+    outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "numbers"
+    joins: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"start", "decay", "warm_up", "least"})
 
+    type: Literal["skip"] = "skip"
     start: Annotated[int, Field(ge=0)]
     """Global step after which steps may be skipped: where growth has ended and photographs have their full size."""
     decay: Annotated[float, Field(ge=0, lt=1)] = 0.95
@@ -53,15 +59,8 @@ class Skip(Settings):
     """Least share of steps that do the whole work; `auto`: the share of the warm-up that would not have been
     skipped."""
 
-    def visit(self, view: str, losses: ViewLosses, numbers: Mapping[str, float]) -> Visit:
-        """Decide on a step from `numbers`, which it leaves as they are; up to `start` the loss is not read.
-
-        view: its name.  A loss that is not finite is not skipped, and no part of an average.
-        """
-        if losses.comparison.step <= self.start:
-            return Visit()
-        camera = losses.comparison.camera
-        return self.decide(f"skip/loss/{camera.width}x{camera.height}/{view}", losses.loss, numbers)
+    def state(self, run: Run) -> ModuleState:
+        return SkipState(self, run.scene.split("train"))
 
     def decide(self, name: str, loss: float, numbers: Mapping[str, float]) -> Visit:
         """Decide on a step after `start`; name: of the view's average."""
@@ -72,19 +71,41 @@ class Skip(Settings):
         converged = average is not None and loss <= average
         if warming := warm_up < self.warm_up:
             warm_up, above = warm_up + 1, above + (not converged)
-        skipped = converged and not warming and whole >= self._share(above, warm_up) * steps
+        skipped = converged and not warming and whole >= self.share(above, warm_up) * steps
         counts = steps, whole + (not skipped), warm_up, above
         after = loss if average is None else self.decay * average + (1 - self.decay) * loss
         return Visit(skipped, {name: after, **dict(zip((f"skip/{count}" for count in COUNTS), counts, strict=True))})
 
-    def tell(self, run: Run) -> None:
-        """Say and record how many steps of a run were skipped."""
-        steps, whole, warm_up, above = (run.numbers.get(f"skip/{count}", 0.0) for count in COUNTS)
-        least, skipped = self._share(above, warm_up), steps - whole
-        run.records.add(run.step, "skip", steps=int(steps), skipped=int(skipped), least=least)
-        whole_at_least = f"at least {least:.1%} were to do the whole work"
-        LOG.info(f"{skipped:,.0f} of {steps:,.0f} steps after step {self.start:,} were skipped; {whole_at_least}")
-
-    def _share(self, above: float, warm_up: float) -> float:
+    def share(self, above: float, warm_up: float) -> float:
         """The least share of whole steps; warm_up: its steps so far, of which so many were `above` the average."""
         return above / max(warm_up, 1) if self.least == "auto" else self.least
+
+
+class SkipState(ModuleState):
+    def __init__(self, settings: Skip, views: Sequence[View]) -> None:
+        super().__init__()
+        self.settings, self.names = settings, [view.name for view in views]
+
+    def after_losses(self, step: Step) -> None:
+        if step.number <= self.settings.start or step.view is None:
+            return
+        camera = step.camera
+        name = f"skip/loss/{camera.width}x{camera.height}/{self.names[step.view]}"
+        visit = self.settings.decide(name, step.loss, self.numbers)
+        step.skipped |= visit.skipped
+        step.keep(self, visit)
+
+    def update(self, step: Step) -> None:
+        self.numbers.update(visit.numbers if (visit := step.kept(self)) else {})
+
+    update_skipped = update
+
+    def finish(self, run: Run) -> None:
+        """Say and record how many steps were skipped."""
+        steps, whole, warm_up, above = (self.numbers.get(f"skip/{count}", 0.0) for count in COUNTS)
+        least, skipped = self.settings.share(above, warm_up), steps - whole
+        run.records.add(run.step, "skip", steps=int(steps), skipped=int(skipped), least=least)
+        whole_at_least = f"at least {least:.1%} were to do the whole work"
+        LOG.info(
+            f"{skipped:,.0f} of {steps:,.0f} steps after step {self.settings.start:,} were skipped; {whole_at_least}"
+        )

@@ -5,25 +5,25 @@ Found by their residuals alone (SpotLessSplats, Sabour et al. 2024, without its 
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.core.settings import Settings
 from clsplat.opencl.device import Array, constants
-from clsplat.photos.transforms import Planes
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
+from clsplat.training.modules.base import ModuleState, Numbers, Step, TrainingModule
+from clsplat.training.run import Run
 
 _NAMES = constants("transients.cl")
 BINS, FIRST_BIN, BIN_SHIFT = (int(_NAMES[name]) for name in ("BINS", "FIRST_BIN", "BIN_SHIFT"))
-KEYS = tuple(f"transients/{k:02d}" for k in range(BINS))  # in the numbers of a run
+KEYS = tuple(f"{k:02d}" for k in range(BINS))
 TAIL = 0.99  # share of the pixels
 
 
-class Transients(Settings):
+class Transients(TrainingModule):
     """Leave out the pixels of a photograph that differ much more from the image than most do.
 
     A residual is a pixel's absolute difference, the mean over channels.  The distribution of all views' residuals is
@@ -34,7 +34,10 @@ class Transients(Settings):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "quantile", "above", "tail", "box", "decay"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
+    place: ClassVar[int] = 90  # they compare what all others have made of both images
+    outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "numbers"
 
+    type: Literal["transients"] = "transients"
     start: Annotated[int, Field(ge=0)]
     """Global step after which pixels are left out: where the scene is there, but not yet what passes through it."""
     quantile: Annotated[float, Field(gt=0, lt=1)] = 0.9
@@ -56,11 +59,10 @@ class Transients(Settings):
         most, tail = (_upper(int((reached < share * reached[-1]).sum())) for share in (self.quantile, TAIL))
         return self.above * most if tail > self.tail * most else None
 
-    def mask(self, workspace: Workspace, camera: DeviceCamera, residuals: Array, threshold: float) -> Array:
-        """Return which pixels count, [1, rows, stride], by their residuals [1, rows, stride]."""
-        return mask_transients(workspace, camera, residuals, threshold, max(1, round(self.box * camera.width / 2)))
+    def state(self, run: Run) -> ModuleState:
+        return TransientsState(self)
 
-    def learn(self, numbers: dict[str, float], counts: NDArray[np.uint32]) -> None:
+    def learn(self, numbers: Numbers, counts: NDArray[np.uint32]) -> None:
         """Add the residuals of a step, [BINS], to the distribution."""
         for key, count in zip(KEYS, counts, strict=True):
             numbers[key] = self.decay * numbers.get(key, 0.0) + float(count)
@@ -71,16 +73,21 @@ def _upper(bin_number: int) -> float:
     return float(np.array(FIRST_BIN + bin_number + 1 << BIN_SHIFT, np.int32).view(np.float32))
 
 
-def without_transients(
-    transients: Transients, planes: Planes, image: Array, numbers: dict[str, float], step: int
-) -> tuple[Planes, list[Callable[[], None]]]:
-    """Return a photograph without what the scene does not have, and what adds its residuals to the distribution."""
-    workspace, camera = planes.workspace, planes.camera
-    residuals, counts = measure_residuals(workspace, camera, image, planes.colours, planes.mask)
-    threshold = transients.threshold(numbers, step)
-    if threshold is not None:
-        planes = replace(planes, mask=transients.mask(workspace, camera, residuals, threshold))
-    return planes, [lambda: transients.learn(numbers, counts())]
+class TransientsState(ModuleState):
+    def __init__(self, settings: Transients) -> None:
+        super().__init__()
+        self.settings = settings
+
+    def after_render(self, step: Step) -> None:
+        workspace, camera, planes = step.workspace, step.camera, step.planes
+        residuals, counts = measure_residuals(workspace, camera, step.image, planes.colours, planes.mask)
+        if (threshold := self.settings.threshold(self.numbers, step.number)) is not None:
+            reach = max(1, round(self.settings.box * camera.width / 2))
+            step.planes = replace(planes, mask=mask_transients(workspace, camera, residuals, threshold, reach))
+        step.keep(self, counts)
+
+    def update(self, step: Step) -> None:
+        self.settings.learn(self.numbers, step.kept(self)())
 
 
 def measure_residuals(

@@ -1,0 +1,108 @@
+"""Training modules: what the loop knows of them, their order, and how `--set` addresses them."""
+
+import numpy as np
+import pytest
+
+from clsplat.core.errors import ConfigError
+from clsplat.core.settings import variants
+from clsplat.losses.base import LossValue
+from clsplat.losses.image import L1, L2
+from clsplat.pipeline.loading import load
+from clsplat.training.modules.base import ModuleState, TrainingModule, kind_of
+from tests.support.device_images import trainer_of
+from tests.support.sources import PATHS, own_imports
+
+BASE = "clsplat.training.modules.base"
+FRAMEWORK = (  # trainer, checkpoint, memory plan, the loop, evaluation, writer and reader of side files
+    "clsplat.training.trainer", "clsplat.training.checkpoint", "clsplat.training.best_model", "clsplat.training.memory",
+    "clsplat.training.run", "clsplat.stages.optimize", "clsplat.stages.evaluate", "clsplat.stages.export",
+    "clsplat.runs.model_file", "clsplat.runs.film", "clsplat.runs.opening", "clsplat.runs.status",
+)  # fmt: skip
+
+
+def types(*settings: str) -> list[str]:
+    return [one.type for one in load("smoke", list(settings)).settings.training.modules]
+
+
+def test_the_framework_knows_no_module_by_name():
+    faults = [
+        f"{module}:{line} imports {target}"
+        for module, line, target in own_imports()
+        if module in FRAMEWORK and target.startswith("clsplat.training.modules.") and target != BASE
+    ]
+    for module in FRAMEWORK:
+        text = PATHS[module].read_text()
+        faults += [f"{module} has '{name}'" for name in variants(TrainingModule) if f'"{name}"' in text]
+    assert not faults, "\n".join(faults)
+
+
+def test_modules_are_set_by_their_type():
+    exposure, cameras = "optimize.modules.exposure={}", "optimize.modules.camera_optimizer.start=3"
+    late = "optimize.modules.transients={start: 3}"
+    assert types() == []
+    assert types(late, exposure, cameras) == ["camera_optimizer", "exposure", "transients"], "each at its place"
+    assert types(late, exposure, "optimize.modules.transients=null") == ["exposure"]
+    assert types("optimize.modules.exposure=null") == [], "what is not there may be removed"
+    (found,) = load("smoke", [exposure, "optimize.modules.exposure.model=affine"]).settings.training.modules
+    assert found.model.type == "affine"
+
+
+@pytest.mark.parametrize(
+    ("settings", "fault"),
+    [
+        (["optimize.modules.expsure={}"], "no 'expsure'; expected one of .*; did you mean exposure"),
+        (["optimize.modules.exposure=gain"], "expected a mapping of its keys"),
+        (["optimize.modules=[{type: transients, start: 1}, exposure]"], "'exposure' stands after 'transients'"),
+        (["optimize.modules=[exposure, exposure]"], "'exposure' and 'exposure' exclude each other"),
+        (["optimize.modules=[exposure, bilateral_grid]"], "'bilateral_grid' and 'exposure' exclude each other"),
+        (["optimize.modules.camera_optimizer={}", "model.background=directions"], "does not go with sky"),
+    ],
+)
+def test_lists_that_do_not_go_together_are_refused(settings, fault):
+    with pytest.raises(ConfigError, match=fault):
+        load("smoke", settings)
+
+
+class Order(ModuleState):
+    """Notes the hooks of a step, and adds a loss."""
+
+    def __init__(self, name: str, notes: list[str], skips: bool = False) -> None:
+        super().__init__()
+        self.name, self.notes, self.skips = name, notes, skips
+
+    def after_render(self, step) -> None:
+        step.own_losses.append(LossValue(self.name, lambda: 2.0))
+        self.notes.append(f"forward {self.name}")
+
+    def after_losses(self, step) -> None:
+        step.skipped |= self.skips
+
+    def backward(self, step) -> None:
+        self.notes.append(f"backward {self.name}")
+
+    def update(self, step) -> None:
+        self.notes.append(f"update {self.name}")
+
+    def update_skipped(self, step) -> None:
+        self.notes.append(f"skipped {self.name}")
+
+
+def test_a_step_goes_forward_in_order_and_back_in_reverse(device, rng):
+    trainer, photograph = trainer_of(device, rng, [L1(weight=0.5), L2()])
+    alone, notes = trainer.compare(photograph, 1), []
+    trainer.modules = [Order("a", notes), Order("b", notes)]
+    view = trainer.step(photograph, 1)
+    assert notes == ["forward a", "forward b", "backward b", "backward a", "update b", "update a"]
+    assert view.loss == pytest.approx(alone.loss + 2 * 2.0), "each loss once"
+    assert [one.name for one in view.losses[-2:]] == ["a", "b"]
+    means = trainer.model.gaussians.get("means")
+    notes.clear()
+    trainer.modules = [Order("a", notes), Order("b", notes, skips=True)]
+    trainer.step(photograph, 2)
+    assert sorted(notes) == ["forward a", "forward b", "skipped a", "skipped b"]
+    np.testing.assert_array_equal(trainer.model.gaussians.get("means"), means)
+
+
+def test_a_module_that_is_not_known_is_named():
+    with pytest.raises(ConfigError, match="a module 'nosuch', which is not known; give its --plugin"):
+        kind_of("nosuch")
