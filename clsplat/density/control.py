@@ -1,4 +1,4 @@
-"""Apply density rules, as one edit; reset or lower opacities (Kerbl et al. 2023, section 5); move means at random."""
+"""Apply density rules, as one edit; reset opacities (Kerbl et al. 2023, section 5)."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
@@ -176,35 +176,6 @@ def cap_opacity(gaussians: Gaussians, limit: float) -> None:
         filter_variance=gaussians["filter_variance"],
         logit_opacity=gaussians["logit_opacity"],
         limit=limit,
-        stride=gaussians.capacity,
-        count=gaussians.count,
-    )
-
-
-def decay_opacity(gaussians: Gaussians, factor: float) -> None:
-    """Multiply all opacities by a factor in (0, 1)."""
-    gaussians.device.program("density.cl").decay_opacity(
-        items=gaussians.count,
-        logit_opacity=gaussians["logit_opacity"],
-        fall=1 - factor,
-        count=gaussians.count,
-    )
-
-
-def add_noise(gaussians: Gaussians, rate: float, opacity_below: float, seed: int, step: int) -> None:
-    """Move each mean by rate / (1 + exp(-100 (opacity_below - opacity))) Σ n, n three normal numbers (Kheradmand et
-    al. 2024).  rate: scene units⁻¹.
-    """
-    gaussians.device.program("noise.cl").add_noise(
-        items=gaussians.count,
-        means=gaussians["means"],
-        quats=gaussians["quats"],
-        log_scales=gaussians["log_scales"],
-        logit_opacity=gaussians["logit_opacity"],
-        rate=rate,
-        opacity_below=opacity_below,
-        seed=seed,
-        step=step,
         stride=gaussians.capacity,
         count=gaussians.count,
     )

@@ -8,13 +8,13 @@ from functools import partial
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from clsplat.core.errors import NumericError, amount
-from clsplat.core.schedule import AtLeastOne, Bounded, Positive, at_step, places
+from clsplat.core.schedule import AtLeastOne, places
 from clsplat.core.settings import OneOf
 from clsplat.density.budget import Budget, Moment
-from clsplat.density.control import Box, cap_opacity, decay_opacity, densify
+from clsplat.density.control import Box, cap_opacity, densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.thresholds import SceneScale
 from clsplat.training import adam
@@ -179,28 +179,6 @@ class ResetOpacity(Scheduled):
 
     def _acts(self, run: Run) -> bool:
         return self.when_background in (None, run.photographs.background_name)
-
-
-class DecayOpacity(Scheduled):
-    """Lower all opacities a little, in the place of a reset; training raises those of needed Gaussians (Binocular3DGS,
-    Han et al. 2024).
-
-    Published is a factor of 0.995 at each step, for 3 to 8 photographs.  Ours is one for each pass over the training
-    photographs: among many a Gaussian is seen as often, not more rarely, while its opacity falls as much.
-    """
-
-    stage: Literal["decay_opacity"] = "decay_opacity"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"per_pass"})
-
-    per_pass: Annotated[Positive, AfterValidator(Bounded(0, most=1))] = 0.975
-    """Factor of the opacities in as many steps as there are training photographs; 1 changes nothing; by step."""
-
-    def run(self, run: Run) -> None:
-        factor = at_step(self.per_pass, run.step) ** ((self.every or 1) / len(run.scene.split("train")))
-        if factor < 1:
-            decay_opacity(run.model.gaussians, factor)
 
 
 class RefreshFilter(Scheduled):

@@ -31,6 +31,7 @@ from clsplat.core.reading import read_json, sha256
 from clsplat.core.text_table import text_table
 from clsplat.formats.ply import join_plys
 from clsplat.formats.table import detect
+from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.model import NUMBERS, Model, as_trained, model_at
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
@@ -50,7 +51,7 @@ from clsplat.runs.status import status_text
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.stages.export import image_path
-from clsplat.stages.init import Init, from_points
+from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.sweeps.batch import Batch
 from clsplat.sweeps.store import Store
