@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.schedule import NonNegative, Positive, explained
-from clsplat.density.control import largest
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import largest
 from clsplat.density.mixture import mass_of, merged
 from clsplat.density.statistics import SEEN, Statistic, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
@@ -66,7 +66,7 @@ class Subdivide(Rule):
     def subdivide(self, edit: Edit, candidates: NDArray[np.bool_], score: NDArray[np.float32]) -> None:
         """Split the candidates, [N], with the largest scores; those of earlier rules and small ones are left out."""
         candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
-        chosen = largest(candidates, score, int(self.at_most * len(candidates)))
+        chosen = largest(score, int(self.at_most * len(candidates)), candidates)
         edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
 
 

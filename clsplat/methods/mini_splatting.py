@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.errors import NumericError
-from clsplat.density.control import Change, Weights, drawn_order, largest_of, weights
+from clsplat.density.control import Change
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import Weights, drawn_order, largest_of, weights
 from clsplat.density.survey import WEIGHT, Survey
 from clsplat.density.thresholds import Share
 from clsplat.gaussians.conversion import from_points

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.density.budget import Budget, Moment
-from clsplat.density.control import SampledPruning, drawn_order
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import SampledPruning, drawn_order
 from clsplat.density.survey import BLENDED, LOSSES, WEIGHT, Look, Survey, scaled
 from clsplat.formats.splats import inverse_opacities
 

@@ -12,8 +12,9 @@ from pydantic import Field, field_validator, model_validator
 
 from clsplat.core.errors import NoneInsideError, NumericError
 from clsplat.core.settings import OneOf
-from clsplat.density.control import SCORES, Box, Score, apply_marks, best, keep, mark
+from clsplat.density.control import Box, apply_marks, keep, mark
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import SCORES, Score, largest
 from clsplat.density.outliers import PruneFar
 from clsplat.density.statistics import SplatStats
 from clsplat.density.thresholds import SceneScale, Share
@@ -148,7 +149,7 @@ class PruneLeast(Scheduled):
     def run(self, run: Run) -> None:
         gaussians, score = run.model.gaussians, scores(run, self.score)
         share = 1 - (self.remove or 0) if self.keep is None else self.keep
-        kept = best(score, max(1, round(share * len(score))))
+        kept = np.flatnonzero(largest(score, max(1, round(share * len(score)))))
         change = keep(gaussians, kept, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
@@ -187,8 +188,7 @@ class ReduceSh(Scheduled):
             return
         rest = gaussians.get("sh_rest")
         energy = band_energy(rest) * scores(run)[:, None]
-        dropped = np.ones(energy.size, bool)
-        dropped[best(energy.ravel(), energy.size - round(self.share * energy.size))] = False
+        dropped = ~largest(energy.ravel(), energy.size - round(self.share * energy.size))
         gaussians.set("sh_rest", np.where(columns_of(dropped.reshape(energy.shape)), 0, rest))
         if run.adam is not None:
             run.adam.forget("sh_rest")

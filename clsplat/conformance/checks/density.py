@@ -11,8 +11,9 @@ from clsplat.conformance.check import GRADIENT, SUM, Checks, Figure, Note, by_el
 from clsplat.conformance.checks.blending import BACKGROUND, MARGIN
 from clsplat.conformance.checks.images import comparison_of, magnitude_of, planes_of
 from clsplat.conformance.scenes import Case, random_case, safe_case, with_world_filter
-from clsplat.density.control import cap_opacity, contributions, densify, sensitivities
+from clsplat.density.control import cap_opacity, densify
 from clsplat.density.edit import Edit
+from clsplat.density.importance import contributions, sensitivities
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.density.survey import Look
 from clsplat.density.thresholds import SceneScale
