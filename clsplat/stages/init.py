@@ -19,7 +19,8 @@ from clsplat.gaussians.sky import Sky
 from clsplat.photos.sky_detection import Seen, looked_at, panorama
 from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.scene.plane_sweep import swept_points
-from clsplat.scene.quality import is_transparent, laplacian_chance, opaque_pixels, require_ahead
+from clsplat.scene.quality import is_transparent, laplacian_chance, opaque_pixels
+from clsplat.scene.reprojection import require_ahead
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View, load_image, load_rgba
 from clsplat.scene.viewpoint import centre_of, looked_at_box, random_points
