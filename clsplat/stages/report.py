@@ -13,13 +13,13 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from clsplat.core.errors import amount
+from clsplat.core.errors import amount, size_text
 from clsplat.core.files import PIPELINE, write_text
 from clsplat.core.page import charts, duration, embedded, render, require_end
 from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import SHARES, ViewMetrics, measure, render_view
-from clsplat.prepare.steps import photographs_text, size_text
+from clsplat.prepare.gather import photographs_text
 from clsplat.render.backdrops import Auto, Backdrop
 from clsplat.scene.scene import SPLITS
 from clsplat.scene.view import View, some_of

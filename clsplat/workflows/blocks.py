@@ -50,9 +50,9 @@ from clsplat.runs.opening import read_run_scene
 from clsplat.runs.status import status_text
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.stages.export import image_path
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
+from clsplat.stages.render import image_path
 from clsplat.sweeps.batch import Batch
 from clsplat.sweeps.store import Store
 from clsplat.workflows.finetune import claimed, is_trained, trained
