@@ -55,22 +55,10 @@ from clsplat.stages.optimize import Optimize
 from clsplat.stages.render import image_path
 from clsplat.sweeps.batch import Batch
 from clsplat.sweeps.store import Store
+from clsplat.workflows.block_pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
 from clsplat.workflows.finetune import claimed, is_trained, trained
-from clsplat.workflows.partition import (
-    COARSE,
-    MERGED,
-    RECORD,
-    SIGHT,
-    Block,
-    Cell,
-    Partition,
-    Partitioner,
-    of_block,
-    of_coarse,
-    of_merged,
-    require_divisible,
-    without_start,
-)
+from clsplat.workflows.folder import COARSE, MERGED, RECORD
+from clsplat.workflows.partition import SIGHT, Block, Cell, Partition, Partitioner
 
 # How long the training of each block takes, roughly.
 
