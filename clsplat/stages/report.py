@@ -273,11 +273,11 @@ REMEDY = (
 )
 
 
-def parting(run: Run) -> str:
+def overfitting_note(run: Run) -> str:
     """Return how good the model is where it was trained and elsewhere; "" where that is not known, or unremarkable."""
     if run.best:
         return run.best.told()
-    split, now = _parting_measured(run)
+    split, now = _psnr_elsewhere(run)
     if now is None:
         return ""
     text = now.told(split)
@@ -286,11 +286,11 @@ def parting(run: Run) -> str:
 
 def is_by_heart(run: Run) -> bool:
     """Return whether the model of a run has learnt its photographs by heart, as far as that is known."""
-    now = run.best.found if run.best else _parting_measured(run)[1]
+    now = run.best.found if run.best else _psnr_elsewhere(run)[1]
     return now is not None and now.is_apart
 
 
-def _parting_measured(run: Run) -> tuple[str, Measured | None]:
+def _psnr_elsewhere(run: Run) -> tuple[str, Measured | None]:
     """The split whose views were not trained on, and the last PSNR there and at training views.
 
     Validation views come before test views; training views that were not measured count as the reports saw them.
@@ -416,7 +416,7 @@ class Report(Stage):
             title=run.scene_name,
             subtitle=f"{run.name} · {run.device.text}",
             main=_main(run),
-            parting=parting(run),
+            overfitting_note=overfitting_note(run),
             advice=advised,
             photographs=photographs_text(run.found) or f"{amount(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
