@@ -80,7 +80,7 @@ def resume(
 
 def steps_key(folder: Path) -> str:
     """Return the key of the steps that a run trains, such as optimize.steps."""
-    from clsplat.runs.steps_key import steps_key
+    from clsplat.runs.state import steps_key
 
     load_plugins()
     return steps_key(folder)
@@ -94,7 +94,7 @@ def status(folder: PathLike, html: PathLike | None = None) -> dict[str, Any]:
     `killed` where its process is gone.  Of the store of a sweep return its `cells`, `counts` of their states, `events`,
     of a scene in blocks its `state` and its `parts`.  html: a page to be written of a store.
     """
-    from clsplat.workflows.partition import status_of
+    from clsplat.workflows.folder import status_of
 
     return status_of(Path(folder), path_of(html))
 
@@ -113,7 +113,7 @@ def check(pipeline: PathLike) -> dict[str, Any]:
     `whole`, and a `detail`.  Of a model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`,
     and whether it is `valid`.
     """
-    from clsplat.workflows.partition import check
+    from clsplat.workflows.folder import check
 
     load_plugins()
     return check(str(pipeline))

@@ -135,8 +135,8 @@ def write_cameras(
     images: copy the photographs to out/images, too.  Returns the files of cameras.  Raises DataError for a lens that
     the format cannot hold, ConfigError where a file is there.
     """
-    from clsplat.runs import film
+    from clsplat.runs import cameras
     from clsplat.scene.scene import Scene
 
     load_plugins()
-    return film.write(scene if isinstance(scene, Scene) else Path(scene), Path(out), format, images)
+    return cameras.write(scene if isinstance(scene, Scene) else Path(scene), Path(out), format, images)

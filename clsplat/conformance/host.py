@@ -1,36 +1,19 @@
-"""The host: its system, and the memory that is free."""
+"""The host: its system, and the variables of the environment that concern OpenCL."""
 
 import os
 import platform
 import sys
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from clsplat.core import machine
+from clsplat.core.machine import available_memory
 from clsplat.core.resources import full_version
 
 CODE = ("PYOPENCL_BUILD", "POCL_", "CL_", "RUSTICL_", "LP_", "IGC_", "AMD_", "GPU_", "CUDA_")  # may change what runs
 CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not
 PREFIXES = (*CODE, "CLSPLAT_", "OCL_", "PYOPENCL_NO", "PYOPENCL_CTX", "OCLGRIND_")
-CONTAINER = Path("/sys/fs/cgroup")
-
-
-def available_memory() -> int | None:
-    """Return the bytes that the host can give without swapping, within a container's limit; None: not known."""
-    found: list[int] = []
-    with suppress(OSError, ValueError):
-        lines = Path("/proc/meminfo").read_text("utf-8").splitlines()
-        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    with suppress(OSError, ValueError):  # where there is no container, or no limit ("max")
-        found.append(
-            int((CONTAINER / "memory.max").read_text("utf-8")) - int((CONTAINER / "memory.current").read_text("utf-8"))
-        )
-    if not found and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
-        found.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return max(0, min(found)) if found else None
 
 
 def system() -> dict[str, Any]:

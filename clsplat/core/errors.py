@@ -143,6 +143,11 @@ def amount(count: int, word: str) -> str:
     return f"{count:,} {word}{'s' if count != 1 else ''}"
 
 
+def size_text(gaussians: int | None, parameters: int | None) -> str:
+    """Return how large what was trained is, in words."""
+    return f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
+
+
 def in_shell(path: object) -> str:
     """Return a path as a shell reads it, for a command in a message."""
     return subprocess.list2cmdline([str(path)]) if os.name == "nt" else shlex.quote(str(path))

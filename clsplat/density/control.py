@@ -1,21 +1,16 @@
-"""Apply density rules, as one edit; reset or lower opacities (Kerbl et al. 2023, section 5); move means at random."""
+"""Apply density rules, as one edit; reset opacities (Kerbl et al. 2023, section 5)."""
 
-from abc import abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from clsplat.core.errors import MemoryLimitError
-from clsplat.core.schedule import Positive
 from clsplat.core.settings import Settings
 from clsplat.density.edit import MAX_ROWS, Edit, Rule
-from clsplat.density.survey import SQUARE, WEIGHT, Look
-from clsplat.density.thresholds import Share
-from clsplat.formats.splats import inverse_opacities
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.opencl.device import Array
 from clsplat.render.tiles import Tiler
@@ -181,153 +176,9 @@ def cap_opacity(gaussians: Gaussians, limit: float) -> None:
     )
 
 
-def decay_opacity(gaussians: Gaussians, factor: float) -> None:
-    """Multiply all opacities by a factor in (0, 1)."""
-    gaussians.device.program("density.cl").decay_opacity(
-        items=gaussians.count,
-        logit_opacity=gaussians["logit_opacity"],
-        fall=1 - factor,
-        count=gaussians.count,
-    )
-
-
-def add_noise(gaussians: Gaussians, rate: float, opacity_below: float, seed: int, step: int) -> None:
-    """Move each mean by rate / (1 + exp(-100 (opacity_below - opacity))) Σ n, n three normal numbers (Kheradmand et
-    al. 2024).  rate: scene units⁻¹.
-    """
-    gaussians.device.program("noise.cl").add_noise(
-        items=gaussians.count,
-        means=gaussians["means"],
-        quats=gaussians["quats"],
-        log_scales=gaussians["log_scales"],
-        logit_opacity=gaussians["logit_opacity"],
-        rate=rate,
-        opacity_below=opacity_below,
-        seed=seed,
-        step=step,
-        stride=gaussians.capacity,
-        count=gaussians.count,
-    )
-
-
-# What Gaussians do to the pictures, over pixels and views, and pruning by it.
-
-Score = Literal["weight", "sensitivity"]
-Scoring = Callable[[Iterable[Look], int], NDArray[np.float32]]
-
-
-@dataclass(frozen=True)
-class Weights:
-    """What each Gaussian is in some views."""
-
-    total: NDArray[Any]  # [N] blend weight, alpha T, summed over all pixels; 0 where it is seen nowhere
-    views: NDArray[np.int64]  # [N] in which it is useful; 0 where that was not asked for
-
-
-def weights(looks: Iterable[Look], count: int, of_view: float | None = None, dtype: DTypeLike = np.float64) -> Weights:
-    """Return the weights of N = `count` Gaussians, added in the order of the views.
-
-    of_view: the share of a view's weight that is made by what is useful in it, the largest first; None: not counted.
-    dtype: of the total.
-    """
-    total, views = np.zeros(count, dtype), np.zeros(count, np.int64)
-    for look in looks:
-        weight = look.sum(WEIGHT)
-        total += weight
-        if of_view is not None:
-            views += largest_of(weight.astype(np.float64), of_view)
-    return Weights(total, views)
-
-
-def largest_of(weight: NDArray[np.float64], share: float) -> NDArray[np.bool_]:
-    """Return the fewest Gaussians, [N], that make this share of the weight; those without weight are none of them."""
-    order = np.argsort(-weight, kind="stable")
-    before = np.cumsum(weight[order]) - weight[order]
-    found = np.zeros(len(weight), bool)
-    found[order] = (before < share * weight.sum()) & (weight[order] > 0)
-    return found
-
-
-def contributions(looks: Iterable[Look], count: int) -> NDArray[np.float32]:
-    """Return the blend weights, alpha T, summed over pixels and views, [N]; single precision decides near ties."""
-    return weights(looks, count, dtype=np.float32).total
-
-
-def sensitivities(looks: Iterable[Look], count: int) -> NDArray[np.float32]:
-    """Return the squares of dI/dG summed over views and channels, [N]: I is a value of the image, G that of the
-    Gaussian there, whose alpha is opacity times G (Speedy-Splat, Hanson et al. 2025).
-    """
-    total = np.zeros(count, np.float32)
-    for look in looks:
-        for channel in range(3):
-            total += look.sum(SQUARE, channel=channel)
-    return total
-
-
-SCORES: dict[Score, Scoring] = {"weight": contributions, "sensitivity": sensitivities}
-
-
-def best(score: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Return the places of the `count` largest scores, ascending; of equal ones the first."""
-    return np.sort(np.argsort(-score, kind="stable")[:count])
-
-
 def keep(gaussians: Gaussians, kept: NDArray[np.int64], cause: str) -> Change:
     """Remove all Gaussians but those in some rows, ascending.  cause: a name of what chose them."""
     before = gaussians.count
     source = gaussians.device.upload(kept.astype(np.uint32))
     gaussians.rearrange(source, gaussians.device.zeros(len(kept), np.uint32), len(kept))
     return Change(before, len(kept), {cause: before - len(kept)}, {})
-
-
-# Choices of Gaussians: the largest scores, draws without replacement, the removal of some that are faint or large.
-
-Mask = NDArray[np.bool_]
-
-
-def drawn_order(candidates: Mask, weights: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.intp]:
-    """Return the candidates, [N], as they are drawn one after another by their weights, 0 to infinity (Efraimidis and
-    Spirakis 2006: by ln(U) / weight, the largest first)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        keys = np.log1p(-random.random(len(weights))) / weights
-    places = np.flatnonzero(candidates)
-    return places[np.argsort(-keys[places], kind="stable")]
-
-
-def largest(candidates: Mask, score: NDArray[np.floating], limit: int) -> Mask:
-    """Return which candidates, [N], have the largest scores: at most `limit` of them, ties by index."""
-    places = np.flatnonzero(candidates)
-    order = np.argsort(-score[places], kind="stable")
-    chosen = np.zeros_like(candidates)
-    chosen[places[order[:limit]]] = True
-    return chosen
-
-
-class SampledPruning(Rule):
-    """Base of rules that remove a share of the faint and the large Gaussians, which is drawn."""
-
-    grows: ClassVar[bool] = False
-    training_keys: ClassVar[frozenset[str]] = frozenset({"share", "opacity_below", "size_above"})
-
-    share: Share = 0.5
-    """Share of the faint and large ones that is removed."""
-    opacity_below: Positive = 0.005
-    """Opacity of faint Gaussians; by step."""
-    size_above: Positive = 0.1
-    """Size of large Gaussians, largest standard deviation as a share of the extent; by step."""
-
-    @abstractmethod
-    def weights(self, edit: Edit) -> NDArray[np.float64]:
-        """Return the weights of the draw, [N], 0 to infinity."""
-
-    def mark(self, edit: Edit) -> None:
-        """Sizes are those of the children after a split."""
-        gaussians = edit.gaussians
-        opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
-        size = np.exp(gaussians.get("log_scales").max(axis=1)) * edit.shrink.get()
-        large = size > edit.at(self.size_above) * edit.scene_scale.extent
-        candidates = ((opacity < edit.at(self.opacity_below)) | large) & (edit.rows() > 0)
-        order = drawn_order(candidates, self.weights(edit), edit.random())
-        chosen = np.zeros_like(candidates)
-        chosen[order[: int(self.share * len(order))]] = True
-        edit.choose(chosen, copies=0, kept=0)

@@ -16,7 +16,6 @@ from clsplat.core.settings import Settings, VariantName, variants
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array, constants
-from clsplat.photos.photographs import known_gradient
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame
 
 FOLDER = "stats/"
@@ -90,26 +89,6 @@ class Texture(Statistic):
 
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         _add_pixel_sum(gaussians, view, TEXTURE, total)
-
-
-class RenderedTexture(Statistic):
-    """The rendered image's gradient magnitude at the projected mean, per px (Micro-splatting, Lee et al. 2025)."""
-
-    type: Literal["rendered_texture"] = "rendered_texture"
-
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
-        frame, comparison = view.frame, view.comparison
-        gaussians.device.program("texture.cl").sample_magnitude(
-            items=gaussians.count,
-            magnitude=known_gradient(comparison.workspace, frame.camera, frame.image, comparison.mask),
-            splats=frame.splats,
-            radius=frame.radius,
-            total=total,
-            width=frame.camera.width,
-            height=frame.camera.height,
-            stride=frame.camera.stride,
-            count=gaussians.count,
-        )
 
 
 class ScreenRadius(Statistic):

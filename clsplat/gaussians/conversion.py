@@ -1,6 +1,7 @@
 """Model files into one of another format: merged, moved, cropped, and with fewer Gaussians or harmonics."""
 
 import logging
+import math
 import os
 import re
 import shutil
@@ -11,16 +12,29 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, DataError, quoted
 from clsplat.core.files import check_no_file_of_a_run, is_there, scratch_folder, told_as
 from clsplat.formats.ply import MAX_NUMBER
-from clsplat.formats.splats import EXPECTED, MAX_DEGREE, SH_C0, Quality, Reading, Writing, is_moment, with_degree
+from clsplat.formats.splats import (
+    EXPECTED,
+    MAX_DEGREE,
+    SH_C0,
+    Parameters,
+    Quality,
+    Reading,
+    Writing,
+    is_moment,
+    sh_coefficients,
+    with_degree,
+)
 from clsplat.formats.table import bytes_of, detect, for_writing, named
 from clsplat.gaussians.model import Model, load, model_at
 from clsplat.gaussians.motion import alike, still
 from clsplat.gaussians.sky import sampled, sky_file
+from clsplat.scene.scene import PointCloud
 
 # Several models as one.
 
@@ -422,3 +436,37 @@ def _turns(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Quaternions, [N, 4], that turn the z axis into unit vectors."""
     x, y, z = directions.T
     return np.stack([1 + z, -y, x, np.zeros_like(x)], axis=1)
+
+
+# Gaussians of points.
+
+MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
+
+
+def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0) -> Parameters:
+    """Return one Gaussian for each point, `scale` times as large as the point, or as the distance to its neighbours."""
+    count = len(points)
+    log_scales = 0.5 * np.log(neighbour_distance2(points.positions))
+    if points.sizes is not None:
+        log_scales = np.where(np.isnan(points.sizes), log_scales, np.log(points.sizes))
+    log_scales = log_scales + math.log(scale)
+    quats = np.zeros((count, 4))
+    quats[:, 0] = 1
+    return {
+        "means": points.positions.astype(np.float32),
+        "quats": quats.astype(np.float32),
+        "log_scales": np.repeat(log_scales[:, None], 3, axis=1).astype(np.float32),
+        "logit_opacity": np.full((count, 1), math.log(opacity / (1 - opacity)), np.float32),
+        "sh_base": ((points.colours - 0.5) / SH_C0).astype(np.float32),
+        "sh_rest": np.zeros((count, 3 * (sh_coefficients(degree) - 1)), np.float32),
+    }
+
+
+def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the mean squared distance to the three nearest neighbours, exact, [N] scene units²."""
+    neighbours = min(4, len(positions))
+    if neighbours < 2:
+        return np.full(len(positions), 1.0)
+    distance = scipy.spatial.cKDTree(positions).query(positions, k=neighbours, workers=-1)[0]
+    squared: NDArray[np.float64] = np.square(distance[:, 1:]).mean(axis=1)
+    return np.maximum(squared, MIN_DISTANCE2)

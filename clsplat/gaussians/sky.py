@@ -16,16 +16,16 @@ from clsplat.opencl.device import Array, Device
 
 # The octahedral map: all directions in a square (Meyer et al. 2010), as cl_kernels/sky.cl describes it.
 
-OctahedralFloats = NDArray[np.float64]
+Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
-def signs(directions: NDArray[np.floating]) -> OctahedralFloats:
+def signs(directions: NDArray[np.floating]) -> Floats:
     """Return -1 for components below 0 and else 1, [..., 3]."""
     return np.where(directions < 0, -1.0, 1.0)
 
 
-def places(directions: NDArray[np.floating], side: int) -> OctahedralFloats:
+def places(directions: NDArray[np.floating], side: int) -> Floats:
     """Return where directions, [..., 3] of any length, lie between the centres of texels, [..., 2] from -0.5 on."""
     directions = np.asarray(directions, np.float64)
     sign = signs(directions)
@@ -35,7 +35,7 @@ def places(directions: NDArray[np.floating], side: int) -> OctahedralFloats:
     return np.asarray((inside + 1) * (side / 2) - 0.5, np.float64)
 
 
-def texel_directions(side: int) -> OctahedralFloats:
+def texel_directions(side: int) -> Floats:
     """Return the directions of the centres of all texels, unit vectors, [side * side, 3], row by row."""
     centres = (2 * np.arange(side) + 1) / side - 1
     v, u = (axis.ravel() for axis in np.meshgrid(centres, centres, indexing="ij"))
@@ -66,13 +66,13 @@ def corners(i: Integers, j: Integers, side: int) -> Integers:
     return np.stack([texel_at(i + right, j + down, side) for down in (0, 1) for right in (0, 1)], axis=-1)
 
 
-def weights(fractions: OctahedralFloats) -> OctahedralFloats:
+def weights(fractions: Floats) -> Floats:
     """Return the bilinear weights of the four texels, [..., 4], of the fractional parts of places, [..., 2]."""
     a, b = fractions[..., 0], fractions[..., 1]
     return np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=-1)
 
 
-def sampled(texels: NDArray[np.floating], directions: NDArray[np.floating]) -> OctahedralFloats:
+def sampled(texels: NDArray[np.floating], directions: NDArray[np.floating]) -> Floats:
     """Return the values of a map, [side * side, C], in directions [..., 3]: [..., C]."""
     side = int(np.sqrt(len(texels)))
     place = places(directions, side)
@@ -82,7 +82,7 @@ def sampled(texels: NDArray[np.floating], directions: NDArray[np.floating]) -> O
 
 
 LOG = logging.getLogger("clsplat")
-Floats = NDArray[np.float32]
+
 SIDES = 8, 512  # texels: smallest and largest
 MEANING = (
     "colours behind the model by direction, an octahedral map: with s = |x| + |y| + |z| the direction (x, y, z) of the "
@@ -107,7 +107,7 @@ class DeviceSky:
 class Sky:
     """A map of the colours behind a model."""
 
-    texels: Floats  # [side * side, 3], row by row
+    texels: NDArray[np.float32]  # [side * side, 3], row by row
 
     @property
     def side(self) -> int:

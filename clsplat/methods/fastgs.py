@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.schedule import NonNegative
-from clsplat.density.control import SampledPruning
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import SampledPruning
 from clsplat.density.survey import BLENDED, LOSSES, Survey, scaled
 from clsplat.density.thresholds import Share
 

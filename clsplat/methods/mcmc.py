@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.schedule import NonNegative, Positive, at_step
-from clsplat.density.control import add_noise
 from clsplat.density.edit import Edit, Rule
+from clsplat.gaussians.gaussians import Gaussians
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled
 
@@ -105,3 +105,22 @@ class AddNoise(Scheduled):
     def run(self, run: Run) -> None:
         rate, below = at_step(self.rate, run.step) / run.scene.extent, at_step(self.opacity_below, run.step)
         add_noise(run.model.gaussians, rate, below, run.seed, run.step)
+
+
+def add_noise(gaussians: Gaussians, rate: float, opacity_below: float, seed: int, step: int) -> None:
+    """Move each mean by rate / (1 + exp(-100 (opacity_below - opacity))) Σ n, n three normal numbers (Kheradmand et
+    al. 2024).  rate: scene units⁻¹.
+    """
+    gaussians.device.program("noise.cl").add_noise(
+        items=gaussians.count,
+        means=gaussians["means"],
+        quats=gaussians["quats"],
+        log_scales=gaussians["log_scales"],
+        logit_opacity=gaussians["logit_opacity"],
+        rate=rate,
+        opacity_below=opacity_below,
+        seed=seed,
+        step=step,
+        stride=gaussians.capacity,
+        count=gaussians.count,
+    )

@@ -11,15 +11,38 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.schedule import NonNegative, Positive, explained
-from clsplat.density.control import largest
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import largest
 from clsplat.density.mixture import mass_of, merged
-from clsplat.density.statistics import SEEN, StatisticName
+from clsplat.density.statistics import SEEN, Statistic, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
 from clsplat.formats.splats import SH_C0, inverse_opacities
-from clsplat.gaussians.gaussians import INTERVAL2
+from clsplat.gaussians.gaussians import INTERVAL2, Gaussians
+from clsplat.losses.base import ViewGradients
+from clsplat.opencl.device import Array
+from clsplat.photos.photographs import known_gradient
 
 BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
+
+
+class RenderedTexture(Statistic):
+    """The rendered image's gradient magnitude at the projected mean, per px (Micro-splatting, Lee et al. 2025)."""
+
+    type: Literal["rendered_texture"] = "rendered_texture"
+
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+        frame, comparison = view.frame, view.comparison
+        gaussians.device.program("texture.cl").sample_magnitude(
+            items=gaussians.count,
+            magnitude=known_gradient(comparison.workspace, frame.camera, frame.image, comparison.mask),
+            splats=frame.splats,
+            radius=frame.radius,
+            total=total,
+            width=frame.camera.width,
+            height=frame.camera.height,
+            stride=frame.camera.stride,
+            count=gaussians.count,
+        )
 
 
 class Subdivide(Rule):
@@ -43,7 +66,7 @@ class Subdivide(Rule):
     def subdivide(self, edit: Edit, candidates: NDArray[np.bool_], score: NDArray[np.float32]) -> None:
         """Split the candidates, [N], with the largest scores; those of earlier rules and small ones are left out."""
         candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
-        chosen = largest(candidates, score, int(self.at_most * len(candidates)))
+        chosen = largest(score, int(self.at_most * len(candidates)), candidates)
         edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
 
 

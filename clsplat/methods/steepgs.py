@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.schedule import NonNegative, Positive, Schedule
-from clsplat.density.control import largest
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import largest
 from clsplat.density.mixture import covariance_of
 from clsplat.density.statistics import Statistic
 from clsplat.gaussians.gaussians import Gaussians
@@ -78,7 +78,7 @@ class SplitSaddle(Rule):
         rows = np.flatnonzero(steep & (edit.rows() == 1))
         least, axes = least_axes(edit.stats.means("splitting")[rows].astype(np.float64) * extent**2)
         room = len(rows) if edit.room is None else max(edit.room, 0)
-        lowest = largest(least < edit.at(self.eigenvalue_below), -least, room)
+        lowest = largest(-least, room, least < edit.at(self.eigenvalue_below))
         rows, axes = rows[lowest], axes[lowest]
         tables = {
             name: gaussians.get(name)[rows].astype(np.float64)

@@ -8,8 +8,9 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.density.control import SampledPruning, drawn_order
+from clsplat.density.budget import Budget, Moment
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import SampledPruning, drawn_order
 from clsplat.density.survey import BLENDED, LOSSES, WEIGHT, Look, Survey, scaled
 from clsplat.formats.splats import inverse_opacities
 
@@ -105,3 +106,23 @@ class PruneScored(SampledPruning, ByScore):
     def weights(self, edit: Edit) -> Floats:
         with np.errstate(divide="ignore"):
             return np.asarray(1 / self.score(edit))
+
+
+class Parabola(Budget):
+    """Growth to a number, steep at first: P0 + (B - P0) (2x/S - x²/S²) after x of S edits (Taming 3DGS, Mallick et al.
+    2024).
+
+    It is planned anew at every edit from the number that there is, so that it needs no P0 and makes up for what was
+    pruned.
+    """
+
+    type: Literal["parabola"] = "parabola"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"gaussians"})
+
+    gaussians: Annotated[int, Field(ge=1)]
+    """The number B, to which the last edit may grow."""
+
+    def limit(self, edit: Edit, moment: Moment, numbers: dict[str, float]) -> int:
+        missing = self.gaussians - edit.gaussians.count
+        left = (moment.edits - 1) / moment.edits
+        return self.gaussians - int(missing * left**2) if missing > 0 else self.gaussians

@@ -7,11 +7,11 @@ from clsplat.core.settings import Settings, variants
 from clsplat.density.edit import Rule
 from clsplat.density.statistics import Statistic
 from clsplat.gaussians.gaussians import INTERVAL2
+from clsplat.methods.mini_splatting import ReinitFromDepth
 from clsplat.pipeline.choices import as_asked
 from clsplat.pipeline.file import PipelineFile
 from clsplat.render.backdrops import Directions
 from clsplat.stages.optimize import Optimize
-from clsplat.stages.reinit import ReinitFromDepth
 from clsplat.training.memory import Harmonics
 
 

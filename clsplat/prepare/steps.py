@@ -1,47 +1,21 @@
 """The steps of `prepare:` in pipeline files.  Each makes a folder from a folder, on the host."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from clsplat.core.errors import DataError, first_few
+from clsplat.core.errors import DataError
 from clsplat.core.settings import Settings
 from clsplat.prepare.database import require_pycolmap
 from clsplat.prepare.features import CameraModel, Sought, find_features
-from clsplat.prepare.gather import left_out, require_photographs
+from clsplat.prepare.gather import left_out, photographs_text, require_photographs
 from clsplat.prepare.mapping import MOST, Mapper, map_cameras
 from clsplat.prepare.matching import Matching, match_features, most_pairs
 from clsplat.prepare.shared_intrinsics import Cameras
 from clsplat.prepare.undistort import Blank, undistort_scene
 from clsplat.scene.detect import holds_scene
-
-# What the steps of `prepare` have found, in words.
-
-
-def photographs_text(found: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return how many photographs have cameras, how well these fit, and which are left out; "" where it is not known.
-
-    found: of `facts`; the error is the mean distance in px between points and their features.
-    """
-    cameras = found.get("map_cameras", {})
-    try:
-        damaged = [f"{name} ({reason})" for name, reason in found.get("find_features", {}).get("damaged", {}).items()]
-        why = cameras.get("reasons", {})
-        missing = [f"{name} ({why[name]})" if name in why else str(name) for name in cameras["not_registered"]]
-        placed, lost = int(cameras["registered"]), [*damaged, *missing]
-        text = f"{placed} of {placed + len(lost)} photographs placed, {float(cameras['error_px']):.2f} px"
-    except (AttributeError, KeyError, TypeError, ValueError):
-        return ""
-    return text + (f"; left out: {first_few(lost)}" if lost else "")
-
-
-def size_text(gaussians: int | None, parameters: int | None) -> str:
-    """Return how large what was trained is, in words."""
-    return f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
-
 
 Positive = Annotated[int, Field(gt=0)]
 

@@ -17,8 +17,8 @@ from clsplat.runs.run_folder import Start, check_run_folder, start_of
 from clsplat.runs.runner import check_in, restore
 from clsplat.scene.quality import Measures
 from clsplat.stages.evaluate import Evaluate
-from clsplat.stages.export import Render
 from clsplat.stages.init import Init
+from clsplat.stages.render import Render
 from clsplat.training.memory import first_tables, last_place
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage, Training

@@ -37,13 +37,10 @@ from clsplat.runs.model_file import (
     write_pictures,
 )
 from clsplat.runs.state import has_pipeline
-from clsplat.scene.camera_files import write_cameras
-from clsplat.scene.detect import read_scene
 from clsplat.scene.photographs import load_photograph
-from clsplat.scene.scene import HOLDOUT, Background, Scene
+from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import NO_FILE, View
 from clsplat.scene.viewpoint import Stand
-from clsplat.training.modules.base import scene_beside
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import BUDGET, Page, Which, described, is_viewer
 from clsplat.viewer.video import camera_path
@@ -253,24 +250,3 @@ def names(models: Sequence[Path]) -> list[str]:
     if len(set(short)) < len(short):
         short = [f"{parent}/{name}" for parent, name in zip(parents, short, strict=True)]
     return short if len(set(short)) == len(short) else [f"{name} ({i})" for i, name in enumerate(short, 1)]
-
-
-# The cameras of a dataset, or of the dataset of a run, as files of other programs.
-
-
-def write(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:
-    """Write the cameras; return the files.  scene: a dataset, in a folder or as read, or a run folder, whose
-    cameras are those that it has learned.
-
-    Raises ClsplatError.
-    """
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"{out}: expected a folder to write into")
-    return write_cameras(scene if isinstance(scene, Scene) else _cameras_read(scene), out, format_, images)
-
-
-def _cameras_read(folder: Path) -> Scene:
-    if not has_pipeline(folder):
-        return read_scene(folder, HOLDOUT)
-    source = Source.of(folder, None)
-    return scene_beside(source.file, read_scene(source.folder, source.settings.split))

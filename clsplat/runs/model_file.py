@@ -40,7 +40,8 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import is_image, write_image
 from clsplat.scene.scene import Background, Scene, scene_name
 from clsplat.scene.view import Alpha, View
-from clsplat.stages.export import Export, image_paths
+from clsplat.stages.export import Export
+from clsplat.stages.render import image_paths
 from clsplat.stages.train_field import ExportField
 from clsplat.training.modules.base import measured_beside, scene_beside
 from clsplat.viewer.video.film import require_motion, times_of

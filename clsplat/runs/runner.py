@@ -20,7 +20,7 @@ from clsplat.runs.run_folder import RESOLVED, Start, clear
 from clsplat.scene.identity import Identity
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
-from clsplat.stages.report import parting
+from clsplat.stages.report import overfitting_note
 from clsplat.training import checkpoint
 from clsplat.training.best_model import Best
 from clsplat.training.checkpoint import saved_on_failure
@@ -143,7 +143,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
         run_stages(pipeline, run)
     for finding in few_views(len(run.original.train)):
         LOG.warning("%s", finding.text)
-    if run.best is None and (text := parting(run)):
+    if run.best is None and (text := overfitting_note(run)):
         LOG.info("%s", text)
     run.status.require_held()
     write_metrics(pipeline, run)

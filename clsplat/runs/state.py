@@ -6,15 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import ConfigError, DataError, in_shell
+from clsplat.core.errors import ClsplatError, ConfigError, DataError, in_shell
 from clsplat.core.files import CHECKSUMS, METRICS, PIPELINE, STATUS, is_inside
 from clsplat.core.reading import read_json, sha256
+from clsplat.core.settings import variants
 from clsplat.pipeline.capture_choice import without_choices
 from clsplat.pipeline.choices import undone
 from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs.results import read_metrics
+from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.settings_diff import first_difference
+from clsplat.training.stage import Stage, Training
 from clsplat.training.status import read_status
 
 
@@ -106,3 +110,18 @@ def sum_of(file: Path) -> str | None:
     with suppress(DataError):
         return sha256(file)
     return None
+
+
+def steps_key(folder: Path) -> str:
+    """Return the key of the steps in a run folder, such as optimize.steps; this one too where the file tells none."""
+    try:
+        data = read_yaml(folder / PIPELINE).data
+    except ClsplatError:  # told when the run is resumed
+        data = None
+    stages = data.get("stages") if isinstance(data, dict) else None
+    known = variants(Stage)
+    for stage in stages if isinstance(stages, list) else ():
+        name = stage.get("stage", next(iter(stage), "")) if isinstance(stage, dict) else stage
+        if isinstance(name, str) and issubclass(known.get(name, Stage), Training):
+            return f"{name}.steps"
+    return f"{Optimize.model_fields['stage'].default}.steps"

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import DataError, in_shell, one_line
+from clsplat.core.errors import DataError, in_shell, one_line, size_text
 from clsplat.core.files import END_STATES, METRICS, PIPELINE, SILENT, STATUS
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json
 from clsplat.core.settings import variants
-from clsplat.prepare.steps import photographs_text, size_text
+from clsplat.prepare.gather import photographs_text
 from clsplat.runs.results import read_metrics
 from clsplat.training import checkpoint
 from clsplat.training.modules.base import TrainingModule

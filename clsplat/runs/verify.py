@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import ConfigError, DataError, in_shell, one_line, shortened
+from clsplat.core.errors import ConfigError, DataError, in_shell, one_line, shortened, size_text
 from clsplat.core.files import (
     CHECKPOINTS,
     CHECKSUMS,
@@ -33,7 +33,6 @@ from clsplat.pipeline.loading import load
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.prepare.cache import noted
-from clsplat.prepare.steps import size_text
 from clsplat.runs.outputs import acting
 from clsplat.runs.recovery import beyond_repair
 from clsplat.runs.results import read_metrics, read_settings

@@ -19,8 +19,8 @@ from clsplat.scene.camera import MODELS as LENS_MODELS
 from clsplat.scene.images import inside, present
 from clsplat.scene.photographs import mask_file
 from clsplat.scene.points import MAX_VALUE, PointTable
-from clsplat.scene.quality import misses
 from clsplat.scene.reader import Parts, Reader
+from clsplat.scene.reprojection import misses
 from clsplat.scene.scene import PointCloud, Scene, Tracks, every_nth, make_scene
 from clsplat.scene.times_file import timed
 from clsplat.scene.view import View

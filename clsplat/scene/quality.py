@@ -1,6 +1,6 @@
 """What is measured of a capture before training, for the choices that follow from it."""
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -9,90 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, amount
+from clsplat.core.errors import amount
 from clsplat.scene.images import read_grey
-from clsplat.scene.scene import PointCloud, Scene, Tracks
-from clsplat.scene.view import View, lens_of, load_mask, load_transparency, some_of
-
-# How far the points of a dataset are from where its photographs show them.
-
-Floats = NDArray[np.float64]
-NEAR = 1.0  # px at the size of training, ours: beyond it a pixel does not show the point
-EXACT = 1e-3  # px: below it places were computed from the cameras, and tell nothing of them
-
-
-def misses(view: View, positions: NDArray[np.floating], places: Floats) -> Floats:
-    """Return the vectors, [K, 2] px, from where a view at its full size shows positions, [K, 3], to places, [K, 2] px
-    of the photograph as it was taken; NaN behind the camera, and for places far outside the photograph."""
-    taken = view.lens or view.camera
-    size = np.array([taken.width, taken.height])
-    # a place of a damaged file says nothing of cameras
-    near = np.all(np.abs(places - size / 2) <= size, axis=1, keepdims=True)
-    return np.where(near, places - projected(view, positions), np.nan)
-
-
-def projected(view: View, positions: NDArray[np.floating]) -> Floats:
-    """Return where a view at its full size shows positions, [K, 3]: [K, 2] px of the photograph as it was taken, NaN
-    behind the camera."""
-    points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
-    points[~(points[:, 2] > 0)] = np.nan
-    with np.errstate(all="ignore"):
-        if view.lens is not None:
-            return lens_of(view).project(points)
-        camera = view.camera
-        return np.asarray(points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
-
-
-def with_cameras(scene: Scene, views: Sequence[View]) -> Scene:
-    """Return a scene, at its full size, whose views have other cameras; photographs show its points where they did."""
-    tracks, missed = scene.tracks, dict[str, Floats]()
-    if tracks is not None:
-        for old, new in zip(scene.views, views, strict=True):
-            if old.name in tracks.misses:
-                positions = tracks.positions[tracks.seen[old.name]]
-                moved = projected(old, positions) - projected(new, positions)
-                missed[old.name] = tracks.misses[old.name] + moved
-        tracks = replace(tracks, misses={**tracks.misses, **missed})
-    return replace(scene, views=tuple(views), tracks=tracks)
-
-
-def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats | None:
-    """Return the mean distance for each point that views show, px at their sizes; None where the dataset does not tell
-    it."""
-    if tracks is None or not tracks.misses:
-        return None
-    sums, counts = np.zeros(len(tracks.positions)), np.zeros(len(tracks.positions))
-    for view in views:
-        distances = np.linalg.norm(tracks.misses.get(view.name, np.empty((0, 2))), axis=1) / view.downscale
-        known = np.isfinite(distances)
-        if known.any():
-            np.add.at(sums, tracks.seen[view.name][known], distances[known])
-            np.add.at(counts, tracks.seen[view.name][known], 1)
-    errors = sums[counts > 0] / counts[counts > 0]
-    return errors if len(errors) and errors.mean() > EXACT else None
-
-
-def within(tracks: Tracks, views: Iterable[View], limit: float = NEAR) -> Tracks:
-    """Return the tracks without the points that views show `limit` px or more, at their sizes, from where the cameras
-    do; a view without known places keeps all of its points, and so do other views than these."""
-    seen, missed = dict(tracks.seen), dict(tracks.misses)
-    for view in sorted(views, key=lambda view: -view.downscale):  # of a photograph in several sizes the largest one
-        if view.name in tracks.misses:
-            found = tracks.misses[view.name]
-            kept = ~(np.linalg.norm(found, axis=1) / view.downscale >= limit)  # NaN: not known
-            seen[view.name], missed[view.name] = tracks.seen[view.name][kept], found[kept]
-    return Tracks(tracks.positions, seen, missed)
-
-
-def require_ahead(points: PointCloud, scene: Scene) -> None:
-    """Raise DataError when every point lies behind every training camera."""
-    poses = np.stack([view.world_to_camera for view in scene.split("train")])
-    if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):
-        raise DataError(
-            f"{scene.path}: all {len(points):,} points lie behind all training cameras; poses and points follow "
-            "different conventions: export both again, or use init: {source: sweep}"
-        )
-
+from clsplat.scene.reprojection import reprojection_errors
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import View, load_mask, load_transparency, some_of
 
 Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "reprojection_error", "sky"]
 Measures = dict[Measure, float]
@@ -186,11 +107,11 @@ def is_blurred(own: NDArray[np.float64], middle: NDArray[np.float64]) -> bool:
 
 # How much detail photographs show at each pixel: there Gaussians are to lie densely.
 
-DetailFloats = NDArray[np.floating]
+Floats = NDArray[np.floating]
 MAX_SPACING = 0.1  # by the width of the photograph (Meuleman et al. 2025)
 
 
-def laplacian_chance(image: DetailFloats) -> DetailFloats:
+def laplacian_chance(image: Floats) -> Floats:
     """Return the chance, [H, W], with which a pixel of a photograph, [H, W, 3] in [0, 1], becomes a point.
 
     It is min(1, ‖∇²I‖₁) with the Laplacian of five points, summed over the colours (Meuleman et al. 2025).  There it is
@@ -200,16 +121,16 @@ def laplacian_chance(image: DetailFloats) -> DetailFloats:
     """
     framed = np.pad(image.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")
     middle, around = framed[1:-1, 1:-1], (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
-    chance: DetailFloats = np.minimum(np.abs(sum(around) - 4 * middle).sum(axis=2), 1)
+    chance: Floats = np.minimum(np.abs(sum(around) - 4 * middle).sum(axis=2), 1)
     return chance
 
 
-def spacing(chance: DetailFloats, width: int) -> DetailFloats:
+def spacing(chance: Floats, width: int) -> Floats:
     """Return the distance in pixels between points that are taken with some chances above 0: 1/√chance.
 
     It is at most MAX_SPACING by the width of the photograph, px.
     """
-    distance: DetailFloats = np.minimum(1 / np.sqrt(chance), MAX_SPACING * width)
+    distance: Floats = np.minimum(1 / np.sqrt(chance), MAX_SPACING * width)
     return distance
 
 

@@ -350,3 +350,17 @@ def _below(view: View) -> Iterator[tuple[Path, str]]:
     for number, folder in enumerate(view.image_path.parents[: len(parts)], 1):
         if view.image_path.parts[-number:] == parts[-number:]:
             yield folder, "/".join(parts[-number:])
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A view with the name of its image below the folder of all images, and its lens with distortion."""
+
+    name: str
+    view: View
+    test: bool
+
+    @property
+    def lens(self) -> Lens:
+        """The lens of the photograph as it is on disk: that of the view, or its pinhole camera."""
+        return lens_of(self.view)

@@ -1,4 +1,4 @@
-"""Stages that make a model smaller: cleanup, crop, fewer Gaussians, fewer harmonics, and what views hide."""
+"""Stages that make a model smaller: cleanup, crop, fewer Gaussians, fewer harmonics."""
 
 import logging
 from collections.abc import Collection
@@ -12,15 +12,15 @@ from pydantic import Field, field_validator, model_validator
 
 from clsplat.core.errors import NoneInsideError, NumericError
 from clsplat.core.settings import OneOf
-from clsplat.density.control import SCORES, Box, Score, apply_marks, best, keep, mark
+from clsplat.density.control import Box, apply_marks, keep, mark
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import SCORES, Score, largest
+from clsplat.density.outliers import PruneFar
 from clsplat.density.statistics import SplatStats
 from clsplat.density.thresholds import SceneScale, Share
 from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
-from clsplat.gaussians.gaussians import HIDDEN, HIDDEN_VIEWS, hide
 from clsplat.methods.adc import PruneFaint
-from clsplat.methods.mini_splatting import PruneUseless, useless
-from clsplat.methods.outliers import PruneFar
+from clsplat.methods.mini_splatting import PruneUseless
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage
 
@@ -149,7 +149,7 @@ class PruneLeast(Scheduled):
     def run(self, run: Run) -> None:
         gaussians, score = run.model.gaussians, scores(run, self.score)
         share = 1 - (self.remove or 0) if self.keep is None else self.keep
-        kept = best(score, max(1, round(share * len(score))))
+        kept = np.flatnonzero(largest(score, max(1, round(share * len(score)))))
         change = keep(gaussians, kept, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
@@ -188,8 +188,7 @@ class ReduceSh(Scheduled):
             return
         rest = gaussians.get("sh_rest")
         energy = band_energy(rest) * scores(run)[:, None]
-        dropped = np.ones(energy.size, bool)
-        dropped[best(energy.ravel(), energy.size - round(self.share * energy.size))] = False
+        dropped = ~largest(energy.ravel(), energy.size - round(self.share * energy.size))
         gaussians.set("sh_rest", np.where(columns_of(dropped.reshape(energy.shape)), 0, rest))
         if run.adam is not None:
             run.adam.forget("sh_rest")
@@ -215,30 +214,3 @@ def _bands(columns: int) -> list[tuple[int, int]]:
     """First column and end of each band above 0."""
     ends = [3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)]
     return [(first, end) for first, end in pairwise(ends) if end <= columns]
-
-
-# What a training view need not draw.
-
-
-class HideUseless(Scheduled):
-    """Leave out of the steps on each training view the Gaussians that make little of it, which saves time
-    (Mini-Splatting2, Fang and Wang 2024).
-
-    Useful in a view are those that make most of its weight, alpha T over all pixels, the largest first.  What is new
-    later is hidden where its source was.  All are drawn in other pictures, and in all after the training.
-    """
-
-    stage: Literal["hide_useless"] = "hide_useless"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"of_view"})
-    edits: ClassVar[bool] = True
-
-    of_view: Share = 0.99
-    """Share of a view's weight that is made by what it shows."""
-
-    def attach(self, run: Run) -> None:
-        if HIDDEN not in run.model.gaussians.tables:
-            run.model.gaussians.add(HIDDEN, -(-len(run.scene.split("train")) // HIDDEN_VIEWS))
-
-    def run(self, run: Run) -> None:
-        hide(run.model.gaussians, useless(run.survey(), self.of_view))

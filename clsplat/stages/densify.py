@@ -8,20 +8,19 @@ from functools import partial
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from clsplat.core.errors import NumericError, amount
-from clsplat.core.schedule import AtLeastOne, Bounded, Positive, at_step, places
+from clsplat.core.schedule import AtLeastOne, places
 from clsplat.core.settings import OneOf, variants
 from clsplat.density.budget import Budget, Moment
-from clsplat.density.control import Box, cap_opacity, decay_opacity, densify
+from clsplat.density.control import Box, densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import Statistic
 from clsplat.density.thresholds import SceneScale
-from clsplat.training import adam
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import make_room, more_room, most_gaussians
-from clsplat.training.stage import Scheduled, Stage
+from clsplat.training.stage import Scheduled
 
 LOG = logging.getLogger("clsplat")
 
@@ -146,125 +145,3 @@ class Densify(Scheduled):
             left = len(places(self.every, run.step - 1, self.stop))
             moment = Moment(run.step / self.stop, left, run.divisor)
             yield self.budget.limit(edit, moment, run.numbers)
-
-
-# Small changes of the model at a cadence.
-
-
-class RaiseSh(Scheduled):
-    """Add one band of spherical harmonics to the colours."""
-
-    stage: Literal["raise_sh"] = "raise_sh"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    edits: ClassVar[bool] = True
-
-    def run(self, run: Run) -> None:
-        model = run.model
-        model.degree = min(model.degree + 1, model.gaussians.sh_degree)
-
-
-class ResetOpacity(Scheduled):
-    """Lower all opacities; training raises those of needed Gaussians, and pruning removes floaters (Kerbl et al. 2023).
-
-    `to` holds after the world filter (Yu et al. 2024).
-    """
-
-    stage: Literal["reset_opacity"] = "reset_opacity"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"to"})
-
-    to: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Largest opacity after the reset."""
-    when_background: Literal["black", "white"] | None = None
-    """Background on which the stage acts; without it, on both."""
-
-    def stale(self, run: Run) -> Collection[str]:
-        return ("logit_opacity",) if self._acts(run) else ()
-
-    def run(self, run: Run) -> None:
-        if not self._acts(run):
-            return
-        cap_opacity(run.model.gaussians, self.to)
-        if run.adam is not None:
-            run.adam.forget("logit_opacity")
-
-    def _acts(self, run: Run) -> bool:
-        return self.when_background in (None, run.photographs.background_name)
-
-
-class DecayOpacity(Scheduled):
-    """Lower all opacities a little, in the place of a reset; training raises those of needed Gaussians (Binocular3DGS,
-    Han et al. 2024).
-
-    Published is a factor of 0.995 at each step, for 3 to 8 photographs.  Ours is one for each pass over the training
-    photographs: among many a Gaussian is seen as often, not more rarely, while its opacity falls as much.
-    """
-
-    stage: Literal["decay_opacity"] = "decay_opacity"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"per_pass"})
-
-    per_pass: Annotated[Positive, AfterValidator(Bounded(0, most=1))] = 0.975
-    """Factor of the opacities in as many steps as there are training photographs; 1 changes nothing; by step."""
-
-    def run(self, run: Run) -> None:
-        factor = at_step(self.per_pass, run.step) ** ((self.every or 1) / len(run.scene.split("train")))
-        if factor < 1:
-            decay_opacity(run.model.gaussians, factor)
-
-
-class RefreshFilter(Scheduled):
-    """Update the world filter and the sampling intervals, which sizes in pixels depend on, to the present means.
-
-    `init` and every density edit update them too.  For a model without both, the stage has no effect.
-    """
-
-    stage: Literal["refresh_filter"] = "refresh_filter"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    edits: ClassVar[bool] = True
-
-    def run(self, run: Run) -> None:
-        run.refresh_filter()
-
-
-# The average of the Gaussians over the last steps of a training, in the place of those of the last step.
-
-
-class AddToAverage(Scheduled):
-    """Add every parameter to its average over the steps at which this stage runs (Polyak and Juditsky 1992).
-
-    Training goes on from the parameters themselves.  A Gaussian that is new has an average since then.  What an edit
-    changes in Gaussians that stay, such as a reset of opacities, is averaged with what was before: `start` belongs
-    after those.
-    """
-
-    stage: Literal["add_to_average"] = "add_to_average"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    makes: ClassVar[frozenset[str]] = frozenset({"average"})
-    edits: ClassVar[bool] = True
-    reads_harmonics: ClassVar[bool] = True
-
-    def attach(self, run: Run) -> None:
-        adam.attach(run.model.gaussians)
-
-    def run(self, run: Run) -> None:
-        self.attach(run)
-        adam.add(run.model.gaussians)
-
-
-class TakeAverage(Stage):
-    """Replace the parameters by their averages; it belongs right behind the training.
-
-    Steps that jump about a good model, at learning rates that are still large, lie around one that is better.
-    """
-
-    stage: Literal["take_average"] = "take_average"
-    needs: ClassVar[frozenset[str]] = frozenset({"model", "average"})
-    takes: ClassVar[frozenset[str]] = frozenset({"average"})
-    edits: ClassVar[bool] = True
-
-    def run(self, run: Run) -> None:
-        adam.take(run.model.gaussians)
-        run.refresh_filter()

@@ -1,26 +1,26 @@
 """The first Gaussians: from the scene's points, at random, or from a model file."""
 
 import logging
-import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.settings import ReadPath
-from clsplat.formats.splats import SH_C0, Parameters, sh_coefficients, with_degree
+from clsplat.formats.splats import Parameters, with_degree
+from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import load
 from clsplat.gaussians.sky import Sky
 from clsplat.photos.sky_detection import Seen, looked_at, panorama
 from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.scene.plane_sweep import swept_points
-from clsplat.scene.quality import is_transparent, laplacian_chance, opaque_pixels, require_ahead
+from clsplat.scene.quality import is_transparent, laplacian_chance, opaque_pixels
+from clsplat.scene.reprojection import require_ahead
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View, load_image, load_rgba
 from clsplat.scene.viewpoint import centre_of, looked_at_box, random_points
@@ -204,7 +204,6 @@ def _photographs(run: Run, scene: Scene) -> Iterator[tuple[View, NDArray[np.uint
         yield view, photograph.image(), photograph.counted()
 
 
-MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
 CHANCES = {"uniform": None, "laplacian": laplacian_chance}  # of a pixel to become a point of a sweep
 
 
@@ -352,32 +351,3 @@ class Init(Stage):
         """Random points, where so many Gaussians fit.  Raises MemoryLimitError before any is made."""
         self._require_memory(run, self.count)
         return random_points(run.scene, self.count, run.seed)
-
-
-def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0) -> Parameters:
-    """Return one Gaussian for each point, `scale` times as large as the point, or as the distance to its neighbours."""
-    count = len(points)
-    log_scales = 0.5 * np.log(neighbour_distance2(points.positions))
-    if points.sizes is not None:
-        log_scales = np.where(np.isnan(points.sizes), log_scales, np.log(points.sizes))
-    log_scales = log_scales + math.log(scale)
-    quats = np.zeros((count, 4))
-    quats[:, 0] = 1
-    return {
-        "means": points.positions.astype(np.float32),
-        "quats": quats.astype(np.float32),
-        "log_scales": np.repeat(log_scales[:, None], 3, axis=1).astype(np.float32),
-        "logit_opacity": np.full((count, 1), math.log(opacity / (1 - opacity)), np.float32),
-        "sh_base": ((points.colours - 0.5) / SH_C0).astype(np.float32),
-        "sh_rest": np.zeros((count, 3 * (sh_coefficients(degree) - 1)), np.float32),
-    }
-
-
-def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the mean squared distance to the three nearest neighbours, exact, [N] scene units²."""
-    neighbours = min(4, len(positions))
-    if neighbours < 2:
-        return np.full(len(positions), 1.0)
-    distance = scipy.spatial.cKDTree(positions).query(positions, k=neighbours, workers=-1)[0]
-    squared: NDArray[np.float64] = np.square(distance[:, 1:]).mean(axis=1)
-    return np.maximum(squared, MIN_DISTANCE2)

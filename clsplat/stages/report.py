@@ -13,13 +13,13 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from clsplat.core.errors import amount
+from clsplat.core.errors import amount, size_text
 from clsplat.core.files import PIPELINE, write_text
 from clsplat.core.page import charts, duration, embedded, render, require_end
 from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import SHARES, ViewMetrics, measure, render_view
-from clsplat.prepare.steps import photographs_text, size_text
+from clsplat.prepare.gather import photographs_text
 from clsplat.render.backdrops import Auto, Backdrop
 from clsplat.scene.scene import SPLITS
 from clsplat.scene.view import View, some_of
@@ -272,11 +272,11 @@ REMEDY = (
 )
 
 
-def parting(run: Run) -> str:
+def overfitting_note(run: Run) -> str:
     """Return how good the model is where it was trained and elsewhere; "" where that is not known, or unremarkable."""
     if run.best:
         return run.best.told()
-    split, now = _parting_measured(run)
+    split, now = _psnr_elsewhere(run)
     if now is None:
         return ""
     text = now.told(split)
@@ -285,11 +285,11 @@ def parting(run: Run) -> str:
 
 def is_by_heart(run: Run) -> bool:
     """Return whether the model of a run has learnt its photographs by heart, as far as that is known."""
-    now = run.best.found if run.best else _parting_measured(run)[1]
+    now = run.best.found if run.best else _psnr_elsewhere(run)[1]
     return now is not None and now.is_apart
 
 
-def _parting_measured(run: Run) -> tuple[str, Measured | None]:
+def _psnr_elsewhere(run: Run) -> tuple[str, Measured | None]:
     """The split whose views were not trained on, and the last PSNR there and at training views.
 
     Validation views come before test views; training views that were not measured count as the reports saw them.
@@ -415,7 +415,7 @@ class Report(Stage):
             title=run.scene_name,
             subtitle=f"{run.name} · {run.device.text}",
             main=_main(run),
-            parting=parting(run),
+            overfitting_note=overfitting_note(run),
             advice=advised,
             photographs=photographs_text(run.found) or f"{amount(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),

@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.conformance.bench.packing import known_packing, told
-from clsplat.conformance.host import available_memory
 from clsplat.core import machine
 from clsplat.core.errors import ConfigError, DataError, DeviceError, OutputError, amount
 from clsplat.core.files import write_text
-from clsplat.core.machine import Owner, cache_folder
+from clsplat.core.machine import Owner, available_memory, cache_folder
 from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
 from clsplat.sweeps.cell import code_digest

@@ -31,6 +31,7 @@ from clsplat.core.reading import read_json, sha256
 from clsplat.core.text_table import text_table
 from clsplat.formats.ply import join_plys
 from clsplat.formats.table import detect
+from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.model import NUMBERS, Model, as_trained, model_at
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
@@ -49,27 +50,15 @@ from clsplat.runs.opening import read_run_scene
 from clsplat.runs.status import status_text
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.stages.export import image_path
-from clsplat.stages.init import Init, from_points
+from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
+from clsplat.stages.render import image_path
 from clsplat.sweeps.batch import Batch
 from clsplat.sweeps.store import Store
+from clsplat.workflows.block_pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
 from clsplat.workflows.finetune import claimed, is_trained, trained
-from clsplat.workflows.partition import (
-    COARSE,
-    MERGED,
-    RECORD,
-    SIGHT,
-    Block,
-    Cell,
-    Partition,
-    Partitioner,
-    of_block,
-    of_coarse,
-    of_merged,
-    require_divisible,
-    without_start,
-)
+from clsplat.workflows.folder import COARSE, MERGED, RECORD
+from clsplat.workflows.partition import SIGHT, Block, Cell, Partition, Partitioner
 
 # How long the training of each block takes, roughly.
 

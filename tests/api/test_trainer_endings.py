@@ -14,7 +14,7 @@ import clsplat
 from clsplat.core.errors import ClsplatError, ConfigError, NumericError
 from clsplat.density.statistics import SplatStats
 from clsplat.photos.photographs import Photographs
-from clsplat.stages.densify import RaiseSh
+from clsplat.stages.schedule import RaiseSh
 from tests.support.models import equal
 
 pytestmark = pytest.mark.slow

@@ -9,7 +9,8 @@ import pytest
 from clsplat.core import progress, terminal
 from clsplat.core.progress import Count, Progress, clock, heard_by, watched
 from clsplat.prepare.cache import Planned, prepare
-from clsplat.prepare.steps import FindFeatures, MapCameras, photographs_text
+from clsplat.prepare.gather import photographs_text
+from clsplat.prepare.steps import FindFeatures, MapCameras
 from clsplat.runs.opening import READ_SCENE, counts_of
 from clsplat.training.status import StatusFile
 

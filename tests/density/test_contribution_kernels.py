@@ -6,7 +6,7 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.checks.density import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
-from clsplat.density.control import contributions
+from clsplat.density.importance import contributions
 from clsplat.density.survey import Look
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Budget, Rasterizer

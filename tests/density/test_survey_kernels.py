@@ -8,7 +8,7 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import Case, random_case, safe_case
-from clsplat.density.control import sensitivities
+from clsplat.density.importance import sensitivities
 from clsplat.density.survey import BLENDED, SQUARE, WEIGHT, Look, Survey
 from clsplat.losses.image import L1, Dssim
 from clsplat.opencl.device import Device

@@ -9,8 +9,9 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.core.errors import ConfigError
-from clsplat.density.control import densify, drawn_order
+from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.importance import drawn_order
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey, scaled
 from clsplat.density.thresholds import SceneScale

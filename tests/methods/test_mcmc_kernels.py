@@ -6,14 +6,14 @@ from scipy.special import comb
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
-from clsplat.density.control import add_noise, densify
+from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import moment_tables
-from clsplat.methods.mcmc import Relocate, divided, systematic
+from clsplat.methods.mcmc import Relocate, add_noise, divided, systematic
 from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam

@@ -4,8 +4,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from clsplat.conformance.scenes import random_case
-from clsplat.density.control import densify, largest
+from clsplat.density.control import densify
 from clsplat.density.edit import Edit
+from clsplat.density.importance import largest
 from clsplat.density.mixture import covariance_of, mass_of, merged
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale
@@ -91,7 +92,7 @@ def test_only_the_most_textured_share_splits(device, rng):
 
 
 def test_ties_go_to_the_first():
-    chosen = largest(np.array([True, False, True, True]), np.array([1, 9, 1, 1], np.float32), 2)
+    chosen = largest(np.array([1, 9, 1, 1], np.float32), 2, np.array([True, False, True, True]))
     assert chosen.tolist() == [True, False, True, False]
 
 

@@ -9,8 +9,8 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.checks.density import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
-from clsplat.density.control import Weights, largest_of
 from clsplat.density.edit import Edit
+from clsplat.density.importance import Weights, largest_of
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale

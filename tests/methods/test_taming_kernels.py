@@ -1,4 +1,4 @@
-"""Draws by score within a budget (taming.py, clsplat/density/budget.py), against the formulas in float64."""
+"""Draws by score within a budget (clsplat/methods/taming.py), against the formulas in float64."""
 
 from types import SimpleNamespace
 
@@ -9,14 +9,14 @@ from scipy.ndimage import convolve
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import random_case, safe_case
-from clsplat.density.budget import Moment, Parabola
+from clsplat.density.budget import Moment
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
 from clsplat.methods.adc import Clone, Split
-from clsplat.methods.taming import GrowScored, PruneScored, by_median, view_scores
+from clsplat.methods.taming import GrowScored, Parabola, PruneScored, by_median, view_scores
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.devices import on_devices, on_one_setting

@@ -21,8 +21,8 @@ from clsplat.photos.sampling import ViewPool
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
 from clsplat.runs.model_file import require_model
+from clsplat.runs.state import steps_key
 from clsplat.runs.status import summary
-from clsplat.runs.steps_key import steps_key
 from clsplat.runs.time_budget import Rehearsal
 from clsplat.runs.verify import verify
 from clsplat.scene.camera import Camera

@@ -8,7 +8,8 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import Decay
-from clsplat.density.budget import Moment, Momentum
+from clsplat.density.budget import Moment
+from clsplat.methods.dash import Momentum
 from clsplat.photos.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, course, knots
 from clsplat.photos.sampling import ViewSettings
 from clsplat.pipeline.loading import load

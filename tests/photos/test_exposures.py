@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, _fitted, measured, samples, with_noted
-from clsplat.prepare.undistort import undistort_scene, write_model
+from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.colmap import read_images, read_point_table, tracks_of
+from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import CameraExposure, write_exposures
 from clsplat.scene.scene import PointCloud

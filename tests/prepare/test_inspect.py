@@ -21,7 +21,7 @@ from clsplat.prepare.inspect.page import MAX_NAMES, inspection_page
 from clsplat.scene.camera import Lens
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import CameraExposure, write_exposures
-from clsplat.scene.quality import require_ahead
+from clsplat.scene.reprojection import require_ahead
 from clsplat.scene.view import load_image, load_mask
 from tests.support.colmap_writer import (
     ImageEntry,

@@ -23,8 +23,9 @@ from clsplat.prepare.features import Sought, find_features
 from clsplat.prepare.gather import list_photographs
 from clsplat.prepare.mapping import map_cameras, with_pairs
 from clsplat.prepare.matching import Pairing, alike, match_features
-from clsplat.prepare.undistort import undistort_scene, write_model
+from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.camera import Camera, Lens
+from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.detect import read_scene
 from clsplat.scene.view import View, load_image, load_mask
 from tests.support.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry

@@ -35,10 +35,10 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 VERBS = ("mark", "choose", "set_rows", "set_children")
 TESTED = {  # where
-    **dict.fromkeys(("box_blur.py", "opacity_entropy.py"), "core/test_plugins.py"),
+    **dict.fromkeys(("box_blur.py", "opacity_entropy.py"), "pipeline/test_plugins.py"),
     "csv_reader.py": "scene/test_csv_reader.py",
-    "random_pruning.py": "core/test_plugins.py",
-    "learned_cameras.yaml": "photos/test_learned_cameras.py",
+    "random_pruning.py": "pipeline/test_plugins.py",
+    "learned_cameras.yaml": "training/test_learned_cameras.py",
     "test_opacity_entropy.py": "repository/test_docs.py",
 }
 PAGES = ("README.md", "docs/python.md")

@@ -15,7 +15,7 @@ from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, outputs, runner, verify
 from clsplat.scene.images import write_image
-from clsplat.stages.export import image_paths
+from clsplat.stages.render import image_paths
 from clsplat.stages.report import Report
 from clsplat.sweeps.experiment import Job
 from clsplat.training.run import Run

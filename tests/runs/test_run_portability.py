@@ -9,7 +9,7 @@ import pytest
 import clsplat
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.gaussians.model import load
-from clsplat.prepare.steps import photographs_text
+from clsplat.prepare.gather import photographs_text
 from clsplat.runs.model_file import Source, photographs_of, run_of
 from clsplat.runs.status import summary
 from clsplat.sweeps.experiment import Job

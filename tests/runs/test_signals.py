@@ -13,7 +13,7 @@ import pytest
 
 from clsplat.core.errors import Interrupted
 from clsplat.metrics import views
-from clsplat.stages import densify, export, report
+from clsplat.stages import densify, render, report
 from clsplat.stages.init import Init
 from clsplat.sweeps.experiment import Job
 from clsplat.training.status import read_status
@@ -69,7 +69,7 @@ PLACES = {  # what is called for the n-th time when the signal comes -> the mess
     "an evaluation in training": (views, "render_floats", 1, "stopped at step 4, saved in "),
     "a stage that edits": (densify, "densify", 1, "stopped in densify, saved in "),
     "an evaluation": (views, "render_floats", 4, "stopped in evaluate, saved in "),
-    "renders": (export, "render_view", 1, "stopped in render, saved in "),
+    "renders": (render, "render_view", 1, "stopped in render, saved in "),
     "the report": (report, "render_view", 1, "stopped in report, saved in "),
 }
 
@@ -94,7 +94,7 @@ def test_long_stage_ends_early_with_saved_state_and_is_repeated(
 
 
 def test_the_second_signal_stops_at_once(pipeline, tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(export, "render_view", signalled(export.render_view, 1, times=2))
+    monkeypatch.setattr(render, "render_view", signalled(render.render_view, 1, times=2))
     words = f"stopped at once, and no checkpoint was saved; `clsplat resume {tmp_path}` begins it again"
     with pytest.raises(Interrupted, match=re.escape(words)):
         Job.open(pipeline, tiny_scene, tmp_path).run()

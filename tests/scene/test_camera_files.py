@@ -19,7 +19,7 @@ from clsplat.scene import camera_files
 from clsplat.scene.camera import MODELS, Lens
 from clsplat.scene.camera_files import DISTORTION
 from clsplat.scene.images import CameraExposure, write_exposures
-from clsplat.scene.quality import with_cameras
+from clsplat.scene.reprojection import with_cameras
 from clsplat.scene.scene import PointCloud, Tracks, make_scene
 from clsplat.scene.view import View, camera_exposures
 from clsplat.stages.export import Cameras

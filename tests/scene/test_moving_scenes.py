@@ -13,8 +13,9 @@ from clsplat.data_tools.moments import write_moments
 from clsplat.data_tools.moving import STANDING, Moving, shapes_at
 from clsplat.data_tools.synthetic import write_dataset
 from clsplat.prepare.inspect.findings import Inspection, figures
-from clsplat.prepare.undistort import undistort_scene, write_model
+from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.camera_files import write_cameras
+from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import decode_all, require_whole
 from clsplat.scene.points import read_points_ply, write_points_ply

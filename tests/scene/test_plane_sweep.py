@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from clsplat.core.errors import DataError
 from clsplat.data_tools.casting import camera_pose
 from clsplat.data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, STILL_LIFE, write_png
+from clsplat.gaussians.conversion import from_points
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
 from clsplat.scene.plane_sweep import MAX_DEPTH, MIN_DEPTH, PLANES, Surface, swept_points
@@ -21,7 +22,7 @@ from clsplat.scene.quality import MAX_SPACING, laplacian_chance, opaque_pixels, 
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View, load_image
 from clsplat.scene.viewpoint import centre_of
-from clsplat.stages.init import Init, from_points
+from clsplat.stages.init import Init
 from tests.support.data_sets import data_set
 from tests.support.runs import train
 

@@ -14,7 +14,8 @@ from clsplat.prepare.undistort import undistort_scene
 from clsplat.runs.describe import describe
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
-from clsplat.scene.quality import measured, misses, reprojection_errors, within
+from clsplat.scene.quality import measured
+from clsplat.scene.reprojection import misses, reprojection_errors, within
 from clsplat.scene.scene import Tracks
 from clsplat.scene.view import View
 from clsplat.sweeps.experiment import run_pipeline

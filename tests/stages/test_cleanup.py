@@ -8,11 +8,11 @@ import pytest
 
 from clsplat.core.errors import ConfigError, Interrupted, NumericError
 from clsplat.core.progress import Progress
+from clsplat.density.outliers import PruneFar, PruneWide
 from clsplat.gaussians.model import Model
 from clsplat.methods.adc import PruneFaint
 from clsplat.methods.micro_splatting import MergeNeighbours
 from clsplat.methods.mini_splatting import PruneUseless
-from clsplat.methods.outliers import PruneFar, PruneWide
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner
 from clsplat.scene.detect import read_scene

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.photos.exposure_estimate import Exposures, measured
-from clsplat.prepare.undistort import write_model
 from clsplat.scene.camera import Camera
+from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.images import write_image
 from clsplat.scene.scene import PointCloud, Tracks
 from clsplat.scene.view import View

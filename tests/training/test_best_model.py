@@ -16,7 +16,7 @@ from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
 from clsplat.runs.runner import as_trained
 from clsplat.runs.status import summary
-from clsplat.stages.report import NAMES, is_by_heart, parting
+from clsplat.stages.report import NAMES, is_by_heart, overfitting_note
 from clsplat.sweeps.experiment import Job
 from clsplat.training import best_model, checkpoint
 from clsplat.training.archive import split
@@ -393,11 +393,11 @@ def test_six_decibels_apart_are_learnt_by_heart(train_, validation, expected):
 def test_run_without_validation_is_told_when_it_overfits(tiny_scene, tmp_path, pipeline):
     plain = ("scene.validation=0", "optimize.keep=last", "optimize.steps=8")
     run = train(tiny_scene, tmp_path / "run", *plain, pipeline=pipeline)
-    assert parting(run) == ""
+    assert overfitting_note(run) == ""
     assert not is_by_heart(run)
     run.records.add(8, "evaluate", split="train", downscale=1, psnr=40.0, ssim=1.0)
     run.records.write()
-    assert "40.0 dB at training views" in parting(run)
-    assert "dB at test views, more than 6 dB apart: the photographs are learnt by heart" in parting(run)
-    assert "`scene.validation: auto` with `optimize.keep: best`" in parting(run)
+    assert "40.0 dB at training views" in overfitting_note(run)
+    assert "dB at test views, more than 6 dB apart: the photographs are learnt by heart" in overfitting_note(run)
+    assert "`scene.validation: auto` with `optimize.keep: best`" in overfitting_note(run)
     assert is_by_heart(run)

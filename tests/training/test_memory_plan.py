@@ -65,7 +65,7 @@ def test_points_beyond_the_memory_have_no_neighbours_looked_for(tiny_scene, tmp_
     def looked_for(*_):
         raise AssertionError("neighbours are looked for")
 
-    monkeypatch.setattr("clsplat.stages.init.neighbour_distance2", looked_for)
+    monkeypatch.setattr("clsplat.gaussians.conversion.neighbour_distance2", looked_for)
     tight = MemoryPlan(gaussian=1000, pair=0, fixed=0, largest_table=1, memory=9000, allocation=10**9)
     monkeypatch.setattr("clsplat.training.run.plan", lambda *_: tight)
     with pytest.raises(MemoryLimitError):

@@ -18,11 +18,11 @@ from clsplat.metrics.images import psnr
 from clsplat.photos.sky_detection import Seen, looked_at, panorama
 from clsplat.pipeline.capture_choice import without_choices
 from clsplat.pipeline.loading import load
-from clsplat.prepare.undistort import write_model
 from clsplat.render.backdrops import Auto
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.state import has_ended
 from clsplat.scene.camera import Camera
+from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.images import write_image
 from clsplat.scene.view import View
 from clsplat.sweeps.experiment import run_pipeline

@@ -10,6 +10,7 @@ from clsplat.conformance.checks.images import comparison_of
 from clsplat.conformance.checks.images import pictures as images
 from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
+from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, Gaussians
 from clsplat.losses.base import ImageLoss, Loss, returned
 from clsplat.losses.host import HostLoss
@@ -24,7 +25,6 @@ from clsplat.render.filters import FilterViews, measure_intervals
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs import opening
 from clsplat.scene.detect import read_scene
-from clsplat.stages.init import from_points
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
 from tests.support.device_images import gradient_of, trainer_of

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from clsplat.core.errors import DataError
 from clsplat.scene import camera_files
 from clsplat.scene.camera import Camera
-from clsplat.scene.camera_files import Posed
-from clsplat.scene.view import View
+from clsplat.scene.view import Posed, View
 from clsplat.viewer.video import camera_path
 from clsplat.viewer.video.paths import PATHS
 from tests.support.camera_rings import SIZE, rig_of, ring

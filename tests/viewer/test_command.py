@@ -16,7 +16,7 @@ from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.runs.film import names
 from clsplat.scene.detect import read_scene
-from clsplat.stages.export import Viewer
+from clsplat.stages.render import Viewer
 from clsplat.viewer import page as module
 from tests.support.commands import ran
 from tests.support.html_page import Page
@@ -119,7 +119,7 @@ def test_the_link_leads_from_another_folder(tiny_scene, tmp_path):
 
 def test_run_with_too_many_splats_shows_the_most_important(tiny_scene, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(module, "MAX_SIZE", 0.25)
-    monkeypatch.setattr("clsplat.stages.export.MAX_SIZE", 0.25)
+    monkeypatch.setattr("clsplat.stages.render.MAX_SIZE", 0.25)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set={**SHORT, "init.count": 8000})
     assert (out / "viewer.html").stat().st_size < 250_000
     assert any("most important of" in record.message for record in caplog.records)

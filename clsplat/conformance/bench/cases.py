@@ -17,6 +17,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.formats.splats import PARAMETERS, SH_C0, Parameters
 from clsplat.formats.table import detect
+from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import load
 from clsplat.methods.adc import PruneLarge
@@ -28,7 +29,6 @@ from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
 from clsplat.scene.camera import Camera
 from clsplat.scene.points import read_points_ply
 from clsplat.scene.view import View
-from clsplat.stages.init import from_points
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.memory import plan
 from clsplat.training.motion import MotionRates

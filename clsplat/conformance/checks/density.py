@@ -11,8 +11,9 @@ from clsplat.conformance.check import GRADIENT, SUM, Checks, Figure, Note, by_el
 from clsplat.conformance.checks.blending import BACKGROUND, MARGIN
 from clsplat.conformance.checks.images import comparison_of, magnitude_of, planes_of
 from clsplat.conformance.scenes import Case, random_case, safe_case, with_world_filter
-from clsplat.density.control import add_noise, cap_opacity, contributions, decay_opacity, densify, sensitivities
+from clsplat.density.control import cap_opacity, densify
 from clsplat.density.edit import Edit
+from clsplat.density.importance import contributions, sensitivities
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.density.survey import Look
 from clsplat.density.thresholds import SceneScale
@@ -22,6 +23,8 @@ from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.methods.adc import Clone, PruneFaint, PruneLarge, Split
+from clsplat.methods.binocular import decay_opacity
+from clsplat.methods.mcmc import add_noise
 from clsplat.opencl.device import Device, constants
 from clsplat.photos.photographs import Mask, Photograph
 from clsplat.render.rasterizer import Rasterizer

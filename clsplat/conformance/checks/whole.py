@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from clsplat.conformance.bench.cases import Peaks, measure_peaks, run_bench
 from clsplat.conformance.bench.cases import case as bench_case
 from clsplat.conformance.check import Checks, Figure, Note, by_element, equal
-from clsplat.conformance.host import available_memory
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.core.errors import MemoryLimitError
+from clsplat.core.machine import available_memory
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats

@@ -22,8 +22,9 @@ from clsplat.scene.detect import read_scene, reader_of
 from clsplat.scene.identity import ImageFile, decode_all
 from clsplat.scene.images import CameraExposure, exposure_of, is_image, read_grey
 from clsplat.scene.points import MAX_VALUE
-from clsplat.scene.quality import SIDE, both_sharpnesses, is_blurred, reprojection_errors, require_ahead
+from clsplat.scene.quality import SIDE, both_sharpnesses, is_blurred
 from clsplat.scene.reader import Parts
+from clsplat.scene.reprojection import reprojection_errors, require_ahead
 from clsplat.scene.scene import camera_extent, strayed
 from clsplat.scene.times import by_camera, moments_of
 from clsplat.scene.view import NO_FILE, View, camera_exposures, fits

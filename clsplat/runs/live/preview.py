@@ -211,9 +211,9 @@ class Budget:
 # The photographs of a run as small files, read when a page asks for them, and kept as long as there is room.
 
 Kind = Literal["thumbnail", "photograph"]
-PICTURES_SIDES: dict[Kind, int] = {"thumbnail": THUMBNAIL, "photograph": LARGEST}
-PICTURES_QUALITY = 88  # of JPEG
-PICTURES_ROOM = 48 << 20  # bytes that are kept
+JPEG_SIDES: dict[Kind, int] = {"thumbnail": THUMBNAIL, "photograph": LARGEST}
+JPEG_QUALITY = 88
+CACHE_BYTES = 48 << 20  # of photographs that are kept
 PATIENCE = 20.0  # s that a page waits for its share of the time
 
 
@@ -253,11 +253,11 @@ class Pictures:
         """Read a photograph, and keep all of its sizes."""
         started = time.thread_time()
         pixels = load_photograph(self.views[index], self._background, self._undistorted)[:, :, :3]
-        for kind, side in PICTURES_SIDES.items():
+        for kind, side in JPEG_SIDES.items():
             bgr = np.ascontiguousarray(shrunk(pixels, side)[..., ::-1])
-            _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, PICTURES_QUALITY])
+            _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             self._kept[kind, index] = data.tobytes()
-        while len(self._kept) > len(PICTURES_SIDES) and sum(map(len, self._kept.values())) > PICTURES_ROOM:
+        while len(self._kept) > len(JPEG_SIDES) and sum(map(len, self._kept.values())) > CACHE_BYTES:
             self._kept.popitem(last=False)
         self._budget.spend((time.thread_time() - started) / (os.cpu_count() or 1))
 

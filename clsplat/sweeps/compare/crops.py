@@ -18,7 +18,7 @@ from clsplat.runs.results import RunFolder
 from clsplat.scene.images import read_image
 from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import View, load_image
-from clsplat.stages.export import image_path
+from clsplat.stages.render import image_path
 
 MIN_SIDE, MAX_SIDE = 48, 192  # px, of a crop: a third of the image within these limits
 MAX_CROPS = 4  # of a scene, each of another view

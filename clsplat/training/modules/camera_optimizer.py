@@ -23,7 +23,7 @@ from clsplat.photos.appearance import ViewTable, adam_step
 from clsplat.render.camera import moved_camera
 from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.render.workspace import Workspace
-from clsplat.scene.quality import with_cameras
+from clsplat.scene.reprojection import with_cameras
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, zooms
 from clsplat.training.modules.base import ModuleState, Numbers, Step, TrainingModule

@@ -8,7 +8,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.losses.base import Loss
 from clsplat.losses.depth import InverseDepth
 from clsplat.photos.depths import DepthMaps, PointDepths
-from clsplat.scene.quality import within
+from clsplat.scene.reprojection import within
 from clsplat.scene.scene import Scene
 from clsplat.training.modules.base import ModuleState, Step, TrainingModule
 from clsplat.training.run import Run

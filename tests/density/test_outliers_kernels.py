@@ -9,10 +9,10 @@ from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.checks.density import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.edit import Edit
+from clsplat.density.outliers import PruneFar, PruneWide, largest_on_screen
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
-from clsplat.methods.outliers import PruneFar, PruneWide, largest_on_screen
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.devices import on_devices, on_one_setting
 

@@ -9,11 +9,11 @@ import pytest
 from clsplat.core.errors import ConfigError, Interrupted, NumericError
 from clsplat.core.progress import Progress
 from clsplat.gaussians.model import Model
+from clsplat.methods.mini_splatting import ReinitFromDepth, drawn_of
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
-from clsplat.stages.reinit import ReinitFromDepth, drawn_of
 from clsplat.training import checkpoint
 from clsplat.training.modules.base import learned_scene
 from clsplat.training.modules.camera_optimizer import DEPTHS, SHIFTS, CameraOptimizer, CameraState
