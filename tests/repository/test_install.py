@@ -144,7 +144,7 @@ def test_the_version_of_other_code_is_another(monkeypatch):
     monkeypatch.setattr("clsplat.core.resources.__version__", "1.0.dev0")
     first = compute()
     assert first.startswith("1.0.dev0+d")
-    monkeypatch.setattr("clsplat.core.resources.list_sources", lambda: ["other"])
+    monkeypatch.setattr("clsplat.core.resources._files_of_code", lambda: ["other"])
     assert compute() not in (first, "1.0.dev0")
     monkeypatch.setattr("clsplat.core.resources.__version__", "1.0")
     assert compute() == "1.0"
