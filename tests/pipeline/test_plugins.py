@@ -455,7 +455,9 @@ def test_the_public_module_lists_all_that_it_imports():
     from clsplat import plugin
 
     node = ast.parse(Path(plugin.__file__).read_text("utf-8"))
-    names = {alias.name for part in node.body if isinstance(part, ast.ImportFrom) for alias in part.names}
+    names = {
+        alias.asname or alias.name for part in node.body if isinstance(part, ast.ImportFrom) for alias in part.names
+    }
     assert sorted(names) == plugin.__all__ == sorted(plugin.__all__)
     inside = [
         path for path in (ROOT / "clsplat").rglob("*.py") if "clsplat.plugin" in imported(path.read_text("utf-8"))

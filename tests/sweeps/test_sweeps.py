@@ -93,7 +93,7 @@ def test_the_tasks_of_a_job_array_run_the_cells_of_a_matrix(file, runs, tmp_path
     for name, text in {"sbatch": tasks, "clsplat": f'echo "$@" >> {shlex.quote(str(calls))}'}.items():
         (programs / name).write_text(f"#!/bin/sh\n{text}\n")
         (programs / name).chmod(0o755)
-    script = Path(__file__).parents[1] / "examples" / "deploy" / "array.sh"
+    script = Path(__file__).parents[2] / "examples" / "deploy" / "array.sh"
     path = {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"}
     subprocess.run([programs / "sbatch", "--array=0-1", script, file, store], env=path, timeout=60, check=True)
     for line in calls.read_text().splitlines():
