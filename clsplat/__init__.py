@@ -11,8 +11,7 @@ Names are imported when they are first used, and no device is opened before that
 
 import importlib
 import sys
-from importlib.machinery import ModuleSpec
-from importlib.util import spec_from_file_location
+from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,7 +83,10 @@ class _CheckoutFinder:
         folder = Path(__file__).resolve().parents[1] / "data_tools"
         if name != "clsplat.data_tools" or not folder.is_dir():
             return None
-        return spec_from_file_location(name, folder / "__init__.py", submodule_search_locations=[str(folder)])
+        file = str(folder / "__init__.py")
+        spec = ModuleSpec(name, SourceFileLoader(name, file), origin=file, is_package=True)
+        spec.submodule_search_locations = [str(folder)]
+        return spec
 
 
 sys.meta_path.append(_CheckoutFinder)
