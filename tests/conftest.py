@@ -32,7 +32,10 @@ from clsplat.sweeps.task import Terms
 from tests.support.devices import NAMES, TUNINGS
 from tests.support.runs import FEW, killed, train
 
-hypothesis.settings.register_profile("suite", deadline=None)  # a busy machine is no fault
+# A busy machine is no fault, and a change is judged by the same examples each time; `--hypothesis-profile search` tries
+# other ones.
+hypothesis.settings.register_profile("search", deadline=None)
+hypothesis.settings.register_profile("suite", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("suite")
 KERNEL_TESTS = "test_*_kernels.py"
 LAST = "test_every_kernel_was_launched"
