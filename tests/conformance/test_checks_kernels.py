@@ -31,6 +31,7 @@ def cases() -> list[Any]:
     ]
 
 
+@pytest.mark.usefixtures("reference_once")
 @pytest.mark.parametrize(("device", "check"), cases(), indirect=["device"])
 def test_the_figures_of_a_check_hold(device, check):
     found = list(check.figures(device))

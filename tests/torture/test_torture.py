@@ -18,7 +18,8 @@ SCRIPT = """
 import json, sys
 from pathlib import Path
 from tests.torture import kills
-kills.SETTINGS = {"smoke": {"checkpoint.every": 1, "optimize.steps": 8, "init.count": 60}}
+steps = {"optimize.steps": 8, "checkpoint.every": 1, "densify.every": 2, "densify.start": 1}
+kills.SETTINGS = {"smoke": {**steps, "init.count": 60}}
 *_, tally = kills.kills(Path(sys.argv[1]), Path(sys.argv[2]), 1)
 print(json.dumps(tally))
 """

@@ -68,9 +68,9 @@ def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_p
     run = train(
         tiny_scene,
         tmp_path / "run",
-        "optimize.steps=300",
-        "densify.stop=200",
-        "optimize.modules.transients={start: 300}",
+        "optimize.steps=150",
+        "densify.stop=100",
+        "optimize.modules.transients={start: 150}",
     )
     photograph = run.photographs.get(run.scene.split("train")[3])
     pixels = photograph.colours.get()
@@ -79,8 +79,8 @@ def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_p
     workspace, planes = run.rasterizer.workspace, photograph.planes(run.rasterizer.workspace)
     image = run.rasterizer.forward(run.model, photograph.camera, run.photographs.background).image
     residuals, _ = measure_residuals(workspace, photograph.camera, image, planes.colours, None)
-    settings = Transients(start=300, tail=0)
-    threshold = settings.threshold(run.modules["transients"].numbers, 301)
+    settings = Transients(start=150, tail=0)
+    threshold = settings.threshold(run.modules["transients"].numbers, 151)
     assert threshold is not None
     reach = max(1, round(settings.box * 40 / 2))
     left_out = mask_transients(workspace, photograph.camera, residuals, threshold, reach).get()[0, :40, :40] == 0
