@@ -303,9 +303,9 @@ def test_a_record_that_was_changed_is_damaged(scene):
 
 
 @pytest.mark.parametrize("what", ["photograph", "pose", "points"])
-def test_a_run_does_not_go_on_with_other_inputs(scene, few_steps, tmp_path, what):
+def test_a_run_does_not_go_on_with_other_inputs(scene, tmp_path, what):
     out = tmp_path / "run"
-    shutil.copytree(few_steps, out)
+    train(scene, out, *FEW)
     file = views(scene)[0].image_path
     kept = {path: path.read_bytes() for path in (file, scene / "transforms_train.json", scene / "points3d.ply")}
     if what == "photograph":
@@ -331,8 +331,8 @@ def test_a_run_does_not_go_on_with_other_inputs(scene, few_steps, tmp_path, what
     command("run", "smoke", *WORDS, "--scene", scene, "--out", out, "--resume")
 
 
-def test_without_the_record_the_checkpoint_knows_the_inputs(scene, few_steps, tmp_path, caplog):
-    shutil.copytree(few_steps, tmp_path / "run")
+def test_without_the_record_the_checkpoint_knows_the_inputs(scene, tmp_path, caplog):
+    train(scene, tmp_path / "run", *FEW)
     record = tmp_path / "run" / "inputs.json"
     record.write_text("{}")
     train(scene, tmp_path / "run", *FEW, resume=True)
@@ -345,8 +345,8 @@ def test_without_the_record_the_checkpoint_knows_the_inputs(scene, few_steps, tm
     assert record.read_text() == "{}", "the new inputs do not become those of the start"
 
 
-def test_run_that_never_looked_at_its_inputs_resumes_and_says_so(scene, few_steps, tmp_path, caplog):
-    shutil.copytree(few_steps, tmp_path / "run")
+def test_run_that_never_looked_at_its_inputs_resumes_and_says_so(scene, tmp_path, caplog):
+    train(scene, tmp_path / "run", *FEW)
     (tmp_path / "run" / "inputs.json").unlink()
     newest = sorted((tmp_path / "run" / "checkpoints").iterdir())[-1]
     crafted(newest, lambda notes, arrays: notes.update(inputs=""))
@@ -357,12 +357,12 @@ def test_run_that_never_looked_at_its_inputs_resumes_and_says_so(scene, few_step
 # ---- dry runs
 
 
-def test_a_dry_run_of_a_resumed_run_says_from_where(scene, few_steps, tmp_path):
+def test_a_dry_run_of_a_resumed_run_says_from_where(scene, tmp_path):
     out = tmp_path / "run"
     words = ["run", "smoke", *WORDS, "--scene", scene, "--out", out, "--dry-run"]
     assert "nothing to resume; would run in" in command(*words, "--resume").stdout
     assert not out.exists()
-    shutil.copytree(few_steps, out)
+    train(scene, out, *FEW)
     assert f"would go on from step 12 in {out}" in command(*words, "--resume").stdout
     assert "already holds a run" in command(*words, expect=2).stderr
     done = command(*words, "--resume", "--set", "seed=7", expect=2)
