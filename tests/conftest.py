@@ -7,7 +7,9 @@ cases of a test with parameters with one each, in turn (`on_devices`). Their lau
 every kernel has a test.
 """
 
+import copy
 import functools
+import os
 import signal
 import sys
 from collections.abc import Generator, Iterator
@@ -25,7 +27,7 @@ from clsplat.opencl import device as opencl_device
 from clsplat.opencl import device as program
 from clsplat.opencl.device import Array, Device, Kernel, Program
 from clsplat.opencl.discovery import DeviceInfo, choose
-from clsplat.pipeline import plugins
+from clsplat.pipeline import loading, plugins, yaml_file
 from clsplat.scene.reader import Reader
 from clsplat.sweeps.store import Store
 from clsplat.sweeps.task import Terms
@@ -55,18 +57,27 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Give processes that share the tests whole modules, and one of them all of the kernels."""
+    """Give processes that share the tests whole modules, and one of them all of the kernels, in the order of
+    collection: xdist would sort modules by their number of tests, and a few expensive tests would be the last."""
     from xdist.scheduler import LoadFileScheduling
 
     class Scheduling(LoadFileScheduling):  # type: ignore[misc]
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            self.config.option.loadscopereorder = False
+
         def _split_scope(self, nodeid: str) -> str:
             return "kernels" if "_kernels.py::" in nodeid else str(super()._split_scope(nodeid))
 
     return Scheduling(config, log)
 
 
+def is_kernel_path(path: Path) -> bool:
+    return path.match(KERNEL_TESTS)
+
+
 def is_kernel_test(item: pytest.Item) -> bool:
-    return item.path.match(KERNEL_TESTS)
+    return is_kernel_path(item.path)
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
@@ -81,9 +92,11 @@ def pytest_deselected(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(trylast=True)  # after -m and -k
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Put the test that looks back behind all others; note whether all kernel tests are there."""
-    items.sort(key=lambda item: item.name == LAST)
+    """Begin with kernel tests and slow modules, so that processes end together; put the test that looks back behind
+    all others; note whether all kernel tests are there."""
     collected = {item.path for item in items}
+    first = {item.path for item in items if item.get_closest_marker("slow")} | set(filter(is_kernel_path, collected))
+    items.sort(key=lambda item: (item.name == LAST, item.path not in first, not is_kernel_test(item)))
     parts = any("::" in argument for argument in config.args)
     if parts or config.getoption("--one-each") or not collected >= set(Path(__file__).parent.rglob(KERNEL_TESTS)):
         config.stash[IS_WHOLE] = False
@@ -200,16 +213,45 @@ def built_once() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def parsed_once() -> Iterator[None]:
+    """Texts of YAML are parsed, and plain data become text, once: tests read the shipped pipelines again and again."""
+    parse, texts, write = functools.lru_cache(512)(yaml_file._parse), dict[str, str](), yaml_file.yaml_text
+
+    def text_of(data: Any) -> str:
+        key = repr(data)
+        if key not in texts:
+            if len(texts) == 512:
+                texts.clear()
+            texts[key] = write(data)
+        return texts[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(yaml_file, "_parse", lambda *words: copy.deepcopy(parse(*words)))
+        patch.setattr(loading, "yaml_text", text_of)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_wait_for_the_disk() -> Iterator[None]:
+    """No test pulls the plug: what is written need not reach the disk. Processes that tests start do wait."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", os.fstat)
+        yield
+
+
 @pytest.fixture
 def without_plugins() -> Iterator[None]:
     """Forget the plug-ins that a test has loaded."""
     defined, readers = list(Settings.defined), list(Reader.defined)
     yield
+    is_clean = not plugins._loaded and (Settings.defined, Reader.defined) == (defined, readers)
     Settings.defined[:], Reader.defined[:] = defined, readers
     plugins._loaded.clear()
     for name in [name for name in sys.modules if name.startswith("clsplat_plugin_")]:
         del sys.modules[name]
-    rebuild()
+    if not is_clean:
+        rebuild()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -16,6 +16,7 @@ from clsplat import cli
 from clsplat.core.errors import ClsplatError, OutputError
 from clsplat.core.files import write_text
 from clsplat.opencl.device import Device
+from clsplat.stages.evaluate import Evaluate
 from tests.support.commands import clsplat, process
 
 pytestmark = pytest.mark.slow
@@ -53,7 +54,7 @@ def folder_in_the_way(scene: Path, folder: Path) -> list[str]:
 
 CAUSES: dict[str, tuple[int, str | Callable[[Path, Path], list[str]], str, str | None]] = {
     # name: (code, what is added to the command or done before it, words of the sentence, state; None: no run folder)
-    "a run to its end": (0, "", "", "done"),
+    "a run to its end": (0, "--set optimize.steps=5", "", "done"),
     "an unknown key": (2, "--set optimize.stepz=3", "did you mean 'steps'", None),
     "no such option": (2, "--fast", "no option --fast", None),
     "a damaged photograph": (3, damaged_photograph, "", "failed"),
@@ -158,8 +159,7 @@ def test_too_little_memory_is_code_5(tiny_scene, tmp_path, monkeypatch, capsys):
     check_status(out, 5, "failed", errors)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-def test_a_signal_is_code_130(number, tiny_scene, tmp_path):
+def test_a_signal_is_code_130(tiny_scene, tmp_path):
     out = tmp_path / "run"
     command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(out)]
     command += ["--set", "optimize.steps=1000000"]
@@ -167,9 +167,25 @@ def test_a_signal_is_code_130(number, tiny_scene, tmp_path):
     while not (out / "metrics.jsonl").exists() or not (out / "metrics.jsonl").read_text():
         assert process.poll() is None
         time.sleep(0.05)
-    process.send_signal(number)
+    process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
+    check_interrupted(out, process.returncode, errors)
+
+
+def test_sigterm_within_a_step_is_code_130(tiny_scene, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "run"
+
+    def stop(*arguments):
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Evaluate, "run", stop)
+    words = ["--set", "optimize.steps=20", "optimize.evaluate.every=2"]
+    code, errors = in_this_process(monkeypatch, capsys, "run", "smoke", "--scene", tiny_scene, "--out", out, *words)
+    check_interrupted(out, code, errors)
+
+
+def check_interrupted(out: Path, code: int, errors: str) -> None:
+    assert code == 130
     assert "error" not in errors
     assert "stopped at step" in errors
     assert list((out / "checkpoints").glob("*.npz"))

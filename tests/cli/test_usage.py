@@ -129,14 +129,16 @@ def test_the_device_stands_before_the_command_or_after_it(finished):
 
 
 JSON = ["check smoke --json", "check --schema", "pipelines --json", "pipelines splat --json", "status RUN --json",
-        "inspect SCENE --json", "pipelines smoke --copy FILE --json", "evaluate RUN"]  # fmt: skip
-JSON_OF_DEVICES = ["evaluate RUN/point_cloud.ply --scene SCENE",
-                   "bench --scenes , --model RUN/point_cloud.ply --scene SCENE --repeats 1 --json"]  # fmt: skip
+        "inspect SCENE --json", "pipelines smoke --copy FILE --json", "evaluate RUN",
+        "bench --scenes , --model RUN/point_cloud.ply --scene SCENE --repeats 1 --json"]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("run", "arguments"),
-    [*((clsplat, line) for line in JSON), *((process, line) for line in JSON_OF_DEVICES)],  # whose runtimes print too
+    [
+        *((clsplat, line) for line in JSON),
+        (process, "evaluate RUN/point_cloud.ply --scene SCENE"),
+    ],  # runtimes print too
 )
 def test_json_is_all_that_stdout_holds(run, arguments, finished, tiny_scene, tmp_path):
     places = {"RUN": str(finished), "SCENE": str(tiny_scene), "FILE": str(tmp_path / "x.yaml")}

@@ -24,6 +24,7 @@ from clsplat.runs import run_folder
 from clsplat.runs.run_folder import free_folder
 from clsplat.training import status as writing
 from tests.support.commands import clsplat as command
+from tests.support.runs import ONE_CORE
 
 pytestmark = pytest.mark.slow
 NONE = 99999999  # no process has this number
@@ -145,7 +146,8 @@ def test_two_runs_in_one_folder(tiny_scene, tmp_path):
     """The second is refused while the first goes on, with and without --resume; the first ends undisturbed."""
     out = tmp_path / "run"
     arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(out), "--set", "optimize.steps=1000000"]
-    process = subprocess.Popen([sys.executable, "-m", "clsplat", *arguments], stdout=subprocess.DEVNULL)
+    slow = {**os.environ, **ONE_CORE}
+    process = subprocess.Popen([sys.executable, "-m", "clsplat", *arguments], stdout=subprocess.DEVNULL, env=slow)
     try:
         while not (out / "metrics.jsonl").exists() or not (out / "metrics.jsonl").read_text():
             assert process.poll() is None

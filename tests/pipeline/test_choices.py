@@ -284,6 +284,10 @@ def test_photos_recipe_chooses_by_their_number_and_the_sky(photographs, sky, dro
     growing = [stage for stage in training.during if isinstance(stage, Densify)]
     assert [one.per_pixel for one in growing] == [most, None]
     assert settings.training.modules[0].above == 0.2, "of a dataset that does not tell how good its cameras are"
+
+
+def test_photos_recipe_of_many_photographs_is_fast():
+    settings = load("photos").settings
     many, fast = choose(settings, {"photographs": 200, "sky": 1, "reprojection_error": 0.3}), load("fast").settings
     assert [getattr(one, "above", None) for one in many.training.modules] == [0.2]
     init, training, *others = many.stages

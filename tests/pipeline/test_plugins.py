@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from clsplat.core.errors import ConfigError, as_clsplat_error
 from clsplat.core.settings import Settings, variants
@@ -19,6 +18,7 @@ from clsplat.density.edit import Rule
 from clsplat.pipeline import plugins
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import readers
+from tests.support.commands import clsplat
 from tests.support.runs import train
 
 ROOT = Path(__file__).parents[2]
@@ -350,61 +350,48 @@ def with_imports_of_the_package(text: str) -> str:
 
 
 def test_the_bits_are_those_of_the_same_code_inside_the_package(tiny_scene, tmp_path):
-    """A copy of the package with the example among its modules, run in a process of its own, beside the plug-in."""
+    """A copy of the package with the examples among its modules runs in a process of its own; the plug-ins here."""
     inside = tmp_path / "inside"
     shutil.copytree(EXAMPLES.parent / "clsplat", inside / "clsplat", ignore=shutil.ignore_patterns("__pycache__"))
     for folder in ("cl_kernels", "pipelines", "data_tools"):
         shutil.copytree(EXAMPLES.parent / folder, inside / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    plugins_used = []
     for name, room in {"opacity_entropy": "losses", "box_blur": "photos"}.items():
         text = (EXAMPLES / f"{name}.py").read_text("utf-8")
         (inside / "clsplat" / room / f"{name}.py").write_text(with_imports_of_the_package(text), "utf-8")
         shutil.copy(EXAMPLES / f"{name}.cl", inside / "clsplat" / room)
-        plugins_used += ["--plugin", str(EXAMPLES / f"{name}.py")]
+        plugins.load_file(EXAMPLES / f"{name}.py")
     code = f"import sys; sys.path.insert(0, {str(inside)!r}); from clsplat.cli import main; main()"
-    hashes = []
-    for file in plugins_used[1::2]:
-        plugins.load_file(Path(file))
     sets = [part for setting in TRIAL for part in ("--set", setting)]
-    for label, command in (
-        ("in", [sys.executable, "-c", code]),
-        ("out", [sys.executable, "-m", "clsplat", *plugins_used]),
-    ):
-        arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(tmp_path / label), *sets]
-        cwd = inside if label == "in" else EXAMPLES.parent
-        done = subprocess.run([*command, *arguments], capture_output=True, text=True, cwd=cwd, check=False)
-        assert done.returncode == 0, done.stderr
-        hashes.append((tmp_path / label / "point_cloud.ply").read_bytes())
-    assert hashes[0] == hashes[1]
+    arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(tmp_path / "in"), *sets]
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=inside)
+    assert done.returncode == 0, done.stderr
+    train(tiny_scene, tmp_path / "out", *TRIAL)
+    within, beside = ((tmp_path / label / "point_cloud.ply").read_bytes() for label in ("in", "out"))
+    assert within == beside
     recorded = (tmp_path / "out" / "pipeline.yaml").read_text()
     assert re.search(r"plugins: \{opacity_entropy: .*, box_blur: ", recorded)
     for name, setting in (("opacity_entropy", "optimize.losses=[l1]"), ("box_blur", "optimize.views.transforms=[]")):
         without = train(tiny_scene, tmp_path / f"without_{name}", *TRIAL, setting)
-        assert (without.out / "point_cloud.ply").read_bytes() != hashes[0], f"{name} changes nothing"
+        assert (without.out / "point_cloud.ply").read_bytes() != within, f"{name} changes nothing"
 
 
-def test_a_run_with_a_plugin_resumes_only_with_it(tiny_scene, tmp_path):
-    runner, out = CliRunner(), tmp_path / "run"
-    from clsplat import cli
-
-    arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(out)]
-    arguments += ["--set", "optimize.losses=[l1, opacity_entropy]"]
-    plugin = ["--plugin", str(EXAMPLES / "opacity_entropy.py")]
-    assert runner.invoke(cli.app, [*plugin, *arguments]).exit_code == 0
-    command = [sys.executable, "-m", "clsplat", "run", str(out / "pipeline.yaml"), "--out", str(out), "--resume"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=EXAMPLES.parent, check=False)
-    assert done.returncode == 2
-    assert "needs the plug-in 'opacity_entropy', which is not loaded" in done.stderr
-    assert "Traceback" not in done.stderr
-    status = json.loads((out / "status.json").read_text())
-    assert status["state"] == "done", "a refused command leaves the run as it was"
+def test_a_run_with_a_plugin_is_used_only_with_it(tiny_scene, tmp_path):
+    plugin, out = EXAMPLES / "opacity_entropy.py", tmp_path / "run"
+    sets = ["--set", "optimize.losses=[l1, opacity_entropy]", "optimize.steps=4"]
+    clsplat("--plugin", plugin, "run", "smoke", "--scene", tiny_scene, "--out", out, *sets)
+    plugins._loaded.clear()
+    for command in (["run", out / "pipeline.yaml", "--out", out, "--resume"], ["evaluate", out]):
+        done = clsplat(*command, expect=2)
+        assert "needs the plug-in 'opacity_entropy', which is not loaded; use --plugin" in done.stderr
+        status = json.loads((out / "status.json").read_text())
+        assert status["state"] == "done", "a refused command leaves the run as it was"
 
 
 def test_a_comparison_says_which_plugins_are_missing(tiny_scene, tmp_path, caplog):
     from clsplat.sweeps.compare.page import write_comparison
 
     plugins.load_file(EXAMPLES / "opacity_entropy.py")
-    out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]").out
+    out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]", "optimize.steps=4").out
     write_comparison([out], tmp_path / "with.html")
     plugins._loaded.clear()
     write_comparison([out], tmp_path / "without.html")
@@ -412,15 +399,6 @@ def test_a_comparison_says_which_plugins_are_missing(tiny_scene, tmp_path, caplo
     assert sentence in caplog.text
     assert sentence not in (tmp_path / "with.html").read_text()
     assert sentence.replace("'", "&#39;") in (tmp_path / "without.html").read_text()
-
-
-def test_commands_on_a_run_say_that_its_plugin_is_missing(tiny_scene, tmp_path):
-    plugins.load_file(EXAMPLES / "opacity_entropy.py")
-    out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]").out
-    arguments = [sys.executable, "-m", "clsplat", "evaluate", str(out)]
-    done = subprocess.run(arguments, capture_output=True, text=True, cwd=EXAMPLES.parent, check=False)
-    assert done.returncode == 2
-    assert "needs the plug-in 'opacity_entropy', which is not loaded; use --plugin" in done.stderr
 
 
 # ---- the public module
@@ -459,9 +437,9 @@ def test_the_public_module_lists_all_that_it_imports():
         alias.asname or alias.name for part in node.body if isinstance(part, ast.ImportFrom) for alias in part.names
     }
     assert sorted(names) == plugin.__all__ == sorted(plugin.__all__)
-    inside = [
-        path for path in (ROOT / "clsplat").rglob("*.py") if "clsplat.plugin" in imported(path.read_text("utf-8"))
-    ]
+    texts = {path: path.read_text("utf-8") for path in (ROOT / "clsplat").rglob("*.py")}
+    may = [path for path, text in texts.items() if re.search(r"clsplat\.plugin\b|from clsplat import", text)]
+    inside = [path for path in may if "clsplat.plugin" in imported(texts[path])]
     assert inside == [], "nothing in the package imports it"
 
 

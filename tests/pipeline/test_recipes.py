@@ -39,10 +39,10 @@ ALONE = """
 import functools, sys
 from pathlib import Path
 from clsplat.opencl import device
-from tests.support.recipes import short, train
+from tests.support.recipes import STEPS, short, train
 device.context_of, device.built = functools.cache(device.context_of), functools.cache(device.built)
 for name in sys.argv[3:]:
-    train(short(name, Path(sys.argv[1])), Path(sys.argv[2]) / name)
+    train(short(name, Path(sys.argv[1]), saved=STEPS), Path(sys.argv[2]) / name)
 """
 
 
@@ -69,6 +69,7 @@ def test_recipes_of_7000_steps_differ_from_twins_in_numbers():
 
 @pytest.fixture(scope="module")
 def with_one_thread(tiny_scene, tmp_path_factory):
+    """The runs of a process with one thread; their bits are the same whether or not they save checkpoints."""
     folder = tmp_path_factory.mktemp("alone")
     command = [sys.executable, "-c", ALONE, tiny_scene, folder, *RECIPES]
     environment = {**os.environ, **ONE_THREAD}

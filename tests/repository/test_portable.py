@@ -2,6 +2,8 @@
 
 import ast
 import errno
+import functools
+import json
 import os
 import subprocess
 import sys
@@ -57,6 +59,19 @@ def outside(function):
 builtins.open = io.open = outside(open)
 os.readlink, os.stat, os.listdir = outside(os.readlink), outside(os.stat), outside(os.listdir)
 '''
+SEVERAL = """
+import json, sys
+from clsplat.cli import main
+
+for code, *words in json.loads(sys.argv[1]):
+    sys.argv = ["clsplat", *words]
+    try:
+        main()
+    except SystemExit as end:
+        assert (end.code or 0) == code, (words, end.code)
+    else:
+        assert code == 0, words
+"""
 SYSTEMS = {"without POSIX": WITHOUT_POSIX.format(modules=sorted(POSIX_ONLY - {"posix"})), "like macOS": LIKE_MACOS}
 
 
@@ -79,6 +94,14 @@ def command(environment: dict[str, str], *arguments: str | Path, expect: int = 0
     return done
 
 
+def commands(environment: dict[str, str], *lines: list[int | str | Path], text: bool = True):
+    """Run commands, each with the exit code to expect before its words, in one process: a start costs a second."""
+    words = [sys.executable, "-c", SEVERAL, json.dumps(lines, default=str)]
+    done = subprocess.run(words, capture_output=True, text=text, env=environment, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
 def test_every_test_module_is_imported(tmp_path):
     (tmp_path / "every_test.py").write_text(
         "import importlib, sys, pytest\n"
@@ -95,26 +118,25 @@ def test_every_test_module_is_imported(tmp_path):
 
 def test_a_scene_is_made_trained_and_resumed(system, tmp_path):
     scene, out = tmp_path / "scene", tmp_path / "run"
-    command(system, "clsplat", "data", "synthetic", scene, "--size", "32", "--train", "4", "--test", "1")
+    made = [0, "data", "synthetic", scene, "--size", "32", "--train", "4", "--test", "1"]
     small = ["--set", "optimize.steps=8", "optimize.log_every=2"]
-    command(system, "clsplat", "run", "smoke", "--scene", scene, "--out", out, *small)
-    assert ": done at step 8" in command(system, "clsplat", "status", out).stdout
+    trained = [0, "run", "smoke", "--scene", scene, "--out", out, *small]
+    assert ": done at step 8" in commands(system, made, trained, [0, "status", out]).stdout
     (out / "point_cloud.ply").unlink()
     command(system, "clsplat", "resume", out)
     assert (out / "point_cloud.ply").is_file()
 
 
-CONSOLES = [
-    *(("ascii", shown) for shown in (["run", "--help"], ["pipelines", "splat"], ["run", "…×°.yaml"])),
-    *(("cp1252", ["devices"]), ("cp437", ["run", "…×°.yaml"])),
-]
+CONSOLES = {
+    "ascii": [[0, "run", "--help"], [0, "pipelines", "splat"], [2, "run", "…×°.yaml"]],
+    **{"cp1252": [[0, "devices"]], "cp437": [[2, "run", "…×°.yaml"]]},
+}
 
 
-@pytest.mark.parametrize(("encoding", "arguments"), CONSOLES, ids=str)
-def test_a_console_of_few_characters_shows_every_text(encoding, arguments):
+@pytest.mark.parametrize("encoding", CONSOLES)
+def test_a_console_of_few_characters_shows_every_text(encoding):
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0", "LC_ALL": "C"}
-    expect = 2 if arguments[-1].endswith(".yaml") else 0
-    done = command(environment, "clsplat", *arguments, expect=expect, text=False)
+    done = commands(environment, *CONSOLES[encoding], text=False)
     assert b"Traceback" not in done.stderr
     assert (done.stdout + done.stderr).decode(encoding)
 
@@ -127,8 +149,13 @@ def test_a_run_on_a_console_of_few_characters_ends_well(tiny_scene, tmp_path):
     assert "Traceback" not in done.stderr
 
 
+@functools.cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"))
+
+
 def calls(path: Path) -> list[ast.Call]:
-    return [node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Call)]
+    return [node for node in ast.walk(tree(path)) if isinstance(node, ast.Call)]
 
 
 def is_text_of_an_unknown_encoding(call: ast.Call) -> bool:
@@ -167,11 +194,12 @@ def test_text_files_name_their_encoding():
 def test_modules_of_some_systems_are_imported_where_used():
     faults = []
     for path in FILES:
-        for node in ast.parse(path.read_text("utf-8")).body:
+        for node in tree(path).body:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             if set(names) & (POSIX_ONLY | {"msvcrt", "winreg", "_winapi"}):
                 faults.append(f"{path}:{node.lineno}: import it where it is used")
+    tree.cache_clear()
     assert not faults, "\n".join(faults)
 
 

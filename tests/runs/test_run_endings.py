@@ -26,7 +26,6 @@ from clsplat.runs import opening
 from clsplat.sweeps import experiment
 from clsplat.sweeps.experiment import Job
 from tests.support.commands import clsplat
-from tests.support.runs import write_status
 
 pytestmark = pytest.mark.slow
 
@@ -127,7 +126,7 @@ def test_a_run_continues_when_its_output_is_not_read(tiny_scene, tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-@pytest.mark.parametrize("arguments", [["devices"], ["check", "smoke", "--json"], ["--help"]], ids=" ".join)
+@pytest.mark.parametrize("arguments", [["devices"], ["--help"]], ids=" ".join)
 def test_output_that_cannot_be_written_is_one_line(arguments):
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "clsplat", *arguments]
@@ -160,11 +159,10 @@ def test_the_terminal_keeps_stdout_for_json(capsys):
     assert captured.err == "a remark\nwarning: a warning\n"
 
 
-@pytest.mark.parametrize("arguments", ["status RUN --json", "--version"])
-def test_a_command_without_stdout_says_so(arguments, tmp_path):
-    write_status(tmp_path, state="done", step=7)
-    command = f'"{sys.executable}" -m clsplat {arguments.replace("RUN", str(tmp_path))} >&-'
-    done = subprocess.run(command, shell=True, stderr=subprocess.PIPE, text=True, timeout=60)
+def test_a_command_without_stdout_says_so():
+    done = subprocess.run(
+        f'"{sys.executable}" -m clsplat --version >&-', shell=True, stderr=subprocess.PIPE, text=True, timeout=60
+    )
     assert done.returncode == 7
     assert done.stderr.startswith("error: stdout: cannot be written")
     assert done.stderr.count("\n") == 1

@@ -26,6 +26,8 @@ from clsplat.stages.init import Init
 from tests.support.data_sets import data_set
 from tests.support.runs import train
 
+pytestmark = pytest.mark.slow
+
 DEPTH = 4.0
 SIDE = 96  # px of the ray-cast photographs
 
@@ -60,7 +62,7 @@ def test_a_wall_is_found_where_it_is(rng):
 
 
 def test_the_same_points_every_time(rng):
-    views, photographs = wall_views(rng)
+    views, photographs = wall_views(rng, 3)
     first, second = (swept_points(views, np.array([0, 0, 4.0]), lambda v: photographs[v.name], 700, 3) for _ in "ab")
     np.testing.assert_array_equal(first.positions, second.positions)
     np.testing.assert_array_equal(first.colours, second.colours)
@@ -121,10 +123,16 @@ def test_a_sky_gives_no_points_of_detail(table):
     assert len(detailed(table, lambda view: inner[view.name], chance=None)) > 500, "the sweep alone finds some"
 
 
-def test_transparent_pixels_give_no_points(table):
+@pytest.fixture(scope="module")
+def everywhere(table):
+    """Points of detail on all pixels."""
+    return detailed(table, lambda view: None)
+
+
+def test_transparent_pixels_give_no_points(table, everywhere):
     shown = {view.name: opaque_pixels(view) for view in table[0]}
     assert not any((shown[name] & np.isinf(depth)).any() for name, depth in table[1].items())
-    assert 500 < len(detailed(table, opaque_pixels)) < len(detailed(table, lambda view: None))
+    assert 500 < len(detailed(table, opaque_pixels)) < len(everywhere)
 
 
 def test_pixels_that_a_mask_leaves_out_give_no_points(table, tmp_path):
@@ -138,7 +146,7 @@ def test_pixels_that_a_mask_leaves_out_give_no_points(table, tmp_path):
 
 
 def test_detail_gets_more_points(rng):
-    views, photographs = wall_views(rng)
+    views, photographs = wall_views(rng, 3)
     blurred = {name: cv2.GaussianBlur(image, (0, 0), 4) for name, image in photographs.items()}
     half = np.arange(120) < 60
     mixed = {name: np.where(half[:, None], image, blurred[name]) for name, image in photographs.items()}
@@ -181,7 +189,7 @@ def test_what_the_scene_has_is_not_new():
 
 
 def test_what_the_scene_lacks_is_added(rng):
-    views, photographs = wall_views(rng)
+    views, photographs = wall_views(rng, 4)
     centre, load = np.array([0, 0, DEPTH]), lambda view: photographs[view.name]
     alone = swept_points(views, centre, load, 10**6, 0).positions
     left = alone[alone[:, 0] < 0].astype(np.float64)
@@ -190,8 +198,8 @@ def test_what_the_scene_lacks_is_added(rng):
     assert np.mean(new[:, 0] > -0.1) > 0.95
 
 
-def test_points_of_detail_are_the_same_every_time(table):
-    first, second = (detailed(table, lambda view: None) for _ in "ab")
+def test_points_of_detail_are_the_same_every_time(table, everywhere):
+    first, second = everywhere, detailed(table, lambda view: None)
     for name in ("positions", "colours", "sizes"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     some = swept_points(table[0], LOOK_AT, before_a_sky, 700, 0, laplacian_chance)

@@ -22,22 +22,27 @@ SENSITIVE = {
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
 
 
-def short(name: str, scene: Path, *overrides: str) -> Pipeline:
-    """A recipe in STEPS steps, with edits every 4, without pictures and pages."""
+def short(name: str, scene: Path, *overrides: str, saved: int = 4) -> Pipeline:
+    """A recipe in STEPS steps, with edits every 4, a checkpoint every `saved`, without pictures and pages."""
     opaque, sensitive = "init.opacity=0.3", SENSITIVE.get(name.removesuffix("_7k"), [])  # faint ones have no time
     pipeline = load(name, [f"scene.path='{scene}'", opaque, *sensitive, *overrides])
     settings = stretched(pipeline.settings, STEPS / pipeline.settings.training.steps)
     pairs = zip(pipeline.stages, settings.stages, strict=True)
-    stages = [often(old, stage) if isinstance(stage, Optimize) else stage for old, stage in pairs]
+    stages = [often(old, stage, saved) if isinstance(stage, Optimize) else stage for old, stage in pairs]
     kept = [stage for stage in stages if stage.stage in ("init", "optimize", "take_average", "export")]
     return Pipeline(pipeline.path, settings.model_copy(update={"stages": kept}))
 
 
-def often(old: Stage, loop: Optimize) -> Optimize:
+def often(old: Stage, loop: Optimize, saved: int) -> Optimize:
     """Edits every few steps; without resets to faint, from which so few steps do not recover."""
     assert isinstance(old, Optimize)
     during = [
-        stage.model_copy(update={"every": 4, **({"start": 0} if stage.stage == "add_to_average" else {})})
+        stage.model_copy(
+            update={
+                "every": saved if stage.stage == "checkpoint" else 4,
+                **({"start": 0} if stage.stage == "add_to_average" else {}),
+            }
+        )
         if before.every != 1 and stage.stage != "raise_sh"
         else stage
         for before, stage in zip(old.during, loop.during, strict=True)

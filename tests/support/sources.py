@@ -1,6 +1,7 @@
 """The checkout and its Python sources, and what they import: lints read them."""
 
 import ast
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,8 +23,13 @@ def room(module: str) -> str:
     return module.split(".")[1] if module not in FACES else ""
 
 
-def imports(module: str) -> Iterator[tuple[ast.stmt, str]]:
-    """Yield the statements of a module that import, with the full names of the modules that they name."""
+@functools.cache
+def imports(module: str) -> tuple[tuple[ast.stmt, str], ...]:
+    """The statements of a module that import, with the full names of the modules that they name."""
+    return tuple(_imports(module))
+
+
+def _imports(module: str) -> Iterator[tuple[ast.stmt, str]]:
     for node in ast.walk(ast.parse(PATHS[module].read_text())):
         if isinstance(node, ast.Import):
             yield from ((node, alias.name) for alias in node.names)

@@ -30,7 +30,9 @@ TAG = re.compile(r"</?(html|head|body|p|div|span|table|t[rdh]|h\d|ul|li|a|b|i|br
 
 def strings(path: Path) -> list[tuple[int, str]]:
     """The string literals of a source file, and the parts of its f-strings, with their lines."""
-    constants = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Constant)]
+    text = path.read_text()
+    nodes = ast.walk(ast.parse(text)) if "<" in text else ()  # no tag begins otherwise
+    constants = [node for node in nodes if isinstance(node, ast.Constant)]
     return [(node.lineno, node.value) for node in constants if isinstance(node.value, str)]
 
 

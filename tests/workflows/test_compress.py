@@ -174,11 +174,12 @@ def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatc
     assert opened == [few_steps / "point_cloud.ply"]
 
 
-def test_interrupted_search_resumes_when_asked_again(few_steps, tmp_path, monkeypatch):
-    def interrupted(pipeline: Pipeline, run: Run) -> None:
-        run.interrupted = True
-        run_stages(pipeline, run)
+def interrupted(pipeline: Pipeline, run: Run, run_stages=runner.run_stages) -> None:
+    run.interrupted = True
+    run_stages(pipeline, run)
 
+
+def test_interrupted_search_resumes_when_asked_again(few_steps, tmp_path, monkeypatch):
     run_stages = runner.run_stages
     monkeypatch.setattr(runner, "run_stages", interrupted)
     search = {"target": "1MB", "out": tmp_path / "out", "keep": [0.5], "steps": STEPS}
@@ -197,10 +198,12 @@ def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
 
 
-def test_a_search_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path):
+def test_a_search_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path, monkeypatch):
     shutil.copytree(tiny_scene, tmp_path / "scene")
-    ask = {"target": "1MB", "out": tmp_path / "out", "keep": [1.0], "steps": STEPS}
-    clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
+    ask = {"target": "1MB", "out": tmp_path / "out", "keep": [0.5], "steps": STEPS}
+    monkeypatch.setattr(runner, "run_stages", interrupted)
+    with pytest.raises(Interrupted):
+        clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
     first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
     second.write_bytes(first.read_bytes())
     with pytest.raises(ConfigError, match=r"a search that differs in photographs"):
