@@ -76,7 +76,7 @@ def overrides() -> list[bytes]:
 def test_a_damaged_setting_is_valid_or_refused(name):
     one = damaged(overrides(), [*YAML, "stages[0]", ".", "=", "[", "]"])
 
-    @fuzzed(60, data=lambda random: [one(random) for _ in range(random.randint(1, 2))])
+    @fuzzed(100, data=lambda random: [one(random) for _ in range(random.randint(1, 2))])
     def reads(data):
         pipeline = outcome(load, name, [text.decode("utf-8", "surrogateescape") for text in data])
         if pipeline is not None:
@@ -88,7 +88,7 @@ def test_a_damaged_setting_is_valid_or_refused(name):
 def test_any_word_as_a_value_is_valid_or_refused():
     places = [key.place for key in settable(load("splat_7k").settings)]
 
-    @fuzzed(60, place=one_of(places), word=one_of([*WORDS, *YAML]))
+    @fuzzed(100, place=one_of(places), word=one_of([*WORDS, *YAML]))
     def reads(place, word):
         outcome(load, "splat_7k", [f"{place}={word}"])
 
