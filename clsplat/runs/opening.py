@@ -12,7 +12,6 @@ from clsplat.core.machine import Owner
 from clsplat.core.progress import Listener, heard_by
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
-from clsplat.pipeline.checks import harmonics_of
 from clsplat.pipeline.choices import choose
 from clsplat.pipeline.file import PipelineFile, SceneSettings
 from clsplat.pipeline.input_files import contents
@@ -20,6 +19,7 @@ from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.pipeline.stretching import of_trainings
 from clsplat.prepare.cache import Planned, facts, note, noted, prepare
 from clsplat.render.backdrops import Auto as AutoSky
+from clsplat.render.backdrops import Directions
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.preflight import check_preparation
 from clsplat.runs.run_folder import Start
@@ -173,7 +173,7 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         settings=settings,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        harmonics=harmonics_of(settings),
+        harmonics=settings.harmonics,
         photographs=Photographs(device, scene.background, budget, undistorted_folder(out)),
         status=status,
         model_settings=settings.model,
@@ -228,7 +228,7 @@ def _by_capture(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pi
 def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
     """The same; the run has its settings."""
     run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
-    run.harmonics = harmonics_of(pipeline.settings)
+    run.harmonics = pipeline.settings.harmonics
     return pipeline
 
 
@@ -245,8 +245,10 @@ def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
 
 def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
     """Settings with the choice of a sky, where it is open: none beside what it does not go with."""
-    background = settings.model.background
-    if isinstance(background, AutoSky) and background.chosen is None and (reason := _against_a_sky(settings, run)):
+    background, reason = settings.model.background, _against_a_sky(settings, run)
+    if reason and isinstance(background.in_use if isinstance(background, AutoSky) else background, Directions):
+        raise ConfigError(f"model.background: {reason}; leave one of them out")
+    if reason and isinstance(background, AutoSky) and background.chosen is None:
         background = background.model_copy(update={"chosen": "off", "reason": reason})
         LOG.info("model.background: off, since %s", reason)
     background = settled_sky(background, run)
@@ -258,5 +260,5 @@ def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
 def _against_a_sky(settings: PipelineFile, run: Run) -> str:
     """What a sky does not go with, of what the trainings do; "" where there is nothing."""
     modules = [one for stage in settings.stages if isinstance(stage, Optimize) for one in stage.modules]
-    excluding = next((one for one in modules if one.excludes("sky", run.scene)), None)
-    return f"'{excluding.type}' does not go with sky: {excluding.conflicts['sky']}" if excluding else ""
+    rival = next((one for one in modules if "sky" in one.conflicts and one.is_active(run.scene)), None)
+    return f"'{rival.type}' does not go together with sky: {rival.conflicts['sky']}" if rival else ""

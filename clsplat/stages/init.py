@@ -120,12 +120,6 @@ def begin_sky(run: Run, own: Sky | None = None) -> None:
     LOG.info("sky: %d of %d x %d colours by direction are learned", free.sum(), background.side, background.side)
 
 
-def will_learn_sky(run: Run) -> bool:
-    """Whether the model of a run has a sky, once its choices are made."""
-    background = run.model_settings.background
-    return isinstance(background.in_use if isinstance(background, Auto) else background, Directions)
-
-
 def settled(background: Backdrop | None, run: Run) -> Backdrop | None:
     """Return what is behind the Gaussians, with the choice that follows from a run's photographs; one that is made
     stays."""

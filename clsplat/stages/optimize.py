@@ -1,5 +1,6 @@
 """The training loop: render, compare, differentiate, update."""
 
+import itertools
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,10 +17,8 @@ from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses, require_symmetric
 from clsplat.metrics.views import distribution
 from clsplat.photos.sampling import Sampler, ViewSettings
-from clsplat.scene.scene import Scene
 from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
-from clsplat.stages.init import will_learn_sky
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.best_model import Best, Measured
 from clsplat.training.checkpoint import copied_of, finite_values, put_back
@@ -107,6 +106,16 @@ class Keeping(Training):
         self.require_measured(run.step - run.stage_step)
         if run.stage_step == 0:
             run.best, run.best_tables = None, {}
+
+    def check_with(self, pipeline: Any) -> None:
+        if self.keep == "best" and pipeline.scene.validation == 0:
+            raise ConfigError("optimize.keep: best chooses by validation views; expected scene.validation: auto")
+        trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
+        if self.refit and (found := sum(isinstance(one, Keeping) for one in trainings)) > 1:
+            raise ConfigError(f"optimize.refit: expected one stage that trains, found {found}")
+        before = list(itertools.takewhile(lambda one: one is not self, trainings))
+        if not any(getattr(one, "patience", None) for one in before):  # else nobody knows at which step it begins
+            self.require_measured(sum(one.steps for one in before))
 
     def require_measured(self, begun: int) -> None:
         """Raise ConfigError where `keep: best` measures nothing before the last step; begun: global step before it."""
@@ -258,8 +267,6 @@ class Optimize(Keeping):
 
     def check(self) -> None:
         require_symmetric(self.losses, self.views.transforms)
-        for loss in self.losses:
-            self.check_beside(str(getattr(loss, "type", "")))
         super().check()
 
     def outputs(self, out: Path) -> list[Path]:
@@ -274,18 +281,6 @@ class Optimize(Keeping):
         super().check_in(run)
         for module in (*brought(run, self), *self.modules):
             module.check_in(run)
-        if will_learn_sky(run):
-            self.check_beside("sky", run.scene)
-
-    def check_beside(self, part: str, scene: Scene | None = None) -> None:
-        """Raise ConfigError for modules that do not go with a part of the model, or with a loss; without a scene, in
-        any scene."""
-        for module in self.modules:
-            if module.excludes(part, scene):
-                raise ConfigError(
-                    f"optimize.modules: '{module.type}' does not go with {part}: {module.conflicts[part]}; leave one "
-                    "of them out"
-                )
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
@@ -347,8 +342,6 @@ class Optimize(Keeping):
         run.adam = run.adam or Adam(gaussians)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates = self.rates.settled(views.full_size(last))
-        if run.sky:
-            self.check_beside("sky", run.scene)
         states: list[ModuleState] = attached(self.modules, run, last)
         trained = self.losses, rates, run.scene.extent, run.numbers, self.update
         return Trainer(*parts, *trained, modules=states)

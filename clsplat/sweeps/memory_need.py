@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from clsplat.core.schedule import at_step
 from clsplat.photos.photographs import BUDGET_SHARE
-from clsplat.pipeline.checks import harmonics_of
 from clsplat.pipeline.loading import Pipeline
 from clsplat.scene.scene import Scene
 from clsplat.stages.densify import Densify
@@ -55,7 +54,7 @@ class Need:
             begins,
             max(begins, int(max(ends, default=0))),
             settings.model.time.width if settings.model.time else 0,
-            harmonics_of(settings),
+            settings.harmonics,
         )
 
     def plan(self, limits: Limits) -> MemoryPlan:

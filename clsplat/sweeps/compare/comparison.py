@@ -19,6 +19,7 @@ from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs.results import RunFolder, read_settings
 from clsplat.scene.scene import scene_name
+from clsplat.training.settings_diff import differences
 from clsplat.viewer.charts import COLOURS
 
 # The settings in which resolved pipelines differ.
@@ -37,9 +38,9 @@ def flat(settings: dict[str, Any]) -> dict[str, str]:
 
 
 def differing(settings: Sequence[dict[str, str]]) -> list[str]:
-    """Return the places whose values differ between flat settings, in order of their first occurrence."""
-    places = list(dict.fromkeys(place for one in settings for place in one))
-    return [place for place in places if len({one.get(place) for one in settings}) > 1]
+    """Return the places at which some of flat settings differ from the first."""
+    first, *others = settings
+    return list(dict.fromkeys(one.place for other in others for one in differences(first, other)))
 
 
 def _add(found: dict[str, str], place: str, value: Any) -> None:

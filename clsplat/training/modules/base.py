@@ -140,9 +140,7 @@ class TrainingModule(Settings):
     place: ClassVar[int] = 0  # in the list: modules stand in ascending order of it
     outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "no"
     """What outlasts its training: its numbers, for measurements; or it acts in later trainings too."""
-    conflicts: ClassVar[Mapping[str, str]] = {}  # why it does not go with another module, a part of the model or a loss
     files: ClassVar[Mapping[str, str]] = {}  # side files in the run folder, which begin with `view_`, and their titles
-    family: ClassVar[str] = ""  # of those that exclude each other; "": those of the same type
 
     brought_as: ClassVar[str] = ""  # its type, where no list names it: the model, a loss or the views bring it
     by_type: ClassVar[bool] = True
@@ -174,9 +172,8 @@ class TrainingModule(Settings):
         """Whether it does anything with the photographs of a scene; without one, whether it does with any."""
         return True
 
-    def excludes(self, other: str, scene: Scene | None = None) -> bool:
-        """Whether it does not go with another module or a part of the model; without a scene, in any scene."""
-        return other in self.conflicts and self.is_active(scene)
+    def excluded(self) -> Mapping[str, str]:
+        return self.conflicts if self.is_active() else {}
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
         """Return what it takes on the device at most.  tile: px of its sides."""
@@ -208,7 +205,7 @@ class TrainingModule(Settings):
 
 
 def check_list(modules: Sequence[TrainingModule]) -> None:
-    """Raise ValueError for modules out of order, twice, or that exclude each other."""
+    """Raise ValueError for modules out of order, or of which two have the same kin."""
     kin = [one.kin for one in modules]
     for before, after in itertools.pairwise(modules):
         if after.place < before.place:
@@ -216,9 +213,6 @@ def check_list(modules: Sequence[TrainingModule]) -> None:
     for i, one in enumerate(modules):
         if (first := kin.index(one.kin)) < i:
             raise ValueError(f"'{one.type}' and '{modules[first].type}' exclude each other; leave one out")
-        for other in kin:
-            if one.excludes(other):
-                raise ValueError(f"'{one.type}' does not go with '{other}': {one.conflicts[other]}; leave one out")
 
 
 def attached(modules: Sequence[TrainingModule], run: Run, last: int) -> list[ModuleState]:
