@@ -86,7 +86,7 @@ class PruneSpare(Rule):
 # What a Gaussian promises to take away of the error, in a unit that all scenes share (ours).
 
 
-class Gain(Statistic):
+class ErrorGain(Statistic):
     """How many pixels' errors a Gaussian promises to take away: those of mean pixels, over all training views (ours).
 
     It is what the loss changes by a shift of one standard deviation on the screen, whatever the photographs' exposure,

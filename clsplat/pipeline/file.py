@@ -19,7 +19,7 @@ from clsplat.opencl.discovery import Schedule
 from clsplat.pipeline.capture_choice import CaptureChoice
 from clsplat.prepare.steps import Step
 from clsplat.render.filters import ModelSettings
-from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
+from clsplat.render.rasterizer import MAX_PAIRS, RECORD, RenderLimits
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import Missing
@@ -125,12 +125,12 @@ class RasterizerSettings(Settings):
     def known_as(self) -> set[str]:
         return {ON_HOST} if self.harmonics == "host" else set()
 
-    def budget(self) -> Budget | None:
+    def budget(self) -> RenderLimits | None:
         """Return the rasterizer's limits on memory and launches; None for the defaults."""
         if self.pair_budget is None and self.launch_tiles == 0:
             return None
         records = MAX_PAIRS if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)
-        return Budget(records, self.launch_tiles)
+        return RenderLimits(records, self.launch_tiles)
 
 
 STAGE_LISTS = ("prepare", "stages")

@@ -142,7 +142,7 @@ def _of_a_box(variance: float) -> float:
     return variance
 
 
-class Box(ScreenFilter):
+class BoxFilter(ScreenFilter):
     """Integrate every splat over the box of each pixel, instead of taking its value at the pixel's centre.
 
     Where a splat is larger than a pixel this differs little from a Gaussian blur of the box's variance, 1/12 px², which

@@ -16,7 +16,7 @@ from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import load
 from clsplat.gaussians.sky import Sky
-from clsplat.photos.sky_detection import Seen, looked_at, panorama
+from clsplat.photos.sky_detection import SkyEvidence, looked_at, panorama
 from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.scene.plane_sweep import swept_points
 from clsplat.scene.quality import is_transparent, laplacian_chance, opaque_pixels
@@ -184,7 +184,7 @@ def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]
     return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 
 
-def _seen(run: Run, scene: Scene) -> list[Seen]:
+def _seen(run: Run, scene: Scene) -> list[SkyEvidence]:
     """What each training photograph of a scene shows of the sky."""
     return list(looked_at(scene, _photographs(run, scene)))
 

@@ -27,7 +27,7 @@ from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room, place_harmonics
 from clsplat.training.stage import Scheduled, Training
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 
 # Which model a training leaves: that of its last step, or the best one by photographs that it did not see.
 
@@ -329,7 +329,7 @@ class Optimize(Keeping):
     def _density(self) -> list[Densify]:
         return [stage for stage in self.during if isinstance(stage, Densify)]
 
-    def _trainer(self, run: Run, views: ViewSettings, last: int) -> Trainer:
+    def _trainer(self, run: Run, views: ViewSettings, last: int) -> StepTrainer:
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.stats = SplatStats(gaussians, self.statistics, len(run.scene.split("train")))
@@ -344,7 +344,7 @@ class Optimize(Keeping):
         rates = self.rates.settled(views.full_size(last))
         states: list[ModuleState] = attached(self.modules, run, last)
         trained = self.losses, rates, run.scene.extent, run.numbers, self.update
-        return Trainer(*parts, *trained, modules=states)
+        return StepTrainer(*parts, *trained, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the step before."""
@@ -356,7 +356,7 @@ class Optimize(Keeping):
                 stage.act(run)
             run.edited = True
 
-    def _step(self, run: Run, trainer: Trainer, sampler: Sampler) -> ViewLosses:
+    def _step(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> ViewLosses:
         """Do one step; a failure before its update leaves the run at the step before."""
         run.step += 1
         run.stage_step += 1
@@ -373,7 +373,7 @@ class Optimize(Keeping):
         run.status.note(step=run.step)
         return view
 
-    def _differentiate(self, run: Run, trainer: Trainer, sampler: Sampler) -> tuple[ViewLosses, set[str]]:
+    def _differentiate(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> tuple[ViewLosses, set[str]]:
         """The losses of one view, with gradients unless it is skipped, and the parameters that they do not update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)

@@ -13,7 +13,7 @@ from clsplat.scene.scene import Scene
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
-from clsplat.training.memory import Harmonics, Limits, MemoryPlan, first_tables, last_place, plan
+from clsplat.training.memory import DeviceLimits, Harmonics, MemoryPlan, first_tables, last_place, plan
 from clsplat.training.stage import Stage
 
 TILE = 16  # px a side, the larger of those that devices take
@@ -57,25 +57,25 @@ class Need:
             settings.harmonics,
         )
 
-    def plan(self, limits: Limits) -> MemoryPlan:
+    def plan(self, limits: DeviceLimits) -> MemoryPlan:
         """Return the plan of its training on a device."""
         budget = int(limits.memory * BUDGET_SHARE) if self.budget is None else self.budget
         tables, photographs = first_tables(self.degree, self.motion), min(budget, self.photographs)
         return plan(limits, tables, photographs, self.pixels, harmonics=last_place(self.harmonics, limits))
 
-    def limit_on(self, limits: Limits) -> int:
+    def limit_on(self, limits: DeviceLimits) -> int:
         """Return the largest number of Gaussians that a device holds."""
         return self.plan(limits).limit
 
-    def begins_on(self, limits: Limits) -> bool:
+    def begins_on(self, limits: DeviceLimits) -> bool:
         """Whether a device holds what it begins with, without which its run would be refused."""
         return self.limit_on(limits) >= self.first
 
-    def ends_on(self, limits: Limits) -> bool:
+    def ends_on(self, limits: DeviceLimits) -> bool:
         """Whether a device holds it when its growth ends."""
         return self.limit_on(limits) >= self.most
 
-    def refusal(self, limits: Limits) -> str:
+    def refusal(self, limits: DeviceLimits) -> str:
         """Return why no device takes it; limits: of the one that holds most."""
         return (
             f"no device of the sweep holds it; of the largest, {self.plan(limits).text(self.first)}; offer a larger "

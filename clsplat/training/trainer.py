@@ -24,7 +24,7 @@ from clsplat.photos.photographs import Photograph, apply_mask, known_gradient
 from clsplat.photos.transforms import LearnedTransform, PhotographTransform, learned_of, name_of
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.modules.base import ModuleState, Numbers, Step
+from clsplat.training.modules.base import ModuleState, Numbers, TrainingStep
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
@@ -36,7 +36,7 @@ class _Learning(ModuleState):
         super().__init__()
         self.transform, self.numbers = transform, numbers
 
-    def before_losses(self, step: Step) -> None:
+    def before_losses(self, step: TrainingStep) -> None:
         """A loss keeps the sums of its last call, so that the gradient by the photograph comes before its value."""
         gradient = gradient_by_photograph(step.losses_asked, step.comparison)
         if step.planes.mask is not None:
@@ -46,21 +46,21 @@ class _Learning(ModuleState):
         step.own_losses.append(LossValue(name_of(self.transform), lambda: value))
         step.keep(self, (of_images, of_numbers))
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         of_images, of_numbers = step.kept(self)
         gradients = {name: derivative + of_numbers[name] for name, derivative in of_images().items()}
         self.transform.update(self.numbers, gradients, step.number)
 
 
 @dataclass
-class Trainer:
+class StepTrainer:
     """The objects of a training step; pipelines, benchmarks and notebooks call the same `step`.
 
     A loop of one's own, on the training views of a scene, from a model of `clsplat.load`:
 
         model = model.upload(device)
         photographs = Photographs(device, scene.background)
-        trainer = Trainer(
+        trainer = StepTrainer(
             Rasterizer(device),
             model,
             Adam(model.gaussians),
@@ -124,7 +124,7 @@ class Trainer:
         content = content_of(self.losses, step)
         require_symmetric(self.losses, transforms)
         workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings
-        now = Step(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
+        now = TrainingStep(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
         learned = learned_of(transforms)
         now.modules = [*self.modules, *([_Learning(learned, self.numbers)] if learned else [])]
         for module in now.modules:

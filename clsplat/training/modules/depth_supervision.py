@@ -10,7 +10,7 @@ from clsplat.losses.depth import InverseDepth
 from clsplat.photos.depths import DepthMaps, PointDepths
 from clsplat.scene.reprojection import within
 from clsplat.scene.scene import Scene
-from clsplat.training.modules.base import ModuleState, Step, TrainingModule
+from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 
@@ -43,7 +43,7 @@ class KnownDepthsState(ModuleState):
         super().__init__()
         self.depths = depths
 
-    def before_losses(self, step: Step) -> None:
+    def before_losses(self, step: TrainingStep) -> None:
         if self.depths:
             step.comparison.depths = self.depths.at(step.camera)
 

@@ -13,7 +13,7 @@ from clsplat.opencl.device import Array
 from clsplat.photos.photographs import apply_mask
 from clsplat.render.backdrops import Auto, Directions
 from clsplat.render.rasterizer import Frame, Rasterizer
-from clsplat.training.modules.base import ModuleState, Numbers, Step, Tables, TrainingModule
+from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import SKY, Run
 
 TEXELS, MOMENTS, BIASES, FREE = "texels", ("moment1", "moment2"), "biases", "free"
@@ -96,15 +96,15 @@ class LearnedSky(ModuleState):
         """Return derivatives by the texels that a view shows, [3, shown], from those by its image."""
         return rasterizer.skies.by_texels(self.sky, frame.camera, frame.transmittance, gradient)
 
-    def before_losses(self, step: Step) -> None:
+    def before_losses(self, step: TrainingStep) -> None:
         if cover := self.cover(step.rasterizer, step.frame, step.comparison):
             step.behind, value = cover
             step.own_losses.append(value)
 
-    def backward(self, step: Step) -> None:
+    def backward(self, step: TrainingStep) -> None:
         step.keep(self, self.by_texels(step.rasterizer, step.frame, step.gradient))
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         """Change the texels that a view shows by Adam."""
         rate = at_step(self.settings.rate, step.number)
         step.rasterizer.skies.update(self.sky, step.frame.camera, step.kept(self), self._arrays, rate)
