@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,6 +13,8 @@ from clsplat.conformance.checks.appearance import response_figures
 from clsplat.conformance.reference.appearance import taken, taken_backward
 from clsplat.core.errors import DataError
 from clsplat.core.resources import resource_dir
+from clsplat.data_tools.city import City
+from clsplat.data_tools.synthetic import write_dataset
 from clsplat.runs.model_file import evaluate
 from clsplat.training.modules import camera_response
 from clsplat.training.run import Run
@@ -75,6 +78,22 @@ def test_test_views_are_measured_as_their_camera_takes_them(ended, tmp_path):
             evaluate(ended.out)
     finally:
         (tmp_path / camera_response.FILE).rename(ended.out / camera_response.FILE)
+
+
+@pytest.mark.slow
+def test_known_vignetting_is_found_again(tmp_path):
+    """From photographs that move over a scene; those about an object do not tell it from darker surroundings."""
+    write_dataset(tmp_path / "scene", City(size=48, train=12, test=2, lots=2), workers=1)
+    for file in (tmp_path / "scene").rglob("*.png"):
+        pixels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        x, y = np.meshgrid(*2 * [np.linspace(-1, 1, 97)[1::2]])
+        pixels[..., :3] = np.rint(pixels[..., :3] * (1 - 0.2 * (x**2 + y**2))[..., None])
+        cv2.imwrite(str(file), pixels)
+    quick = ("optimize.during=[]", "optimize.modules.camera_response={rate: 0.01, weight: 0.001}")
+    run = train(tmp_path / "scene", tmp_path / "run", "optimize.steps=300", *quick)
+    row, q = run.modules["camera_response"].row(run.scene.views[0].name), np.array([0.25, 0.5, 0.75, 1])
+    np.testing.assert_allclose(1 + row[2] * q + row[3] * q**2 + row[4] * q**3, 1 - 0.4 * q, atol=0.04)
+    np.testing.assert_allclose(row[:2], 0, atol=0.05)
 
 
 def rewritten(text: str) -> str:
