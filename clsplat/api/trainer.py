@@ -27,6 +27,7 @@ from clsplat.runs.failures import failures_recorded
 from clsplat.runs.model_file import as_setting
 from clsplat.runs.opening import RunScene, settle
 from clsplat.runs.run_folder import Start
+from clsplat.runs.state import RunState
 from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
@@ -97,7 +98,7 @@ class Trainer:
             out = tempfile.mkdtemp(prefix="clsplat-")
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
         self.out = Path(out)
-        outputs.check_places(self.pipeline, self.out)
+        outputs.check_places(self.pipeline, RunState.read(self.out))
         rasterizer = self.pipeline.settings.rasterizer
         opened = proved(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:

@@ -15,6 +15,7 @@ from clsplat.runs.outputs import check_places
 from clsplat.runs.preflight import known, listed
 from clsplat.runs.run_folder import Start, check_run_folder, start_of
 from clsplat.runs.runner import check_in, restore
+from clsplat.runs.state import RunState
 from clsplat.scene.quality import Measures
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.init import Init
@@ -39,14 +40,15 @@ def describe(
     read: reads the scene; with_time: whether lines follow that say how long a new run takes.
     Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
     """
-    planned = pipeline.preparation(out)
-    begun = start_of(pipeline, planned, out, start)
+    state = RunState.read(out)
+    begun = start_of(pipeline, state, start)
     if begun is None:
         return f"{out}: up to date"
     start = begun
-    check_places(pipeline, out)
-    check_run_folder(out, start)
+    check_places(pipeline, state)
+    check_run_folder(state, start)
     tell_of_waiting(out)
+    planned = pipeline.preparation(out)
     lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
     run, verdict = None, "would run"
     if any(one.why for one in planned):

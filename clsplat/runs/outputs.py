@@ -1,11 +1,10 @@
 """The files that a run has at its end."""
 
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from clsplat.core.errors import ConfigError, DataError, OutputError
+from clsplat.core.errors import ConfigError, OutputError
 from clsplat.core.files import (
     BEFORE_A_RUN,
     CHECKSUMS,
@@ -15,20 +14,17 @@ from clsplat.core.files import (
     OF_A_RUN,
     PIPELINE,
     RECORDS,
-    STATUS,
     TRIAL,
     is_there,
     write_text,
 )
 from clsplat.core.machine import Owner
-from clsplat.core.reading import read_file, read_json, sha256
-from clsplat.pipeline.loading import Pipeline, load
-from clsplat.runs.recovery import Course, is_below
-from clsplat.runs.results import read_metrics
-from clsplat.runs.state import has_begun, not_whole, read_sums, sum_of
+from clsplat.core.reading import read_file, sha256
+from clsplat.pipeline.loading import Pipeline
+from clsplat.runs.state import Phase, RunState, is_below, not_whole, read_sums
 from clsplat.stages.report import is_by_heart
 from clsplat.training.run import Run
-from clsplat.training.stage import Stage, Training
+from clsplat.training.stage import Training
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
@@ -60,58 +56,38 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
     write_text(run.out / METRICS, json.dumps(metrics, indent=1) + "\n")
 
 
-@dataclass(frozen=True)
-class Lost:
-    """Files of an earlier end of a run that are missing or changed."""
+def sums_before(pipeline: Pipeline, run: Run) -> dict[str, str]:
+    """Return the SHA-256 of files that an earlier end of the run has written and that its coming stages do not, by
+    path in the folder: while the run goes on, and at its end, these are never taken for whole with other bytes.
 
-    repeatable: list[Path] = field(default_factory=list)  # that a stage which has ended can write again
-    gone: dict[Path, tuple[str, str | None]] = field(default_factory=dict)
-    """Those that no stage writes again, each with the SHA-256 of what was written, and of what is there."""
-    is_unlisted: bool = False
-    """Whether the list of what a run that was done had written is lost itself."""
-
-
-def keep_checksums(course: Course, run: Run) -> Lost:
-    """Leave in the list what holds while the run goes on: the files that it does not write.  Return what is lost.
-
-    What cannot be made again stays in the list, so that it is not taken for whole at the end.
+    Of what a training that goes on writes, and of the records, only those that are lost are among them.
     """
     sums = read_sums(run.out)
-    is_unlisted = sums is None and run.status.was_done
     if sums is None:
-        sums = run.written if is_unlisted else {}
-    sums = {name: value for name, value in sums.items() if not course.writes(run.out / name)}
-    lost = not_whole(run.out, sums)
-    gone = {file: (sums[_name(file, run)], sum_of(file)) for file in lost if not course.mends(file)}
-    going_on = {name for name in sums if run.out / name not in lost and course.may_write(run.out / name)}
-    _write_sums(run, {name: value for name, value in sums.items() if name not in going_on})
-    return Lost([file for file in lost if file not in gone], gone, is_unlisted)
+        sums = run.written if run.status.was_done else {}
+    stages = pipeline.stages[run.cursor :]
+    trained = [path for stage in stages if isinstance(stage, Training) for path in stage.outputs(run.out)]
+    written = [path for stage in stages if not isinstance(stage, Training) for path in stage.outputs(run.out)]
+    written += [run.out / name for name in (PIPELINE, METRICS)]
+    before = {name: value for name, value in sums.items() if not is_below(run.out / name, written)}
+    lost, grown = not_whole(run.out, before), [run.out / RECORDS, *trained]
+    return {n: value for n, value in before.items() if n in lost or not is_below(run.out / n, grown)}
 
 
-def renew_checksums(stage: Stage, run: Run) -> None:
-    """Put what a stage has written again into the list that the run goes on with."""
-    sums = read_sums(run.out) or {}
-    for name in [name for name in sums if is_below(run.out / name, stage.outputs(run.out))]:
-        sums[name] = sum_of(run.out / name) or sums[name]
-    _write_sums(run, sums)
-
-
-def write_checksums(pipeline: Pipeline, run: Run, gone: Mapping[Path, tuple[str, str | None]]) -> None:
+def write_checksums(pipeline: Pipeline, run: Run, before: Mapping[str, str]) -> None:
     """Write the SHA-256 of every file that the run has at its end, by its path in the run folder.
 
-    Files that are `gone` keep that of what was written, unless they were made anew after all.
+    Those that were written `before` keep theirs.
     """
     found = [run.out / name for name in (PIPELINE, METRICS, RECORDS, TRIAL)]
     for place in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
         found += sorted(place.rglob("*")) if place.is_dir() else [place]
-    sums = {_name(path, run): sha256(path, kind=OutputError) for path in dict.fromkeys(found) if path.is_file()}
-    for file, (written, damaged) in gone.items():
-        if file == run.out / RECORDS or sums.get(_name(file, run)) == damaged:
-            sums[_name(file, run)] = written
-    _write_sums(run, sums)
+    new = [path for path in dict.fromkeys(found) if path.is_file() and _name(path, run) not in before]
+    keep_checksums(run, {**{_name(path, run): sha256(path, kind=OutputError) for path in new}, **before})
 
 
-def _write_sums(run: Run, sums: Mapping[str, str]) -> None:
+def keep_checksums(run: Run, sums: Mapping[str, str]) -> None:
+    """Write the list of checksums, or remove it where there are none."""
     if sums:
         write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
     else:
@@ -122,11 +98,12 @@ def _name(path: Path, run: Run) -> str:
     return path.relative_to(run.out).as_posix()
 
 
-def check_places(pipeline: Pipeline, out: Path) -> None:
-    """Raise ConfigError where a run in `out` would write elsewhere, or over files that no run there has made.
+def check_places(pipeline: Pipeline, state: RunState) -> None:
+    """Raise ConfigError where a run in a folder would write elsewhere, or over files that no run there has made.
 
     Raises OutputError where there can be no such folder.
     """
+    out = state.out
     is_there(out)
     folder, scene = out.resolve(), pipeline.settings.scene
     if folder == folder.parent:
@@ -134,20 +111,20 @@ def check_places(pipeline: Pipeline, out: Path) -> None:
     taken = [folder, folder.parent] if pipeline.settings.prepare else [folder]  # the photographs' folder is hashed
     if scene.path is not None and scene.folder.resolve() in taken:
         raise ConfigError(f"{out}: is the folder of the photographs, or right in it; give another folder for the run")
-    check_names(out, OF_A_RUN)
-    own = [path for stage in pipeline.stages for path in stage.outputs(out)]
-    _require_inside(out, own)
-    if not has_begun(out):
-        _require_free(own)
+    check_names(state, OF_A_RUN, [path for stage in pipeline.stages for path in stage.outputs(out)])
 
 
-def check_names(out: Path, names: Collection[str]) -> None:
-    """Raise ConfigError where a name that a run or a matrix writes in `out` is taken by a file that none has made."""
-    files = [out / name for name in sorted(names)]
-    _require_inside(out, files)
-    if not has_begun(out):
-        before = BEFORE_A_RUN if _names_a_process(out / STATUS) else {LOCK} if _is_lock(out / LOCK) else set()
-        _require_free(file for file in files if file.name not in before)
+def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path] = ()) -> None:
+    """Raise ConfigError where what a run or a matrix writes leads outside, or is a file that none there has made."""
+    out, files = state.out, [*(state.out / name for name in sorted(names)), *outputs]
+    folder = out.resolve()
+    if outside := [path for path in files if not path.resolve().is_relative_to(folder)]:
+        raise ConfigError(f"{outside[0]}: a link leads outside of the run folder; remove it, or choose another name")
+    own = BEFORE_A_RUN if Owner.named_by(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
+    left = {out / name for name in own}  # by a run that has not begun
+    for path in files if state.phase < Phase.BEGUN else ():
+        if path not in left and (path.is_file() or (path.is_dir() and any(path.iterdir()))):
+            raise ConfigError(f"{path}: exists, and is not of this run; give another folder for the run")
 
 
 def _is_lock(file: Path) -> bool:
@@ -156,47 +133,20 @@ def _is_lock(file: Path) -> bool:
     return file.is_file() and begin.startswith(read_file(file)[: len(begin)])
 
 
-def _names_a_process(file: Path) -> bool:
-    try:
-        found = read_json(file)
-    except DataError:
-        return False
-    return isinstance(found, dict) and Owner.named_by(found) is not None
+def check_outputs(pipeline: Pipeline, run: Run, lost: Collection[str] = ()) -> None:
+    """Look for the files that a run has declared, but for those that were `lost` before, which a warning names.
 
-
-def _require_inside(out: Path, files: Iterable[Path]) -> None:
-    folder = out.resolve()
-    for path in files:
-        if not path.resolve().is_relative_to(folder):
-            raise ConfigError(f"{path}: a link leads outside of the run folder; remove it, or choose another name")
-
-
-def _require_free(files: Iterable[Path]) -> None:
-    for path in files:
-        if path.is_file() or (path.is_dir() and any(path.iterdir())):
-            raise ConfigError(f"{path}: exists, and is not of this run; give another folder for the run")
-
-
-def check_outputs(pipeline: Pipeline, run: Run, gone: Collection[Path] = ()) -> None:
-    """Read back the files of a run, but of the stages whose files are `gone`, which a warning has named.
-
-    Raises OutputError where one is missing or damaged.
+    Raises OutputError where one is missing, or a model is not as it was written.
     """
-    try:
-        read_metrics(run.out / METRICS)
-        load(str(run.out / PIPELINE))
-        for stage in acting(pipeline):
-            if not any(is_below(file, stage.outputs(run.out)) for file in gone):
-                stage.verify(run)
-    except (ConfigError, DataError) as error:
-        raise OutputError(f"{error}, at the end of the run; see {run.out / LOG_FILE}") from error
+    places = [path for stage in pipeline.stages for path in stage.outputs(run.out)]
+    models = {name: value for name, value in run.written.items() if is_below(run.out / name, places)}
+    faults = {name for name in (METRICS, PIPELINE, *declared(pipeline)) if not (run.out / name).is_file()}
+    if faults := (faults | {*not_whole(run.out, models)}) - {*lost}:
+        what = "is missing or differs from what was written"
+        raise OutputError(f"{run.out / min(faults)}: {what}, at the end of the run; see {run.out / LOG_FILE}")
 
 
-def acting(pipeline: Pipeline) -> Iterator[Stage]:
-    """The stages of a whole run, each training with those of its `during` that have run."""
-    step = 0
-    for stage in pipeline.stages:
-        yield stage
-        if isinstance(stage, Training):
-            yield from stage.acting(step)
-            step += stage.steps
+def declared(pipeline: Pipeline) -> list[str]:
+    """Return the files that the stages of a pipeline name, by path in the run folder."""
+    fields = [(stage, *named) for stage in pipeline.stages for named in stage.named_outputs().items()]
+    return [name for stage, key, endings in fields if endings and (name := getattr(stage, key)) is not None]

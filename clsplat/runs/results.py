@@ -9,13 +9,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clsplat.core.errors import ConfigError, DataError, shortened
-from clsplat.core.files import METRICS, PIPELINE, STATUS
-from clsplat.core.reading import read_file, read_json
+from clsplat.core.files import METRICS, PIPELINE
+from clsplat.core.reading import read_file
 from clsplat.pipeline import plugins
 from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.prepare.cache import noted
+from clsplat.runs.state import RunState
 from clsplat.training.records import Records
 
 Points = list[tuple[float, float]]
@@ -80,12 +81,11 @@ class RunFolder:
 
         Raises DataError when it is missing, unfinished or damaged, ConfigError when its pipeline.yaml cannot be read.
         """
-        if not path.is_dir():
-            raise DataError(f"{path}: no such folder; expected the folder of a finished run")
-        if not (path / PIPELINE).is_file():
-            raise DataError(f"{path}: has no pipeline.yaml; expected the folder of a finished run")
-        if not (path / METRICS).is_file():
-            raise DataError(f"{path}: has no metrics.json, so the run {_state(path)}; finish it with --resume")
+        state = RunState.read(path)
+        if PIPELINE not in state.names:
+            raise DataError(f"{path}: has no {PIPELINE}; expected the folder of a finished run")
+        if METRICS not in state.names:
+            raise DataError(f"{path}: has no {METRICS}, for the run is {state.state_name}; finish it with --resume")
         settings = read_settings(path)
         return cls(path, settings, _scene(path, settings), read_metrics(path / METRICS))
 
@@ -155,11 +155,3 @@ def read_metrics(path: Path) -> RunMetrics:
         raise DataError(
             f"{path}: {place + ': ' if place else ''}{message}; the file is damaged: run the pipeline again"
         ) from error
-
-
-def _state(path: Path) -> str:
-    try:
-        state = read_json(path / STATUS).get("state")
-    except (DataError, AttributeError):
-        state = None
-    return {"failed": "failed", "interrupted": "was interrupted"}.get(str(state), "is not finished")

@@ -1,7 +1,7 @@
 """The run folder: made and held, cleared, left as it was by a run that has not begun."""
 
 import shutil
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -29,11 +29,9 @@ from clsplat.core.files import (
 from clsplat.core.reading import read_text
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.prepare.cache import Planned, note, noted
-from clsplat.runs.recovery import is_complete
-from clsplat.runs.state import has_begun, has_pipeline, is_done, is_done_with, restart
-from clsplat.training import checkpoint
-from clsplat.training.status import StatusFile, read_status
+from clsplat.prepare.cache import note, noted
+from clsplat.runs.state import Phase, RunState
+from clsplat.training.status import StatusFile
 
 RESOLVED = "# resolved from "  # the beginning of a pipeline.yaml that a single run has written
 Start = Literal["new", "resume", "restart"]
@@ -47,16 +45,16 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
     one that was done before, and is refused before it goes on, stays done.
     Raises ConfigError when it holds another run, OutputError when it is in use or cannot be written.
     """
-    check_run_folder(out, start)
+    check_run_folder(RunState.read(out), start)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    is_new = not (out / PIPELINE).exists()
     with told_as(out):
         make_folder(out)
     try:
         with lock.held(out) as require_held:
-            check_run_folder(out, start)  # again: another run may have ended since
+            state = RunState.read(out)  # again: another run may have ended since
+            check_run_folder(state, start)
             sweep(out, border=PIPELINE)
-            before = read_text(out / STATUS) if start != "new" and is_done(out) else None
+            before = read_text(out / STATUS) if state.phase is Phase.DONE else None
             status = StatusFile(out, require_held, **values)
             status.begin()
             try:
@@ -68,7 +66,7 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
                         status.require_held()
                         write_text(out / STATUS, before)
                 is_defect = isinstance(as_clsplat_error(error), InternalError)  # its log has the traceback
-                if is_new and not status.now.step and not is_defect:
+                if PIPELINE not in state.names and not status.now.step and not is_defect:
                     written = BEFORE_A_RUN if status.now.cells else OF_A_RUN - {CHECKPOINTS}
                     with suppress(OutputError):
                         status.require_held()
@@ -99,17 +97,16 @@ def clear(status: StatusFile) -> None:
     status.note(checkpoint=None)
     status.write()
     out = status.out
-    checkpoints = out / CHECKPOINTS
-    files = [*checkpoint.saved(out), *checkpoints.glob("failed_*.npz"), *checkpoints.glob("damaged_*.npz")]
-    files += [out / name for name in (CHECKSUMS, METRICS, RECORDS, TRIAL, INPUTS, NOTE)]
-    for file in files:
+    states = (out / CHECKPOINTS).glob("*_[0-9]*.npz")  # failed and damaged ones too
+    for file in [*states, *(out / name for name in (CHECKSUMS, METRICS, RECORDS, TRIAL, INPUTS, NOTE))]:
         with told_as(file):
             file.unlink(missing_ok=True)
 
 
-def _is_of_a_run(out: Path) -> bool:
+def _is_of_a_run(state: RunState) -> bool:
     """Whether a folder's pipeline.yaml, where there is one, was written by a run, or by that of a matrix."""
-    if not has_pipeline(out) or (out / STATUS).exists() or checkpoint.saved(out):
+    out = state.out
+    if PIPELINE not in state.names or STATUS in state.names or state.checkpoints:
         return True
     with suppress(ClsplatError):
         if read_text(out / PIPELINE).startswith(RESOLVED):
@@ -120,26 +117,28 @@ def _is_of_a_run(out: Path) -> bool:
     return False
 
 
-def check_run_folder(out: Path, start: Start) -> None:
+def check_run_folder(state: RunState, start: Start) -> None:
     """Raise ConfigError when a new run finds another one in its folder, or any finds a pipeline.yaml of the user's.
 
     Raises OutputError when a run that is to go on has lost its state.
     """
+    out = state.out
     if start not in get_args(Start):
         raise ConfigError(f"no start '{start}'; there are {', '.join(get_args(Start))}")
-    if not _is_of_a_run(out):
+    if not _is_of_a_run(state):
         raise ConfigError(
             f"{out / PIPELINE}: is not that of a run, which would write its own in its place; give another folder"
         )
-    if start == "new" and has_begun(out):
+    if start == "new" and state.phase >= Phase.BEGUN:
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
-    status = read_status(out) if start == "resume" else {}
-    if status.get("state") == "done" and "cells" not in status and not checkpoint.saved(out):
-        raise ConfigError(f"{out}: is done, and has no checkpoint to go on from; {restart(out)} trains it again")
-    if start == "resume" and not status and (out / INPUTS).exists() and not checkpoint.saved(out):
+    if start != "resume":
+        return
+    if state.phase is Phase.DONE and "cells" not in state.status and not state.checkpoints:
+        raise ConfigError(f"{out}: is done, and has no checkpoint to go on from; {state.restart} trains it again")
+    if state.phase is Phase.STATELESS:
         raise OutputError(
             f"{out}: has neither a readable {STATUS} nor a checkpoint, though a run has begun there; put them back, or "
-            f"give {restart(out)}, which begins it again"
+            f"give {state.restart}, which begins it again"
         )
 
 
@@ -149,7 +148,6 @@ def check_run_folder(out: Path, start: Start) -> None:
 def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
     """Return the default run folder: a new run beside one that is not up to date gets the next free number."""
     number, free = 1, folder
-    planned = pipeline.preparation(folder) if pipeline else []
 
     def taken() -> bool:
         if (free / LOCK).exists():
@@ -158,7 +156,7 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
                     return True
             except OutputError:  # by a run that may not have begun yet
                 return True
-        return (free / PIPELINE).exists() and not (pipeline and is_same(pipeline, planned, free))
+        return PIPELINE in (state := RunState.read(free)).names and not (pipeline and is_same(pipeline, state))
 
     while start == "new" and taken():
         number += 1
@@ -166,14 +164,15 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
     return free
 
 
-def start_of(pipeline: Pipeline, planned: Sequence[Planned], out: Path, start: Start) -> Start | None:
-    """How a run begins in `out`; None: it is up to date.  One that is done goes on where files of it were lost."""
-    if start == "restart" or not is_same(pipeline, planned, out):
-        return start
-    return None if is_complete(out) else "resume"
+def start_of(pipeline: Pipeline, state: RunState, start: Start) -> Start | None:
+    """How a run begins in a folder; None: it is done, and whole.  One that is done goes on where files were lost."""
+    if start == "new" and is_same(pipeline, state):
+        start = "resume"
+    return None if start == "resume" and state.is_whole(pipeline) else start
 
 
-def is_same(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:
-    """Whether a run of this pipeline and the same photographs has come to its end in `out`; never where nothing is
-    prepared."""
-    return bool(planned) and noted(out) == note(planned) and is_done_with(pipeline, out)
+def is_same(pipeline: Pipeline, state: RunState) -> bool:
+    """Whether a run of this pipeline and the same photographs is done; never where nothing is prepared."""
+    if not pipeline.settings.prepare or state.phase is not Phase.DONE or state.difference(pipeline):
+        return False
+    return noted(state.out) == note(pipeline.preparation(state.out))

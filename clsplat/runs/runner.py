@@ -8,15 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from clsplat.core.errors import ConfigError, DataError, Interrupted, in_shell, shortened
-from clsplat.core.files import CHECKSUMS, INPUTS, NOTE, PIPELINE, write_text
+from clsplat.core.files import INPUTS, NOTE, PIPELINE, write_text
 from clsplat.core.progress import Progress, Stopped
 from clsplat.core.reading import read_json
 from clsplat.core.signals import stop_at_once, stopping_on_signals
 from clsplat.pipeline.loading import Pipeline
+from clsplat.pipeline.stretching import of_trainings
 from clsplat.prepare.inspect.findings import few_views
-from clsplat.runs.outputs import Lost, check_outputs, keep_checksums, renew_checksums, write_checksums, write_metrics
-from clsplat.runs.recovery import Course, is_below
+from clsplat.runs.outputs import check_outputs, keep_checksums, sums_before, write_checksums, write_metrics
 from clsplat.runs.run_folder import RESOLVED, Start, clear
+from clsplat.runs.state import not_whole
 from clsplat.scene.identity import Identity
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
@@ -25,7 +26,7 @@ from clsplat.training import checkpoint
 from clsplat.training.best_model import Best
 from clsplat.training.checkpoint import saved_on_failure
 from clsplat.training.run import Run
-from clsplat.training.stage import Stage, Training
+from clsplat.training.stage import Training
 
 # Training again on all photographs, for the number of steps that validation has found best.
 
@@ -52,31 +53,27 @@ def begin_if_due(run: Run) -> None:
 
 
 def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
-    """Return the pipeline with as many steps as validation leaves its training; in a refit that keeps its last model.
+    """Return the pipeline; in a refit with as many steps as validation has found best, and with its last model kept.
 
     The bits of a refit are those of a run of this pipeline without validation views.
     """
-    stages, before = list[Stage](), 0
-    for stage in pipeline.stages:
-        now = _as_trained(stage, run, before) if isinstance(stage, Optimize) and stage.keep == "best" else stage
-        before += stage.steps if isinstance(stage, Optimize) else 0
-        stages.append(now)
-    return replace(pipeline, settings=pipeline.settings.model_copy(update={"stages": stages}))
+    if not run.is_refit or run.best is None:
+        return pipeline
+    best = run.best
+
+    def refitted(stage: Optimize) -> Optimize:
+        if stage.keep != "best":
+            return stage
+        during = [_as_grown(inner, best) if isinstance(inner, Densify) else inner for inner in stage.during]
+        return stage.model_copy(update={"steps": best.found.step, "during": during, **WITHOUT})
+
+    return replace(pipeline, settings=of_trainings(pipeline.settings, Optimize, refitted))
 
 
 def _as_grown(stage: Densify, best: Best) -> Densify:
     """The same, with the step from which on nothing grew in the place of its patience."""
     ended = [step for step in (stage.grow_until, best.growth_ended if stage.patience else None) if step is not None]
     return stage.model_copy(update={"patience": None, "grow_until": min(ended, default=None)})
-
-
-def _as_trained(stage: Optimize, run: Run, before: int) -> Optimize:
-    if run.is_refit and run.best:
-        during = [_as_grown(inner, run.best) if isinstance(inner, Densify) else inner for inner in stage.during]
-        return stage.model_copy(update={"steps": run.best.found.step, "during": during, **WITHOUT})
-    taken = run.best.taken if run.best else None
-    ended = taken is not None and before < taken < before + stage.steps
-    return stage.model_copy(update={"steps": taken - before}) if taken and ended else stage
 
 
 # The record of what a run was started with, inputs.json, and its comparison when the run goes on.
@@ -137,9 +134,8 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     The caller records a failure.
     """
     run.show = show
-    lost = begin(pipeline, run, start)
+    before = begin(pipeline, run, start)
     with finishing_on_interrupt(run), saved_on_failure(run):
-        _write_again(pipeline, run, lost)
         run_stages(pipeline, run)
     for finding in few_views(len(run.original.train)):
         LOG.warning("%s", finding.text)
@@ -147,15 +143,18 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
         LOG.info("%s", text)
     run.status.require_held()
     write_metrics(pipeline, run)
-    check_outputs(as_trained(pipeline, run), run, lost.gone)
-    write_checksums(pipeline, run, lost.gone)
+    lost = not_whole(run.out, before)
+    check_outputs(pipeline, run, lost)
+    write_checksums(pipeline, run, before)
+    for name in lost:
+        LOG.warning("%s: is missing or was changed, and only --restart writes it again", run.out / name)
     run.status.end("done", exit_code=0)
 
 
-def begin(pipeline: Pipeline, run: Run, start: Start) -> Lost:
+def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
     """Take the newest checkpoint, or clear the folder, and write what a run folder holds from the beginning on.
 
-    Return which files of an earlier end are lost.
+    Return the checksums of files that an earlier end of the run has written, and that its coming stages do not.
     """
     taken = restore(pipeline, run) if start == "resume" else None
     check_in(pipeline, run)
@@ -163,15 +162,16 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> Lost:
         clear(run.status)
     if start == "resume":
         LOG.info("resumed at step %d" if taken else "nothing to resume; starting from the beginning%.0s", run.step)
+    before = sums_before(pipeline, run) if taken else {}
     run.status.enter("running", step=run.step)  # a refusal leaves all as it was; from here on files change
-    lost = keep_checksums(Course(pipeline, run.out, run), run)
+    keep_checksums(run, before)
     checkpoint.drop_later(run.out, taken)
     write_pipeline(pipeline, run)
     write_inputs(run)
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
     run.records.start(run.is_refit)
-    return lost
+    return before
 
 
 def check_in(pipeline: Pipeline, run: Run) -> None:
@@ -206,40 +206,23 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
     return taken
 
 
-def _write_again(pipeline: Pipeline, run: Run, lost: Lost) -> None:
-    """Repeat the stages whose files are lost or damaged, of those that ended since the model changed last.
-
-    Files that are lost and that no stage writes again are named in a warning.
-    """
-    stages = Course(pipeline, run.out, run).repeatable
-    if stages and lost.is_unlisted:
-        LOG.warning("%s: is missing or damaged; what can be is written again, the rest is not verified", CHECKSUMS)
-    for stage in reversed(stages):
-        own = [file for file in lost.repeatable if is_below(file, stage.outputs(run.out))]
-        try:
-            stage.verify(run)
-            if own:
-                raise DataError(f"{own[0]}: is missing or was changed")
-        except DataError as error:
-            LOG.warning("%s; it is written again", error)
-        else:
-            if not (lost.is_unlisted and stage.outputs(run.out)):
-                continue
-        stage.act(run)
-        renew_checksums(stage, run)
-    for file in lost.gone:
-        LOG.warning("%s: is missing or was changed since it was written, and cannot be made again", file)
-
-
 def run_stages(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages from where the run stands on, and again from the beginning for a refit."""
+    """Run the stages from where the run stands on, and again from the beginning for a refit.
+
+    Behind a training or an edit the run stands there until the next one begins: the stages between them see the same
+    model, and a run that goes on has them all again.
+    """
     begin_if_due(run)
-    for cursor, stage in enumerate(as_trained(pipeline, run).stages if run.is_refit else pipeline.stages):
+    for cursor, stage in enumerate(as_trained(pipeline, run).stages):
         if cursor < run.cursor:
             continue
+        changes = stage.edits or isinstance(stage, Training)
+        if changes and cursor > run.cursor:
+            run.next_stage(cursor)
         with suppress(Stopped):
             stage.act(run)
-            run.next_stage(cursor + 1)  # a resumed run must not repeat an edit
+            if changes:
+                run.next_stage(cursor + 1)  # a resumed run must not repeat an edit
         if run.interrupted:
             path = checkpoint.save(run)
             raise Interrupted(

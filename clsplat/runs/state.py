@@ -1,25 +1,113 @@
-"""What a folder holds of a run."""
+"""The folder of a run, read once: how far the run is, and which of its files are lost."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import ClsplatError, ConfigError, DataError, in_shell
-from clsplat.core.files import CHECKSUMS, METRICS, PIPELINE, STATUS, is_inside
+from clsplat.core.errors import ConfigError, DataError, in_shell, one_line
+from clsplat.core.files import CHECKSUMS, END_STATES, INPUTS, PIPELINE, STATUS, is_inside
+from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json, sha256
-from clsplat.core.settings import variants
 from clsplat.pipeline.capture_choice import without_choices
 from clsplat.pipeline.choices import undone
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.runs.results import read_metrics
-from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.settings_diff import first_difference
-from clsplat.training.stage import Stage, Training
 from clsplat.training.status import read_status
+
+
+class Phase(IntEnum):
+    """How far the run of a folder is."""
+
+    EMPTY = 0
+    """There is no run."""
+    PREPARING = 1
+    """There is a status.json only: no stage has begun."""
+    BEGUN = 2
+    """It is running, or it has stopped before its end."""
+    STATELESS = 3
+    """It has begun, and both its status and its checkpoints are lost."""
+    DONE = 4
+    """It has come to its end; `RunState.lost` has the files that were lost since."""
+
+
+@dataclass(frozen=True)
+class RunState:
+    """What the folder of a run, or of a matrix, holds at one moment."""
+
+    out: Path
+    names: frozenset[str]  # of the files and folders in it
+    status: Mapping[str, Any]  # of status.json; empty where that is missing or damaged
+    checkpoints: tuple[Path, ...]  # from old to new
+    sums: Mapping[str, str] | None  # SHA-256 by path in the folder; None where the list is missing or damaged
+
+    @classmethod
+    def read(cls, out: Path) -> "RunState":
+        """Read a folder, which need not exist.  Its pipeline and its outputs are read at their first use."""
+        names = frozenset[str]()
+        with suppress(OSError):
+            names = frozenset(path.name for path in out.iterdir())
+        return cls(out, names, read_status(out), tuple(checkpoint.saved(out)), read_sums(out))
+
+    @cached_property
+    def phase(self) -> Phase:
+        """How far the run is."""
+        has_begun = PIPELINE in self.names or self.checkpoints or (self.status and self.sums is not None)
+        if self.status.get("state") == "done" and (has_begun or Owner.named_by(self.status)):
+            return Phase.DONE
+        if not has_begun:
+            return Phase.PREPARING if STATUS in self.names else Phase.EMPTY
+        is_known = self.status or self.checkpoints or INPUTS not in self.names
+        return Phase.BEGUN if is_known else Phase.STATELESS
+
+    @property
+    def state_name(self) -> str:
+        """The state as status.json names it; `killed` where its process has ended without a word."""
+        owner = Owner.named_by(self.status) if self.status.get("state") not in END_STATES else None
+        return "killed" if owner and owner.has_ended else str(self.status.get("state", "unknown"))
+
+    @cached_property
+    def pipeline(self) -> Pipeline:
+        """The pipeline of the run.  Raises ConfigError where its file is missing or damaged."""
+        return load(str(self.out / PIPELINE))
+
+    @cached_property
+    def lost(self) -> list[str]:
+        """The files that are missing or changed since they were written; of a run that is done the list of them too."""
+        if self.sums is None:
+            return [CHECKSUMS] if self.phase is Phase.DONE and "cells" not in self.status else []
+        return not_whole(self.out, self.sums)
+
+    def difference(self, pipeline: Pipeline) -> str:
+        """Say in which setting another pipeline differs, or why that of the run cannot be read; "" where in none."""
+        try:
+            return str(first_difference(_asked(self.pipeline), _asked(pipeline)) or "")
+        except ConfigError as error:
+            return one_line(error)
+
+    def require_same(self, pipeline: Pipeline) -> None:
+        """Raise ConfigError where a run that is done was one of another pipeline."""
+        is_known = self.phase is Phase.DONE and PIPELINE in self.names
+        if is_known and (difference := self.difference(pipeline)) and PIPELINE not in self.lost:
+            raise ConfigError(
+                f"{self.out}: was run with other settings: {difference}; use another folder, or those settings"
+            )
+
+    def is_whole(self, pipeline: Pipeline) -> bool:
+        """Whether a run of a pipeline is done, and has all its files as they were written."""
+        return self.phase is Phase.DONE and not self.difference(pipeline) and not self.lost
+
+    @property
+    def restart(self) -> str:
+        """The command that begins the run again."""
+        pipeline = "…"
+        with suppress(ConfigError):  # where it is lost
+            pipeline = in_shell(self.pipeline.path)
+        return f"`clsplat run {pipeline} --out {in_shell(self.out)} --restart`"
 
 
 def has_pipeline(folder: Path) -> bool:
@@ -27,56 +115,14 @@ def has_pipeline(folder: Path) -> bool:
     return (folder / PIPELINE).is_file()
 
 
-def has_begun(out: Path) -> bool:
-    """Whether a run has begun in a folder, whatever is left of it."""
-    is_listed = bool(read_status(out)) and read_sums(out) is not None
-    return (out / PIPELINE).exists() or bool(checkpoint.saved(out)) or is_listed
-
-
-def has_state(folder: Path) -> bool:
-    """Whether a folder holds a run or a matrix, or what one has said before it began."""
-    return has_pipeline(folder) or (folder / STATUS).is_file()
-
-
-def is_done(out: Path) -> bool:
-    """Whether a run has come to its end in a folder, whose files may have been lost since."""
-    return read_status(out).get("state") == "done"
-
-
-def is_done_with(pipeline: Pipeline, out: Path) -> bool:
-    """Whether that was a run of this pipeline."""
-    with suppress(ConfigError):  # a damaged file
-        return is_done(out) and _asked(load(str(out / PIPELINE))) == _asked(pipeline)
-    return False
-
-
-def has_ended(pipeline: Pipeline, out: Path) -> bool:
-    """Whether a run of this pipeline has come to its end.  Raises ConfigError when that was with other settings."""
-    if not is_done(out) or not has_pipeline(out):
-        return False
-    try:
-        before = _asked(load(str(out / PIPELINE)))
-    except ConfigError:
-        if out / PIPELINE in changed(out):  # the run writes it again, or says that it cannot go on
-            return False
-        raise
-    if difference := first_difference(before, _asked(pipeline)):
-        raise ConfigError(f"{out}: was run with other settings: {difference}; use another folder, or those settings")
-    return True
-
-
 def _asked(pipeline: Pipeline) -> Any:
     """The resolved pipeline without what a run chose."""
     return without_choices(replace(pipeline, settings=undone(pipeline.settings)).resolved())
 
 
-def restart(out: Path) -> str:
-    """The command that begins a run again."""
-    pipeline = "…"
-    with suppress(ConfigError):  # where it is lost
-        load(str(out / PIPELINE))
-        pipeline = in_shell(out / PIPELINE)
-    return f"`clsplat run {pipeline} --out {in_shell(out)} --restart`"
+def is_below(file: Path, places: Iterable[Path]) -> bool:
+    """Whether a file is one of some files, or lies in one of some folders."""
+    return any(file.is_relative_to(place) for place in places)
 
 
 def read_sums(out: Path) -> dict[str, str] | None:
@@ -88,21 +134,9 @@ def read_sums(out: Path) -> dict[str, str] | None:
     return {name: str(value) for name, value in sums.items() if is_inside(name)} if isinstance(sums, dict) else None
 
 
-def changed(out: Path) -> list[Path]:
-    """The files of a finished run that are missing or not as they were written; the list of them where that is lost."""
-    sums = read_sums(out)
-    if sums is not None:
-        return not_whole(out, sums)
-    try:
-        read_metrics(out / METRICS)
-    except DataError:
-        return [out / CHECKSUMS, out / METRICS]
-    return [out / CHECKSUMS]
-
-
-def not_whole(out: Path, sums: Mapping[str, str]) -> list[Path]:
-    """The files of a list of checksums that are missing or changed."""
-    return [out / name for name, expected in sums.items() if sum_of(out / name) != expected]
+def not_whole(out: Path, sums: Mapping[str, str]) -> list[str]:
+    """Return the files of a list of checksums that are missing or changed."""
+    return [name for name, value in sums.items() if sum_of(out / name) != value]
 
 
 def sum_of(file: Path) -> str | None:
@@ -114,14 +148,6 @@ def sum_of(file: Path) -> str | None:
 
 def steps_key(folder: Path) -> str:
     """Return the key of the steps in a run folder, such as optimize.steps; this one too where the file tells none."""
-    try:
-        data = read_yaml(folder / PIPELINE).data
-    except ClsplatError:  # told when the run is resumed
-        data = None
-    stages = data.get("stages") if isinstance(data, dict) else None
-    known = variants(Stage)
-    for stage in stages if isinstance(stages, list) else ():
-        name = stage.get("stage", next(iter(stage), "")) if isinstance(stage, dict) else stage
-        if isinstance(name, str) and issubclass(known.get(name, Stage), Training):
-            return f"{name}.steps"
-    return f"{Optimize.model_fields['stage'].default}.steps"
+    with suppress(ConfigError):  # told when the run is resumed
+        return f"{RunState.read(folder).pipeline.settings.training.stage}.steps"
+    return "optimize.steps"

@@ -13,10 +13,10 @@ from clsplat.core.reading import read_json
 from clsplat.core.settings import variants
 from clsplat.prepare.gather import photographs_text
 from clsplat.runs.results import read_metrics
-from clsplat.training import checkpoint
+from clsplat.runs.state import RunState
 from clsplat.training.modules.base import TrainingModule
 from clsplat.training.records import Records
-from clsplat.training.status import read_status, status_of
+from clsplat.training.status import status_of
 
 LOG = logging.getLogger("clsplat")
 
@@ -28,8 +28,8 @@ def run_status(out: Path) -> dict[str, Any]:
     that has not ended, on whatever machine it runs; ahead: seconds by which that is in the future, from a minute on.
     Raises DataError when the folder holds no run, or a damaged status.json or metrics.json.
     """
-    status = read_status(out)
-    if not status:
+    state = RunState.read(out)
+    if not (status := dict(state.status)):
         raise DataError(f"{out}: has no readable status.json; expected the folder of a run")
     try:
         known = status_of(status)
@@ -39,7 +39,7 @@ def run_status(out: Path) -> dict[str, Any]:
         ) from error
     if known is None:
         raise DataError(f"{out / STATUS}: of a newer clsplat; update clsplat to read it")
-    status["state"] = state_of(status)
+    status["state"] = state.state_name
     for own in ("silent", "ahead"):
         status.pop(own, None)
     if status["state"] not in (*END_STATES, "killed"):
@@ -48,7 +48,7 @@ def run_status(out: Path) -> dict[str, Any]:
         if silent <= -SILENT:
             status["ahead"] = -silent
     metrics = None
-    if (out / METRICS).exists():
+    if METRICS in state.names:
         metrics = read_metrics(out / METRICS).model_dump(exclude_unset=True)
     return {"run": str(out), **status, "last": _last(out), "metrics": metrics}
 
@@ -61,12 +61,6 @@ def _last(out: Path) -> dict[str, Any] | None:
         LOG.warning("%s", error)
         return None
     return lines[-1] if lines else None
-
-
-def state_of(status: dict[str, Any]) -> str:
-    """Return the state that status.json tells, `killed` where its process has ended without a word."""
-    owner = Owner.named_by(status) if status.get("state") not in END_STATES else None
-    return "killed" if owner and owner.has_ended else str(status.get("state", "unknown"))
 
 
 def status_text(status: dict[str, Any]) -> str:
@@ -94,9 +88,10 @@ def _advice(status: dict[str, Any]) -> str:
     """How to go on with a run that has ended before its end."""
     out, message = Path(status["run"]), str(status.get("message"))
     resume = f"clsplat resume {in_shell(out)}"
-    if not (out / PIPELINE).is_file() or resume in message or "--restart" in message:
+    state = RunState.read(out)
+    if PIPELINE not in state.names or resume in message or "--restart" in message:
         return ""
-    if "cells" in status or checkpoint.saved(out):
+    if "cells" in status or state.checkpoints:
         return f"`{resume}` goes on with it"
     if status.get("checkpoint"):  # without which it does not go on
         again = f"`clsplat run {in_shell(out / PIPELINE)} --out {in_shell(out)} --restart`"

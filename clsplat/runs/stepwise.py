@@ -27,7 +27,7 @@ def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
     """
     whole, begins = pipeline, is_due(run)
     begin_if_due(run)
-    pipeline = as_trained(whole, run) if run.is_refit else whole
+    pipeline = as_trained(whole, run)
     if begins:
         run_until_training(pipeline, run)
     first, last = _training_stages(pipeline)
@@ -60,7 +60,7 @@ def _edit_behind(pipeline: Pipeline, run: Run) -> None:
 def is_trained(pipeline: Pipeline, run: Run) -> bool:
     """Return whether no step of the training is left."""
     _, last = _training_stages(pipeline)
-    stage = (as_trained(pipeline, run) if run.is_refit else pipeline).stages[last]
+    stage = as_trained(pipeline, run).stages[last]
     in_its_end = isinstance(stage, Optimize) and run.cursor == last and stage.has_ended(run)
     return (run.cursor > last or in_its_end) and not is_due(run)
 

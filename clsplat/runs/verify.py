@@ -1,6 +1,5 @@
 """Verify a run folder from its files alone: which it must have, and whether each is whole."""
 
-import stat
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
@@ -22,7 +21,7 @@ from clsplat.core.files import (
     is_there,
 )
 from clsplat.core.page import require_end
-from clsplat.core.reading import KINDS, read_json, sha256
+from clsplat.core.reading import read_json, sha256
 from clsplat.formats.table import endings
 from clsplat.gaussians.model import load as load_model
 from clsplat.gaussians.validate import examine, is_model
@@ -30,33 +29,18 @@ from clsplat.nerf.files import is_field, load_field
 from clsplat.pipeline import plugins
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.prepare.cache import noted
-from clsplat.runs.outputs import acting
-from clsplat.runs.recovery import beyond_repair
+from clsplat.runs.outputs import declared
 from clsplat.runs.results import read_metrics, read_settings
-from clsplat.runs.state import has_state, read_sums, restart
-from clsplat.runs.status import state_of
+from clsplat.runs.state import Phase, RunState
 from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import read_status, status_of
+from clsplat.training.status import status_of
 
 # How each file of a run is looked at: what it is, or the DataError of what is wrong with it.
-
-
-def require(path: Path, kind: int = stat.S_IFREG) -> None:
-    """Raise DataError, with what is there instead, where there is no file, or nothing of another `kind`."""
-    try:
-        found = stat.S_IFMT(path.stat().st_mode)
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise DataError("is a link that leads to nothing" if path.is_symlink() else "is missing") from error
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror})") from error
-    if found != kind:
-        raise DataError(f"is {KINDS.get(found, 'a file')}; expected {KINDS.get(kind, 'a file')}")
 
 
 def require_sum(expected: str | None, path: Path) -> None:
@@ -64,15 +48,16 @@ def require_sum(expected: str | None, path: Path) -> None:
         raise DataError("differs from its checksum")
 
 
-def settings_file(path: Path, settings: dict[str, Any], expected: str | None) -> str:
-    require_sum(expected, path)
+def settings_file(state: RunState, settings: dict[str, Any], path: Path) -> str:
+    settings.update(read_settings(state.out))
+    require_sum((state.sums or {}).get(PIPELINE), path)
     if "matrix" in settings:
         load_experiment(str(path))
         return "of a matrix"
     recorded = settings.get("plugins")
     if isinstance(recorded, dict) and (faults := plugins.differences(recorded)):
         return f"not checked further: {faults[0]}"
-    load_pipeline(str(path))
+    load(str(path))
     return ""
 
 
@@ -82,33 +67,17 @@ def status_file(path: Path) -> str:
     return status.state if status else f"not checked further: format {content['format']}, of a newer clsplat"
 
 
-def checkpoint_file(written: dict[str, str], path: Path) -> str:
-    """Also note in `written` the checksums of models, where no training follows that may write them anew."""
+def checkpoint_file(path: Path) -> str:
+    if path.name.startswith("failed"):
+        return f"the state of a failure at step {archive.read(path)[0].get('step')}"
     state, tables = checkpoint.load(path)
-    if not any("optimize" in stage for stage in state.pipeline["stages"][state.cursor :]):
-        written.update(state.written)
     gaussians = None if state.field else len(tables["gaussians/means"])
     return f"step {state.step}, {size_text(gaussians, state.field['parameters'] if state.field else None)}"
 
 
-def failed_state(path: Path) -> str:
-    return f"the state of a failure at step {archive.read(path)[0].get('step')}"
-
-
-def inputs_file(path: Path) -> str:
-    Identity.from_data(read_json(path))
-    return ""
-
-
-def note_file(path: Path) -> str:
+def note_file(path: Path) -> None:
     if noted(path.parent) is None:
         raise DataError("expected the hash and the folder of prepared photographs")
-    return ""
-
-
-def page(path: Path) -> str:
-    require_end(path)
-    return ""
 
 
 def sums_file(expected: list[str], path: Path) -> str:
@@ -139,11 +108,6 @@ def output(expected: str | None, path: Path) -> str:
     return ""
 
 
-def folder(path: Path) -> str:
-    """Look at a folder that stands for its files."""
-    return f"{sum(one.is_file() for one in path.rglob('*'))} files"
-
-
 NO_SUMS = "is missing, as in runs of a Trainer; without it the outputs are not verified"
 
 
@@ -153,104 +117,73 @@ def verify(out: Path) -> dict[str, Any]:
     Files that a run declares and does not have yet are no fault while it is not done.  Raises DataError where the
     folder holds no run.
     """
-    if not has_state(out):
+    state = RunState.read(out)
+    if state.phase is Phase.EMPTY:
         raise DataError(f"{out}: holds neither pipeline.yaml nor status.json; expected the folder of a run")
-    objects = list(_objects(out))
+    objects = list(_objects(state))
     return {
         "run": str(out),
-        "state": state_of(read_status(out)),
+        "state": state.state_name,
         "whole": all(one["whole"] for one in objects),
         "objects": objects,
     }
 
 
-def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
+def _objects(state: RunState, whole: bool = False) -> Iterator[dict[str, Any]]:
     """What is found of each file of a run, or of the cells of a matrix; `whole` expects those of one that is done."""
+    out, names, status, sums = state.out, state.names, state.status, state.sums or {}
     settings: dict[str, Any] = {}
-
-    def pipeline(path: Path) -> str:
-        settings.update(read_settings(out))
-        return settings_file(path, settings, sums.get(PIPELINE))
-
-    status, sums = read_status(out), read_sums(out) or {}
-    ended = is_there(out / CHECKSUMS) and (PIPELINE in sums or not sums)  # while a run goes on it lists other files
-    done = whole or status.get("state") == "done" or (not status and ended)
+    ended = CHECKSUMS in names and (PIPELINE in sums or not sums)  # while a run goes on it lists other files
+    done = whole or state.phase is Phase.DONE or (not status and ended)
     one = partial(look_at, out)
-    yield one(PIPELINE, pipeline)
+    yield one(PIPELINE, partial(settings_file, state, settings))
     yield one(STATUS, status_file)
     if "matrix" in settings or "cells" in status:
         for cell in _cells(out, done):
-            yield from ({**found, "file": f"{cell}/{found['file']}"} for found in _objects(out / cell, done))
-        if done or (out / COMPARISON).exists():
-            yield one(COMPARISON, page)
+            yield from ({**found, "file": f"{cell.out.name}/{found['file']}"} for found in _objects(cell, done))
+        if done or COMPARISON in names:
+            yield one(COMPARISON, require_end)
         return
-    written: dict[str, str] = {}  # models of a run that is not done
-    yield from (one(name, partial(checkpoint_file, written)) for name in _checkpoints(out, status))
-    expected = {**{name: value for name, value in written.items() if is_inside(name)}, **sums}
-    for path in sorted((out / CHECKPOINTS).glob("failed_*.npz")):
-        yield one(f"{CHECKPOINTS}/{path.name}", failed_state)
-    files, folders = _declared(out, sums) if done else ([], [])
-    if done and not is_there(out / CHECKSUMS):
-        yield {"file": CHECKSUMS, "whole": False, "detail": NO_SUMS}
-    elif is_there(out / CHECKSUMS):
+    saved = [*(path.name for path in state.checkpoints), str(status.get("checkpoint") or "")]
+    saved += sorted(path.name for path in (out / CHECKPOINTS).glob("failed_*.npz"))
+    for name in filter(is_inside, dict.fromkeys(saved)):
+        yield one(f"{CHECKPOINTS}/{name}", checkpoint_file)
+    files = [RECORDS, METRICS] if done else []
+    with suppress(ConfigError):  # told already
+        files += declared(state.pipeline) if done else []
+    if CHECKSUMS in names:
         yield one(CHECKSUMS, partial(sums_file, [PIPELINE, *files] if done else []))
-    if done or is_there(out / INPUTS):
-        yield one(INPUTS, inputs_file)
-    if (done and settings.get("prepare")) or is_there(out / NOTE):
+    elif done:
+        yield {"file": CHECKSUMS, "whole": False, "detail": NO_SUMS}
+    if done or INPUTS in names:
+        yield one(INPUTS, lambda path: Identity.from_data(read_json(path)))
+    if (done and settings.get("prepare")) or NOTE in names:
         yield one(NOTE, note_file)
-    for name in dict.fromkeys([*expected, *files, *_present(out)]):
+    for name in dict.fromkeys([*sums, *files, *sorted({METRICS, RECORDS} & names)]):
         if name != PIPELINE:
-            yield one(name, partial(output, expected.get(name)))
-    yield from (one(name, folder, stat.S_IFDIR) for name in folders)
+            yield one(name, partial(output, sums.get(name)))
 
 
-def look_at(out: Path, name: str, look: Callable[[Path], str], kind: int = stat.S_IFREG) -> dict[str, Any]:
-    """Return what is found of one file of a folder, or of a folder in it."""
+def look_at(out: Path, name: str, look: Callable[[Path], Any]) -> dict[str, Any]:
+    """Return what is found of one file of a folder."""
     path = out / name
     try:
-        require(path, kind)
-        return {"file": name, "whole": True, "detail": look(path)}
+        if not path.exists():
+            raise DataError("is a link that leads to nothing" if path.is_symlink() else "is missing")
+        detail = look(path)
+        return {"file": name, "whole": True, "detail": detail if isinstance(detail, str) else ""}
     except Exception as error:  # whatever is wrong with a file, the others are looked at too
         reason = one_line(error).removeprefix(f"{path}: ") or type(error).__name__
         return {"file": name, "whole": False, "detail": reason}
 
 
-def _checkpoints(out: Path, status: dict[str, Any]) -> list[str]:
-    """The checkpoints that are there, and the newest that the status names."""
-    names = [path.name for path in checkpoint.saved(out)]
-    named = status.get("checkpoint")
-    if isinstance(named, str) and is_inside(named) and named not in names:
-        names.append(named)
-    return [f"{CHECKPOINTS}/{name}" for name in names]
-
-
-def _cells(out: Path, done: bool) -> list[str]:
+def _cells(out: Path, done: bool) -> list[RunState]:
     """The folders of a matrix's cells: those that are there, and of one that is done all of them."""
-    cells = {one.name for one in out.iterdir() if one.is_dir() and not one.is_symlink() and has_state(one)}
+    names = {one.name for one in out.iterdir() if one.is_dir() and not one.is_symlink() and RunState.read(one).phase}
     with suppress(ConfigError):  # told already
         found = load_experiment(str(out / PIPELINE)) if done else None
-        cells |= {cell.name for cell in found.cells} if found else set()
-    return sorted(cells)
-
-
-def _declared(out: Path, sums: dict[str, str]) -> tuple[list[str], list[str]]:
-    """Files that a run has when it is done, and folders, which stand for their files where no checksum tells them."""
-    try:
-        stages = [stage for stage in acting(load(str(out / PIPELINE))) if stage.named_outputs()]
-    except ConfigError:  # told already
-        stages = []
-    paths = [(path, stage) for stage in stages for path in stage.outputs(out)]
-    found = {path.relative_to(out).as_posix(): stage for path, stage in paths}
-    folders = [name for name, stage in found.items() if not any(stage.named_outputs().values())]
-    files = [name for name in found if name not in folders]
-    optional = [name for name in files if name not in sums and Path(name).stem.endswith(("_raw", "_sky"))]
-    return [RECORDS, METRICS, *(name for name in files if name not in optional)], [] if sums else folders
-
-
-def _present(out: Path) -> list[str]:
-    """Records and models that are there without a checksum, such as those of a run that is not done."""
-    names = [name for name in (METRICS, RECORDS) if (out / name).exists()]
-    return [*names, *sorted(path.name for path in out.glob("*.ply"))]
+        names |= {cell.name for cell in found.cells} if found else set()
+    return [RunState.read(out / name) for name in sorted(names)]
 
 
 # What `clsplat check RUN` says of a run folder.
@@ -271,31 +204,25 @@ def verdict(found: dict[str, Any]) -> str:
 
 
 def _remedy(found: dict[str, Any], file: str) -> str:
-    """How the run of a damaged file is mended by running it again."""
+    """How the run of a damaged file comes back: from a checkpoint that is whole, or from the beginning."""
     out = Path(found["run"])
-    cell = next((one for one in (out / file).parents if one != out and out in one.parents and has_state(one)), out)
-    prefix = "" if cell == out else f"{cell.relative_to(out).as_posix()}/"
-    whole = {
-        one["file"].removeprefix(prefix): one["whole"] for one in found["objects"] if one["file"].startswith(prefix)
-    }
-    damaged = [cell / name for name, good in whole.items() if not good]
-    left = beyond_repair(cell, damaged)
-    if not whole.get(PIPELINE):
-        return f"give its `clsplat run … --out {in_shell(cell)}` again, with {'--restart' if left else '--resume'}"
-    resume = f"`clsplat resume {in_shell(cell)}` makes them again"
-    if not left:
-        return resume
-    others = "" if len(left) == len(damaged) else f"; {resume} but for {', '.join(map(str, left))}"
-    return f"begin again: {restart(cell)}{others}"
+    folders = [*(one for one in (out / file).parents if out in one.parents), out]
+    state = next(one for one in map(RunState.read, folders) if one.phase or one.out == out)
+    whole = {out / one["file"] for one in found["objects"] if one["whole"]}
+    goes_on = "cells" in state.status or any(path in whole for path in state.checkpoints)
+    goes_on |= state.phase < Phase.STATELESS and not (state.checkpoints or state.status.get("checkpoint"))
+    if state.out / PIPELINE not in whole:
+        how = "--resume" if goes_on else "--restart"
+        return f"give its `clsplat run … --out {in_shell(state.out)}` again, with {how}"
+    if goes_on:
+        return f"`clsplat resume {in_shell(state.out)}` runs the stages after its newest checkpoint again"
+    return f"begin again: {state.restart}"
 
 
 def lines(found: dict[str, Any]) -> str:
     """Return what `verify` found, a line for each file."""
-    rows = [
-        f"{'whole  ' if one['whole'] else 'DAMAGED'}  {one['file']}{', ' if one['detail'] else ''}{one['detail']}"
-        for one in found["objects"]
-    ]
-    return "\n".join(rows)
+    rows = ((f"{'whole  ' if one['whole'] else 'DAMAGED'}  {one['file']}", one["detail"]) for one in found["objects"])
+    return "\n".join(", ".join(filter(None, row)) for row in rows)
 
 
 # What `clsplat check` was given: a pipeline, a matrix, the folder of a run, or a model.
@@ -309,11 +236,12 @@ def check(pipeline: str) -> dict[str, Any]:
     """
     if is_field(Path(pipeline)) and is_there(Path(pipeline)):
         return {"path": pipeline, "name": Path(pipeline).name, "parameters": load_field(pipeline).shape.learned}
-    if not has_state(Path(pipeline)) and pipeline not in shipped() and is_model(Path(pipeline)):
+    phase = RunState.read(Path(pipeline)).phase
+    if not phase and pipeline not in shipped() and is_model(Path(pipeline)):
         return examine(Path(pipeline))
     if len(Path(pipeline).parts) > 1 and not is_there(Path(pipeline)):
         raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
-    if Path(pipeline).is_dir() and (has_state(Path(pipeline)) or pipeline not in shipped()):
+    if Path(pipeline).is_dir() and (phase or pipeline not in shipped()):
         return verify(Path(pipeline))
     if found := load_experiment(pipeline):
         return {"path": str(found.path), "name": found.name, "cells": [cell.name for cell in found.cells]}

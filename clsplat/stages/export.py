@@ -14,7 +14,7 @@ from clsplat.formats.table import endings, for_writing
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import load
 from clsplat.gaussians.sky import sky_file
-from clsplat.scene.camera_files import PLACES, checked, write_cameras
+from clsplat.scene.camera_files import checked, write_cameras
 from clsplat.training import checkpoint
 from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model
@@ -83,15 +83,6 @@ class Export(Scheduled):
         if model.sky:
             LOG.info("their sky written to %s; `export: {sky: splats}` makes Gaussians of it", behind)
 
-    def verify(self, run: Run) -> None:
-        path, *more = self.outputs(run.out)
-        for file in (path, *(one for one in more if _name(one, run) in run.written or one.exists())):
-            if _name(file, run) not in run.written:
-                raise DataError(f"{file}: this run has no record of writing it; move it away, and use --restart")
-            if sha256(file) != run.written[_name(file, run)]:
-                again = "`clsplat resume` writes those of the last model again, `clsplat run` with --restart all"
-                raise DataError(f"{file}: differs from what was written; {again}")
-
 
 def _name(file: Path, run: Run) -> str:
     return file.relative_to(run.out).as_posix()
@@ -121,11 +112,6 @@ class Cameras(Stage):
         for name in self.formats:
             for path in write_cameras(learned_scene(run), run.out / self.folder, name, over=True):
                 LOG.info("cameras written to %s", path)
-
-    def verify(self, run: Run) -> None:
-        for name in self.formats:
-            if not (path := run.out / self.folder / PLACES[name][0]).is_file():
-                raise DataError(f"{path}: is missing")
 
 
 # Save the run at a cadence.

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.core.errors import DataError, amount
-from clsplat.core.page import require_end
+from clsplat.core.errors import amount
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.metrics.views import render_view
 from clsplat.render.camera import upload_camera
-from clsplat.scene.images import image_size, is_image, write_image
+from clsplat.scene.images import is_image, write_image
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Stand
 from clsplat.training.modules.base import learned_scene
@@ -52,11 +51,6 @@ class Render(Stage):
             write_image(path, render_view(run.painter(), camera))
         if views:
             LOG.info("%s written to %s", amount(len(views), "image"), run.out / self.folder)
-
-    def verify(self, run: Run) -> None:
-        for path, view in self._views(run).items():
-            if image_size(path) != (view.camera.width, view.camera.height):
-                raise DataError(f"{path}: has another size than its view")
 
 
 def image_paths(folder: Path, views: Sequence[str], suffix: str = ".png") -> list[Path]:
@@ -114,6 +108,3 @@ class Viewer(Stage):
             page = Page(page.title, {run.name: pack(shown, page.fitting)}, stand, name, views)
         page.write(path)
         LOG.info("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)
-
-    def verify(self, run: Run) -> None:
-        require_end(run.out / self.file)

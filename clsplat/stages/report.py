@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import amount, size_text
 from clsplat.core.files import PIPELINE, write_text
-from clsplat.core.page import charts, duration, embedded, render, require_end
+from clsplat.core.page import charts, duration, embedded, render
 from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import SHARES, ViewMetrics, measure, render_view
@@ -432,9 +432,6 @@ class HtmlReport(Stage):
         LOG.info("report written to %s", run.out / self.file)
         for text in advised:
             LOG.info("advice: %s", text)
-
-    def verify(self, run: Run) -> None:
-        require_end(run.out / self.file)
 
 
 def _addresses(run: Run, stage: str, page: Path) -> dict[str, str]:

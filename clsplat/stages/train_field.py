@@ -3,13 +3,11 @@
 import logging
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from clsplat.core.errors import ConfigError, DataError, NotFiniteError, OutputError
-from clsplat.core.reading import sha256
 from clsplat.core.schedule import Decay, NonNegative, at_step
 from clsplat.core.settings import OneOf
 from clsplat.gaussians.model import Rendering
@@ -174,10 +172,3 @@ class ExportField(Stage):
         except DataError as error:
             raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
         LOG.info("a field of %s parameters written to %s", f"{field.shape.learned:,}", file)
-
-    def verify(self, run: Run) -> None:
-        file: Path = run.out / self.file
-        if self.file not in run.written:
-            raise DataError(f"{file}: this run has no record of writing it; move it away, and use --restart")
-        if not file.is_file() or sha256(file) != run.written[self.file]:
-            raise DataError(f"{file}: differs from what was written; `clsplat resume` writes it again")

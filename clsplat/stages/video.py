@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from clsplat.core.errors import ConfigError, DataError, quoted
+from clsplat.core.errors import ConfigError, quoted
 from clsplat.core.progress import counted, heard_by
 from clsplat.core.settings import ReadPath
 from clsplat.scene.images import image_size, read_image, write_image
@@ -105,15 +105,6 @@ class Timelapse(Stage):
                 write(letterboxed(np.asarray(read_image(path), np.uint8)[:, :, :3], size))  # one size for all
         LOG.info("time-lapse of %d frames written to %s", len(files), run.out / self.file)
 
-    def verify(self, run: Run) -> None:
-        verify_video(run.out / self.file, len(self._files(run)))
-
-
-def verify_video(path: Path, frames: int) -> None:
-    """Raise DataError unless a video has its frames."""
-    if (found := encoding.frames_of(path)) != frames:
-        raise DataError(f"{path}: {found} of {frames} frames can be read; it is missing or damaged")
-
 
 Moment = Annotated[float, Field(ge=0, le=1)]
 
@@ -167,9 +158,6 @@ class Video(Stage):
         with heard_by(run.status.count):
             shoot(canvas, film, {"colour": path}, None, through)
         LOG.info("video of %d frames written to %s, %.2f MB", len(film.views), path, path.stat().st_size / 1e6)
-
-    def verify(self, run: Run) -> None:
-        verify_video(run.out / self.file, len(self._plan(run).views))
 
 
 def _points(run: Run) -> NDArray[np.float32]:

@@ -1,18 +1,16 @@
 """Cells by their names, run through a store by an engine, with their results in folders of these names."""
 
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from clsplat.core import terminal
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted
-from clsplat.core.files import PIPELINE, told_as, write_text
+from clsplat.core.files import PIPELINE, told_as
 from clsplat.core.progress import Count
 from clsplat.core.reading import read_json
 from clsplat.core.signals import stop_at_once, stopping_on_signals
@@ -22,16 +20,15 @@ from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell as MatrixCell
 from clsplat.pipeline.matrix import Experiment, load_experiment
 from clsplat.prepare.cache import prepare
-from clsplat.runs import run_folder
-from clsplat.runs.failures import Failures, failures_recorded
+from clsplat.runs.failures import Failures
 from clsplat.runs.preflight import check_preparation
 from clsplat.runs.run_folder import Start
-from clsplat.runs.state import sum_of
+from clsplat.runs.state import Phase, RunState, read_sums, sum_of
 from clsplat.sweeps.cell import CellRun, Scenes
 from clsplat.sweeps.child import plugin_files, run_command
 from clsplat.sweeps.devices import places
 from clsplat.sweeps.engines import Drive, Engine, InlineEngine, Wanted
-from clsplat.sweeps.experiment import check_matrix_folder, compare
+from clsplat.sweeps.experiment import matrix_opened
 from clsplat.sweeps.memory_need import Need
 from clsplat.sweeps.store import ERRORS, LEASE, MANIFEST, Store, copy_files, link_or_copy
 from clsplat.sweeps.task import Outcome, Terms, run_cell
@@ -59,28 +56,16 @@ def is_placed(source: Path, target: Path) -> bool:
 
     Raises ConfigError where a run has gone on in it, with settings of its own.
     """
-    own, files = _hashes(target), _hashes(source)
-    settings = sum_of(target / PIPELINE)
-    if own and settings not in (None, own.get(PIPELINE)):
+    placed = None
+    with suppress(DataError, KeyError, TypeError):
+        placed = read_json(target / MANIFEST)["files"][PIPELINE]
+    if placed and sum_of(target / PIPELINE) not in (None, placed):
         raise ConfigError(
             f"{target}: was trained on with other settings since the sweep had put its result there; move that folder, "
             "and run the sweep again with --resume"
         )
-    return bool(files) and all(_is_same(source / name, target / name, digest) for name, digest in files.items())
-
-
-def _hashes(folder: Path) -> dict[str, Any]:
-    """The hashes of files by the manifest of a folder; none where it has no manifest that can be read."""
-    with suppress(DataError, KeyError, TypeError):
-        return dict(read_json(folder / MANIFEST)["files"])
-    return {}
-
-
-def _is_same(source: Path, target: Path, digest: str) -> bool:
-    """Whether a file is a link of another, whose hash is known, or has that hash."""
-    with suppress(OSError):
-        return os.path.samefile(source, target) or sum_of(target) == digest
-    return False
+    here = RunState.read(target)
+    return here.phase is Phase.DONE and here.sums == read_sums(source) and not here.lost
 
 
 # How far the cells of a sweep are: a line of the log now and then, a bar in the terminal.
@@ -325,21 +310,11 @@ def run_sweep(
     device: the one of the engine inline.  A cell that fails does not stop the others; at the end a ClsplatError is
     raised with the exit code of the first one.  Raises Interrupted, Different.
     """
-    check_matrix_folder(out)
-    store, cells = Store(execution.keeps or Path()), experiment.cells
-    with (
-        run_folder.opened(out, start, cells=len(cells), done=0, failed={}) as status,
-        failures_recorded(status),
-    ):
-        write_text(out / PIPELINE, experiment.text)
-        sweep = _Sweep(experiment.name, experiment.text, cells, out, store, Failures("cells"), start == "restart")
+    store = Store(execution.keeps or Path())
+    with matrix_opened(experiment, out, start) as (status, failures):
+        sweep = _Sweep(experiment.name, experiment.text, experiment.cells, out, store, failures, start == "restart")
         sweep.status = status
         sweep.run(execution, device)
-        status.require_held()
-        compare(experiment, out, sweep.failures)
-        if sweep.failures:
-            raise sweep.failures.whole(len(cells))
-        status.end("done", exit_code=0)
 
 
 class _Sweep(Batch):

@@ -21,9 +21,8 @@ from clsplat.runs.failures import Failures, failures_recorded
 from clsplat.runs.live.live import Live
 from clsplat.runs.model_file import overrides_of
 from clsplat.runs.opening import read_run_scene, settle
-from clsplat.runs.recovery import is_finished
 from clsplat.runs.run_folder import Start, free_folder, start_of
-from clsplat.runs.state import has_begun, has_ended
+from clsplat.runs.state import Phase, RunState
 from clsplat.runs.status import summary
 from clsplat.runs.time_budget import Show, execute_within
 from clsplat.sweeps.compare.page import write_comparison
@@ -47,7 +46,7 @@ def run_pipeline(
 
     minutes: as for `Job.run`.
     """
-    outputs.check_places(pipeline, out)
+    outputs.check_places(pipeline, RunState.read(out))
     with (
         run_folder.opened(out, start, step=0) as status,
         stopping_on_signals(stop_at_once),
@@ -152,24 +151,20 @@ class Job:
             raise ConfigError(
                 "--minutes: expected a single run; a matrix has several: give optimize.steps in its cells"
             )
-        if minutes is not None and self.start == "resume" and has_begun(self.out):
+        state = RunState.read(self.out)
+        if minutes is not None and self.start == "resume" and state.phase >= Phase.BEGUN:
             raise ConfigError("--minutes is for a new run, whose steps it chooses; leave it out to go on with this one")
         with previewed(live) as preview:
-            self._run(device, preview, minutes)
-
-    def _run(self, device: str | Device | None, live: Live | None, minutes: float | None) -> None:
-        if isinstance(self.work, Experiment):
-            run_matrix(self.work, self.out, device, self.start, live)
-            return
-        planned = [] if self.start == "restart" else self.work.preparation(self.out)
-        start = start_of(self.work, planned, self.out, self.start)
-        if start is None:
-            LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
-        elif start == "resume" and not (folder := self.work.settings.scene.folder).exists():
-            remedy = f"`clsplat resume {in_shell(self.out)} --scene DIR` says where they are now"
-            raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
-        else:
-            run_pipeline(self.work, self.out, device, start, live, minutes)
+            if isinstance(self.work, Experiment):
+                run_matrix(self.work, self.out, device, self.start, preview)
+            elif start := start_of(self.work, state, self.start):
+                folder = self.work.settings.scene.folder
+                if start == "resume" and not folder.exists():
+                    remedy = f"`clsplat resume {in_shell(self.out)} --scene DIR` says where they are now"
+                    raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
+                run_pipeline(self.work, self.out, device, start, preview, minutes)
+            else:
+                LOG.info("%s: up to date: its files are whole; change a setting or the folder to run again", self.out)
 
 
 @contextmanager
@@ -191,17 +186,34 @@ def run_matrix(
     A cell that fails does not stop the others; at the end a ClsplatError is raised with the exit code of the first one.
     Interrupted stops the whole.
     """
+    done = done_cells(experiment, out, start)  # before anything changes in the folder
+    with matrix_opened(experiment, out, start) as (status, failures):
+        status.enter("running")
+        for number, cell in enumerate(status.counted(experiment.cells, "cells", len(experiment.cells)), 1):
+            title = f"cell {number} of {len(experiment.cells)}: {cell.name}"
+            status.note(stage=cell.name)
+            LOG.info("%s is done" if cell.name in done else "%s", title)
+            try:
+                with failures.kept(cell.name):
+                    if cell.name not in done:
+                        run_pipeline(cell.pipeline, out / cell.name, device, start, live)
+            except Interrupted as stopped:
+                raise Interrupted(f"stopped in {title}; `clsplat resume {in_shell(out)}` goes on with it") from stopped
+            status.note(done=number, failed=failures.texts())
+            status.refresh()
+
+
+@contextmanager
+def matrix_opened(experiment: Experiment, out: Path, start: Start) -> Iterator[tuple[StatusFile, Failures]]:
+    """Hold the folder of a matrix while its cells run; at the end write compare.html.
+
+    Raises a ClsplatError with the exit code of the first cell that is among the failures at the end.
+    """
     check_matrix_folder(out)
-    if start == "resume":  # other settings change nothing in the folder
-        for cell in experiment.cells:
-            has_ended(cell.pipeline, out / cell.name)
-    count = len(experiment.cells)
-    with (
-        run_folder.opened(out, start, cells=count, done=0, failed={}) as status,
-        failures_recorded(status),
-    ):
+    count, failures = len(experiment.cells), Failures("cells")
+    with run_folder.opened(out, start, cells=count, done=0, failed={}) as status, failures_recorded(status):
         write_text(out / PIPELINE, experiment.text)
-        failures = _run_cells(experiment, status, device, start, live)
+        yield status, failures
         status.require_held()
         compare(experiment, out, failures)
         if failures:
@@ -209,34 +221,20 @@ def run_matrix(
         status.end("done", exit_code=0)
 
 
-def _run_cells(
-    experiment: Experiment, status: StatusFile, device: str | Device | None, start: Start, live: Live | None
-) -> Failures:
-    """Run the cells one after the other; return those that failed."""
-    failures = Failures("cells")
-    status.enter("running")
-    for number, cell in enumerate(status.counted(experiment.cells, "cells", len(experiment.cells)), 1):
-        title, folder = f"cell {number} of {len(experiment.cells)}: {cell.name}", status.out / cell.name
-        status.note(stage=cell.name)
-        try:
-            with failures.kept(cell.name):
-                if start == "resume" and is_finished(cell.pipeline, folder):
-                    LOG.info("%s is done", title)
-                else:
-                    LOG.info("%s", title)
-                    run_pipeline(cell.pipeline, folder, device, start, live)
-        except Interrupted as stopped:
-            raise Interrupted(
-                f"stopped in {title}; `clsplat resume {in_shell(status.out)}` goes on with it"
-            ) from stopped
-        status.note(done=number, failed=failures.texts())
-        status.refresh()
-    return failures
+def done_cells(experiment: Experiment, out: Path, start: Start) -> list[str]:
+    """Return the names of the cells that a resumed matrix leaves alone: they are done, and whole.
+
+    Raises ConfigError where one was run with other settings.
+    """
+    states = [(cell, RunState.read(out / cell.name)) for cell in experiment.cells if start == "resume"]
+    for cell, state in states:
+        state.require_same(cell.pipeline)
+    return [cell.name for cell, state in states if state.is_whole(cell.pipeline)]
 
 
 def check_matrix_folder(out: Path) -> None:
     """Raise ConfigError when the folder holds a single run, or files of others under the names of a matrix."""
-    outputs.check_names(out, OF_A_MATRIX)
+    outputs.check_names(RunState.read(out), OF_A_MATRIX)
     if (out / PIPELINE).exists() and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
 
@@ -247,18 +245,15 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
     Raises a ClsplatError with the exit code of the first cell that the run would refuse.
     """
     check_matrix_folder(out)
-    run_folder.check_run_folder(out, start)
+    run_folder.check_run_folder(RunState.read(out), start)
     describe.tell_of_waiting(out)
-    lines, refusals = [], Failures("cells")
+    done, lines, refusals = done_cells(experiment, out, start), [], Failures("cells")
     read = cache(read_run_scene)  # each distinct scene once
     for cell in experiment.cells:
-        folder = out / cell.name
-        state = "unfinished" if folder.exists() else ""
+        state = "done" if cell.name in done else "unfinished" if (out / cell.name).exists() else ""
         try:
-            if start == "resume" and is_finished(cell.pipeline, folder):
-                state = "done"
-            else:
-                describe.describe(cell.pipeline, folder, device, start, read)
+            if state != "done":
+                describe.describe(cell.pipeline, out / cell.name, device, start, read)
         except ClsplatError as error:
             refusals[cell.name] = error
         lines.append(f"  {cell.name}  {state}".rstrip())

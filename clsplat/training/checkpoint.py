@@ -407,7 +407,7 @@ def _write(run: Run, kind: str) -> Path:
         train_seconds=run.train_seconds,
         cpu_seconds=run.cpu_seconds,
         metrics=run.metrics,
-        records=run.records.lines,
+        records=run.records.lines if run.stage_step else run.records.settled,
         written=run.written,
         changes=run.changes,
         device=run.device.text,

@@ -34,6 +34,7 @@ class Records:
         self._require_held = require_held
         self.path, self.trial = out / RECORDS, out / TRIAL
         self.lines = 0  # of metrics.jsonl that belong to the state of the run, with those that wait
+        self.settled = 0  # of them, from before the stages that a resumed run has again
         self._waiting: list[str] = []
 
     def set_aside(self) -> None:
@@ -62,7 +63,7 @@ class Records:
             fault = str(error)
         if len(kept) < self.lines:
             LOG.warning("%s: %d of %d lines can be read; %s; the run goes on", self.path, len(kept), self.lines, fault)
-        self.lines = len(kept)
+        self.lines = self.settled = len(kept)
         write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
 
     def add(self, step: int, kind: str, **values: Any) -> None:

@@ -125,6 +125,7 @@ class Run:
     def next_stage(self, cursor: int) -> None:
         """Come to the beginning of a stage."""
         self.cursor, self.stage_step, self.acted, self.edited = cursor, 0, 0, False
+        self.records.settled = self.records.lines
         self.modules = {name: one for name, one in self.modules.items() if one.outlasts != "no"}
         if self._model is not None:
             self.model.gaussians.tables.pop(HIDDEN, None)  # which a training has for itself

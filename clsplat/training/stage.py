@@ -80,9 +80,6 @@ class Stage(Settings):
         marks = {name: _marks(field.annotation, field.metadata) for name, field in cls.model_fields.items()}
         return {name: found[0].suffixes for name, found in marks.items() if found}
 
-    def verify(self, run: Run) -> None:
-        """Read back what the stage has written.  Raises DataError where it is missing or damaged."""
-
     def act(self, run: Run) -> None:
         """Run the stage, under its name in status.json; what fails inside of an edit leaves a run that is not whole.
 

@@ -25,9 +25,10 @@ from clsplat.render.painter import SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.model_file import ModelFile, ModelSource
 from clsplat.runs.run_folder import Start
-from clsplat.runs.state import changed, is_done_with
+from clsplat.runs.state import RunState
 from clsplat.scene.identity import Identity, decode_all, require_whole
 from clsplat.sweeps.experiment import run_pipeline
+from clsplat.sweeps.store import CellAttempt, whole
 from clsplat.training import checkpoint
 
 LOG = logging.getLogger("clsplat")
@@ -93,7 +94,7 @@ def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL)
     all checkpoints are damaged it begins anew.
     """
     if not is_trained(pipeline, folder):
-        is_whole = _is_any_whole(folder)
+        is_whole = any(whole([CellAttempt(folder)]))
         if checkpoint.saved(folder) and not is_whole:
             LOG.warning("%s: no checkpoint is whole; it is trained again from the beginning", folder)
         begun: Start = "resume" if is_whole else "restart"
@@ -107,20 +108,7 @@ def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL)
 
 def is_trained(pipeline: Pipeline, folder: Path) -> bool:
     """Whether a run of a pipeline has come to its end in a folder, with files that are whole."""
-    return is_done_with(pipeline, folder) and not changed(folder)
-
-
-def _is_any_whole(folder: Path) -> bool:
-    """Whether a checkpoint of a run can be read, or is of another format, which the run will say."""
-    for path in reversed(checkpoint.saved(folder)):
-        try:
-            checkpoint.load(path)
-        except DataError:
-            continue
-        except ConfigError:
-            pass
-        return True
-    return False
+    return RunState.read(folder).is_whole(pipeline)
 
 
 def require_steps(steps: int) -> None:

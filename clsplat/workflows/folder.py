@@ -9,7 +9,7 @@ from clsplat.core.errors import ConfigError, DataError, in_shell, one_line
 from clsplat.core.files import END_STATES, check_result
 from clsplat.core.reading import read_json
 from clsplat.runs import verify
-from clsplat.runs.state import has_state
+from clsplat.runs.state import RunState
 from clsplat.runs.status import run_status
 from clsplat.sweeps.status import is_store, store_status
 
@@ -87,7 +87,7 @@ def _parts(out: Path) -> list[str]:
 
 def _status(folder: Path) -> dict[str, Any]:
     try:
-        return run_status(folder) if has_state(folder) else {"state": "waiting"}
+        return run_status(folder) if RunState.read(folder).phase else {"state": "waiting"}
     except DataError as error:
         return {"state": "unknown", "message": one_line(error)}
 
@@ -108,7 +108,7 @@ def _objects(out: Path, done: bool) -> Iterator[dict[str, Any]]:
         if done or (out / name).exists():
             yield verify.look_at(out, name, look)
     for part in parts:
-        if has_state(out / part):
+        if RunState.read(out / part).phase:
             yield from ({**one, "file": f"{part}/{one['file']}"} for one in verify.verify(out / part)["objects"])
         elif done:
             yield {"file": part, "whole": False, "detail": "is missing"}

@@ -78,8 +78,7 @@ def test_the_field_is_what_its_renders_show(finished, tiny_scene, pipeline):
 
 def test_a_field_is_trained_longer_by_its_steps(finished, tmp_path):
     assert steps_key(finished) == "train_field.steps"
-    (tmp_path / "pipeline.yaml").write_text("stages: [{stage: train_field, steps: 5}]")
-    assert steps_key(tmp_path) == "train_field.steps"
+    assert steps_key(tmp_path) == "optimize.steps"
     told = clsplat_command("resume", finished, "--steps", "14", "--dry-run").stdout
     assert "14 steps" in told
     assert f"`clsplat resume {finished} --steps 24` trains longer" in "\n".join(summary(finished))

@@ -16,7 +16,7 @@ from clsplat.pipeline.stretching import in_steps
 from clsplat.pipeline.yaml_file import yaml_text
 from clsplat.runs import time_budget
 from clsplat.runs.describe import describe
-from clsplat.runs.state import has_ended
+from clsplat.runs.state import RunState
 from clsplat.scene.detect import read_scene
 from clsplat.scene.quality import measured, nearest_points
 from clsplat.scene.quality import told as text_of
@@ -174,7 +174,7 @@ def test_a_run_writes_what_it_chose_and_repeats_without_choosing(tiny_scene, tmp
     assert written.settings.model.sh_degree == 1
     assert [one.chosen for one in written.settings.choices] == [[1], [1]]
     assert "model.sh_degree=1, since 8 training photographs; few say little" in (tmp_path / "run/log.txt").read_text()
-    assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
+    assert RunState.read(tmp_path / "run").is_whole(asked), "the same command finds it up to date"
     plain = train(tiny_scene, tmp_path / "plain", *FEW, "model.sh_degree=1", "reset_opacity.stop=1")
     assert digest(plain.out) == digest(tmp_path / "run")
     run_pipeline(written, tmp_path / "again", None, "new")
@@ -199,7 +199,7 @@ def test_a_choice_may_keep_photographs_out_to_choose_by(tiny_scene, tmp_path):
     assert digest(tmp_path / "run") == digest(tmp_path / "plain")
     found = [json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("run", "plain")]
     assert found[0]["validation"] == found[1]["validation"]
-    assert has_ended(asked, tmp_path / "run")
+    assert RunState.read(tmp_path / "run").is_whole(asked)
     for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
         (tmp_path / "run" / name).unlink()
     clsplat.resume(tmp_path / "run")  # by the pipeline that the folder has, without choices to be made

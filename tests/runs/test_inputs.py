@@ -306,6 +306,7 @@ def test_a_record_that_was_changed_is_damaged(scene):
 def test_a_run_does_not_go_on_with_other_inputs(scene, tmp_path, what):
     out = tmp_path / "run"
     train(scene, out, *FEW)
+    (out / "point_cloud.ply").unlink()  # else there is nothing to do
     file = views(scene)[0].image_path
     kept = {path: path.read_bytes() for path in (file, scene / "transforms_train.json", scene / "points3d.ply")}
     if what == "photograph":
@@ -363,6 +364,8 @@ def test_a_dry_run_of_a_resumed_run_says_from_where(scene, tmp_path):
     assert "nothing to resume; would run in" in command(*words, "--resume").stdout
     assert not out.exists()
     train(scene, out, *FEW)
+    assert f"{out}: up to date" in command(*words, "--resume").stdout
+    (out / "point_cloud.ply").unlink()
     assert f"would go on from step 12 in {out}" in command(*words, "--resume").stdout
     assert "already holds a run" in command(*words, expect=2).stderr
     done = command(*words, "--resume", "--set", "seed=7", expect=2)

@@ -76,6 +76,7 @@ def test_restart_begins_again_and_leaves_the_files_of_others(tiny_scene, tmp_pat
     assert len([line for line in lines if line["kind"] == "train"]) == 2
     for file in (out / "checkpoints").iterdir():
         file.write_bytes(b"")
+    (out / "report.html").unlink()
     broken = command("resume", out, expect=7)
     assert "no checkpoint is whole" in broken.stderr
     advice = broken.stderr.split("`")[1].split()

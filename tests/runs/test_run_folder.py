@@ -13,12 +13,13 @@ from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.runs import outputs
 from clsplat.runs.run_folder import Start, check_run_folder
+from clsplat.runs.state import Phase, RunState
 from clsplat.sweeps import experiment
 from clsplat.sweeps.experiment import Job
 
 
 def opened(scene: Path, out: Path, *changes: str) -> None:
-    outputs.check_places(load("smoke", [f"scene.path={str(scene)!r}", *changes]), out)
+    outputs.check_places(load("smoke", [f"scene.path={str(scene)!r}", *changes]), RunState.read(out))
 
 
 def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
@@ -33,7 +34,7 @@ def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
     opened(tiny_scene, tiny_scene / "runs" / "a")
     photographs = tiny_scene / "train"
     with pytest.raises(ConfigError, match="is the folder of the photographs, or right in it"):
-        outputs.check_places(load("photos", [f"scene.path={str(photographs)!r}"]), photographs / "run")
+        outputs.check_places(load("photos", [f"scene.path={str(photographs)!r}"]), RunState.read(photographs / "run"))
 
 
 def test_a_link_that_leads_outside_is_not_followed(tiny_scene, tmp_path):
@@ -143,4 +144,28 @@ def test_what_a_run_wrote_is_begun_again(tmp_path: Path, sign):
     if sign != "its first line":
         (tmp_path / sign).parent.mkdir(exist_ok=True)
         (tmp_path / sign).write_bytes(b"{}")
-    check_run_folder(tmp_path, "restart")
+    check_run_folder(RunState.read(tmp_path), "restart")
+
+
+DONE = '{"state": "done", "process": 7}'
+PHASES: dict[str, tuple[Phase, dict[str, str]]] = {
+    "nothing": (Phase.EMPTY, {}),
+    "a file of others": (Phase.EMPTY, {"inputs.json": "{}"}),
+    "a status": (Phase.PREPARING, {"status.json": '{"state": "preparing"}'}),
+    "a pipeline": (Phase.BEGUN, {"pipeline.yaml": ""}),
+    "a checkpoint": (Phase.BEGUN, {"inputs.json": "{}", "checkpoints/step_000001.npz": ""}),
+    "no state": (Phase.STATELESS, {"pipeline.yaml": "", "inputs.json": "{}"}),
+    "a damaged status": (Phase.STATELESS, {"pipeline.yaml": "", "inputs.json": "{}", "status.json": "["}),
+    "an end": (Phase.DONE, {"status.json": DONE}),
+}
+
+
+@pytest.mark.parametrize("name", PHASES)
+def test_a_folder_tells_how_far_its_run_is(name, tmp_path):
+    phase, content = PHASES[name]
+    for file, text in content.items():
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text(text)
+    state = RunState.read(tmp_path)
+    assert state.phase is phase
+    assert state.lost == (["checksums.json"] if phase is Phase.DONE else [])

@@ -13,7 +13,7 @@ from clsplat.pipeline.capture_choice import without_choices
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, run_folder
 from clsplat.runs.model_file import evaluate
-from clsplat.runs.state import has_ended
+from clsplat.runs.state import RunState
 from clsplat.sweeps.compare.comparison import RunComparison
 from clsplat.sweeps.compare.page import main_table
 from clsplat.sweeps.experiment import run_pipeline
@@ -132,7 +132,7 @@ def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_pa
     assert found.reason == "neither tracks of points nor cameras tell the exposures"
     assert f"optimize.modules.exposure: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
     assert digest(tmp_path / "run") == digest(few_steps)
-    assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
+    assert RunState.read(tmp_path / "run").is_whole(asked), "the same command finds it up to date"
 
 
 def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):

@@ -13,6 +13,7 @@ import clsplat
 from clsplat.core.errors import ConfigError, DataError, MemoryLimitError, OutputError, as_clsplat_error
 from clsplat.core.files import CHECKSUMS
 from clsplat.runs import run_folder
+from clsplat.runs.state import RunState
 from tests.support.runs import FEW, crafted, digest, records, steps_saved, train
 
 pytestmark = pytest.mark.slow
@@ -135,7 +136,7 @@ def test_restoring_reads_no_other_run(few_steps, tmp_path):
     out = shutil.copytree(few_steps, tmp_path / "run")
     (out / "pipeline.yaml").unlink()
     with pytest.raises(ConfigError, match="already holds a run; give another folder, --resume or --restart"):
-        run_folder.check_run_folder(out, "new")
+        run_folder.check_run_folder(RunState.read(out), "new")
     assert CHECKSUMS in {path.name for path in out.iterdir()}
 
 

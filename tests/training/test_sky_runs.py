@@ -20,7 +20,7 @@ from clsplat.pipeline.capture_choice import without_choices
 from clsplat.pipeline.loading import load
 from clsplat.render.backdrops import Auto
 from clsplat.runs.model_file import evaluate
-from clsplat.runs.state import has_ended
+from clsplat.runs.state import RunState
 from clsplat.scene.camera import Camera
 from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.images import write_image
@@ -58,7 +58,7 @@ def learned(yard, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "yard"
     asked = load("smoke", [f"scene.path='{yard[1]}'", *LONGER, "model.background=auto"])
     run_pipeline(asked, out, None, "new")
-    assert has_ended(asked, out), "the same command finds it up to date"
+    assert RunState.read(out).is_whole(asked), "the same command finds it up to date"
     return out
 
 
