@@ -23,7 +23,7 @@ from clsplat.gaussians.structs import Gradients
 from clsplat.losses.base import Comparison, ImageLoss, LossValue, Penalty, PenaltyInputs, ViewGradients
 from clsplat.opencl.device import Array, Device
 from clsplat.photos.sampling import Order, ViewPool
-from clsplat.photos.transforms import LearnedTransform, PhotographTransform, Planes
+from clsplat.photos.transforms import PhotographTransform, Planes
 from clsplat.prepare.steps import Step
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.filters import FilterViews, ScreenFilter, WorldFilter
@@ -56,7 +56,6 @@ __all__ = [
     "Gaussians",
     "Gradients",
     "ImageLoss",
-    "LearnedTransform",
     "LossValue",
     "MemoryLimitError",
     "ModuleState",

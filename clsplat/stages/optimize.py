@@ -13,7 +13,7 @@ from clsplat.core.progress import Progress
 from clsplat.core.schedule import place
 from clsplat.core.settings import OneOf
 from clsplat.density.statistics import SplatStats
-from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses, require_symmetric
+from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses
 from clsplat.metrics.views import distribution
 from clsplat.photos.sampling import Sampler, ViewSettings
 from clsplat.scene.scene import Scene
@@ -257,7 +257,8 @@ class Optimize(Keeping):
         return modules
 
     def check(self) -> None:
-        require_symmetric(self.losses, self.views.transforms)
+        for module in self.modules:
+            module.check_losses(self.losses)
         for loss in self.losses:
             self.check_beside(str(getattr(loss, "type", "")))
         super().check()
@@ -350,7 +351,7 @@ class Optimize(Keeping):
         if run.sky:
             self.check_beside("sky", run.scene)
         states: list[ModuleState] = attached(self.modules, run, last)
-        trained = self.losses, rates, run.scene.extent, run.numbers, self.update
+        trained = self.losses, rates, run.scene.extent, self.update
         return Trainer(*parts, *trained, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:

@@ -137,7 +137,10 @@ class ModuleState:
 class TrainingModule(Settings):
     """Something that takes part in a training step next to the Gaussians."""
 
-    place: ClassVar[int] = 0  # in the list: modules stand in ascending order of it
+    place: ClassVar[int] = 0
+    """In the list: modules stand in ascending order of it.  Those below 20 change the camera, the model, the background
+    or the photograph; those below 30 what stands in front of the scene, below 40 colors, below 99 what is compared.  It
+    is a number, not names of other modules, so that one that no other knows has its place too."""
     outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "no"
     """What outlasts its training: its numbers, for measurements; or it acts in later trainings too."""
     conflicts: ClassVar[Mapping[str, str]] = {}  # why it does not go with another module, a part of the model or a loss
@@ -177,6 +180,9 @@ class TrainingModule(Settings):
     def excludes(self, other: str, scene: Scene | None = None) -> bool:
         """Whether it does not go with another module or a part of the model; without a scene, in any scene."""
         return other in self.conflicts and self.is_active(scene)
+
+    def check_losses(self, losses: Sequence[Loss]) -> None:
+        """Raise ConfigError for losses that it does not go with."""
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
         """Return what it takes on the device at most.  tile: px of its sides."""
