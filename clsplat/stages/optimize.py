@@ -19,7 +19,6 @@ from clsplat.photos.sampling import Sampler, ViewSettings
 from clsplat.scene.scene import Scene
 from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
-from clsplat.stages.init import will_learn_sky
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.best_model import Best, Measured
 from clsplat.training.checkpoint import copied_of, finite_values, put_back
@@ -275,8 +274,12 @@ class Optimize(Keeping):
         super().check_in(run)
         for module in (*brought(run, self), *self.modules):
             module.check_in(run)
-        if will_learn_sky(run):
-            self.check_beside("sky", run.scene)
+        self.check_brought(run)
+
+    def check_brought(self, run: Run) -> None:
+        """Raise ConfigError for modules that do not go with what the model brings."""
+        for module in brought(run, self):
+            self.check_beside(module.type, run.scene)
 
     def check_beside(self, part: str, scene: Scene | None = None) -> None:
         """Raise ConfigError for modules that do not go with a part of the model, or with a loss; without a scene, in
@@ -348,8 +351,7 @@ class Optimize(Keeping):
         run.adam = run.adam or Adam(gaussians)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates = self.rates.settled(views.full_size(last))
-        if run.sky:
-            self.check_beside("sky", run.scene)
+        self.check_brought(run)
         states: list[ModuleState] = attached(self.modules, run, last)
         trained = self.losses, rates, run.scene.extent, self.update
         return Trainer(*parts, *trained, modules=states)

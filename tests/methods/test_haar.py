@@ -233,7 +233,7 @@ def test_a_loss_that_is_not_symmetric_is_refused_before_a_run():
         training.model_copy(update={"losses": [*training.losses, other]}).check()
 
 
-def test_the_filter_follows_the_same_course_in_its_share_of_steps():
+def test_the_filter_has_the_same_course_in_fewer_steps():
     """By its own loss: from the mean of squares to the photograph, long before the end."""
     training = load("auto_opti3dgs_7k").settings.training
     course = course_of(training.modules[0], training.steps)

@@ -128,7 +128,7 @@ def test_without_visible_sky_the_bits_are_those_without_the_key(tiny_scene, tmp_
     assert not (tmp_path / "run" / "point_cloud_sky.json").exists()
     folder = Yard(rng, clear=False).write(tmp_path / "wall")
     run = train(folder, tmp_path / "walled", *FEW, "model.background=auto")
-    assert run.sky is None
+    assert "sky" not in run.modules
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """A training step as modules see it, and what a module is: settings in a pipeline file, and a state in a training."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.settings import Settings, variants
 from clsplat.gaussians.gaussians import DeviceModel
+from clsplat.gaussians.model import Model
 from clsplat.losses.base import Comparison, Loss, LossValue
 from clsplat.metrics.views import Fitted
 from clsplat.opencl.device import Array
 from clsplat.photos.photographs import Photograph
 from clsplat.photos.transforms import PhotographTransform, Planes
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.filters import ModelSettings
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace
+from clsplat.scene.quality import Measure
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.training.run import Run
@@ -117,7 +120,10 @@ class ModuleState:
     def update(self, step: Step) -> None: ...
     def update_skipped(self, step: Step) -> None: ...
 
-    # after a training
+    # outside steps
+    def complete(self, model: DeviceModel) -> None:
+        """Give a model what it is drawn with besides its Gaussians."""
+
     def finish(self, run: Run) -> None:
         """At the last step, before a better model than that of the last step is put back."""
 
@@ -148,6 +154,7 @@ class TrainingModule(Settings):
     family: ClassVar[str] = ""  # of those that exclude each other; "": those of the same type
 
     brought_as: ClassVar[str] = ""  # its type, where no list names it: the model, a loss or the views bring it
+    measure: ClassVar[Measure | None] = None  # what `measured` returns
     by_type: ClassVar[bool] = True
     joins: ClassVar[bool] = False  # a run may go on with it, or without it; bits then no longer compare
 
@@ -168,6 +175,25 @@ class TrainingModule(Settings):
     def saved(cls, run: Run) -> "TrainingModule | None":
         """Return it for a run whose checkpoint holds its state, where it is brought."""
         return None
+
+    @classmethod
+    def measured(cls, run: Run) -> float | None:
+        """Return a number that `choices` depend on; None where it is not known."""
+        return None
+
+    @classmethod
+    def settled_model(cls, run: Run, settings: ModelSettings, modules: "Sequence[TrainingModule]") -> ModelSettings:
+        """Return settings of a model with what follows from the photographs; modules: of the trainings."""
+        return settings
+
+    @classmethod
+    def begin_model(cls, run: Run, source: Model | None) -> None:
+        """Begin what a new model of a run is to have; source: what it was made of, if a model."""
+
+    @classmethod
+    def advice(cls, run: Run) -> Iterator[str]:
+        """Yield sentences for the page of a run."""
+        yield from ()
 
     def settled(self, run: Run) -> "TrainingModule":
         """Return it with what follows from the photographs."""
@@ -265,11 +291,25 @@ def brought(run: Run, stage: Any = None) -> list[TrainingModule]:
     """Return the modules that no list names, of a stage; None: of that in progress."""
     stages = getattr(run.settings, "stages", ())
     stage = stages[run.cursor] if stage is None and run.cursor < len(stages) else stage
-    return [module for kind in _unlisted().values() if (module := kind.brought(run, stage))]
+    return [module for kind in unlisted().values() if (module := kind.brought(run, stage))]
 
 
-def _unlisted() -> dict[str, type[TrainingModule]]:
+def unlisted() -> dict[str, type[TrainingModule]]:
+    """Return the classes of modules that no list names, by what they are brought as."""
     return {one.brought_as: one for one in Settings.defined if issubclass(one, TrainingModule) and one.brought_as}
+
+
+def settled_model(run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
+    """Return settings of a model with what modules that no list names choose beside those of the trainings."""
+    for kind in unlisted().values():
+        settings = kind.settled_model(run, settings, modules)
+    return settings
+
+
+def begin_model(run: Run, source: Model | None = None) -> None:
+    """Begin what a new model of a run is to have; source: what it was made of, if a model."""
+    for kind in unlisted().values():
+        kind.begin_model(run, source)
 
 
 def restored(run: Run, saved: Mapping[str, tuple[Numbers, Tables]]) -> dict[str, ModuleState]:
@@ -299,7 +339,7 @@ def scene_beside(model: Path, scene: Scene) -> Scene:
 
 def kind_of(name: str) -> type[TrainingModule]:
     """Return the class of a checkpoint's module.  Raises ConfigError for one that is not known."""
-    if (kind := {**variants(TrainingModule), **_unlisted()}.get(name)) is None:
+    if (kind := {**variants(TrainingModule), **unlisted()}.get(name)) is None:
         raise ConfigError(f"the checkpoint has a module '{name}', which is not known; give its --plugin")
     return kind
 

@@ -23,6 +23,7 @@ from clsplat.core.reading import read_json
 from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, explained
 from clsplat.core.settings import OneOf, Settings, variants
 from clsplat.losses.base import LossValue
+from clsplat.metrics.views import Gains
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import IDENTITY, LUMINANCE, MEANING, Floats, ViewTable
 from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, measured, noted, with_noted
@@ -201,7 +202,7 @@ class Gain(ColourModel):
         return np.array([exposure, log_gains[0] - exposure, log_gains[2] - exposure])
 
     def fitted(self, image: Floats, photograph: Floats) -> Floats:
-        return fitted_gains(image, photograph)
+        return Gains().fitted(image, photograph)
 
 
 class Affine(ColourModel):
@@ -361,16 +362,6 @@ class ExposureState(ColourState):
         meaning = f"{MEANING}; matrix: the rows of [E | b]"
         facts = {"meaning": meaning, "type": self.settings.type, "model": model.type, "photographs": photographs}
         return Written(matrices, facts)
-
-
-def fitted_gains(image: Floats, photograph: Floats) -> Floats:
-    """Return the matrix, [3, 4], of the gains of red, green and blue that bring an image nearest to a photograph.
-
-    By least squares; both are pixels, [M, 3].
-    """
-    squares, products = (image * image).sum(axis=0), (image * photograph).sum(axis=0)
-    gains = np.where((squares > 0) & (products > 0), products / np.where(squares > 0, squares, 1), 1.0)
-    return np.column_stack([np.diag(gains), np.zeros(3)])
 
 
 def exposures_of(run: Run) -> Exposures:

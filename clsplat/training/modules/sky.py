@@ -1,5 +1,7 @@
-"""The sky while a model is trained: its Adam, its losses, and its tables in a checkpoint."""
+"""The sky of a model: whether there is one, what it begins with, its Adam, its losses, its tables in a checkpoint."""
 
+import logging
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -7,15 +9,24 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.core.schedule import at_step
+from clsplat.gaussians.gaussians import DeviceModel
+from clsplat.gaussians.model import Model
 from clsplat.gaussians.sky import SIDES, DeviceSky, Sky
 from clsplat.losses.base import Comparison, LossValue
 from clsplat.opencl.device import Array
 from clsplat.photos.photographs import apply_mask
-from clsplat.render.backdrops import Auto, Directions
+from clsplat.photos.sky_detection import Seen, looked_at, panorama
+from clsplat.render.backdrops import Auto, Backdrop, Directions
+from clsplat.render.filters import ModelSettings
 from clsplat.render.rasterizer import Frame, Rasterizer
+from clsplat.scene.quality import Measure, is_transparent
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import View
 from clsplat.training.modules.base import ModuleState, Numbers, Step, Tables, TrainingModule
-from clsplat.training.run import SKY, Run
+from clsplat.training.run import Run
 
+LOG = logging.getLogger("clsplat")
+SKY: Literal["sky"] = "sky"  # the type of the module
 TEXELS, MOMENTS, BIASES, FREE = "texels", ("moment1", "moment2"), "biases", "free"
 WIDTHS = {TEXELS: 3, **dict.fromkeys(MOMENTS, 3), BIASES: 2, FREE: 1}
 
@@ -24,23 +35,81 @@ class SkyModule(TrainingModule):
     """The sky of a model.  The model brings it: no list names it."""
 
     brought_as: ClassVar[str] = SKY
+    measure: ClassVar[Measure | None] = SKY
     place: ClassVar[int] = -20
     outlasts: ClassVar[Literal["acts"]] = "acts"
 
     @classmethod
     def brought(cls, run: Run, stage: Any) -> "SkyModule | None":
-        return cls(type=SKY) if run.sky else None
+        has_sky = SKY in run.modules if run.has_model else _in_use(run.model_settings.background)
+        return cls(type=SKY) if has_sky else None
 
     @classmethod
     def saved(cls, run: Run) -> "SkyModule | None":
         return cls(type=SKY) if _background(run) else None
+
+    @classmethod
+    def measured(cls, run: Run) -> float | None:
+        """Return the share of the training photographs that show a sky; None where that is not known.
+
+        Views for validation count as training views.
+        """
+        if _unknown(run):
+            return None
+        background = run.model_settings.background
+        number, count = _counted(run, (background if isinstance(background, Auto) else Auto()).share)
+        return number / count
+
+    @classmethod
+    def settled_model(cls, run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
+        """Return the settings with the choice of a sky, where it is open: none where a module does not go with it."""
+        background = settings.background
+        if not isinstance(background, Auto) or background.chosen is not None:
+            return settings
+        excluding = next((one for one in modules if one.excludes(SKY, run.scene)), None)
+        if excluding:
+            chosen, reason = "off", f"'{excluding.type}' does not go with sky: {excluding.conflicts[SKY]}"
+        else:
+            chosen, reason = _choice(background, run)
+        LOG.info("model.background: %s, since %s", chosen, reason)
+        return settings.model_copy(
+            update={"background": background.model_copy(update={"chosen": chosen, "reason": reason})}
+        )
+
+    @classmethod
+    def begin_model(cls, run: Run, source: Model | None) -> None:
+        """Give the run's new model its first sky, where it is to have one: that of the source, or, without it and at
+        another size of the map, the colours of the sky that the photographs show."""
+        own, settings = source and source.sky, cls.settled_model(run, run.model_settings, ())
+        if (background := _in_use(settings.background)) is None:
+            run.modules.pop(SKY, None)
+            if own:
+                LOG.warning("the sky of the model is left out; model.background: directions keeps it")
+            return
+        if is_transparent(run.scene):
+            LOG.warning(
+                "model.background: the photographs have transparency: what is learned and exported as a sky is the "
+                "colour that clsplat puts behind them; leave model.background out"
+            )
+        texels, free = _first(run, background.side)
+        sky = own if own and own.side == background.side else Sky(texels)
+        run.modules[SKY] = LearnedSky(background, sky.upload(run.device), free)
+        LOG.info("sky: %d of %d x %d colours by direction are learned", free.sum(), background.side, background.side)
+
+    @classmethod
+    def advice(cls, run: Run) -> Iterator[str]:
+        """What a sky means that was chosen by the photographs."""
+        background = run.model_settings.background
+        if isinstance(background, Auto) and background.in_use is not None:
+            why, _, _ = background.reason.partition(";")
+            yield f"a sky was added, since {why}; other viewers show it where `export` has `sky: splats`"
 
     def state(self, run: Run) -> "LearnedSky":
         """Return that of the run, or one to load: an init stage begins it."""
         background = _background(run)
         assert background
         blank = Sky(np.zeros((background.side**2, 3), np.float32))
-        return run.sky or LearnedSky(background, blank.upload(run.device))
+        return run.modules.get(SKY) or LearnedSky(background, blank.upload(run.device))
 
     @classmethod
     def check_saved(cls, numbers: Numbers, tables: Tables) -> None:
@@ -50,9 +119,75 @@ class SkyModule(TrainingModule):
 def _background(run: Run) -> Directions | None:
     """The sky that the model of a run has; one that is not chosen yet counts."""
     given = run.model_settings.background
-    if isinstance(given, Auto):
-        given = None if given.chosen == "off" else given.model
+    return given.model if isinstance(given, Auto) and given.chosen is None else _in_use(given)
+
+
+def _in_use(background: Backdrop | None) -> Directions | None:
+    """The sky that settings ask for, once it is chosen."""
+    given = background.in_use if isinstance(background, Auto) else background
     return given if isinstance(given, Directions) else None
+
+
+# What photographs show of a sky.
+
+
+def _unknown(run: Run) -> str:
+    """Why photographs do not tell whether they show a sky; empty where they do."""
+    if run.scene.points is None:
+        return "the dataset has no points, and what is far from them is not known"
+    return "the photographs have transparency" if is_transparent(run.scene) else ""
+
+
+def _counted(run: Run, share: float) -> tuple[int, int]:
+    """How many training photographs show the sky in such a share of their upper third, or more, and how many there are.
+
+    Views for validation count as training views.
+    """
+    seen = _seen(run, run.scene.with_fold())
+    return sum(one.share >= share for one in seen), len(seen)
+
+
+def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
+    """Whether there is a sky, and why."""
+    if why := _unknown(run):
+        return "off", why
+    number, count = _counted(run, background.share)
+    text = (
+        f"{number} of {count} photographs show bright or blue regions above the horizon, without points, in "
+        f"{background.share:.0%} or more of their upper third"
+    )
+    enough = number >= background.photographs * count
+    return ("on" if enough else "off"), f"{text}; {'' if enough else 'not '}{background.photographs:.0%} of them"
+
+
+def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The first colours of the map and which are learned; all, from the mean of the upper thirds of photographs, where
+    none shows a sky."""
+    seen = _seen(run, run.scene)
+    if found := panorama(seen, side):
+        return found
+    uppers = [one.upper.mean(axis=0) / 255 for one in seen if len(one.upper)]
+    if not uppers:
+        LOG.warning("masks leave out the upper thirds of all photographs: the sky begins black")
+    mean = np.mean(uppers, axis=0) if uppers else np.zeros(3)
+    return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
+
+
+def _seen(run: Run, scene: Scene) -> list[Seen]:
+    """What each training photograph of a scene shows of the sky."""
+    return list(looked_at(scene, _photographs(run, scene)))
+
+
+def _photographs(run: Run, scene: Scene) -> Iterator[tuple[View, NDArray[np.uint8], NDArray[np.bool_] | None]]:
+    """The training photographs of a scene at the first size that they have, [height, width, 3], and which pixels
+    count, [height, width]; None: all."""
+    views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
+    for view in run.status.counted(views, "photographs", len(views)):
+        photograph = run.photographs.get(view)
+        yield view, photograph.image(), photograph.counted()
+
+
+# The sky in a training.
 
 
 class LearnedSky(ModuleState):
@@ -66,6 +201,9 @@ class LearnedSky(ModuleState):
         self._arrays = {name: zeros((width, texels)) for name, width in WIDTHS.items() if name != TEXELS}
         chosen = np.ones(texels, bool) if free is None else free
         self._arrays[FREE].set(chosen[None].astype(np.float32))
+
+    def complete(self, model: DeviceModel) -> None:
+        model.sky = self.sky
 
     def load(self, numbers: Numbers, tables: Tables) -> None:
         self.sky.texels.set(np.ascontiguousarray(tables[TEXELS].T))
