@@ -1,5 +1,8 @@
 """Training modules: what the loop knows of them, their order, and how `--set` addresses them."""
 
+import json
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -8,8 +11,10 @@ from clsplat.core.settings import variants
 from clsplat.losses.base import LossValue
 from clsplat.losses.image import L1, L2
 from clsplat.pipeline.loading import load
-from clsplat.training.modules.base import ModuleState, TrainingModule, kind_of, unlisted
+from clsplat.training import checkpoint
+from clsplat.training.modules.base import ModuleState, TrainingModule, check_list, kind_of, unlisted
 from tests.support.device_images import trainer_of
+from tests.support.runs import FEW, killed, train
 from tests.support.sources import PATHS, own_imports, room
 
 MODULES = "clsplat.training.modules"
@@ -106,3 +111,55 @@ def test_a_step_goes_forward_in_order_and_back_in_reverse(device, rng):
 def test_a_module_that_is_not_known_is_named():
     with pytest.raises(ConfigError, match="a module 'nosuch', which is not known; give its --plugin"):
         kind_of("nosuch")
+
+
+NEEDED = {  # so that each acts within seven steps
+    "camera_optimizer": {"start": 2, "focal": "auto"},
+    "distractors": {"count": 30, "start": 2},
+    "dropout": {"probability": 0.1},
+    "skip": {"start": 3, "warm_up": 1, "least": 0},
+    "transients": {"start": 2, "above": 1, "tail": 0},
+}
+
+
+def lists() -> list[list[dict[str, Any]]]:
+    """Lists of all shipped modules, each in the first one with which it goes; the second run has a sky."""
+    found: list[list[TrainingModule]] = [[], []]
+    shipped = [kind for kind in variants(TrainingModule).values() if kind.__module__.startswith("clsplat.")]
+    for kind in sorted(shipped, key=lambda kind: kind.place):
+        module = kind.model_validate({"type": (name := kind.model_fields["type"].default), **NEEDED.get(name, {})})
+        for one, parts in zip(found, ([], ["sky"]), strict=True):
+            if not ({*parts} & module.conflicts.keys()) and not conflict([*one, module]):
+                one.append(module)
+                break
+        else:
+            pytest.fail(f"{name} goes with neither list: make another")
+    return [[{"type": one.type, **NEEDED.get(one.type, {})} for one in modules] for modules in found]
+
+
+def conflict(modules: list[TrainingModule]) -> bool:
+    try:
+        check_list(modules)
+    except ValueError:
+        return True
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 1], ids=["without a sky", "with a sky"])
+def test_a_run_that_was_killed_has_the_same_bits(tiny_scene, tmp_path, number):
+    """Of the model, of all tables and numbers of all modules, and of their side files."""
+    settings = (*FEW, f"optimize.modules={json.dumps(lists()[number])}")
+    settings += ("model.background={type: directions, side: 16}",) if number else ()
+    whole, again = tmp_path / "whole", tmp_path / "again"
+    train(tiny_scene, whole, *settings)
+    train(tiny_scene, killed(whole, again), *settings, resume=True)
+    (one, tables), (other, resumed) = (checkpoint.load(checkpoint.saved(out)[-1]) for out in (whole, again))
+    assert one.modules == other.modules
+    assert one.modules.keys() == {module["type"] for module in lists()[number]} | ({"sky"} if number else set())
+    assert {name: table.tobytes() for name, table in tables.items()} == {
+        name: table.tobytes() for name, table in resumed.items()
+    }
+    files = [path.name for path in whole.iterdir() if path.name.startswith(("view_", "point_cloud"))]
+    assert len(files) > 1
+    assert [(whole / name).read_bytes() for name in files] == [(again / name).read_bytes() for name in files]

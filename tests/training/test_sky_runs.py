@@ -194,17 +194,6 @@ def test_directions_without_visible_sky_are_left_to_gaussians(yard):
 # ---- bits
 
 
-def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_sky, tiny_scene, tmp_path):
-    out = tmp_path / "run"
-    shutil.copytree(with_sky, out)
-    (out / "checkpoints" / "step_000012.npz").unlink()
-    for name in ("point_cloud.ply", "point_cloud_sky.json", "metrics.json", "checksums.json"):
-        (out / name).unlink()
-    train(tiny_scene, out, *SKY, resume=True)
-    assert digest(out) == digest(with_sky)
-    assert sky_bytes(out) == sky_bytes(with_sky)
-
-
 def test_the_best_model_is_left_with_the_sky_of_its_step(tiny_scene, tmp_path):
     wild = "model.background={type: directions, side: 16, rate: {points: [[0, 0.005], [9, 5.0]], between: steps}}"
     kept = (
