@@ -27,7 +27,7 @@ from clsplat.scene.identity import Identity, decode_all, require_whole
 from clsplat.scene.quality import measured, nearest_points
 from clsplat.scene.scene import SPLITS, Background, Scene
 from clsplat.stages.optimize import Optimize
-from clsplat.training.modules.base import settled_model, unlisted
+from clsplat.training.modules.base import unlisted
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
@@ -241,5 +241,8 @@ def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
 
     settings = of_trainings(pipeline.settings, Optimize, chosen)
     modules = [one for stage in settings.stages if isinstance(stage, Optimize) for one in stage.modules]
-    settings = settings.model_copy(update={"model": settled_model(run, settings.model, modules)})
+    model = settings.model
+    for kind in unlisted().values():
+        model = kind.settled_model(run, model, modules)
+    settings = settings.model_copy(update={"model": model})
     return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)

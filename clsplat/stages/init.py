@@ -24,7 +24,7 @@ from clsplat.scene.viewpoint import centre_of, looked_at_box, random_points
 from clsplat.scene.visual_hull import hull_points
 from clsplat.stages.init_motion import moving, require_times, with_motion
 from clsplat.training.memory import first_tables, last_place
-from clsplat.training.modules.base import begin_model
+from clsplat.training.modules.base import unlisted
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room
 from clsplat.training.stage import Stage
@@ -159,7 +159,9 @@ class Init(Stage):
         run.adam, run.stats, run.metrics = None, None, {}  # which were of an earlier model
         run.model = run.model_settings.model(gaussians, degree if self.source == "model" else 0)
         run.refresh_filter()
-        begin_model(run, load(Path(self.file)) if source == "model" and self.file else None)
+        began_as = load(Path(self.file)) if source == "model" and self.file else None
+        for kind in unlisted().values():
+            kind.begin_model(run, began_as)
         LOG.info("%s Gaussians from %s", f"{run.model.gaussians.count:,}", self._origin(source, run.scene))
 
     def expected_count(self, scene: Scene) -> int:

@@ -28,7 +28,7 @@ from clsplat.scene.view import View
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
-from clsplat.training.modules.sky import check_tables
+from clsplat.training.modules.sky import SkyModule
 from tests.support.outdoor_scene import Yard, painted
 from tests.support.runs import FEW, digest, train
 
@@ -307,14 +307,14 @@ def test_a_damaged_sky_is_refused(tmp_path, damage):
 def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
     _, tables = checkpoint.archive.read(with_sky / "checkpoints" / "step_000012.npz")
     behind, _ = split(tables, "modules/sky/")
-    check_tables(behind)
+    SkyModule.check_saved({}, behind)
     for name, table in {"texels": behind["texels"][:-1], "biases": behind["moment1"]}.items():
         with pytest.raises(DataError, match=f"{name} of its sky"):
-            check_tables({**behind, name: table})
-    with pytest.raises(DataError, match="not finite"):
-        check_tables({**behind, "moment2": behind["moment2"] * np.nan})
+            SkyModule.check_saved({}, {**behind, name: table})
+    with pytest.raises(DataError, match="not of finite numbers"):
+        SkyModule.check_saved({}, {**behind, "moment2": behind["moment2"] * np.nan})
     with pytest.raises(DataError, match="another sky"):
-        check_tables({"texels": behind["texels"], "biases": behind["biases"]})
+        SkyModule.check_saved({}, {"texels": behind["texels"], "biases": behind["biases"]})
 
 
 def test_a_sky_file_keeps_every_bit(rng, tmp_path):

@@ -172,11 +172,6 @@ class TrainingModule(Settings):
         return None
 
     @classmethod
-    def saved(cls, run: Run) -> "TrainingModule | None":
-        """Return it for a run whose checkpoint holds its state, where it is brought."""
-        return None
-
-    @classmethod
     def measured(cls, run: Run) -> float | None:
         """Return a number that `choices` depend on; None where it is not known."""
         return None
@@ -299,24 +294,11 @@ def unlisted() -> dict[str, type[TrainingModule]]:
     return {one.brought_as: one for one in Settings.defined if issubclass(one, TrainingModule) and one.brought_as}
 
 
-def settled_model(run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
-    """Return settings of a model with what modules that no list names choose beside those of the trainings."""
-    for kind in unlisted().values():
-        settings = kind.settled_model(run, settings, modules)
-    return settings
-
-
-def begin_model(run: Run, source: Model | None = None) -> None:
-    """Begin what a new model of a run is to have; source: what it was made of, if a model."""
-    for kind in unlisted().values():
-        kind.begin_model(run, source)
-
-
 def restored(run: Run, saved: Mapping[str, tuple[Numbers, Tables]]) -> dict[str, ModuleState]:
     """Return the states of a checkpoint, by type."""
     modules, found = modules_of(run), dict[str, ModuleState]()
     for name, (numbers, tables) in saved.items():
-        if module := modules.get(name, kind_of(name).saved(run)):
+        if module := modules.get(name):
             found[name] = state_of(module, run)
             found[name].load(numbers, tables)
     return found

@@ -12,13 +12,11 @@ from clsplat.core.schedule import at_step
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.sky import SIDES, DeviceSky, Sky
-from clsplat.losses.base import Comparison, LossValue
-from clsplat.opencl.device import Array
+from clsplat.losses.base import LossValue
 from clsplat.photos.photographs import apply_mask
 from clsplat.photos.sky_detection import Seen, looked_at, panorama
 from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.render.filters import ModelSettings
-from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.scene.quality import Measure, is_transparent
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
@@ -43,10 +41,6 @@ class SkyModule(TrainingModule):
     def brought(cls, run: Run, stage: Any) -> "SkyModule | None":
         has_sky = SKY in run.modules if run.has_model else _in_use(run.model_settings.background)
         return cls(type=SKY) if has_sky else None
-
-    @classmethod
-    def saved(cls, run: Run) -> "SkyModule | None":
-        return cls(type=SKY) if _background(run) else None
 
     @classmethod
     def measured(cls, run: Run) -> float | None:
@@ -106,20 +100,21 @@ class SkyModule(TrainingModule):
 
     def state(self, run: Run) -> "LearnedSky":
         """Return that of the run, or one to load: an init stage begins it."""
-        background = _background(run)
+        background = _in_use(run.model_settings.background)
         assert background
         blank = Sky(np.zeros((background.side**2, 3), np.float32))
         return run.modules.get(SKY) or LearnedSky(background, blank.upload(run.device))
 
     @classmethod
     def check_saved(cls, numbers: Numbers, tables: Tables) -> None:
-        check_tables(tables)
-
-
-def _background(run: Run) -> Directions | None:
-    """The sky that the model of a run has; one that is not chosen yet counts."""
-    given = run.model_settings.background
-    return given.model if isinstance(given, Auto) and given.chosen is None else _in_use(given)
+        super().check_saved(numbers, tables)
+        if tables.keys() not in (WIDTHS.keys(), {TEXELS}):
+            raise DataError("it has another sky than one of its own tables")
+        texels = len(tables[TEXELS])
+        side = int(np.sqrt(texels))
+        for name, table in tables.items():
+            if side * side != texels or not SIDES[0] <= side <= SIDES[1] or table.shape != (texels, WIDTHS[name]):
+                raise DataError(f"{name} of its sky is not [side * side, {WIDTHS[name]}]")
 
 
 def _in_use(background: Backdrop | None) -> Directions | None:
@@ -215,47 +210,27 @@ class LearnedSky(ModuleState):
         arrays = {TEXELS: self.sky.texels, **self._arrays}
         return {name: np.ascontiguousarray(array.get().T) for name, array in arrays.items()}
 
-    def cover(self, rasterizer: Rasterizer, frame: Frame, comparison: Comparison) -> tuple[Array, LossValue] | None:
-        """Return T dL/dT of the loss of what covers the sky, [1, rows, stride], and its value; None where it has no
-        weight."""
-        camera, step = comparison.camera, comparison.step
-        weight = at_step(self.settings.cover, step)
-        if not weight:
-            return None
-        scale, difference = weight / (camera.width * camera.height), at_step(self.settings.difference, step)
-        behind, sums = rasterizer.skies.cover(
-            self.sky, self._arrays[FREE], camera, comparison.photograph, frame.transmittance, difference, scale
+    def before_losses(self, step: Step) -> None:
+        """Add the loss of what covers the sky, where it has a weight."""
+        camera, comparison = step.camera, step.comparison
+        if not (weight := at_step(self.settings.cover, step.number)):
+            return
+        scale = weight / (camera.width * camera.height)
+        difference = at_step(self.settings.difference, step.number)
+        step.behind, sums = step.rasterizer.skies.cover(
+            self.sky, self._arrays[FREE], camera, comparison.photograph, step.frame.transmittance, difference, scale
         )
         if comparison.mask is not None:
-            apply_mask(rasterizer.workspace, camera, behind, comparison.mask)
-        return behind, LossValue("sky", lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
-
-    def by_texels(self, rasterizer: Rasterizer, frame: Frame, gradient: Array) -> Array:
-        """Return derivatives by the texels that a view shows, [3, shown], from those by its image."""
-        return rasterizer.skies.by_texels(self.sky, frame.camera, frame.transmittance, gradient)
-
-    def before_losses(self, step: Step) -> None:
-        if cover := self.cover(step.rasterizer, step.frame, step.comparison):
-            step.behind, value = cover
-            step.own_losses.append(value)
+            apply_mask(step.workspace, camera, step.behind, comparison.mask)
+        value = LossValue(SKY, lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
+        step.own_losses.append(value)
 
     def backward(self, step: Step) -> None:
-        step.keep(self, self.by_texels(step.rasterizer, step.frame, step.gradient))
+        """By the texels that the view shows, [3, shown], from the gradient by its image."""
+        frame = step.frame
+        step.keep(self, step.rasterizer.skies.by_texels(self.sky, frame.camera, frame.transmittance, step.gradient))
 
     def update(self, step: Step) -> None:
         """Change the texels that a view shows by Adam."""
         rate = at_step(self.settings.rate, step.number)
         step.rasterizer.skies.update(self.sky, step.frame.camera, step.kept(self), self._arrays, rate)
-
-
-def check_tables(tables: Tables) -> None:
-    """Raise DataError for tables that are not those of a sky."""
-    if tables.keys() not in (WIDTHS.keys(), {TEXELS}):
-        raise DataError("it has another sky than one of its own tables")
-    texels = len(tables[TEXELS])
-    side = int(np.sqrt(texels))
-    for name, table in tables.items():
-        if side * side != texels or not SIDES[0] <= side <= SIDES[1] or table.shape != (texels, WIDTHS[name]):
-            raise DataError(f"{name} of its sky is not [side * side, {WIDTHS[name]}]")
-        if not np.isfinite(table).all():
-            raise DataError(f"{name} of its sky holds values that are not finite")
