@@ -34,6 +34,7 @@ class Haar(TrainingModule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
     rate_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
     place: ClassVar[int] = 10  # before what compares the photograph with the image
+    planes: ClassVar[int] = 6  # the photograph that is changed, and its gradient
     outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "numbers"
 
     type: Literal["haar"] = "haar"

@@ -274,11 +274,6 @@ class Optimize(Keeping):
         super().check_in(run)
         for module in (*brought(run, self), *self.modules):
             module.check_in(run)
-        self.check_brought(run)
-
-    def check_brought(self, run: Run) -> None:
-        """Raise ConfigError for modules that do not go with what the model brings."""
-        for module in brought(run, self):
             self.check_beside(module.type, run.scene)
 
     def check_beside(self, part: str, scene: Scene | None = None) -> None:
@@ -351,7 +346,6 @@ class Optimize(Keeping):
         run.adam = run.adam or Adam(gaussians)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates = self.rates.settled(views.full_size(last))
-        self.check_brought(run)
         states: list[ModuleState] = attached(self.modules, run, last)
         trained = self.losses, rates, run.scene.extent, self.update
         return Trainer(*parts, *trained, modules=states)

@@ -29,7 +29,7 @@ from clsplat.scene.scene import Scene, scene_name
 from clsplat.training.adam import Adam
 from clsplat.training.best_model import Best, Tables
 from clsplat.training.field import TrainedField
-from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, plan
+from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, bytes_of_modules, most_pixels, plan
 from clsplat.training.records import Records, clocks
 from clsplat.training.status import StatusFile
 
@@ -213,9 +213,8 @@ class Run:
         components = components or self.model.gaussians.components
         views, tile = self.scene.split("train"), int(self.device.tuning["TILE"])
         bytes_held = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
-        lists = [getattr(stage, "modules", ()) for stage in getattr(self.settings, "stages", ())]
-        bytes_held += max((sum(one.device_bytes(views, tile) for one in modules) for modules in lists), default=0)
-        pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
+        bytes_held += bytes_of_modules(getattr(self.settings, "stages", ()), views, tile)
+        pixels = most_pixels(views, tile)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
         return plan(self.device.info, components, bytes_held, pixels, pixel_sums, harmonics, seen)
 

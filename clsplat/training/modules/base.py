@@ -25,6 +25,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.quality import Measure
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
+from clsplat.training.memory import most_pixels
 from clsplat.training.run import Run
 
 Tables = dict[str, NDArray[np.float32]]
@@ -153,6 +154,8 @@ class TrainingModule(Settings):
     files: ClassVar[Mapping[str, str]] = {}  # side files in the run folder, which begin with `view_`, and their titles
     family: ClassVar[str] = ""  # of those that exclude each other; "": those of the same type
 
+    planes: ClassVar[int] = 0  # of floats on the device, of the largest view's size
+
     brought_as: ClassVar[str] = ""  # its type, where no list names it: the model, a loss or the views bring it
     measure: ClassVar[Measure | None] = None  # what `measured` returns
     by_type: ClassVar[bool] = True
@@ -207,7 +210,7 @@ class TrainingModule(Settings):
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
         """Return what it takes on the device at most.  tile: px of its sides."""
-        return 0
+        return 4 * self.planes * most_pixels(views, tile) if self.planes else 0
 
     def check_in(self, run: Run) -> None:
         """Raise errors that can be known before the first stage."""

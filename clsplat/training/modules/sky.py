@@ -19,7 +19,6 @@ from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.render.filters import ModelSettings
 from clsplat.scene.quality import Measure, is_transparent
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import View
 from clsplat.training.modules.base import ModuleState, Numbers, Step, Tables, TrainingModule
 from clsplat.training.run import Run
 
@@ -61,10 +60,8 @@ class SkyModule(TrainingModule):
         if not isinstance(background, Auto) or background.chosen is not None:
             return settings
         excluding = next((one for one in modules if one.excludes(SKY, run.scene)), None)
-        if excluding:
-            chosen, reason = "off", f"'{excluding.type}' does not go with sky: {excluding.conflicts[SKY]}"
-        else:
-            chosen, reason = _choice(background, run)
+        against = excluding and f"'{excluding.type}' does not go with sky: {excluding.conflicts[SKY]}"
+        chosen, reason = ("off", against) if against else _choice(background, run)
         LOG.info("model.background: %s, since %s", chosen, reason)
         return settings.model_copy(
             update={"background": background.model_copy(update={"chosen": chosen, "reason": reason})}
@@ -169,17 +166,11 @@ def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]
 
 
 def _seen(run: Run, scene: Scene) -> list[Seen]:
-    """What each training photograph of a scene shows of the sky."""
-    return list(looked_at(scene, _photographs(run, scene)))
-
-
-def _photographs(run: Run, scene: Scene) -> Iterator[tuple[View, NDArray[np.uint8], NDArray[np.bool_] | None]]:
-    """The training photographs of a scene at the first size that they have, [height, width, 3], and which pixels
-    count, [height, width]; None: all."""
+    """What each training photograph of a scene, at the first size that it has, shows of the sky."""
     views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
-    for view in run.status.counted(views, "photographs", len(views)):
-        photograph = run.photographs.get(view)
-        yield view, photograph.image(), photograph.counted()
+    counted = run.status.counted(views, "photographs", len(views))
+    photographs = ((view, run.photographs.get(view)) for view in counted)
+    return list(looked_at(scene, ((view, one.image(), one.counted()) for view, one in photographs)))
 
 
 # The sky in a training.
