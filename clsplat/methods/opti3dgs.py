@@ -79,7 +79,7 @@ class HaarState(ModuleState):
 
     def after_render(self, step: Step) -> None:
         step.keep(self, step.planes)
-        step.planes = filtered(step.planes, self.filter)
+        step.planes = apply_filter(step.planes, self.filter)
 
     def before_losses(self, step: Step) -> None:
         """A loss keeps the sums of its last call, so that the gradient by the photograph comes before its value."""
@@ -87,7 +87,7 @@ class HaarState(ModuleState):
         gradient = gradient_by_photograph(step.losses_asked, step.comparison)
         if step.planes.mask is not None:
             apply_mask(step.workspace, step.camera, gradient, step.planes.mask)
-        of_images = by_filter(step.kept(self), self.filter, gradient)
+        of_images = filter_gradients(step.kept(self), self.filter, gradient)
         value, of_filter = self.settings.penalty(self.filter, step.number)
         step.own_losses.append(LossValue(self.settings.type, lambda: value))
         step.keep(self, (of_images, of_filter))
@@ -102,7 +102,7 @@ class HaarState(ModuleState):
         adam_step(self.numbers, self.filter, gradients, at_step(self.settings.rate, step))
 
 
-def filtered(planes: Planes, numbers: ByNumber) -> Planes:
+def apply_filter(planes: Planes, numbers: ByNumber) -> Planes:
     """Return a photograph after the transform; the colours of `planes` stay as they are."""
     camera, workspace = planes.camera, planes.workspace
     found = workspace.array("haar", planes.colours.shape)
@@ -115,8 +115,8 @@ def filtered(planes: Planes, numbers: ByNumber) -> Planes:
     return replace(planes, colours=found)
 
 
-def by_filter(planes: Planes, numbers: ByNumber, gradient: Array) -> Callable[[], ByNumber]:
-    """Begin the derivatives by scale and leak of what `filtered` returned of `planes`; the result waits for them.
+def filter_gradients(planes: Planes, numbers: ByNumber, gradient: Array) -> Callable[[], ByNumber]:
+    """Begin the derivatives by scale and leak of what `apply_filter` returned of `planes`; the result waits for them.
 
     gradient: by those colours, [3, rows, stride], zero outside the image and where the mask is.
     """

@@ -159,9 +159,9 @@ class Init(Stage):
         run.adam, run.stats, run.metrics = None, None, {}  # which were of an earlier model
         run.model = run.model_settings.model(gaussians, degree if self.source == "model" else 0)
         run.refresh_filter()
-        began_as = load(Path(self.file)) if source == "model" and self.file else None
+        source_model = load(Path(self.file)) if source == "model" and self.file else None
         for kind in unlisted().values():
-            kind.begin_model(run, began_as)
+            kind.begin_model(run, source_model)
         LOG.info("%s Gaussians from %s", f"{run.model.gaussians.count:,}", self._origin(source, run.scene))
 
     def expected_count(self, scene: Scene) -> int:

@@ -13,7 +13,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim, WeightEntropy
 from clsplat.losses.penalties import Anisotropy
-from clsplat.methods.opti3dgs import NAMES, Haar, HaarState, filtered
+from clsplat.methods.opti3dgs import NAMES, Haar, HaarState, apply_filter
 from clsplat.photos.photographs import Photograph, apply_mask
 from clsplat.photos.transforms import Planes
 from clsplat.pipeline.loading import load
@@ -42,7 +42,7 @@ def through(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> 
     counted = None if mask is None else planes_of(device, camera, mask[None])
     numbers = {"haar/scale": HAAR @ taps, "haar/leak": LEAK @ taps}
     planes = Planes(Workspace(device), camera, planes_of(device, camera, image), counted)
-    return filtered(planes, numbers).colours.get()[:, : camera.height, : camera.width]
+    return apply_filter(planes, numbers).colours.get()[:, : camera.height, : camera.width]
 
 
 @on_devices("width, height, share", each_once(SIZES, [None, 0.7, 0.1]))
