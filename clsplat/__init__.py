@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from clsplat.api.commands import view as view
     from clsplat.api.commands import work_for as work_for
     from clsplat.api.commands import write_levels as write_levels
-    from clsplat.api.device import Device as Device
     from clsplat.api.pictures import camera_path as camera_path
     from clsplat.api.pictures import render_path as render_path
     from clsplat.api.pictures import render_views as render_views
@@ -66,6 +65,7 @@ if TYPE_CHECKING:
     from clsplat.gaussians.model import load as load
     from clsplat.nerf.files import FieldModel as FieldModel
     from clsplat.nerf.files import load_field as load_field
+    from clsplat.opencl.device import Device as Device
     from clsplat.scene.camera import Camera as Camera
     from clsplat.scene.detect import read_scene as read_scene
     from clsplat.scene.scene import PointCloud as PointCloud
@@ -94,7 +94,6 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.commands": "cancel check compare_runs compress_model convert copy_pipeline describe_run evaluate"
     " pipeline_schema pipelines plan_in_blocks resume run run_cell status status_schema"
     " train_in_blocks view work_for write_levels",
-    "clsplat.api.device": "Device",
     "clsplat.api.pictures": "camera_path render_path render_views write_cameras write_video",
     "clsplat.api.renderer": "FieldRenderer Gradients Picture Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_packing measure_speed"
@@ -104,6 +103,7 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.formats.splats": "Reading Writing",
     "clsplat.gaussians.model": "load Model Rendering",
     "clsplat.nerf.files": "FieldModel load_field",
+    "clsplat.opencl.device": "Device",
     "clsplat.scene.camera": "Camera",
     "clsplat.scene.detect": "read_scene",
     "clsplat.scene.scene": "PointCloud Scene",

@@ -19,7 +19,7 @@ from clsplat.core.settings import OneOf, Settings, variants
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import Statistic
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.gaussians.structs import Gradients
+from clsplat.gaussians.structs import GaussianGradients
 from clsplat.losses.base import Comparison, ImageLoss, LossValue, Penalty, PenaltyInputs, ViewGradients
 from clsplat.opencl.device import Array, Device
 from clsplat.photos.sampling import Order, ViewPool
@@ -34,8 +34,7 @@ from clsplat.scene.images import inside, require_files
 from clsplat.scene.reader import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.view import View
-from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule
-from clsplat.training.modules.base import Step as TrainingStep
+from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage, path_in_run
 
@@ -53,8 +52,8 @@ __all__ = [
     "DeviceError",
     "Edit",
     "FilterViews",
+    "GaussianGradients",
     "Gaussians",
-    "Gradients",
     "ImageLoss",
     "LossValue",
     "MemoryLimitError",

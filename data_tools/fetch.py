@@ -25,7 +25,7 @@ Report = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Source:
+class WebArchive:
     """An archive on the web.  Without a checksum, `fetch` reports that of the file, so that the user can compare it."""
 
     url: str
@@ -34,25 +34,25 @@ class Source:
 
 
 SOURCES = {
-    "mipnerf360": Source(
+    "mipnerf360": WebArchive(
         "http://storage.googleapis.com/gresearch/refraw360/360_v2.zip",
         "Mip-NeRF 360 (Barron et al. 2022); no licence is stated: for research",
     ),
-    "tandt_db": Source(
+    "tandt_db": WebArchive(
         "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip",
         "Tanks and Temples (Knapitsch et al. 2017) and Deep Blending (Hedman et al. 2018), as 3DGS uses them",
     ),
 }
 
 
-def named(name: str) -> Source:
+def named(name: str) -> WebArchive:
     """Return a known source.  Raises ConfigError."""
     if name not in SOURCES:
         raise ConfigError(f"no data set named '{name}'; there are {', '.join(SOURCES)}, or give --url")
     return SOURCES[name]
 
 
-def fetch(source: Source, out: Path, report: Report = print) -> Path:
+def fetch(source: WebArchive, out: Path, report: Report = print) -> Path:
     """Download an archive and unpack it as the folder `out`; an existing folder stays unchanged.
 
     An interrupted download stays beside `out` as `….part`; the next call continues it.
@@ -74,7 +74,7 @@ def fetch(source: Source, out: Path, report: Report = print) -> Path:
     return out
 
 
-def _download(source: Source, archive: Path, report: Report) -> None:
+def _download(source: WebArchive, archive: Path, report: Report) -> None:
     part = archive.with_name(f"{archive.name}.part")
     for attempt in range(1, MAX_TRIES + 1):
         try:

@@ -22,7 +22,7 @@ from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
 
 from .casting import World, camera_pose
-from .shapes import Array, Box, Cylinder, Shape, Sphere, Vector
+from .shapes import Array, Cuboid, Cylinder, Shape, Sphere, Vector
 from .still_life import (
     SCENE_RADIUS,
     bound,
@@ -37,7 +37,7 @@ from .still_life import (
     planks,
     tin,
 )
-from .synthetic import CAMERA_DISTANCE, LOOK_AT, Options, surface_points, write_png
+from .synthetic import CAMERA_DISTANCE, LOOK_AT, SyntheticOptions, surface_points, write_png
 
 MOVING_VERSION = 1  # increase it when the images change
 HELD_OUT, FIRST_HELD_OUT = 5, 2  # of the moments: every fifth, from the third on
@@ -64,10 +64,10 @@ def flight(time: float) -> Vector:
 
 STANDING: tuple[Shape, ...] = (
     Cylinder(centre=(0, 0, -0.05), radius=SCENE_RADIUS, half=0.05, paint=planks, yaw=25),
-    Box(centre=(0.02, 0.0, 0.03), half=(0.52, 0.52, 0.03), paint=chessboard, yaw=-22),
+    Cuboid(centre=(0.02, 0.0, 0.03), half=(0.52, 0.52, 0.03), paint=chessboard, yaw=-22),
     Sphere(centre=(-0.12, 0.14, 0.39), radius=0.33, paint=globe, tilt=23, yaw=40),
     Cylinder(centre=(0.40, 0.16, 0.28), radius=0.17, half=0.22, paint=tin, yaw=10),
-    Box(centre=(0.20, -0.30, 0.145), half=(0.085, 0.085, 0.085), paint=die, yaw=33),
+    Cuboid(centre=(0.20, -0.30, 0.145), half=(0.085, 0.085, 0.085), paint=die, yaw=33),
     Sphere(centre=(-0.42, 0.85, 0.16), radius=0.16, paint=marble),
     Cylinder(centre=(0.30, 0.86, 0.26), radius=0.075, half=0.26, paint=candy),
 )
@@ -79,7 +79,7 @@ def shapes_at(time: float) -> tuple[Shape, ...]:
     return (
         *STANDING,
         Sphere(centre=flight(time), radius=BALL, paint=dotted, yaw=30, tilt=20),
-        Box(
+        Cuboid(
             centre=(0.80, 0.42, BOOK[2]),
             half=BOOK,
             yaw=TURN[0] + (TURN[1] - TURN[0]) * time,
@@ -90,7 +90,7 @@ def shapes_at(time: float) -> tuple[Shape, ...]:
 
 
 @dataclass(frozen=True)
-class Moving(Options):
+class Moving(SyntheticOptions):
     """Options of the scene that moves: image size in pixels, training and test cameras, moments, seed of the points."""
 
     size: int = 160

@@ -152,7 +152,7 @@ class Sphere(Shape):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Box(Shape):
+class Cuboid(Shape):
     """A block of half sides `half`."""
 
     half: Vector

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from .shapes import Array, Box, Cylinder, Shape, Sphere, Vector, dot, spiral, unit
+from .shapes import Array, Cuboid, Cylinder, Shape, Sphere, Vector, dot, spiral, unit
 
 SCENE_RADIUS = 1.25  # of the table
 SCENE_VERSION = 1  # increase it when the images change: folders of other versions count as incomplete
@@ -171,18 +171,18 @@ def pencil(p: Array) -> Array:
     return mix(mix(body, metal, p[2] > 0.22), (0.8, 0.28, 0.27), p[2] > 0.285)
 
 
-def book(centre: Vector, half: Vector, yaw: float, cover: Vector) -> Box:
+def book(centre: Vector, half: Vector, yaw: float, cover: Vector) -> Cuboid:
     """A bound box: its paint needs its size."""
-    return Box(centre=centre, half=half, yaw=yaw, paint=partial(bound, cover, half))
+    return Cuboid(centre=centre, half=half, yaw=yaw, paint=partial(bound, cover, half))
 
 
 SCENE: tuple[Shape, ...] = (
     Cylinder(centre=(0, 0, -0.05), radius=SCENE_RADIUS, half=0.05, paint=planks, yaw=25),
-    Box(centre=(0.02, 0.0, 0.03), half=(0.52, 0.52, 0.03), paint=chessboard, yaw=-22),
+    Cuboid(centre=(0.02, 0.0, 0.03), half=(0.52, 0.52, 0.03), paint=chessboard, yaw=-22),
     Sphere(centre=(-0.12, 0.14, 0.39), radius=0.33, paint=globe, tilt=23, yaw=40),
     Cylinder(centre=(0.40, 0.20, 0.28), radius=0.17, half=0.22, paint=tin, yaw=10),
     Sphere(centre=(0.22, -0.22, 0.21), radius=0.15, paint=dotted, yaw=30, tilt=20),
-    Box(centre=(-0.20, -0.30, 0.145), half=(0.085, 0.085, 0.085), paint=die, yaw=33),
+    Cuboid(centre=(-0.20, -0.30, 0.145), half=(0.085, 0.085, 0.085), paint=die, yaw=33),
     book((-0.78, -0.12, 0.06), (0.22, 0.30, 0.06), 8, (0.05, 0.13, 0.33)),
     book((-0.77, -0.13, 0.165), (0.19, 0.26, 0.045), 31, (0.42, 0.03, 0.04)),
     Sphere(centre=(-0.78, -0.1, 0.34), radius=0.13, paint=orange, tilt=-15),
@@ -190,5 +190,5 @@ SCENE: tuple[Shape, ...] = (
     Sphere(centre=(-0.42, 0.85, 0.16), radius=0.16, paint=marble),
     Cylinder(centre=(0.42, 0.86, 0.26), radius=0.075, half=0.26, paint=candy),
     Cylinder(centre=(0.10, -0.86, 0.032), radius=0.032, half=0.34, paint=pencil, tilt=90, yaw=62),
-    Box(centre=(0.50, -0.75, 0.085), half=(0.085, 0.085, 0.085), paint=die, yaw=-15, tilt=90),
+    Cuboid(centre=(0.50, -0.75, 0.085), half=(0.085, 0.085, 0.085), paint=die, yaw=-15, tilt=90),
 )

@@ -33,7 +33,7 @@ STILL_LIFE = World(SCENE, camera_angle_x=0.69, grid=4)  # a field of view that j
 
 
 @dataclass(frozen=True)
-class Options:
+class SyntheticOptions:
     """Options of a data set: image size in pixels, numbers of views, seed of the surface points."""
 
     size: int = 256
@@ -72,7 +72,7 @@ class Options:
         return f"{self.train} training and {self.test} test views, {self.size} px, {count:,} points"
 
 
-def write_dataset(out: Path, options: Options, workers: int | None = None) -> str:
+def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = None) -> str:
     """Make folder `out`, all of it or nothing, and return a line of text about it.
 
     `workers` processes share the views (default: one per core; 1 = this process).  Raises DataError when `out` exists
@@ -95,7 +95,7 @@ def write_dataset(out: Path, options: Options, workers: int | None = None) -> st
     return f"wrote {out}: {text}"
 
 
-def is_complete(out: Path, options: Options) -> bool:
+def is_complete(out: Path, options: SyntheticOptions) -> bool:
     """Return whether `out` holds every file of the data set with these options."""
     manifest = out / "synthetic.json"
     if not manifest.exists() or read_file(manifest).decode(errors="replace") != options.manifest():
@@ -104,7 +104,7 @@ def is_complete(out: Path, options: Options) -> bool:
     return all((out / name).is_file() for name in files)
 
 
-def fill(out: Path, options: Options, workers: int) -> int:
+def fill(out: Path, options: SyntheticOptions, workers: int) -> int:
     """Write images, cameras and points into `out`; return the number of points."""
     splits = options.poses()
     jobs = [(split, i, pose) for split, poses in splits.items() for i, pose in enumerate(poses)]

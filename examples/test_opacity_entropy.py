@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.plugin import Gaussians, Gradients, Penalty, PenaltyInputs, Workspace, variants
+from clsplat.plugin import GaussianGradients, Gaussians, Penalty, PenaltyInputs, Workspace, variants
 
 clsplat.load_plugin(Path(__file__).with_name("opacity_entropy.py"))
 
@@ -25,7 +25,7 @@ def test_the_kernel_adds_the_gradient_and_returns_the_value(schedule, count):
     widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 0}
     tables = {name: np.ones((count, width), np.float32) for name, width in widths.items()}
     gaussians = Gaussians(clsplat.Device(schedule=schedule), {**tables, "logit_opacity": logits})
-    gradients = Gradients(gaussians)
+    gradients = GaussianGradients(gaussians)
     gradients["logit_opacity"].fill(0.25)  # what other losses have added
     inputs = PenaltyInputs(Workspace(gaussians.device), gaussians, gradients, extent=1.0, step=1)
     found = variants(Penalty)["opacity_entropy"](weight=3.0).add(inputs)

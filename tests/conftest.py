@@ -22,7 +22,7 @@ import pytest
 
 from clsplat.conformance import quick
 from clsplat.core.settings import Settings, rebuild
-from clsplat.data_tools.synthetic import Options, write_dataset
+from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.opencl import device as opencl_device
 from clsplat.opencl import device as program
 from clsplat.opencl.device import Array, Device, Kernel, Program
@@ -270,7 +270,7 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
 def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten views of the synthetic still life, 40 x 40 px, two of them held out."""
     folder = tmp_path_factory.mktemp("scene") / "tiny"
-    write_dataset(folder, Options(size=40, train=8, test=2, seed=0), workers=1)
+    write_dataset(folder, SyntheticOptions(size=40, train=8, test=2, seed=0), workers=1)
     return folder
 
 

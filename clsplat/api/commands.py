@@ -259,10 +259,10 @@ def write_levels(
     Returns `folder`, `bytes`, the `split` that is measured, and `levels` with
     `gaussians`, `bytes`, and in dB `merged_psnr`, before the training, and `psnr`.
     """
-    from clsplat.workflows.lod import Plan, levels_of_detail
+    from clsplat.workflows.lod import LodPlan, levels_of_detail
 
     load_plugins()
-    plan = Plan(levels, keep, steps, downscale)
+    plan = LodPlan(levels, keep, steps, downscale)
     return levels_of_detail(Path(model), Path(folder), path_of(scene), plan, device)
 
 
@@ -305,10 +305,10 @@ def train_in_blocks(
     Returns what partition.json holds, `run`, the folder of the merged model, and `metrics`.
     """
     from clsplat.pipeline.execution import Execution, values_of
-    from clsplat.workflows.blocks import Plan, train_in_blocks
+    from clsplat.workflows.blocks import BlocksPlan, train_in_blocks
 
     load_plugins()
-    plan = Plan(pipeline, str(coarse), blocks, sight, steps, list(overrides), list(coarse_overrides))
+    plan = BlocksPlan(pipeline, str(coarse), blocks, sight, steps, list(overrides), list(coarse_overrides))
     values = values_of(path_of(on))
     execution = None if values is None else Execution.model_validate(values)
     return train_in_blocks(Path(scene), Path(out), plan, device, only_plan=only_plan, execution=execution)
@@ -401,7 +401,7 @@ def convert(
     for file in files:
         refuse_field(file)
     box = crop if isinstance(crop, str) or crop is None else ",".join(map(str, crop))
-    options = conversion.Options(sh_bits, axes, spz_version, quality, keep_nan)
+    options = conversion.ConversionOptions(sh_bits, axes, spz_version, quality, keep_nan)
     changes = conversion.Changes(
         drop_below,
         None if transform is None else conversion.transform_of(transform),

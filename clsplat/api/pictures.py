@@ -93,7 +93,7 @@ def render_path(
     from clsplat.viewer.video.film import Wish
 
     load_plugins()
-    wish, place = Wish.of(str(path), frames, fps, size, times), film.Place(path_of(video), Path(out), kind)
+    wish, place = Wish.of(str(path), frames, fps, size, times), film.FilmTarget(path_of(video), Path(out), kind)
     extras = film.Extras(None if side is None else str(side), layer_names(depth, alpha), path_of(save_path))
     return film.film(Path(model), path_of(scene), place, wish, extras, downscale=downscale, device=device)
 

@@ -1,28 +1,52 @@
 """Rendering and its derivatives with NumPy in and out."""
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.api.device import proved
+from clsplat.conformance.quick import open_correct
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.gaussians.model import Model
 from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.views import require_finite
 from clsplat.nerf.files import FieldModel
 from clsplat.opencl.device import Array, Device
+from clsplat.opencl.discovery import Schedule
 from clsplat.photos.photographs import BACKGROUNDS
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.painter import Layers, layers
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
+from clsplat.render.tiles import Sort
 from clsplat.scene.view import View, colour_of
 
 Floats = NDArray[np.float32]
 Colour = float | Sequence[float]
+_OPENING = threading.Lock()
 GEOMETRY = 6  # of the sums over pixels, the ones that do not belong to the colour (cl_kernels/splat.h)
+
+
+def proved(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
+    """Return an open device, one of a name, or `default_device`, on which pictures and models may be made.
+
+    It was compared with the reference once, as for a run.  Raises DeviceError when it computes wrongly.
+    """
+    return open_correct(default_device(schedule) if device is None else device, schedule, sort)
+
+
+def default_device(schedule: Schedule = "auto") -> Device:
+    """Return the device that is taken where none is given; opened on first use."""
+    with _OPENING:  # two threads get the same one
+        return _opened(schedule)
+
+
+@cache
+def _opened(schedule: Schedule) -> Device:
+    return Device(schedule=schedule)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, overrides
-from clsplat.api.device import proved
+from clsplat.api.renderer import proved
 from clsplat.core import lock
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
 from clsplat.core.files import CHECKSUMS, END_STATES

@@ -7,7 +7,7 @@ import typer
 
 from clsplat.core.errors import ConfigError
 from clsplat.data_tools.multiscale import write_multiscale
-from clsplat.data_tools.synthetic import Options, write_dataset
+from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.prepare.features import CameraModel
 from clsplat.prepare.mapping import Mapper
 from clsplat.prepare.matching import Matching
@@ -57,7 +57,7 @@ def synthetic(
     found = {name: value for name, value in given.items() if value is not None}
     if times is not None and not moving:
         raise ConfigError("--times is for a scene that moves; give --moving, too")
-    print(write_dataset(out, Moving(seed=seed, **found) if moving else Options(seed=seed, **found)))
+    print(write_dataset(out, Moving(seed=seed, **found) if moving else SyntheticOptions(seed=seed, **found)))
 
 
 @app.command()
@@ -195,7 +195,7 @@ def fetch(
     sha256: Annotated[str, typer.Option(help="The checksum of an archive given by its address.")] = "",
 ) -> None:
     """Download a public data set; a second call continues an interrupted download."""
-    from clsplat.data_tools.fetch import Source, named
+    from clsplat.data_tools.fetch import WebArchive, named
     from clsplat.data_tools.fetch import fetch as download
 
-    download(Source(name, "", sha256 or None) if "://" in name else named(name), out)
+    download(WebArchive(name, "", sha256 or None) if "://" in name else named(name), out)

@@ -15,7 +15,7 @@ from clsplat.conformance.check import Figure
 from clsplat.conformance.checks import KERNELS, SPEED
 from clsplat.conformance.host import system
 from clsplat.conformance.quick import forget, remember
-from clsplat.conformance.supervision import Result, supervised
+from clsplat.conformance.supervision import CheckResult, supervised
 from clsplat.core.errors import amount
 from clsplat.core.files import check_result, told_as, write_text
 from clsplat.core.page import duration, render
@@ -43,7 +43,7 @@ class Verdict:
         return "error" if not self.usable else "warning" if self.advice else "ready"
 
 
-def judge(default: str, schedules: Mapping[str, Sequence[Result]], once: Sequence[Result]) -> Verdict:
+def judge(default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Sequence[CheckResult]) -> Verdict:
     """Judge the results of each schedule, and of the checks that a device needs `once`."""
     verdict = _of_figures(default, schedules, once)
     if verdict.usable and any(result.damaged_cache for part in (*schedules.values(), once) for result in part):
@@ -52,7 +52,7 @@ def judge(default: str, schedules: Mapping[str, Sequence[Result]], once: Sequenc
     return verdict
 
 
-def _of_figures(default: str, schedules: Mapping[str, Sequence[Result]], once: Sequence[Result]) -> Verdict:
+def _of_figures(default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Sequence[CheckResult]) -> Verdict:
     failures = {name: [text for result in results for text in result.failures] for name, results in schedules.items()}
     others = [text for result in once for text in result.failures]
     good = [name for name, found in failures.items() if not found]
@@ -76,7 +76,7 @@ def _with_the_default(good: list[str], failures: Mapping[str, list[str]], others
     return Verdict(True, f"use it, as it is; but {wrong[0]}", f"nothing for training; {REPORT}")
 
 
-def _is_bitonic(result: Result) -> bool:
+def _is_bitonic(result: CheckResult) -> bool:
     return result.fault is None and all(figure.kernel in BITONIC for figure in result.figures if not figure.holds)
 
 
@@ -93,8 +93,8 @@ class DeviceReport:
 
     info: DeviceInfo
     default: str  # schedule
-    schedules: dict[str, list[Result]] = field(default_factory=dict)
-    once: list[Result] = field(default_factory=list)  # memory and speed
+    schedules: dict[str, list[CheckResult]] = field(default_factory=dict)
+    once: list[CheckResult] = field(default_factory=list)  # memory and speed
     seconds: float = 0.0
 
     @property
@@ -167,7 +167,7 @@ class DeviceReport:
         )
 
 
-def summary(results: list[Result]) -> str:
+def summary(results: list[CheckResult]) -> str:
     """Return the number of checks and figures, and of those that do not hold."""
     figures = [figure for result in results for figure in result.figures]
     wrong = sum(not figure.holds for figure in figures)
@@ -184,7 +184,7 @@ def _listed(failures: list[str]) -> list[str]:
     return [*lines, f"          … and {more} more"] if more > 0 else lines
 
 
-def _plain(result: Result) -> dict[str, Any]:
+def _plain(result: CheckResult) -> dict[str, Any]:
     figures = [
         {**asdict(figure), "value": figure.value if math.isfinite(figure.value) else None, "holds": figure.holds}
         for figure in result.figures
@@ -230,7 +230,7 @@ def _is_due(schedule: str, report: DeviceReport) -> bool:
     return report.info.kind == "CPU" and bool(report.failures["simt"])
 
 
-def progress(schedule: str, result: Result) -> str:
+def progress(schedule: str, result: CheckResult) -> str:
     """Return a line for one check."""
     failures = result.failures
     words = f"WRONG: {failures[0]}" if failures else _hold(len(result.figures))
@@ -247,10 +247,10 @@ def _hold(figures: int) -> str:
 
 
 @dataclass(frozen=True)
-class Row:
+class CheckRow:
     """One check in a table."""
 
-    result: Result
+    result: CheckResult
     worst: Figure | None  # the figure nearest to its bound, or furthest beyond it
 
     @property
@@ -324,8 +324,8 @@ def _facts(report: DeviceReport) -> dict[str, str]:
     return facts
 
 
-def _row(result: Result) -> Row:
-    return Row(result, max(result.figures, key=_excess, default=None))
+def _row(result: CheckResult) -> CheckRow:
+    return CheckRow(result, max(result.figures, key=_excess, default=None))
 
 
 def _excess(figure: Figure) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.reference import Splats
-from clsplat.gaussians.gaussians import DeviceModel, Dropout, Gaussians
+from clsplat.gaussians.gaussians import DeviceModel, DropoutMask, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.scene.camera import Camera
@@ -31,7 +31,7 @@ class Case:
     variance: float = 0.3
     compensate: float = 0.0
     pixel_box: float = 0.0  # 1: with a variance of 0
-    dropout: Dropout | None = None
+    dropout: DropoutMask | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -45,11 +45,11 @@ class Case:
     def device_camera(self, device: Device) -> DeviceCamera:
         return upload_camera(device, self.view)
 
-    def gaussians(self) -> ref.Gaussians:
+    def gaussians(self) -> ref.RawGaussians:
         p = {name: table.astype(np.float64) for name, table in self.parameters.items()}
         sh = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1).reshape(len(p["means"]), 16, 3)
         filters = p.get("filter_variance")
-        return ref.Gaussians(
+        return ref.RawGaussians(
             p["means"],
             p["quats"],
             p["log_scales"],
@@ -59,11 +59,11 @@ class Case:
             self.dropout.opacity_factor if self.dropout else 1.0,
         )
 
-    def camera(self) -> ref.Camera:
+    def camera(self) -> ref.PinholeCamera:
         c = self.view.camera
         pose = self.view.world_to_camera.astype(np.float32).astype(np.float64)
         fx, fy, cx, cy = (float(np.float32(value)) for value in (c.fx, c.fy, c.cx, c.cy))
-        return ref.Camera(pose, fx, fy, cx, cy, c.width, c.height)
+        return ref.PinholeCamera(pose, fx, fy, cx, cy, c.width, c.height)
 
     def numbers(self) -> dict[str, float]:
         numbers = {"near": self.near, "variance": self.variance, "compensate": self.compensate}

@@ -23,7 +23,7 @@ END_SECONDS = 30  # between the end of the output and that of the process, which
 
 
 @dataclass
-class Result:
+class CheckResult:
     """What one check found on a device."""
 
     name: str
@@ -50,7 +50,7 @@ class Result:
 
 def supervised(
     info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float = CHECK_SECONDS
-) -> Iterator[Result]:
+) -> Iterator[CheckResult]:
     """Run checks on a device with a schedule; yield each result when it is complete.
 
     A check that says nothing for `seconds` is stopped.  One that cannot be completed is tried again with empty caches
@@ -69,7 +69,7 @@ def supervised(
         left = left[done:]
 
 
-def _with_empty_caches(info: DeviceInfo, schedule: str, check: Check, seconds: float) -> Result:
+def _with_empty_caches(info: DeviceInfo, schedule: str, check: Check, seconds: float) -> CheckResult:
     with empty_kernel_caches() as variables:
         (result,) = _one_process(info, schedule, [check], seconds, variables)
     result.damaged_cache = result.fault is None
@@ -78,7 +78,7 @@ def _with_empty_caches(info: DeviceInfo, schedule: str, check: Check, seconds: f
 
 def _one_process(
     info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float, variables: Mapping[str, str] | None = None
-) -> Iterator[Result]:
+) -> Iterator[CheckResult]:
     """Results of the first checks, up to and including one that ends the process: at least one."""
     command = [sys.executable, *WORKER, *map(str, info.place), schedule]
     names = [check.name for check in checks]
@@ -97,7 +97,7 @@ def _one_process(
         threading.Thread(target=_pump, args=(process.stdout, lines), daemon=True).start()
         try:
             for check in checks:
-                result = Result(check.name, check.kernels)
+                result = CheckResult(check.name, check.kernels)
                 ended = _fill(result, lines, seconds)
                 if ended is not None:
                     result.fault = ended or _death(process, errors)
@@ -111,7 +111,7 @@ def _one_process(
             process.stdin.close()
 
 
-def _fill(result: Result, lines: "queue.Queue[str | None]", seconds: float) -> str | None:
+def _fill(result: CheckResult, lines: "queue.Queue[str | None]", seconds: float) -> str | None:
     """Take the lines of one check; None: it is complete, "": the process ended, else why it is stopped."""
     while True:
         try:

@@ -12,7 +12,7 @@ import itertools
 import pkgutil
 import textwrap
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -43,10 +43,28 @@ class Settings(BaseModel):
     step_keys: ClassVar[frozenset[str]] = frozenset()  # steps that grow with the length of the training
     by_type: ClassVar[bool] = False  # in a list each type is there once, and addressed by it
     rate_keys: ClassVar[frozenset[str]] = frozenset()  # schedules by step whose values fall as much, so that sums stay
+    family: ClassVar[str] = ""  # by which `conflicts` of others may name it, next to its type
+    conflicts: ClassVar[Mapping[str, str]] = {}
+    """What it does not go together with, by type or family, in the same stage or outside of stages: why; what to do."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
         Settings.defined.append(cls)
+
+    def known_as(self) -> set[str]:
+        """Return the names by which the `conflicts` of others mean it."""
+        return {self.family, *(str(getattr(self, tag)) for tag in TAGS if tag in type(self).model_fields)}
+
+    def excluded(self) -> Mapping[str, str]:
+        """Return its `conflicts`, as its values make them."""
+        return self.conflicts
+
+    def check_with(self, pipeline: Any) -> None:
+        """Raise ConfigError where the pipeline file around it (PipelineFile) lacks what it needs."""
+
+    def parts(self) -> dict[str, Any]:
+        """Return its values by key, without those that do not count."""
+        return {key: getattr(self, key) for key in type(self).model_fields}
 
     def place_of(self, key: str, scene: str | None) -> Path | None:
         """Return the file or folder that is read where a key names one, else None.  scene: folder of the dataset."""
@@ -60,6 +78,20 @@ class Settings(BaseModel):
         for name, text in descriptions(cls).items():
             properties.get(name, {}).setdefault("description", text)
         return found
+
+
+def nested(value: Any, place: str = "") -> Iterator[tuple[str, Settings]]:
+    """Yield all settings inside of settings or a list, each with its place, such as stages[1].optimize.losses[0]."""
+    if isinstance(value, list | tuple):
+        for i, inner in enumerate(value):
+            yield from nested(inner, f"{place}[{i}]")
+    elif isinstance(value, dict):
+        yield from nested(list(value.values()), place)
+    elif isinstance(value, Settings):
+        place = f"{place}.{name}" if (name := getattr(value, "stage", None)) else place
+        yield place, value
+        for key, inner in value.parts().items():
+            yield from nested(inner, f"{place}.{key}" if place else key)
 
 
 @functools.cache

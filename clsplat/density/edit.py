@@ -8,7 +8,7 @@ growth and compare the size of the children after a split.
 
 import math
 from abc import abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -17,8 +17,8 @@ from pydantic import Field
 
 from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import Schedule, at_step
-from clsplat.core.settings import Settings
-from clsplat.density.statistics import SEEN, SplatStats
+from clsplat.core.settings import Settings, variants
+from clsplat.density.statistics import SEEN, SplatStats, Statistic
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale, Threshold
 from clsplat.gaussians.gaussians import Gaussians
@@ -241,7 +241,6 @@ class Rule(Settings):
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     grows: ClassVar[bool] = True  # whether it may add Gaussians
     rewrites: ClassVar[bool] = False  # changes tables as it marks, with edit.set_rows: later rules see that
-    reads_means: ClassVar[bool] = False  # as the places of Gaussians, which those that move have at no view's time
 
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the rule acts."""
@@ -255,6 +254,19 @@ class Rule(Settings):
     def tables(self) -> set[str]:
         """Tables of the Gaussians that the rule reads beside the parameters."""
         return set()
+
+    @property
+    def columns(self) -> list[type[Statistic]]:
+        """The classes of its statistics, and of the columns that divide them."""
+        known = variants(Statistic)
+        read = [known[name] for name in self.statistics if name in known]
+        return [*read, *(known[kind.divisor] for kind in read if kind.divisor in known)]
+
+    def excluded(self) -> Mapping[str, str]:
+        found = dict(self.conflicts)
+        for kind in self.columns:
+            found |= kind.conflicts
+        return found
 
     @abstractmethod
     def mark(self, edit: Edit) -> None:

@@ -10,12 +10,12 @@ from numpy.typing import DTypeLike, NDArray
 
 from clsplat.core.schedule import Positive
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.survey import SQUARE, WEIGHT, Look
+from clsplat.density.survey import SQUARE, WEIGHT, SurveyView
 from clsplat.density.thresholds import Share
 from clsplat.formats.splats import inverse_opacities
 
 Score = Literal["weight", "sensitivity"]
-Scoring = Callable[[Iterable[Look], int], NDArray[np.float32]]
+Scoring = Callable[[Iterable[SurveyView], int], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,9 @@ class Weights:
     views: NDArray[np.int64]  # [N] in which it is useful; 0 where that was not asked for
 
 
-def weights(looks: Iterable[Look], count: int, of_view: float | None = None, dtype: DTypeLike = np.float64) -> Weights:
+def weights(
+    looks: Iterable[SurveyView], count: int, of_view: float | None = None, dtype: DTypeLike = np.float64
+) -> Weights:
     """Return the weights of N = `count` Gaussians, added in the order of the views.
 
     of_view: the share of a view's weight that is made by what is useful in it, the largest first; None: not counted.
@@ -50,12 +52,12 @@ def largest_of(weight: NDArray[np.float64], share: float) -> NDArray[np.bool_]:
     return found
 
 
-def contributions(looks: Iterable[Look], count: int) -> NDArray[np.float32]:
+def contributions(looks: Iterable[SurveyView], count: int) -> NDArray[np.float32]:
     """Return the blend weights, alpha T, summed over pixels and views, [N]; single precision decides near ties."""
     return weights(looks, count, dtype=np.float32).total
 
 
-def sensitivities(looks: Iterable[Look], count: int) -> NDArray[np.float32]:
+def sensitivities(looks: Iterable[SurveyView], count: int) -> NDArray[np.float32]:
     """Return the squares of dI/dG summed over views and channels, [N]: I is a value of the image, G that of the
     Gaussian there, whose alpha is opacity times G (Speedy-Splat, Hanson et al. 2025).
     """

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from clsplat.core.schedule import Positive
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.survey import WEIGHT, Survey
+from clsplat.render.filters import AT_REST
 
 DEVIATIONS = 3  # of a radius in pixels, cl_kernels/project.cl
 
@@ -21,7 +22,7 @@ class PruneFar(Rule):
 
     type: Literal["prune_far"] = "prune_far"
     grows: ClassVar[bool] = False
-    reads_means: ClassVar[bool] = True
+    conflicts = AT_REST
     training_keys: ClassVar[frozenset[str]] = frozenset({"distance_above"})
 
     distance_above: Positive = 100

@@ -25,12 +25,17 @@ WEIGHT = int(constants("splat.h")["SUM_WEIGHT"])
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
 
+OF_CONICS = {  # records and sums have others for the pixel's box (cl_kernels/splat.h)
+    "box": "it reads the inverse covariance of splats, which a box does not have; choose another screen filter (mip is "
+    "the nearest), or another rule"
+}
+
+
 class Statistic(Settings):
     """A column, and how a view adds to it."""
 
     components: ClassVar[int] = 1  # numbers of each Gaussian; rules that compare a mean with a threshold need 1
     pixel_sums: ClassVar[int] = PIXEL_SUMS  # number of sums over pixels that the backward pass must compute
-    reads_conics: ClassVar[bool] = False  # from records and sums, where the pixel's box has others (cl_kernels/splat.h)
     divisor: ClassVar[str] = "seen"  # column that divides the sum: views that see the Gaussian, or another column
     of_all_views: ClassVar[bool] = False  # the mean is multiplied by the number of training views
 

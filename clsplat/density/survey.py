@@ -26,7 +26,7 @@ Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
-class Look:
+class SurveyView:
     """One view as the Gaussians show it; valid until the next.  Pixels that a mask leaves out do not count."""
 
     rasterizer: Rasterizer
@@ -35,14 +35,14 @@ class Look:
     frame: Frame
 
     @classmethod
-    def at(cls, rasterizer: Rasterizer, model: DeviceModel, photograph: Photograph, background: Array) -> "Look":
+    def at(cls, rasterizer: Rasterizer, model: DeviceModel, photograph: Photograph, background: Array) -> "SurveyView":
         """Render the view of a photograph.  background: [3]."""
         return cls(rasterizer, model, photograph, rasterizer.forward(model, photograph.camera, background))
 
     @classmethod
     def each(
         cls, rasterizer: Rasterizer, model: DeviceModel, photographs: Iterable[Photograph], background: Array
-    ) -> Iterator["Look"]:
+    ) -> Iterator["SurveyView"]:
         """Render the views of photographs, one after another.  background: [3]."""
         return (cls.at(rasterizer, model, photograph, background) for photograph in photographs)
 
@@ -120,10 +120,10 @@ class Survey:
         self._seed, self._step = seed, step
         self._found: dict[Any, Any] = {}
 
-    def looks(self, views: Iterable[View]) -> Iterator[Look]:
+    def looks(self, views: Iterable[View]) -> Iterator[SurveyView]:
         """Render views, one after another."""
         photographs = (self._photographs.get(view) for view in views)
-        return Look.each(self._rasterizer, self._model, photographs, self._photographs.background)
+        return SurveyView.each(self._rasterizer, self._model, photographs, self._photographs.background)
 
     @property
     def count(self) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.harmonics import basis
-from clsplat.density.survey import WEIGHT, Look
+from clsplat.density.survey import WEIGHT, SurveyView
 from clsplat.formats.splats import SH_C0
 
 Floats = NDArray[np.float64]
@@ -32,7 +32,7 @@ class VisibleError:
 
     @classmethod
     def of(
-        cls, looks: Iterable[tuple[Look, NDArray[np.floating]]], means: NDArray[np.floating], coefficients: int
+        cls, looks: Iterable[tuple[SurveyView, NDArray[np.floating]]], means: NDArray[np.floating], coefficients: int
     ) -> "VisibleError":
         """Sum over views, each with the centre of its camera, [3].  means: [N,3] scene units."""
         i, j = np.triu_indices(coefficients)

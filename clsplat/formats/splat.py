@@ -110,7 +110,7 @@ KINDS = (
 
 
 @dataclass(frozen=True)
-class Section:
+class SplatSection:
     """Where the splats of one section lie."""
 
     count: int
@@ -125,7 +125,7 @@ class Section:
     partial: int
 
     @classmethod
-    def of(cls, data: bytes, start: int) -> "Section":
+    def of(cls, data: bytes, start: int) -> "SplatSection":
         """Take the numbers of a header."""
         count, rows, bucket_size, buckets = struct.unpack_from("<4I", data, start)
         (block,) = struct.unpack_from("<f", data, start + 16)
@@ -169,7 +169,7 @@ def read_ksplat(path: Path) -> SplatFile:
     require_held(path, len(data), start, f"{most} sections")
     parts = []
     for number in range(sections):
-        section = Section.of(data, HEADER + SECTION * number)
+        section = SplatSection.of(data, HEADER + SECTION * number)
         _check(path, section, number)
         sizes = section.sizes(level)
         require_held(path, len(data), start + sum(sizes), f"{section.rows} splats in section {number}")
@@ -181,7 +181,7 @@ def read_ksplat(path: Path) -> SplatFile:
     return SplatFile({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
-def _check(path: Path, section: Section, number: int) -> None:
+def _check(path: Path, section: SplatSection, number: int) -> None:
     """Raise DataError for a section that cannot be."""
     if section.degree > MAX_DEGREE or section.count > section.rows:
         raise DataError(
@@ -193,7 +193,7 @@ def _check(path: Path, section: Section, number: int) -> None:
 
 
 def _tables(
-    path: Path, data: bytes, start: int, section: Section, level: int, ends: tuple[float, ...]
+    path: Path, data: bytes, start: int, section: SplatSection, level: int, ends: tuple[float, ...]
 ) -> dict[str, NDArray[np.float32]]:
     """The parameters of one section."""
     partial, buckets, _ = section.sizes(level)
@@ -217,7 +217,7 @@ def _tables(
         }
 
 
-def _centres(path: Path, data: bytes, start: int, section: Section) -> NDArray[np.float64]:
+def _centres(path: Path, data: bytes, start: int, section: SplatSection) -> NDArray[np.float64]:
     """The centre of each splat's bucket, [count, 3]: full buckets come first, then partial ones."""
     partial = np.frombuffer(data, "<u4", section.partial, start).astype(np.int64)
     filled = section.full * section.bucket_size

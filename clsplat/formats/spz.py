@@ -70,7 +70,7 @@ TURN_STEP = {"small": 4, "balanced": 4, "high": 1}  # levels of quaternions, of 
 
 
 @dataclass(frozen=True)
-class Header:
+class SpzHeader:
     """The numbers that begin a file."""
 
     version: int
@@ -80,7 +80,7 @@ class Header:
     flags: int
 
     @classmethod
-    def of(cls, path: Path, data: bytes) -> "Header":
+    def of(cls, path: Path, data: bytes) -> "SpzHeader":
         """Take them from the first bytes.  Raises DataError where they cannot be."""
         if len(data) < HEADER or data[:4] != MAGIC:
             raise DataError(f"{path}: not an SPZ file; expected its header of {HEADER} bytes: copy or export it again")
@@ -99,7 +99,7 @@ class Header:
         return [self.count * width for width in (*widths, 3 * (sh_coefficients(self.degree) - 1))]
 
 
-def unpacked(header: Header, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
+def unpacked(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
     """Return the parameters that the bytes of the planes stand for: of each, what returns the next so many bytes."""
     byte = np.arange(256, dtype=np.float32)
     levels = {
@@ -125,7 +125,7 @@ def unpacked(header: Header, planes: Sequence[Callable[[int], bytes]]) -> Parame
     return found
 
 
-def _positions(header: Header, data: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _positions(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.float32]:
     if header.version == 1:
         return data.view("<f2").astype(np.float32)
     low, middle, high = data.reshape(-1, 3).astype(np.int32).T
@@ -255,7 +255,7 @@ def compress(data: bytes) -> bytes:
     return packed
 
 
-class Frame:
+class ZstdFrame:
     """A frame that holds `size` bytes, read a part at a time.  Raises DataError for another size or a bad frame."""
 
     def __init__(self, path: Path, data: bytes, size: int) -> None:
@@ -368,10 +368,10 @@ def _gzip(data: bytes) -> bytes:
     return GZIP_START + deflate.deflate_compress(data, LEVEL) + check
 
 
-def _unpacked(path: Path, data: bytes) -> tuple[Header, Parameters]:
+def _unpacked(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
     """Header and parameters of versions 1 to 3."""
     stream = _Gzip(path, data)
-    header = Header.of(path, stream.read(HEADER))
+    header = SpzHeader.of(path, stream.read(HEADER))
     if header.version > 3:
         raise DataError(f"{path}: SPZ of version 4 in gzip; expected Zstandard: export it again")
     _check_size(path, header, sum(header.sizes), len(data) * GZIP_RATIO)
@@ -421,9 +421,9 @@ class _Gzip:
             raise DataError(f"{self.path}: goes on for {rest} bytes after its gzip; copy or export it again")
 
 
-def _unpacked_4(path: Path, data: bytes) -> tuple[Header, Parameters]:
+def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
     """Header and parameters of version 4."""
-    header = Header.of(path, data)
+    header = SpzHeader.of(path, data)
     if header.version != 4 or len(data) < HEADER4:
         raise DataError(f"{path}: SPZ of version {header.version} without gzip; expected version 4: export it again")
     streams, table = struct.unpack_from("<BI", data, HEADER - 1)
@@ -445,14 +445,14 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[Header, Parameters]:
                 f"{path}: stream {number} declares {held} bytes for {declared}; expected {size} for {header.count} "
                 "splats, inside of the file: copy or export it again"
             )
-        frames.append(Frame(path, data[start : start + held], size))
+        frames.append(ZstdFrame(path, data[start : start + held], size))
         start += held
     if start != len(data):
         raise DataError(f"{path}: goes on after its last stream, at byte {start}; copy or export it again")
     return header, unpacked(header, [frame.read for frame in frames])
 
 
-def _check_size(path: Path, header: Header, size: int, most: int) -> None:
+def _check_size(path: Path, header: SpzHeader, size: int, most: int) -> None:
     """Raise DataError where a file cannot hold so many splats, of this size, before any is made."""
     if size > most:
         raise DataError(

@@ -195,7 +195,7 @@ Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Limits:
+class LeafLimits:
     """What a leaf holds at most: numbers of PlayCanvas."""
 
     splats: int = 512 * 1024  # of all levels; and a file no more than these and one leaf's
@@ -220,7 +220,7 @@ class Node:
             yield from child.leaves()
 
 
-def tree(levels: Sequence[Parameters], limits: Limits) -> Node:
+def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
     """Return the tree of levels, the finest first, none without splats."""
     means = np.concatenate([level["means"] for level in levels]).astype(np.float64)
     reach = np.concatenate([half_boxes(level) for level in levels])
@@ -255,10 +255,12 @@ def half_boxes(level: Parameters) -> Floats:
 
 # Write streamed SOG, version 1: the same levels give the same bytes.
 
-USUAL = Limits()
+USUAL = LeafLimits()
 
 
-def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None = None, limits: Limits = USUAL) -> str:
+def write_lod(
+    folder: Path, levels: Sequence[SplatFile], options: Writing | None = None, limits: LeafLimits = USUAL
+) -> str:
     """Write levels, the finest first, into a folder; return the SHA-256 of its JSON, which is written last.
 
     Raises DataError for a level without Gaussians, or one that SOG cannot hold, OutputError.

@@ -109,7 +109,7 @@ class Changes:
 
 
 @dataclass(frozen=True)
-class Options:
+class ConversionOptions:
     """How files are read and written."""
 
     sh_bits: str | None = None  # A/B
@@ -141,7 +141,7 @@ class Options:
 
 
 def convert(
-    sources: Sequence[Path], out: Path, changes: Changes | None = None, options: Options | None = None
+    sources: Sequence[Path], out: Path, changes: Changes | None = None, options: ConversionOptions | None = None
 ) -> dict[str, Any]:
     """Read model files or run folders, and write one file of all their Gaussians, in the format of its name.
 
@@ -150,7 +150,7 @@ def convert(
     if not sources:
         raise ConfigError("convert: expected a model file to read, and one to write")
     check_place(sources, out)
-    reading, writing = (options or Options()).of(sources, out)
+    reading, writing = (options or ConversionOptions()).of(sources, out)
     return written(sources, (changes or Changes()).of(read(sources, reading)), out, writing)
 
 
@@ -291,7 +291,7 @@ def checked_time(time: float | None) -> float | None:
 
 
 def convert_frames(
-    sources: Sequence[Path], out: Path, frames: int, changes: Changes, options: Options
+    sources: Sequence[Path], out: Path, frames: int, changes: Changes, options: ConversionOptions
 ) -> dict[str, Any]:
     """Write one static model of each of so many moments, evenly spaced from the first to the last.
 

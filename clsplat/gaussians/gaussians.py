@@ -49,7 +49,7 @@ def not_finite(gaussians: Struct) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Dropout:
+class DropoutMask:
     """What one step leaves out: each Gaussian with a probability below 1, by (seed, step, row)."""
 
     probability: float
@@ -264,7 +264,7 @@ class DeviceModel:
     screen_variance: float = 0.3  # px²
     compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
     pixel_box: float = 0.0  # 1: splats are integrated over the box of each pixel instead
-    dropout: Dropout | None = None  # of a step
+    dropout: DropoutMask | None = None  # of a step
     sky: DeviceSky | None = None  # behind them, in place of a background of one colour
 
     @property

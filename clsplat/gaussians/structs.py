@@ -56,7 +56,7 @@ class Struct(Protocol):
 # Derivatives of a loss by the parameters of Gaussians, in device memory.
 
 
-class Gradients:
+class GaussianGradients:
     """Derivatives of the loss by each parameter, with the shapes of the parameters."""
 
     def __init__(self, gaussians: Struct) -> None:
@@ -72,7 +72,7 @@ class Gradients:
             )
         return self.arrays[name]
 
-    def without_deferred(self) -> "Gradients":
+    def without_deferred(self) -> "GaussianGradients":
         """Return the same arrays without those of updates that wait for a view: [name] raises ConfigError for them."""
         other = copy.copy(self)
         other._withheld = ("sh_rest",)

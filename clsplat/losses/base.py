@@ -9,7 +9,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import Schedule
 from clsplat.core.settings import Settings
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.gaussians.structs import Gradients
+from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Array
 from clsplat.photos.depths import KnownDepths
 from clsplat.render.camera import DeviceCamera
@@ -118,7 +118,7 @@ class PenaltyInputs:
 
     workspace: Workspace
     gaussians: Gaussians
-    gradients: Gradients
+    gradients: GaussianGradients
     extent: float  # scene units
     step: int  # global
 

@@ -3,6 +3,7 @@
 The trace of the covariance bounds the size of a Gaussian, not its anisotropy, which has a penalty of its own.
 """
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from pydantic import Field
 from clsplat.core.schedule import at_step
 from clsplat.gaussians.gaussians import INTERVAL2
 from clsplat.losses.base import LossValue, Penalty, PenaltyInputs
+from clsplat.render.filters import AT_REST
 
 
 class CovarianceTrace(Penalty):
@@ -29,6 +31,9 @@ class CovarianceTrace(Penalty):
     @property
     def tables(self) -> set[str]:
         return {INTERVAL2} if self.pixels else set()
+
+    def excluded(self) -> Mapping[str, str]:
+        return AT_REST if self.pixels else {}
 
     def add(self, inputs: PenaltyInputs) -> LossValue:
         gaussians, sums = inputs.gaussians, inputs.sums(f"covariance_trace {self.above} {self.pixels}")

@@ -61,7 +61,7 @@ class Clone(Grow):
         edit.mark(copies=2, kept=1, size_below=edit.at(self.size_below), **self.condition(edit))
 
 
-class Split(Grow):
+class SplitLarge(Grow):
     """Replace large Gaussians whose statistic is large by smaller ones, drawn from their own distribution."""
 
     type: Literal["split"] = "split"

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from clsplat.core.schedule import Positive
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.statistics import Statistic
+from clsplat.density.statistics import OF_CONICS, Statistic
 from clsplat.density.survey import Survey
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import ViewGradients
@@ -86,7 +86,7 @@ class PruneSpare(Rule):
 # What a Gaussian promises to take away of the error, in a unit that all scenes share (ours).
 
 
-class Gain(Statistic):
+class ErrorGain(Statistic):
     """How many pixels' errors a Gaussian promises to take away: those of mean pixels, over all training views (ours).
 
     It is what the loss changes by a shift of one standard deviation on the screen, whatever the photographs' exposure,
@@ -95,7 +95,7 @@ class Gain(Statistic):
 
     type: Literal["gain"] = "gain"
     divisor: ClassVar[str] = "view_error"
-    reads_conics: ClassVar[bool] = True
+    conflicts = OF_CONICS
     of_all_views: ClassVar[bool] = True
 
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:

@@ -3,6 +3,7 @@
 Both rules choose on the host, from tables and statistics: comparing Gaussians with each other is a line of NumPy there.
 """
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from clsplat.gaussians.gaussians import INTERVAL2, Gaussians
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array
 from clsplat.photos.photographs import known_gradient
+from clsplat.render.filters import AT_REST
 
 BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
 
@@ -118,6 +120,9 @@ class SplitOversized(Subdivide):
     def tables(self) -> set[str]:
         return {INTERVAL2} if self.pixels else set()
 
+    def excluded(self) -> Mapping[str, str]:
+        return {**super().excluded(), **(AT_REST if self.pixels else {})}
+
     def mark(self, edit: Edit) -> None:
         rms = np.sqrt(np.exp(2 * edit.gaussians.get("log_scales")).mean(axis=1))
         if self.pixels:
@@ -164,7 +169,7 @@ class MergeNeighbours(Rule):
     type: Literal["merge_neighbours"] = "merge_neighbours"
     grows: ClassVar[bool] = False
     rewrites: ClassVar[bool] = True
-    reads_means: ClassVar[bool] = True
+    conflicts = AT_REST
     training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "colour_below"})
 
     distance_below: Positive = 0.5

@@ -2,6 +2,7 @@
 and Wang 2024)."""
 
 import logging
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
@@ -127,6 +128,7 @@ class ReinitFromDepth(Stage):
     takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette", "metrics"})
     edits: ClassVar[bool] = True
     changes_last: ClassVar[bool] = True
+    conflicts: ClassVar[Mapping[str, str]] = {"motion": "a depth is of one moment; leave the stage or model.time out"}
 
     count: Annotated[int, Field(gt=0)] | None = None
     """Number of new Gaussians, at most; without it, as many as there are.  Photographs of which little is

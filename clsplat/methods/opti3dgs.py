@@ -13,7 +13,7 @@ from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import ByNumber, adam_step
 from clsplat.photos.photographs import apply_mask
 from clsplat.photos.transforms import Planes
-from clsplat.training.modules.base import ModuleState, Numbers, Step, TrainingModule
+from clsplat.training.modules.base import ModuleState, Numbers, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 STRIP = int(constants("haar.cl")["STRIP"])
@@ -77,11 +77,11 @@ class HaarState(ModuleState):
         """What is learned, by name."""
         return {name: self.numbers.get(name, 0.0) for name in NAMES[self.settings.learn]}
 
-    def after_render(self, step: Step) -> None:
+    def after_render(self, step: TrainingStep) -> None:
         step.keep(self, step.planes)
         step.planes = apply_filter(step.planes, self.filter)
 
-    def before_losses(self, step: Step) -> None:
+    def before_losses(self, step: TrainingStep) -> None:
         """A loss keeps the sums of its last call, so that the gradient by the photograph comes before its value."""
         self.settings.check_losses(step.losses_asked)
         gradient = gradient_by_photograph(step.losses_asked, step.comparison)
@@ -92,7 +92,7 @@ class HaarState(ModuleState):
         step.own_losses.append(LossValue(self.settings.type, lambda: value))
         step.keep(self, (of_images, of_filter))
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         of_images, of_filter = step.kept(self)
         by_images = of_images()
         self.learn({name: by_images[name] + own for name, own in of_filter.items()}, step.number)

@@ -11,7 +11,7 @@ from pydantic import Field
 from clsplat.density.budget import Budget, Moment
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import SampledPruning, drawn_order
-from clsplat.density.survey import BLENDED, LOSSES, WEIGHT, Look, Survey, scaled
+from clsplat.density.survey import BLENDED, LOSSES, WEIGHT, Survey, SurveyView, scaled
 from clsplat.formats.splats import inverse_opacities
 
 Floats = NDArray[np.float64]
@@ -23,7 +23,7 @@ def by_median(values: NDArray[np.floating]) -> Floats:
     return np.asarray(values / np.median(positive), np.float64) if len(positive) else np.zeros(len(values))
 
 
-def pixel_weights(look: Look) -> Floats:
+def pixel_weights(look: SurveyView) -> Floats:
     """Return the error of a view's pixels and the edges of its photograph, each from 0 to 1, added, [height, width]."""
     counted = look.counted()
     edges = np.abs(scipy.ndimage.laplace(look.photograph.image().mean(axis=2), mode="nearest"))

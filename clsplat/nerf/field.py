@@ -46,7 +46,7 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class Level:
+class SampleLevel:
     """The samples of rays in one level, and what they give; valid until the same level of other rays."""
 
     rays: Rays
@@ -60,7 +60,7 @@ class Level:
 
 
 @dataclass(frozen=True)
-class Target:
+class RayTarget:
     """What the colours of rays are compared with."""
 
     photograph: Array  # [3, rows, stride]
@@ -108,13 +108,13 @@ class Levels:
         )
         return Rays(camera, pixels, cones, count, draw)
 
-    def render(self, parameters: Array, rays: Rays) -> Iterator[Level]:
+    def render(self, parameters: Array, rays: Rays) -> Iterator[SampleLevel]:
         """Yield the coarse level, then the fine one."""
         coarse = self._level(parameters, rays, self._coarse_edges(rays), "coarse")
         yield coarse
         yield self._level(parameters, rays, self._fine_edges(coarse), "fine")
 
-    def differentiate(self, parameters: Array, level: Level, target: Target, gradient: Array) -> None:
+    def differentiate(self, parameters: Array, level: SampleLevel, target: RayTarget, gradient: Array) -> None:
         """Add the derivatives of the loss of a level, the last one that was rendered, to `gradient`, [P]; write the
         squared differences of its rays."""
         rays, tiles = level.rays, level.raw_colours.shape[0]
@@ -149,7 +149,7 @@ class Levels:
         by_grid = self.network.backward(parameters, by_colours, by_densities, gradient)
         self.encoding.backward(by_grid, gradient)
 
-    def place(self, level: Level, image: Array) -> None:
+    def place(self, level: SampleLevel, image: Array) -> None:
         """Put the colours of a level's rays into a picture, [3, rows, stride]."""
         camera = level.rays.camera
         self._composite.place_colours(
@@ -170,7 +170,7 @@ class Levels:
         self._rays.spread_edges(items=rays.count, edges=edges, count=rays.count, **own)
         return edges
 
-    def _fine_edges(self, coarse: Level) -> Array:
+    def _fine_edges(self, coarse: SampleLevel) -> Array:
         samples, count = self.shape.fine_samples, coarse.rays.count
         edges = self.workspace.array("field fine edges", (count, samples + 1))
         own = {"samples": coarse.samples, "fine_samples": samples, **_random(coarse.rays.draw)}
@@ -179,7 +179,7 @@ class Levels:
         )
         return edges
 
-    def _level(self, parameters: Array, rays: Rays, edges: Array, name: str) -> Level:
+    def _level(self, parameters: Array, rays: Rays, edges: Array, name: str) -> SampleLevel:
         samples = edges.shape[1] - 1
         tiles = rays.count * samples // SAMPLES
         self.encoding.forward(parameters, Samples(rays.cones, edges))
@@ -201,7 +201,7 @@ class Levels:
             samples=samples,
             rays=rays.count,
         )
-        return Level(rays, samples, edges, raw_colours, raw_densities, weights, left, colours)
+        return SampleLevel(rays, samples, edges, raw_colours, raw_densities, weights, left, colours)
 
 
 def rays_at_a_time(shape: FieldShape) -> int:
@@ -263,7 +263,7 @@ class Field:
         image.fill(0)
         return image
 
-    def _passes(self, camera: DeviceCamera) -> Iterator[tuple[NDArray[np.uint32], Level]]:
+    def _passes(self, camera: DeviceCamera) -> Iterator[tuple[NDArray[np.uint32], SampleLevel]]:
         """Pixels, [n] of row * width + column, and their fine level, valid until the next."""
         pixels, at_a_time = np.arange(camera.width * camera.height, dtype=np.uint32), self.levels.rays_at_a_time
         for first in range(0, len(pixels), at_a_time):

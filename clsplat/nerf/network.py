@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.nerf.shape import COLOUR_ROWS, GRID, LAYERS, SAMPLES, FieldShape, Layer, in_blocks
+from clsplat.nerf.shape import COLOUR_ROWS, GRID, LAYERS, SAMPLES, DenseLayer, FieldShape, in_blocks
 from clsplat.opencl.device import Array, Device
 from clsplat.render.workspace import Workspace
 
@@ -107,7 +107,7 @@ class Network:
         )
         return by_grid
 
-    def _derive_grid(self, layer: Layer, parameters: Array, by_outputs: Array, row: int, kept: int) -> Array:
+    def _derive_grid(self, layer: DenseLayer, parameters: Array, by_outputs: Array, row: int, kept: int) -> Array:
         """Derive by the features of the grid, which a layer reads from a row on."""
         tiles = by_outputs.shape[0]
         position, by_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
@@ -126,7 +126,7 @@ class Network:
         """Sums of chunks, [chunks, of_network]; what no layer writes is zero, as new arrays are."""
         return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.of_network))
 
-    def _apply(self, layer: Layer, parameters: Array, inputs: _Table, outputs: Array, lowest: float) -> None:
+    def _apply(self, layer: DenseLayer, parameters: Array, inputs: _Table, outputs: Array, lowest: float) -> None:
         tiles = outputs.shape[0]
         count = tiles * self._columns * (layer.columns // BLOCK)
         self._program.dense_forward(
@@ -146,7 +146,7 @@ class Network:
 
     def _derive(
         self,
-        layer: Layer,
+        layer: DenseLayer,
         parameters: Array,
         by_outputs: Array,
         inputs: _Table,
@@ -175,7 +175,7 @@ class Network:
             count=count,
         )
 
-    def _sum(self, layer: Layer, inputs: _Table, by_outputs: Array) -> None:
+    def _sum(self, layer: DenseLayer, inputs: _Table, by_outputs: Array) -> None:
         """Write the partial sums of the derivatives by a layer's parameters."""
         tiles, output_rows = by_outputs.shape[:2]
         chunks = -(-tiles // CHUNK)

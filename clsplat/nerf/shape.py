@@ -90,7 +90,7 @@ def in_blocks(count: int) -> int:
 
 
 @dataclass(frozen=True)
-class Layer:
+class DenseLayer:
     """A dense layer and the place of its parameters: weights [rows, columns], then biases [columns].
 
     Rows and columns beyond the inputs and outputs fill blocks: they are zero and stay so.
@@ -169,7 +169,7 @@ class FieldShape(Settings):
         return in_blocks(3 + 6 * self.direction_degrees)
 
     @property
-    def layers(self) -> list[Layer]:
+    def layers(self) -> list[DenseLayer]:
         """The layers in their order: the trunk, density, bottleneck, condition, colour."""
         width, position, direction = self.width, self.position_parts, 3 + 6 * self.direction_degrees
         described = [("trunk 0", position, width)]  # the parts of the inputs, each in whole blocks; the outputs
@@ -178,13 +178,13 @@ class FieldShape(Settings):
         described += [("density", [width], DENSITIES), ("bottleneck", [width], width)]
         described += [("condition", [width, direction], self.colour_width)]
         described += [("colour", [self.colour_width], COLOURS)]
-        found, first = list[Layer](), 0
+        found, first = list[DenseLayer](), 0
         for name, parts, outputs in described:
             inputs, rows = list[int](), 0
             for part in parts:
                 inputs += range(rows, rows + part)
                 rows += in_blocks(part)
-            found.append(Layer(name, first, tuple(inputs), rows, outputs, in_blocks(outputs)))
+            found.append(DenseLayer(name, first, tuple(inputs), rows, outputs, in_blocks(outputs)))
             first = found[-1].end
         return found
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
-from clsplat.nerf.field import Draw, Field, Target, rays_at_a_time
+from clsplat.nerf.field import Draw, Field, RayTarget, rays_at_a_time
 from clsplat.nerf.network import CHUNK, PLACE_ROWS
 from clsplat.nerf.shape import COLOUR_ROWS, SAMPLES, FieldShape, GridShape, WrittenShape
 from clsplat.opencl.device import Array, constants
@@ -21,7 +21,7 @@ from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import centre_of
 from clsplat.training.field import Tables, TrainedField
-from clsplat.training.memory import Limits
+from clsplat.training.memory import DeviceLimits
 
 TABLES = ("parameters", "moment1", "moment2")
 CHANNELS = 3
@@ -29,7 +29,7 @@ _WRITTEN: TypeAdapter[FieldShape] = TypeAdapter(WrittenShape)
 
 
 @dataclass(frozen=True)
-class Shown:
+class RayPhotograph:
     """A photograph of a step, on the device, and the rays that are drawn from it."""
 
     camera: DeviceCamera
@@ -118,7 +118,7 @@ class LearnedField(TrainedField):
             )
         return [name for name, counter in counters.items() if counter.get_item(0) > 0]
 
-    def step(self, shown: Sequence[Shown], coarse_weight: float, adam: AdamStep, seed: int, step: int) -> None:
+    def step(self, shown: Sequence[RayPhotograph], coarse_weight: float, adam: AdamStep, seed: int, step: int) -> None:
         """Do one update (Barron et al. 2021, section 3.3).
 
         The loss is that of the fine level and `coarse_weight` of that of the coarse one; each is the mean squared
@@ -167,7 +167,9 @@ class LearnedField(TrainedField):
         """Squared differences of the rays of a step, coarse and fine."""
         return [self.field.workspace.array(f"field {name} errors", rays) for name in ("coarse", "fine")]
 
-    def _differentiate(self, shown: Shown, scale: float, coarse_weight: float, draw: Draw, errors: list[Array]) -> None:
+    def _differentiate(
+        self, shown: RayPhotograph, scale: float, coarse_weight: float, draw: Draw, errors: list[Array]
+    ) -> None:
         """Add the derivatives by the rays of one photograph, in passes."""
         levels = self.field.levels
         colours = shown.photograph.planes(self.field.workspace).colours
@@ -177,7 +179,7 @@ class LearnedField(TrainedField):
             rays = levels.drawn(shown.camera, own, min(levels.rays_at_a_time, shown.rays - first))
             rendered = levels.render(self.field.parameters, rays)
             for level, of_level, squares in zip(rendered, scales, errors, strict=True):
-                target = Target(colours, of_level, squares)
+                target = RayTarget(colours, of_level, squares)
                 levels.differentiate(self.field.parameters, level, target, self._gradient)
 
 
@@ -209,7 +211,7 @@ class FieldPlan:
         """Bytes in all."""
         return TABLES_HELD * self.parameters + self.features + self.partials + self.photographs
 
-    def text(self, limits: Limits) -> str:
+    def text(self, limits: DeviceLimits) -> str:
         """Return one line: the memory needed, and that of the device."""
         return (
             f"memory: {self.needed / MIB:,.0f} MiB for a field ({TABLES_HELD} tables of "
@@ -218,7 +220,7 @@ class FieldPlan:
             f"in {limits.memory / MIB:,.0f} MiB with buffers up to {limits.allocation / MIB:,.0f} MiB"
         )
 
-    def check(self, limits: Limits) -> None:
+    def check(self, limits: DeviceLimits) -> None:
         """Raise MemoryLimitError where it does not fit."""
         if self.needed > limits.memory or max(self.parameters, self.partials) > limits.allocation:
             raise MemoryLimitError(

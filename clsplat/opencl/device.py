@@ -151,12 +151,19 @@ class Array:
 
 
 class Device:
-    """An open device: one context, one order of commands, programs built once.
+    """An open OpenCL device: one context, one order of commands, programs built once.
 
-    Raises MemoryLimitError or DeviceError where the runtime refuses to open it, KernelError where nothing can blend.
+    A `with` block waits at its end for all its work.  Memory is released with the arrays, and the device with the last
+    object that uses it.
+
+    `name` is a part of a runtime's or device's name, as `clsplat devices` prints them; without it CLSPLAT_DEVICE, else
+    the strongest GPU that works, else the first CPU.
+    Raises DeviceError when there is none, MemoryLimitError or DeviceError where the runtime refuses to open it,
+    KernelError where nothing can blend.
     """
 
-    def __init__(self, info: DeviceInfo, schedule: Schedule = "auto") -> None:
+    def __init__(self, name: str | DeviceInfo | None = None, schedule: Schedule = "auto") -> None:
+        info = name if isinstance(name, DeviceInfo) else choose(name)
         platform, number = info.place
         self.info = info
         remove_cut_kernels()
@@ -174,6 +181,15 @@ class Device:
         self._programs: dict[tuple[Any, ...], Program] = {}
         if self.schedule == "simt":
             self._fit_groups()
+
+    def __enter__(self) -> "Device":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.finish()
+
+    def __repr__(self) -> str:
+        return f"Device({self.text!r})"
 
     def _fit_groups(self) -> None:
         """Take tiles of 8 x 8 px where the compiler allows blending no group of 16 x 16 items."""
@@ -271,7 +287,7 @@ def open_device(device: str | Device | None = None, schedule: Schedule = "auto")
     Raises DeviceError when there is none, ConfigError for an open device of another schedule.
     """
     if device is None or isinstance(device, str):
-        return Device(choose(device), schedule)
+        return Device(device, schedule)
     if not isinstance(device, Device):
         raise ConfigError(f"device: is a {type(device).__name__}; expected a part of a device's name, or a Device")
     if schedule != "auto" and resolve_schedule(device.info, schedule) != device.schedule:

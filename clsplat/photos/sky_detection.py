@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Seen:
+class SkyEvidence:
     """What one photograph shows of the sky."""
 
     view: View
@@ -62,17 +62,17 @@ class Seen:
         return np.asarray(x[None, :, None] * turn[0] + (y[:, None, None] * turn[1] + turn[2]))
 
 
-def looked_at(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -> Iterator[Seen]:
+def looked_at(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -> Iterator[SkyEvidence]:
     """Yield what photographs, [height, width, 3], show of the sky in pixels that count, [height, width]; None: all."""
     up = upward(scene.split("train"))
     for view, image, counted in views:
         small = _small(image)
         counts = np.ones(small.shape[:2], bool) if counted is None else _small(255 * counted.astype(np.uint8)) == 255
         mask = sky_mask(small, _points_in(scene, view) * (small.shape[1] / view.camera.width), counts)
-        yield Seen(view, small, mask, counts, up)
+        yield SkyEvidence(view, small, mask, counts, up)
 
 
-def panorama(seen: Sequence[Seen], side: int) -> tuple[NDArray[np.float32], Mask] | None:
+def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32], Mask] | None:
     """Return the first colours of a map of directions, [side * side, 3], and its texels that are sky, [side * side].
 
     A texel is sky where a photograph shows it so, or one near it, or where none shows it at all.  It has the mean

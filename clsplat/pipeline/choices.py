@@ -15,8 +15,6 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.overrides import apply, split, value_at
 from clsplat.pipeline.yaml_file import Place
 from clsplat.scene.quality import Measures
-from clsplat.stages.optimize import Optimize
-from clsplat.training.stage import Training
 
 # Where the choices of a pipeline file's data are, and where their keys lead.
 
@@ -51,25 +49,6 @@ def touch(one: Place, other: Place) -> bool:
     return shorter > 0 and one[:shorter] == other[:shorter]
 
 
-# What a training that keeps its best model needs.
-
-
-def check_keeping(settings: PipelineFile) -> None:
-    """Raise ConfigError where a training has nothing to choose its model by, or one of several is a refit."""
-    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-    if any(stage.keep == "best" for stage in trainings) and settings.scene.validation == 0:
-        raise ConfigError("optimize.keep: best chooses by validation views; expected scene.validation: auto")
-    if any(stage.refit for stage in trainings) and len(trainings) > 1:
-        raise ConfigError(f"optimize.refit: expected one stage that trains, found {len(trainings)}")
-    begun = 0  # global step
-    for stage in settings.stages:
-        if isinstance(stage, Optimize):
-            stage.require_measured(begun)
-            if stage.patience:  # nobody knows at which step the next one begins
-                return
-        begun += stage.steps if isinstance(stage, Training) else 0
-
-
 LATE = ("model", "stages")  # parts of a pipeline that are used after the photographs are read
 
 
@@ -100,7 +79,8 @@ def _checked(made: Callable[[], PipelineFile], what: str) -> PipelineFile:
     """Settings that go together.  Raises ConfigError; what: what they are made of."""
     try:
         settings = made()
-        check_keeping(settings)
+        for stage in settings.stages:
+            stage.check_with(settings)
     except ValidationError as error:
         place, complaint = first_fault(error, PipelineFile)
         raise ConfigError(f"choices, {what}: {place_text(place)}: {complaint}") from error

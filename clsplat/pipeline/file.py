@@ -14,12 +14,12 @@ from pydantic import AfterValidator, Field, field_validator
 
 from clsplat.core.errors import ConfigError
 from clsplat.core.files import fault_of_name
-from clsplat.core.settings import OneOf, ReadPath, Settings
+from clsplat.core.settings import OneOf, ReadPath, Settings, nested
 from clsplat.opencl.discovery import Schedule
 from clsplat.pipeline.capture_choice import CaptureChoice
 from clsplat.prepare.steps import Step
 from clsplat.render.filters import ModelSettings
-from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
+from clsplat.render.rasterizer import MAX_PAIRS, RECORD, RenderLimits
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import Missing
@@ -29,7 +29,7 @@ from clsplat.scene.view import Alpha
 from clsplat.scene.view_selection import Choice, Chosen, ChosenOrAuto, Split
 from clsplat.stages.optimize import Optimize
 from clsplat.training.memory import Harmonics
-from clsplat.training.stage import Stage, Training
+from clsplat.training.stage import ON_HOST, Stage, Training
 
 
 class SceneSettings(Settings):
@@ -122,12 +122,15 @@ class RasterizerSettings(Settings):
     launch_tiles: Annotated[int, Field(ge=0)] = 0
     """Number of tiles of one launch, for devices whose display limits its time; 0: all."""
 
-    def budget(self) -> Budget | None:
+    def known_as(self) -> set[str]:
+        return {ON_HOST} if self.harmonics == "host" else set()
+
+    def budget(self) -> RenderLimits | None:
         """Return the rasterizer's limits on memory and launches; None for the defaults."""
         if self.pair_budget is None and self.launch_tiles == 0:
             return None
         records = MAX_PAIRS if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)
-        return Budget(records, self.launch_tiles)
+        return RenderLimits(records, self.launch_tiles)
 
 
 STAGE_LISTS = ("prepare", "stages")
@@ -165,6 +168,26 @@ class PipelineFile(Settings):
     """Stages, in order."""
     plugins: dict[str, str] = Field(default={})
     """Plug-ins of the run: name and sha256.  A run writes them, and a resumed run requires them."""
+
+    def check_together(self) -> None:
+        """Raise ConfigError for the first settings that do not go together, as their classes say."""
+        found = list(nested(self))
+        for place, one in found:
+            one.check_with(self)
+            for name, why in one.excluded().items():
+                for other, rival in found:
+                    apart = other.startswith("stages[") and other.partition(".")[0] != place.partition(".")[0]
+                    if name in rival.known_as() and not apart:
+                        own = getattr(one, "type", getattr(one, "stage", place))
+                        remedy = "" if ";" in why else "; leave one of them out"
+                        raise ConfigError(f"{place}: '{own}' does not go together with {name} ({other}): {why}{remedy}")
+
+    @property
+    def harmonics(self) -> Harmonics:
+        """Where harmonics lie: `auto` is the device where a stage needs all of them there, or bands above 0 lack."""
+        asked = self.rasterizer.harmonics
+        is_needed = any(ON_HOST in one.excluded() for _, one in nested(self.stages))
+        return "device" if asked == "auto" and (self.model.sh_degree == 0 or is_needed) else asked
 
     @property
     def training(self) -> Training:

@@ -12,10 +12,10 @@ from pydantic import ValidationError
 from clsplat.core.errors import ConfigError, OverrideError, one_line
 from clsplat.core.files import PREPARED
 from clsplat.core.schedule import is_act
-from clsplat.core.settings import variants
+from clsplat.core.settings import nested, variants
+from clsplat.density.edit import Rule
 from clsplat.pipeline import plugins
-from clsplat.pipeline.checks import check_moving, check_on_host, check_screen_filter, check_sky, kinds_of
-from clsplat.pipeline.choices import check_choices, check_keeping, held, overridden
+from clsplat.pipeline.choices import as_asked, check_choices, held, overridden
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
@@ -112,11 +112,13 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
     try:
-        for check in (check_screen_filter, check_keeping, check_choices, check_sky, check_moving, check_on_host):
-            check(settings)
+        as_asked(settings).check_together()
+        check_choices(settings)
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
-    return settings.model_copy(update={"plugins": plugins.used_by(kinds_of(settings))})
+    found = [one for _, one in nested(settings)]
+    kinds = {*map(type, found), *(kind for one in found if isinstance(one, Rule) for kind in one.columns)}
+    return settings.model_copy(update={"plugins": plugins.used_by(kinds)})
 
 
 def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
@@ -134,7 +136,9 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
             data = before
             continue
         try:
-            _check_order(path, PipelineFile.model_validate(data))
+            settings = PipelineFile.model_validate(data)
+            _check_order(path, settings)
+            settings.check_together()
             without = None
         except ValidationError as error:
             where, complaint = first_fault(error, PipelineFile)

@@ -1,6 +1,6 @@
 """What is behind the Gaussians, as `model.background` in a pipeline file says."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -24,6 +24,7 @@ class Directions(Backdrop):
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "cover", "difference"})
+    family: ClassVar[str] = "sky"
 
     type: Literal["directions"] = "directions"
     side: Annotated[int, Field(ge=SIDES[0], le=SIDES[1])] = 64
@@ -57,6 +58,9 @@ class Auto(Backdrop):
     """Written by a run: whether there is a sky."""
     reason: str = ""
     """Written by a run: why."""
+
+    def parts(self) -> dict[str, Any]:
+        return {}  # a run leaves the sky out where something excludes it
 
     @property
     def in_use(self) -> Directions | None:

@@ -5,7 +5,7 @@ filter is three numbers of the model.  Rendering reads these numbers and has no 
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -33,10 +33,11 @@ class FilterViews:
         self.focal: NDArray[np.float32] = np.array([view.camera.fx for view in views], np.float32)
 
 
+AT_REST = {"motion": "it reads Gaussians where they are at their own time, not at that of a view"}
+
+
 class WorldFilter(Settings):
     """A blur of Gaussians in the world."""
-
-    reads_means: ClassVar[bool] = False  # as the places of Gaussians, which those that move have at no view's time
 
     @abstractmethod
     def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
@@ -59,7 +60,9 @@ class Smoothing(WorldFilter):
     such interval (eq. 6); `global_max` the smallest z by the largest f of all views, as the paper's code does.
     """
 
-    reads_means: ClassVar[bool] = True
+    conflicts: ClassVar[Mapping[str, str]] = {
+        "motion": f"{AT_REST['motion']}; set model.world_filter: none, or leave model.time out"
+    }
     type: Literal["smoothing"] = "smoothing"
     variance: Annotated[float, Field(ge=0)] = 0.2
     """Variance added to the squared scales, in sampling intervals²."""
@@ -139,7 +142,7 @@ def _of_a_box(variance: float) -> float:
     return variance
 
 
-class Box(ScreenFilter):
+class BoxFilter(ScreenFilter):
     """Integrate every splat over the box of each pixel, instead of taking its value at the pixel's centre.
 
     Where a splat is larger than a pixel this differs little from a Gaussian blur of the box's variance, 1/12 px², which
@@ -156,6 +159,8 @@ class Box(ScreenFilter):
 
 class Motion(Settings):
     """How Gaussians move and fade over the time of a scene: a polynomial, and a bell curve of their opacity."""
+
+    family: ClassVar[str] = "motion"
 
     degree: Annotated[int, Field(ge=1, le=MAX_DEGREE)] = 1
     """Degree of the polynomial in time that a mean follows: 1 in FreeTimeGS, 3 in Spacetime Gaussians."""

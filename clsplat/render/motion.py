@@ -8,7 +8,7 @@ from typing import Any
 
 from clsplat.formats.splats import MOTION, TURN, WIDTHS
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians, Table
-from clsplat.gaussians.structs import Gradients
+from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
@@ -46,7 +46,7 @@ def at_moment(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) ->
     return replace(model, gaussians=_with_tables(gaussians, moved))
 
 
-def to_centres(model: DeviceModel, camera: DeviceCamera, gradients: Gradients) -> None:
+def to_centres(model: DeviceModel, camera: DeviceCamera, gradients: GaussianGradients) -> None:
     """Make gradients by a moving model at the time of a camera those by the model and its motion; a static one has
     them already."""
     gaussians = model.gaussians

@@ -11,7 +11,7 @@ from clsplat.render.workspace import Workspace
 
 
 @dataclass(frozen=True)
-class Layer:
+class OverlayLayer:
     """A layer and the image behind it; valid until the next layer."""
 
     frame: Frame  # of the layer alone, before black
@@ -20,7 +20,7 @@ class Layer:
     loss: Callable[[], float]  # its value; waits for the device
 
 
-def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> Layer:
+def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> OverlayLayer:
     """Return a layer, rendered before black, with the image behind it, [3 or 4, rows, stride].
 
     scale: factor of the loss of what the layer covers, the sum of 1 - T over pixels.
@@ -40,7 +40,7 @@ def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> 
         channels=image.shape[0],
         **camera.plane_arguments(),
     )
-    return Layer(frame, both, behind, lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
+    return OverlayLayer(frame, both, behind, lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
 
 
 def look_behind(workspace: Workspace, frame: Frame, gradient: Array) -> None:

@@ -69,7 +69,7 @@ class Painter(Protocol):
 
 
 @dataclass(frozen=True)
-class Splats:
+class SplatPainter:
     """Paints Gaussians before a background, [3] in [0, 1]."""
 
     rasterizer: Rasterizer

@@ -10,7 +10,7 @@ import numpy as np
 from clsplat.core.errors import MemoryLimitError
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians, left_out_arguments
 from clsplat.gaussians.sh_offload import slots_of
-from clsplat.gaussians.structs import Gradients
+from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Array, Device, Program, constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.motion import at_moment, to_centres
@@ -174,7 +174,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Budget:
+class RenderLimits:
     """Limits on memory and on launches; results do not depend on them."""
 
     pairs: int  # (tile, Gaussian) pairs in memory
@@ -184,9 +184,9 @@ class Budget:
 class Rasterizer:
     """Renders one frame at a time; its buffers are reused from frame to frame."""
 
-    def __init__(self, device: Device, sort: Sort = "auto", budget: Budget | None = None) -> None:
+    def __init__(self, device: Device, sort: Sort = "auto", budget: RenderLimits | None = None) -> None:
         self.device = device
-        self.budget = budget or Budget(MAX_PAIRS)
+        self.budget = budget or RenderLimits(MAX_PAIRS)
         self._limit = min(self.budget.pairs, device.info.allocation // (4 * RECORD), MAX_PAIRS)  # in one buffer
         self._bands: dict[int, int] = {}  # rows of tiles of a frame -> number of bands
         self.workspace = Workspace(device)
@@ -196,7 +196,7 @@ class Rasterizer:
         device.program("project.cl")  # built at once, as the others
         self._blend("colour")
         self._lanes = int(device.tuning["LANES"])
-        self._gradients: Gradients | None = None  # allocated at first use
+        self._gradients: GaussianGradients | None = None  # allocated at first use
 
     def forward(
         self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "colour"
@@ -350,10 +350,10 @@ class Rasterizer:
                 sum_inverse_depths(self.workspace, pair_sums, lists, model.gaussians, accumulate=int(number > 0))
         return pixel_sums
 
-    def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Gradients:
+    def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> GaussianGradients:
         """Return the derivatives of the loss by every parameter of the frame's model; valid until the next call."""
         if self._gradients is None or not self._gradients.fits(model.gaussians):
-            self._gradients = Gradients(model.gaussians)
+            self._gradients = GaussianGradients(model.gaussians)
         gradients = self._gradients
         self.device.program("project.cl", **model.defines).project_backward(
             items=-(-model.gaussians.count // self._lanes),

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from clsplat.core.errors import ConfigError
-from clsplat.runs.model_file import Source
+from clsplat.runs.model_file import ModelSource
 from clsplat.runs.state import has_pipeline
 from clsplat.scene.camera_files import write_cameras
 from clsplat.scene.detect import read_scene
@@ -25,5 +25,5 @@ def write(scene: Path | Scene, out: Path, format_: str, images: str = "none") ->
 def _read_with_poses(folder: Path) -> Scene:
     if not has_pipeline(folder):
         return read_scene(folder, HOLDOUT)
-    source = Source.of(folder, None)
+    source = ModelSource.of(folder, None)
     return scene_beside(source.file, read_scene(source.folder, source.settings.split))

@@ -26,7 +26,7 @@ from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs.model_file import (
     KINDS,
     Loaded,
-    Source,
+    ModelSource,
     moves,
     painter_of,
     points_of,
@@ -53,7 +53,7 @@ PHOTOGRAPH = "photograph"  # what can stand beside a picture; else a model
 
 
 @dataclass(frozen=True)
-class Place:
+class FilmTarget:
     """Where a film goes: into a video, or as pictures into a folder."""
 
     video: Path | None
@@ -73,7 +73,7 @@ class Extras:
 def film(
     model: Path,
     scene: Path | None,
-    place: Place,
+    place: FilmTarget,
     wish: Wish,
     extras: Extras,
     *,
@@ -130,7 +130,7 @@ def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | N
     if not needed and scene is None and not has_pipeline(model):
         return None
     try:
-        source = Source.of(model, scene)
+        source = ModelSource.of(model, scene)
     except DataError as error:
         if needed or scene is not None:
             raise
@@ -194,7 +194,7 @@ def view(
         raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected MB, a finite number of at least 0")
     for path in models:
         require_model(path)
-    source = next((Source.of(path, scene) for path in models if scene is not None or run_of(path)), None)
+    source = next((ModelSource.of(path, scene) for path in models if scene is not None or run_of(path)), None)
     if photographs == "all" and source is None:
         raise ConfigError("--photographs all needs the photographs of a scene; give --scene, or a run folder")
     _tell_of_scenes(models, source)
@@ -231,7 +231,7 @@ def _advise(loaded: Mapping[str, Model], splats: int | None) -> None:
             )
 
 
-def _tell_of_scenes(models: Sequence[Path], source: Source | None) -> None:
+def _tell_of_scenes(models: Sequence[Path], source: ModelSource | None) -> None:
     """Warn where models are of different scenes: the page has the cameras of one."""
     scenes = {}
     for name, run in zip(names(models), map(run_of, models), strict=True):

@@ -32,7 +32,7 @@ from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.prepare.cache import noted
-from clsplat.render.painter import Painter, Splats
+from clsplat.render.painter import Painter, SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.results import read_metrics
 from clsplat.runs.state import has_pipeline
@@ -61,7 +61,7 @@ def painter_of(loaded: Loaded, device: Device, background: Background) -> Painte
     """Return what renders it on a device; Gaussians before a background, a field before its own."""
     if isinstance(loaded, FieldModel):
         return loaded.upload(device)
-    return Splats(Rasterizer(device), loaded.upload(device), Photographs(device, background).background)
+    return SplatPainter(Rasterizer(device), loaded.upload(device), Photographs(device, background).background)
 
 
 def points_of(loaded: Loaded, scene: Scene | None) -> NDArray[np.float32]:
@@ -88,7 +88,7 @@ def size_of(loaded: Loaded) -> dict[str, int | None]:
 
 
 @dataclass(frozen=True)
-class Source:
+class ModelSource:
     """A model file, and the photographs whose cameras look at it."""
 
     file: Path
@@ -98,7 +98,7 @@ class Source:
     alpha: Alpha | None = None  # None: as the model file says
 
     @classmethod
-    def of(cls, model: Path, scene: Path | None) -> "Source":
+    def of(cls, model: Path, scene: Path | None) -> "ModelSource":
         """Take a run folder, or a file that a run has exported, with its photographs; other files need `scene`.
 
         `scene`, a folder of photographs or of a run, replaces those of the model's run.  Raises DataError or
@@ -331,7 +331,7 @@ class ModelFile:
         self, model: Path, scene: Path | None = None, device: str | Device | None = None, downscale: float | None = None
     ) -> None:
         """downscale: divisor of the photographs' size; default: that of the run, 1 for a file."""
-        self.source = Source.of(model, scene)
+        self.source = ModelSource.of(model, scene)
         self.loaded = read(self.source.file)
         self.device = open_correct(device)
         found = self.source.scene(self.loaded)

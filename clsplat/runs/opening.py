@@ -12,7 +12,6 @@ from clsplat.core.machine import Owner
 from clsplat.core.progress import Listener, heard_by
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
-from clsplat.pipeline.checks import harmonics_of
 from clsplat.pipeline.choices import choose
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.input_files import contents
@@ -171,7 +170,7 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         settings=settings,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        harmonics=harmonics_of(settings),
+        harmonics=settings.harmonics,
         photographs=Photographs(device, scene.background, budget, undistorted_folder(out)),
         status=status,
         model_settings=settings.model,
@@ -228,7 +227,7 @@ def _by_capture(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pi
 def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
     """The same; the run has its settings."""
     run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
-    run.harmonics = harmonics_of(pipeline.settings)
+    run.harmonics = pipeline.settings.harmonics
     return pipeline
 
 

@@ -20,7 +20,7 @@ LOG = logging.getLogger("clsplat")
 OF_EVERY_RUN = frozenset({PIPELINE, STATUS, METRICS, CHECKSUMS, INPUTS, NOTE})  # whatever it goes on from
 
 
-class Place(Protocol):
+class RunPosition(Protocol):
     """Where a run stands, or the state in a checkpoint."""
 
     step: int
@@ -42,7 +42,7 @@ class Beginning:
 class Course:
     """What a run that goes on from a place writes in its folder."""
 
-    def __init__(self, pipeline: Pipeline, out: Path, at: Place) -> None:
+    def __init__(self, pipeline: Pipeline, out: Path, at: RunPosition) -> None:
         begun = at.cursor + (at.stage_step > 0)
         ended, training, coming = (pipeline.stages[i:j] for i, j in ((0, at.cursor), (at.cursor, begun), (begun, None)))
         last = takewhile(lambda stage: not (stage.edits or isinstance(stage, Training)), reversed(ended))
@@ -75,7 +75,7 @@ def is_below(file: Path, places: Iterable[Path]) -> bool:
     return any(file.is_relative_to(place) for place in places)
 
 
-def _due(stage: Training, out: Path, at: Place) -> list[Path]:
+def _due(stage: Training, out: Path, at: RunPosition) -> list[Path]:
     """The files, not folders, that a training which has begun writes anew: each time its stage is due."""
     last = at.step - at.stage_step + stage.steps
     return [
@@ -104,7 +104,7 @@ def beyond_repair(out: Path, lost: Sequence[Path]) -> list[Path]:
     return [file for file in lost if not (course.mends(file) or file in later)]
 
 
-def _newest_whole(files: Sequence[Path]) -> tuple[Path | None, Place]:
+def _newest_whole(files: Sequence[Path]) -> tuple[Path | None, RunPosition]:
     """The newest checkpoint that is whole, and where it lets a run go on; without one that is its beginning."""
     for file in reversed(files):
         with suppress(ConfigError, DataError):

@@ -18,7 +18,7 @@ from clsplat.scene.colmap_writer import MODEL, check_colmap, write_colmap
 from clsplat.scene.images import BESIDE, is_image, write_exposures
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud, Scene, Tracks
-from clsplat.scene.transforms_json import Frame, opengl_matrix
+from clsplat.scene.transforms_json import JsonFrame, opengl_matrix
 from clsplat.scene.view import NO_FILE, Posed, View, camera_exposures
 
 # The views of a scene as files name them: unique names of images below one folder, and lenses.
@@ -122,10 +122,10 @@ def read(path: Path) -> list[View]:
     table = read_json(path, "a cameras.json of 3DGS", limit=MAX_BYTES)
     if not isinstance(table, list) or not 1 <= len(table) <= MAX_VIEWS or not all(isinstance(v, dict) for v in table):
         raise DataError(f"{path}: expected a list of 1 to {MAX_VIEWS} cameras, as 3DGS writes it")
-    return [_view(Frame(path.parent, f"{path}: [{i}]", one), i) for i, one in enumerate(table)]
+    return [_view(JsonFrame(path.parent, f"{path}: [{i}]", one), i) for i, one in enumerate(table)]
 
 
-def _view(one: Frame, number: int) -> View:
+def _view(one: JsonFrame, number: int) -> View:
     width, height, fx, fy = (one.number(key) or 0.0 for key in ("width", "height", "fx", "fy"))
     if min(width, height) < 1 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
         raise DataError(
@@ -143,7 +143,7 @@ def _view(one: Frame, number: int) -> View:
         raise DataError(f"{one.where}: {error}; remove that camera or export the file again") from error
 
 
-def _array(one: Frame, key: str, shape: tuple[int, ...]) -> "np.ndarray[Any, np.dtype[np.float64]]":
+def _array(one: JsonFrame, key: str, shape: tuple[int, ...]) -> "np.ndarray[Any, np.dtype[np.float64]]":
     try:
         array = np.array(one.value(key), np.float64)
     except (ValueError, TypeError, OverflowError):

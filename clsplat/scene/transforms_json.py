@@ -30,7 +30,7 @@ MAX_FRAMES = 100_000  # ten times the largest captures that are trained as one s
 MAX_BYTES = 1 << 27  # exporters write at most 1.3 KB for a frame
 
 
-class Frame:
+class JsonFrame:
     """One image of the file, with values of its own, or else those of the whole file; `where` is for messages."""
 
     def __init__(self, folder: Path, where: str, own: dict[str, Any], common: dict[str, Any] | None = None) -> None:
@@ -72,7 +72,7 @@ class Transforms:
             raise DataError(f"{path}: expected a table with a list of tables called `frames`; export it again")
         if len(frames) > MAX_FRAMES:
             raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: divide the scene")
-        self.frames = [Frame(path.parent, f"{path}: frames[{i}]", own, self.table) for i, own in enumerate(frames)]
+        self.frames = [JsonFrame(path.parent, f"{path}: frames[{i}]", own, self.table) for i, own in enumerate(frames)]
 
     def moments(self) -> list[tuple[str, float | None]]:
         """Return the place and the `time` of every frame, as the file has it.  Raises DataError for another value."""
@@ -104,7 +104,7 @@ class Transforms:
 
     def points_path(self) -> Path | None:
         """Return `ply_file_path`, or else `points3d.ply` where that exists."""
-        given = Frame(self.path.parent, str(self.path), self.table).file("ply_file_path")
+        given = JsonFrame(self.path.parent, str(self.path), self.table).file("ply_file_path")
         beside = self.path.parent / "points3d.ply"
         return given or (beside if beside.is_file() else None)
 
@@ -136,7 +136,7 @@ def view_name(file_path: str) -> str:
     return PureWindowsPath(file_path).as_posix()
 
 
-def view_of(frame: Frame, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
+def view_of(frame: JsonFrame, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
     """Return the view of a frame; `size` is the image's where the frame has none.
 
     clock: of the scene, where it moves.  Raises DataError.
@@ -150,7 +150,7 @@ def view_of(frame: Frame, size: tuple[int, int] | None, clock: Clock | None = No
     return View(name, camera, pose, image, mask, lens=distortion, time=time, static_path=still)
 
 
-def image_path_of(frame: Frame) -> Path:
+def image_path_of(frame: JsonFrame) -> Path:
     """Return the path of a frame's image.  Raises DataError when the frame has none."""
     path = frame.file("file_path", suffix=".png")  # Blender's exporter omits the suffix
     if path is None:
@@ -158,7 +158,7 @@ def image_path_of(frame: Frame) -> Path:
     return path
 
 
-def camera_of(frame: Frame, size: tuple[int, int] | None) -> Camera:
+def camera_of(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
     """Return the camera of a frame without its distortion.  Raises DataError when it has no focal length."""
     default_width, default_height = size or (0, 0)
     width, height = int(frame.number("w") or default_width), int(frame.number("h") or default_height)
@@ -173,7 +173,7 @@ def camera_of(frame: Frame, size: tuple[int, int] | None) -> Camera:
     return Camera(width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
 
 
-def _focal(frame: Frame, length_key: str, angle_key: str, pixels: int) -> float | None:
+def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> float | None:
     """Return a focal length in pixels, given as such or as the angle (rad) that `pixels` span."""
     length, angle = frame.number(length_key), frame.number(angle_key)
     if length is not None or angle is None:
@@ -183,7 +183,7 @@ def _focal(frame: Frame, length_key: str, angle_key: str, pixels: int) -> float 
     return pixels / 2 / math.tan(angle / 2)
 
 
-def lens_of(frame: Frame, camera: Camera) -> Lens:
+def lens_of(frame: JsonFrame, camera: Camera) -> Lens:
     """Return the lens of a frame: OpenCV's polynomial, rational or fisheye one.  Raises DataError for others."""
     named = frame.value("camera_model")
     model = "OPENCV_FISHEYE" if frame.value("is_fisheye") else "OPENCV" if named is None else named
@@ -200,7 +200,7 @@ def lens_of(frame: Frame, camera: Camera) -> Lens:
     return Lens(camera.width, camera.height, "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)], params)
 
 
-def pose_of(frame: Frame) -> Floats:
+def pose_of(frame: JsonFrame) -> Floats:
     """Return [3, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
     try:
         matrix = np.array(frame.value("transform_matrix"), np.float64)
@@ -359,7 +359,7 @@ def _views(path: Path, splits: Any, name: str) -> list[View]:
     views = []
     for i, (file, pose, width, height, focal, label) in enumerate(zip(*columns, strict=True)):
         values = {"file_path": file, "transform_matrix": pose, "w": width, "h": height, "fl_x": focal, "label": label}
-        frame = Frame(path.parent, f"{path}: {name}[{i}]", values)
+        frame = JsonFrame(path.parent, f"{path}: {name}[{i}]", values)
         level = frame.number("label")
         if level is None or not 0 <= level <= 8 or level % 1:
             raise DataError(

@@ -11,7 +11,7 @@ from clsplat.core.settings import ReadPath
 from clsplat.gaussians.model import load
 from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
 from clsplat.metrics.views import mean, measure, tell_of_colours
-from clsplat.render.painter import Painter, Splats
+from clsplat.render.painter import Painter, SplatPainter
 from clsplat.scene.view import some_of
 from clsplat.training.modules.base import learned_scene, measured_as
 from clsplat.training.run import Run
@@ -79,7 +79,7 @@ class Evaluate(Scheduled):
     def _painter(self, run: Run) -> Painter:
         if self.file is None:
             return run.painter()
-        return Splats(run.rasterizer, load(run.out / self.file).upload(run.device), run.photographs.background)
+        return SplatPainter(run.rasterizer, load(run.out / self.file).upload(run.device), run.photographs.background)
 
     def run(self, run: Run) -> None:
         if not run.scene.split(self.split):

@@ -1,5 +1,6 @@
 """The training loop: render, compare, differentiate, update."""
 
+import itertools
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,6 @@ from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses
 from clsplat.metrics.views import distribution
 from clsplat.photos.sampling import Sampler, ViewSettings
-from clsplat.scene.scene import Scene
 from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
 from clsplat.training.adam import Adam, Rates, Rows
@@ -27,7 +27,7 @@ from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room, place_harmonics
 from clsplat.training.stage import Scheduled, Training
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 
 # Which model a training leaves: that of its last step, or the best one by photographs that it did not see.
 
@@ -106,6 +106,16 @@ class Keeping(Training):
         self.require_measured(run.step - run.stage_step)
         if run.stage_step == 0:
             run.best, run.best_tables = None, {}
+
+    def check_with(self, pipeline: Any) -> None:
+        if self.keep == "best" and pipeline.scene.validation == 0:
+            raise ConfigError("optimize.keep: best chooses by validation views; expected scene.validation: auto")
+        trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
+        if self.refit and (found := sum(isinstance(one, Keeping) for one in trainings)) > 1:
+            raise ConfigError(f"optimize.refit: expected one stage that trains, found {found}")
+        before = list(itertools.takewhile(lambda one: one is not self, trainings))
+        if not any(getattr(one, "patience", None) for one in before):  # else nobody knows at which step it begins
+            self.require_measured(sum(one.steps for one in before))
 
     def require_measured(self, begun: int) -> None:
         """Raise ConfigError where `keep: best` measures nothing before the last step; begun: global step before it."""
@@ -258,8 +268,6 @@ class Optimize(Keeping):
     def check(self) -> None:
         for module in self.modules:
             module.check_losses(self.losses)
-        for loss in self.losses:
-            self.check_beside(str(getattr(loss, "type", "")))
         super().check()
 
     def outputs(self, out: Path) -> list[Path]:
@@ -274,17 +282,6 @@ class Optimize(Keeping):
         super().check_in(run)
         for module in (*brought(run, self), *self.modules):
             module.check_in(run)
-            self.check_beside(module.type, run.scene)
-
-    def check_beside(self, part: str, scene: Scene | None = None) -> None:
-        """Raise ConfigError for modules that do not go with a part of the model, or with a loss; without a scene, in
-        any scene."""
-        for module in self.modules:
-            if module.excludes(part, scene):
-                raise ConfigError(
-                    f"optimize.modules: '{module.type}' does not go with {part}: {module.conflicts[part]}; leave one "
-                    "of them out"
-                )
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
@@ -333,7 +330,7 @@ class Optimize(Keeping):
     def _density(self) -> list[Densify]:
         return [stage for stage in self.during if isinstance(stage, Densify)]
 
-    def _trainer(self, run: Run, views: ViewSettings, last: int) -> Trainer:
+    def _trainer(self, run: Run, views: ViewSettings, last: int) -> StepTrainer:
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.stats = SplatStats(gaussians, self.statistics, len(run.scene.split("train")))
@@ -348,7 +345,7 @@ class Optimize(Keeping):
         rates = self.rates.settled(views.full_size(last))
         states: list[ModuleState] = attached(self.modules, run, last)
         trained = self.losses, rates, run.scene.extent, self.update
-        return Trainer(*parts, *trained, modules=states)
+        return StepTrainer(*parts, *trained, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the step before."""
@@ -360,7 +357,7 @@ class Optimize(Keeping):
                 stage.act(run)
             run.edited = True
 
-    def _step(self, run: Run, trainer: Trainer, sampler: Sampler) -> ViewLosses:
+    def _step(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> ViewLosses:
         """Do one step; a failure before its update leaves the run at the step before."""
         run.step += 1
         run.stage_step += 1
@@ -377,7 +374,7 @@ class Optimize(Keeping):
         run.status.note(step=run.step)
         return view
 
-    def _differentiate(self, run: Run, trainer: Trainer, sampler: Sampler) -> tuple[ViewLosses, set[str]]:
+    def _differentiate(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> tuple[ViewLosses, set[str]]:
         """The losses of one view, with gradients unless it is skipped, and the parameters that they do not update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)

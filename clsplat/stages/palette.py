@@ -1,7 +1,7 @@
 """A palette of harmonics, as a SOG holds it: drawn, and trained."""
 
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from functools import partial
 from typing import Annotated, ClassVar, Literal
 
@@ -15,7 +15,7 @@ from clsplat.formats.splats import Quality
 from clsplat.gaussians import clusters
 from clsplat.gaussians.clusters import DeviceClusters, most_alike
 from clsplat.training.run import Run
-from clsplat.training.stage import Scheduled, Stage
+from clsplat.training.stage import ALL_HARMONICS, Scheduled, Stage
 
 LOG = logging.getLogger("clsplat")
 
@@ -71,7 +71,10 @@ class SharePalette(Scheduled):
     stage: Literal["share_palette"] = "share_palette"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "palette"})
     edits: ClassVar[bool] = True
-    reads_harmonics: ClassVar[bool] = True
+    conflicts = ALL_HARMONICS
+
+    def excluded(self) -> Mapping[str, str]:
+        return self.conflicts if self.every else {}  # not after a training
 
     def run(self, run: Run) -> None:
         if run.model.gaussians.sh_degree:

@@ -389,7 +389,7 @@ MORE = {  # of clsplat/metrics/views.py: name and unit
 }
 
 
-class Report(Stage):
+class HtmlReport(Stage):
     """Write report.html."""
 
     stage: Literal["report"] = "report"

@@ -8,7 +8,7 @@ from pydantic import Field
 from clsplat.density.control import cap_opacity
 from clsplat.training import adam
 from clsplat.training.run import Run
-from clsplat.training.stage import Scheduled, Stage
+from clsplat.training.stage import ALL_HARMONICS, Scheduled, Stage
 
 
 class RaiseSh(Scheduled):
@@ -82,7 +82,7 @@ class AddToAverage(Scheduled):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"average"})
     edits: ClassVar[bool] = True
-    reads_harmonics: ClassVar[bool] = True
+    conflicts = ALL_HARMONICS
 
     def attach(self, run: Run) -> None:
         adam.attach(run.model.gaussians)

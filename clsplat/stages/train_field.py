@@ -15,7 +15,7 @@ from clsplat.core.settings import OneOf
 from clsplat.gaussians.model import Rendering
 from clsplat.nerf.files import ENDING, FILE, FieldModel, load_field
 from clsplat.nerf.shape import FieldShape
-from clsplat.nerf.training import AdamStep, LearnedField, Shown, field_plan, require_seen
+from clsplat.nerf.training import AdamStep, LearnedField, RayPhotograph, field_plan, require_seen
 from clsplat.photos.sampling import Order, Uniform, ViewPool
 from clsplat.stages.optimize import report
 from clsplat.training import checkpoint
@@ -126,7 +126,7 @@ class TrainField(Training):
         run.device.timings.sampling = False
         run.status.note(step=run.step)
 
-    def _shown(self, run: Run, pool: ViewPool, step: int) -> Iterator[Shown]:
+    def _shown(self, run: Run, pool: ViewPool, step: int) -> Iterator[RayPhotograph]:
         """The photographs of a step."""
         for number in range(self.photographs):
             view = self.order.at(pool, (step - 1) * self.photographs + number + 1)
@@ -134,7 +134,7 @@ class TrainField(Training):
             if photograph.mask is not None:
                 raise ConfigError(f"train_field: {view.name} has a mask; expected photographs whose pixels all count")
             area = view.camera.width * view.camera.height * view.downscale**2  # which its rays stand for
-            yield Shown(photograph.camera, photograph, self.rays // self.photographs, area)
+            yield RayPhotograph(photograph.camera, photograph, self.rays // self.photographs, area)
 
     def _values(self, run: Run, field: LearnedField) -> tuple[float, float]:
         """The loss of the last step and the PSNR of its fine level, dB.

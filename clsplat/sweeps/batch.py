@@ -27,10 +27,10 @@ from clsplat.runs.failures import Failures, failures_recorded
 from clsplat.runs.preflight import check_preparation
 from clsplat.runs.run_folder import Start
 from clsplat.runs.state import sum_of
-from clsplat.sweeps.cell import Cell, Scenes
+from clsplat.sweeps.cell import CellRun, Scenes
 from clsplat.sweeps.child import plugin_files, run_command
 from clsplat.sweeps.devices import places
-from clsplat.sweeps.engines import Drive, Engine, Inline, Wanted
+from clsplat.sweeps.engines import Drive, Engine, InlineEngine, Wanted
 from clsplat.sweeps.experiment import check_matrix_folder, compare
 from clsplat.sweeps.memory_need import Need
 from clsplat.sweeps.store import ERRORS, LEASE, MANIFEST, Store, copy_files, link_or_copy
@@ -97,7 +97,7 @@ class Watched:
         self._steps, self._looked = steps, time.monotonic()
         self._count = Count("steps", sum(steps.values()))
 
-    def __call__(self, store: Store, running: Mapping[str, Cell], ended: Mapping[str, object]) -> None:
+    def __call__(self, store: Store, running: Mapping[str, CellRun], ended: Mapping[str, object]) -> None:
         """Look, where it is time to."""
         if time.monotonic() - self._looked < EVERY:
             return
@@ -129,7 +129,7 @@ class Batch:
     store: Store
     failures: Failures
     is_anew: bool = False  # whether what is in those folders is replaced
-    running: dict[str, Cell] = field(default_factory=dict)
+    running: dict[str, CellRun] = field(default_factory=dict)
     outcomes: dict[str, Outcome] = field(default_factory=dict)
     _keys: dict[str, str] = field(default_factory=dict)
     _stop: threading.Event = field(default_factory=threading.Event)
@@ -180,7 +180,7 @@ class Batch:
     def _go(self, drive: Drive, wanted: Sequence[Wanted]) -> None:
         drive.ended, drive.look = self._ended, self._look
 
-        def began(cell: Cell) -> None:
+        def began(cell: CellRun) -> None:
             if drive.is_same and not self.running and not self.outcomes:  # so that its waiting cells are seen
                 for one in wanted:
                     self._keys[one.cell.name] = one.on(cell.spec["bits"]).key
@@ -192,7 +192,7 @@ class Batch:
         self.ready()
         drive.run(wanted)
 
-    def _began(self, cell: Cell) -> None:
+    def _began(self, cell: CellRun) -> None:
         if self._keys.get(cell.name) != cell.key or not self.running:
             self._keys[cell.name] = cell.key
             self.store.note_sweep(self.name, self._keys, self.text)
@@ -201,7 +201,7 @@ class Batch:
         number = len(self.outcomes) + len(self.running)
         LOG.info("cell %d of %d: %s", number, len(self.cells), cell.name)
 
-    def _ended(self, cell: Cell, outcome: Outcome) -> None:
+    def _ended(self, cell: CellRun, outcome: Outcome) -> None:
         self.running.pop(cell.name, None)
         if outcome.state == "stopped" and self._stop.is_set():
             return
@@ -214,7 +214,7 @@ class Batch:
         self.outcomes[cell.name] = outcome
         self.tell(None)
 
-    def _place(self, cell: Cell) -> None:
+    def _place(self, cell: CellRun) -> None:
         """Put a result into the folder of its name, unless it is there."""
         result, here = self.store.folder(cell.key).result, self.out / cell.name
         with self.failures.kept(cell.name):
@@ -235,7 +235,7 @@ def _engine(execution: Execution, store: Store, device: str | None, is_stopped: 
     names = None if execution.devices == "auto" else execution.devices
     if execution.engine == "inline":
         chosen = [device] if device else names[:1] if names else [""]
-        engine: Engine = Inline(store, places("inline", chosen)[0], is_stopped)
+        engine: Engine = InlineEngine(store, places("inline", chosen)[0], is_stopped)
     else:
         from clsplat.sweeps import dask  # where Dask is installed
 
@@ -255,7 +255,7 @@ def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
         prepare(planned, cell.pipeline.settings.scene.folder, store.prepared)
     known = scenes.known(cell.pipeline)
     need = Need.of(cell.pipeline, known.scene) if known.scene else None
-    own = Cell.of(cell.name, cell.pipeline, known.digest, bits="")
+    own = CellRun.of(cell.name, cell.pipeline, known.digest, bits="")
     return Wanted(own, steps_of(cell.pipeline) * known.pixels, need)
 
 

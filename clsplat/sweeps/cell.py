@@ -141,7 +141,7 @@ KEY = 20  # hexadecimal digits of the hash that names a cell
 
 
 @dataclass(frozen=True)
-class Cell:
+class CellRun:
     """One run, and the pipeline file that runs it on this machine."""
 
     name: str  # in its sweep
@@ -150,7 +150,7 @@ class Cell:
     files: dict[str, str] = field(default_factory=dict)  # hashes of the files that it names, by path
 
     @classmethod
-    def of(cls, name: str, pipeline: Pipeline, scene: str, bits: str) -> "Cell":
+    def of(cls, name: str, pipeline: Pipeline, scene: str, bits: str) -> "CellRun":
         """Return the cell of a pipeline.  scene: the fingerprint of its scene; bits: the bits class of its device.
 
         Raises DataError when a file that it names cannot be read.
@@ -162,7 +162,7 @@ class Cell:
         return cls(name, spec, placed.text(), contents(placed))
 
     @classmethod
-    def from_json(cls, text: str) -> "Cell":
+    def from_json(cls, text: str) -> "CellRun":
         """Return what `json` returned."""
         return cls(**json.loads(text))
 

@@ -12,7 +12,7 @@ from clsplat.core import machine
 from clsplat.core.files import told_as
 from clsplat.core.machine import Cores
 from clsplat.pipeline import plugins
-from clsplat.sweeps.store import ERRORS, PIPELINE_FILE, Attempt
+from clsplat.sweeps.store import ERRORS, PIPELINE_FILE, CellAttempt
 
 # Ctrl-C in the terminal is for the supervisor, which passes it on
 APART: dict[str, Any] = (
@@ -42,7 +42,7 @@ def filled(command: Command, pipeline: Path, out: Path) -> list[str]:
     return [values.get(word, word) for word in command]
 
 
-def supervise(attempt: Attempt, command: Command, is_stopped: Callable[[], bool], own: Cores = ()) -> int:
+def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], bool], own: Cores = ()) -> int:
     """Run an attempt to its end; return its exit code, negative where a signal ended it.
 
     Where `is_stopped`, the run saves its state and ends.  own: the cores that it is kept to, none: those of this
@@ -71,7 +71,7 @@ def supervise(attempt: Attempt, command: Command, is_stopped: Callable[[], bool]
     return code
 
 
-def _wait(process: "subprocess.Popen[bytes]", attempt: Attempt, is_stopped: Callable[[], bool]) -> int:
+def _wait(process: "subprocess.Popen[bytes]", attempt: CellAttempt, is_stopped: Callable[[], bool]) -> int:
     told: float | None = None
     while True:
         try:

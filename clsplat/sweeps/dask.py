@@ -20,11 +20,11 @@ from typing import Any
 from clsplat.core.errors import ConfigError, DeviceError, InternalError, Interrupted
 from clsplat.core.signals import stopping_on_signals
 from clsplat.pipeline.execution import Execution, Tls
-from clsplat.sweeps.cell import Cell, code_digest
+from clsplat.sweeps.cell import CellRun, code_digest
 from clsplat.sweeps.child import PATIENCE, plugin_files, run_command
 from clsplat.sweeps.connection import require_certificates, unanswered, warn_of_open_port
-from clsplat.sweeps.devices import TOLD, Place, place_of, places
-from clsplat.sweeps.engines import ALONE, Lost, Ticket
+from clsplat.sweeps.devices import TOLD, DeviceSlot, place_of, places
+from clsplat.sweeps.engines import ALONE, CellLost, Ticket
 from clsplat.sweeps.store import Store
 from clsplat.sweeps.task import Outcome, Terms, run_cell
 
@@ -67,7 +67,7 @@ ANSWER = 20.0  # seconds that a scheduler may take to answer
 
 def work(cell: str, store: str, command: list[str], terms: str) -> str:
     """Run a cell on a worker: text in, text out."""
-    outcome = run_cell(Cell.from_json(cell), Store(Path(store)), command, Terms(**json.loads(terms)))
+    outcome = run_cell(CellRun.from_json(cell), Store(Path(store)), command, Terms(**json.loads(terms)))
     return json.dumps(asdict(outcome))
 
 
@@ -114,7 +114,7 @@ class _Future:
             if self._address and self._address not in self._cluster.addresses:
                 self.is_over = True
                 self.future.cancel()
-                raise Lost
+                raise CellLost
             return None
         if state == "finished":
             outcome = Outcome(**json.loads(self.future.result()))
@@ -123,26 +123,26 @@ class _Future:
             return outcome
         if state == "error" and not isinstance(error := self.future.exception(), distributed.KilledWorker):
             raise InternalError(f"internal error (a defect) of a worker: {type(error).__name__}: {error}")
-        raise Lost
+        raise CellLost
 
 
 class Cluster:
     """The devices of a Dask cluster."""
 
-    def __init__(self, client: Any, store: Store, cluster: Any = None, found: list[Place] | None = None) -> None:
+    def __init__(self, client: Any, store: Store, cluster: Any = None, found: list[DeviceSlot] | None = None) -> None:
         """cluster: what starts workers of this machine, and starts them again; found: its devices, on any of which they
         run cells.  Of a scheduler elsewhere both are None, and each worker has its own device.
         """
         self._client, self._store, self._cluster, self._found = client, store, cluster, found
         self._sweep = uuid.uuid4().hex
         self._looked, self._seen = -LOOK, time.monotonic()
-        self._places: list[Place] = []
+        self._places: list[DeviceSlot] = []
         self._tickets: list[_Future] = []
         self.addresses: set[str] = set()
         self.settings = ExitStack()  # of Dask, which end with the cluster
         self.command_of = lambda device: run_command(device, plugin_files())
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[DeviceSlot]:
         """Return the devices whose workers live.
 
         Raises DeviceError where the scheduler ended, or no worker of this version was there for a minute.
@@ -184,7 +184,7 @@ class Cluster:
                 raise DeviceError("the scheduler ended; start it, and run the sweep again with --resume") from error
             raise
 
-    def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
+    def start(self, cell: CellRun, place: DeviceSlot, terms: Terms) -> Ticket:
         own = replace(terms, worker=place.worker, sweep=self._sweep, cores=place.cores)
         address = place.worker if self._found is None else None
         with self._needs_scheduler():
@@ -224,7 +224,7 @@ class Cluster:
 # Worker processes of this machine, one a device, for a scheduler elsewhere.
 
 
-def serve(execution: Execution, found: Sequence[Place]) -> None:
+def serve(execution: Execution, found: Sequence[DeviceSlot]) -> None:
     """Let a process a device work for a scheduler, until that ends or a signal comes.  Raises DeviceError."""
     warn_of_open_port(execution)
     stop = threading.Event()
@@ -239,7 +239,7 @@ def _told(text: str, worker: object) -> str:
     return text
 
 
-async def _serve(execution: Execution, found: Sequence[Place], stop: threading.Event) -> None:
+async def _serve(execution: Execution, found: Sequence[DeviceSlot], stop: threading.Event) -> None:
     told = [
         {
             "host": place.worker,

@@ -100,7 +100,7 @@ stages:
 
 
 @dataclass(frozen=True)
-class Place:
+class DeviceSlot:
     """A device that runs cells, one at a time."""
 
     worker: str  # who offers it
@@ -113,7 +113,7 @@ class Place:
     unified: bool = False  # its memory is the host's
 
 
-def place_of(address: str, worker: dict[str, Any]) -> Place | None:
+def place_of(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
     """Return the device that a worker tells; None for a worker of another program, or version."""
     try:
         values = json.loads(str(worker["metrics"][TOLD]))
@@ -121,12 +121,12 @@ def place_of(address: str, worker: dict[str, Any]) -> Place | None:
             return None
         device, bits, text = (str(values[name]) for name in ("device", "bits", "host"))
         memory, allocation = map(int, values["limits"])
-        return Place(address, device, bits, text, (), memory, allocation, bool(values["unified"]))
+        return DeviceSlot(address, device, bits, text, (), memory, allocation, bool(values["unified"]))
     except (ValueError, KeyError, TypeError):
         return None
 
 
-def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) -> list[Place]:
+def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) -> list[DeviceSlot]:
     """Return the devices of this machine that work, or those of a list of names, with their classes.
 
     packing: the runs that share a CPU, each of which has a place; "auto": what was measured, else one.
@@ -138,7 +138,7 @@ def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) 
         raise DeviceError("no OpenCL device works; `clsplat devices` tells why")
     found = []
     for info, parts in zip(chosen, shares_of(chosen, packing), strict=True):
-        own = Place(
+        own = DeviceSlot(
             worker,
             word_of(info, infos),
             bits_class(info, infos),

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from clsplat.core.errors import DeviceError, Interrupted, MemoryLimitError, amount, first_few
-from clsplat.sweeps.cell import Cell
+from clsplat.sweeps.cell import CellRun
 from clsplat.sweeps.child import plugin_files, run_command
-from clsplat.sweeps.devices import Place
+from clsplat.sweeps.devices import DeviceSlot
 from clsplat.sweeps.memory_need import Need
 from clsplat.sweeps.store import Different, Store
 from clsplat.sweeps.task import Outcome, Terms, run_cell
@@ -22,23 +22,23 @@ class Ticket(Protocol):
     """A cell that was handed to an engine."""
 
     def outcome(self) -> Outcome | None:
-        """Return how it ended; None while it runs.  Raises Lost where nobody runs it any more, and its errors."""
+        """Return how it ended; None while it runs.  Raises CellLost where nobody runs it any more, and its errors."""
 
 
-class Lost(Exception):
+class CellLost(Exception):
     """The process that ran a cell is gone; the cell goes on from its checkpoint elsewhere."""
 
 
 class Engine(Protocol):
     """Devices, and a way to run a cell on one of them."""
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[DeviceSlot]:
         """Return the devices that are there now.  Raises ClsplatError where there will be none."""
 
     def may_join(self, waited: float) -> bool:
         """Whether other devices may still join a sweep that has waited for them, for so many seconds."""
 
-    def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
+    def start(self, cell: CellRun, place: DeviceSlot, terms: Terms) -> Ticket:
         """Begin to run a cell on a device that is free."""
 
     def close(self) -> None:
@@ -53,19 +53,19 @@ class _Ended:
         return self._outcome
 
 
-class Inline:
+class InlineEngine:
     """Runs a cell at a time, each as a child of this process."""
 
-    def __init__(self, store: Store, place: Place, is_stopped: Callable[[], bool]) -> None:
+    def __init__(self, store: Store, place: DeviceSlot, is_stopped: Callable[[], bool]) -> None:
         self._store, self._place, self._is_stopped = store, place, is_stopped
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[DeviceSlot]:
         return [self._place]
 
     def may_join(self, waited: float) -> bool:
         return False
 
-    def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
+    def start(self, cell: CellRun, place: DeviceSlot, terms: Terms) -> Ticket:
         command = run_command(place.device, plugin_files())
         return _Ended(run_cell(cell, self._store, command, terms, self._is_stopped))
 
@@ -82,11 +82,11 @@ ALONE = 60.0  # seconds without a device that may run a cell, after which a swee
 class Wanted:
     """A cell before a device is chosen."""
 
-    cell: Cell  # of no class
+    cell: CellRun  # of no class
     cost: float  # steps times pixels, to compare
     need: Need | None = None  # of memory; None: not known, it may run anywhere
 
-    def on(self, bits: str) -> Cell:
+    def on(self, bits: str) -> CellRun:
         """Return the cell in a bits class."""
         return replace(self.cell, spec={**self.cell.spec, "bits": bits})
 
@@ -100,15 +100,15 @@ class Drive:
     is_same: bool  # all cells in one bits class
     terms: Terms
     is_stopped: Callable[[], bool] = lambda: False
-    began: Callable[[Cell], None] = lambda cell: None
-    ended: Callable[[Cell, Outcome], None] = lambda cell, outcome: None
+    began: Callable[[CellRun], None] = lambda cell: None
+    ended: Callable[[CellRun, Outcome], None] = lambda cell, outcome: None
     look: Callable[[], None] = lambda: None  # called again and again
     bits: str | None = None  # the class of all cells, once it is chosen
     _seen: float = field(default_factory=time.monotonic)  # when a device of that class was there last
     _unheld: float | None = None  # since when nothing runs, for no device holds what waits
-    _unsuited: tuple[list[Place], set[Place]] = field(default_factory=lambda: ([], set()))
+    _unsuited: tuple[list[DeviceSlot], set[DeviceSlot]] = field(default_factory=lambda: ([], set()))
     """All devices, and those that suit no cell that waits."""
-    _running: dict[Place, tuple[Wanted, Cell, Ticket]] = field(default_factory=dict)
+    _running: dict[DeviceSlot, tuple[Wanted, CellRun, Ticket]] = field(default_factory=dict)
 
     def run(self, wanted: Sequence[Wanted]) -> None:
         """Run all cells, and tell `ended` how each did.
@@ -170,7 +170,7 @@ class Drive:
                 "offer one of that class, or set placement: {bits: any}; what was done is in the store"
             )
 
-    def _suits(self, one: Wanted, place: Place, places: Sequence[Place]) -> bool:
+    def _suits(self, one: Wanted, place: DeviceSlot, places: Sequence[DeviceSlot]) -> bool:
         """Whether a cell may run on a device: of its class, and such that holds it, as it ends where one does."""
         allowed = self._allowed(one, places)
         need = self._need(one, allowed)
@@ -178,14 +178,14 @@ class Drive:
             return place in allowed
         return need.ends_on(place) or (need.begins_on(place) and not any(map(need.ends_on, allowed)))
 
-    def _allowed(self, one: Wanted, places: Sequence[Place]) -> list[Place]:
+    def _allowed(self, one: Wanted, places: Sequence[DeviceSlot]) -> list[DeviceSlot]:
         """The devices in whose class a cell may run: one that has begun stays in its own, where that is there now."""
         if self.is_same:
             return [place for place in places if place.bits == self.bits]
         begun = [own for own in {place.bits for place in places} if self.store.folder(one.on(own).key).path.is_dir()]
         return [place for place in places if not begun or place.bits in begun]
 
-    def _need(self, one: Wanted, allowed: Sequence[Place]) -> Need | None:
+    def _need(self, one: Wanted, allowed: Sequence[DeviceSlot]) -> Need | None:
         """The memory that a cell needs; none where it is published."""
         classes = {place.bits for place in allowed} if one.need else ()
         return None if any(self.store.folder(one.on(own).key).result.is_dir() for own in classes) else one.need
@@ -193,7 +193,7 @@ class Drive:
     def _refuse(self, waiting: list[Wanted]) -> None:
         """End the cells that no device holds, where none that does may join; it is called when nothing runs, so that
         the others are done."""
-        places, found = self.engine.places(), list[tuple[Wanted, Need, list[Place]]]()
+        places, found = self.engine.places(), list[tuple[Wanted, Need, list[DeviceSlot]]]()
         for one in waiting:
             allowed = self._allowed(one, places)
             need = self._need(one, allowed)
@@ -204,7 +204,7 @@ class Drive:
                 self._give_up(*each)
                 waiting.remove(each[0])
 
-    def _may_join(self, found: Sequence[tuple[Wanted, Need, list[Place]]]) -> bool:
+    def _may_join(self, found: Sequence[tuple[Wanted, Need, list[DeviceSlot]]]) -> bool:
         """Whether a device may still join that holds some of these cells; say so once."""
         now = time.monotonic()
         waited = 0.0 if self._unheld is None else now - self._unheld
@@ -217,18 +217,18 @@ class Drive:
             self._unheld = now
         return True
 
-    def _give_up(self, one: Wanted, need: Need, allowed: Sequence[Place]) -> None:
+    def _give_up(self, one: Wanted, need: Need, allowed: Sequence[DeviceSlot]) -> None:
         largest = max(allowed, key=need.limit_on)
         cell, code, message = one.on(largest.bits), MemoryLimitError.exit_code, need.refusal(largest)
         self.store.add(cell).give_up(code, message)
         self.store.tell("failed", cell=cell.key, exit_code=code)
         self.ended(cell, Outcome("failed", "", code, message))
 
-    def _take_in(self, place: Place, waiting: list[Wanted]) -> None:
+    def _take_in(self, place: DeviceSlot, waiting: list[Wanted]) -> None:
         one, cell, ticket = self._running[place]
         try:
             outcome = ticket.outcome()
-        except Lost:
+        except CellLost:
             del self._running[place]
             self.store.tell("lost", cell=cell.key, worker=place.worker)
             waiting.insert(0, one)

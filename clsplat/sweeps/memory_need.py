@@ -8,15 +8,14 @@ from dataclasses import dataclass
 
 from clsplat.core.schedule import at_step
 from clsplat.photos.photographs import BUDGET_SHARE
-from clsplat.pipeline.checks import harmonics_of
 from clsplat.pipeline.loading import Pipeline
 from clsplat.scene.scene import Scene
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.training.memory import (
+    DeviceLimits,
     Harmonics,
-    Limits,
     MemoryPlan,
     bytes_of_modules,
     first_tables,
@@ -65,29 +64,29 @@ class Need:
             begins,
             max(begins, int(max(ends, default=0))),
             settings.model.time.width if settings.model.time else 0,
-            harmonics_of(settings),
+            settings.harmonics,
             bytes_of_modules(trainings, views, TILE),
         )
 
-    def plan(self, limits: Limits) -> MemoryPlan:
+    def plan(self, limits: DeviceLimits) -> MemoryPlan:
         """Return the plan of its training on a device."""
         budget = int(limits.memory * BUDGET_SHARE) if self.budget is None else self.budget
         tables, held = first_tables(self.degree, self.motion), min(budget, self.photographs) + self.modules
         return plan(limits, tables, held, self.pixels, harmonics=last_place(self.harmonics, limits))
 
-    def limit_on(self, limits: Limits) -> int:
+    def limit_on(self, limits: DeviceLimits) -> int:
         """Return the largest number of Gaussians that a device holds."""
         return self.plan(limits).limit
 
-    def begins_on(self, limits: Limits) -> bool:
+    def begins_on(self, limits: DeviceLimits) -> bool:
         """Whether a device holds what it begins with, without which its run would be refused."""
         return self.limit_on(limits) >= self.first
 
-    def ends_on(self, limits: Limits) -> bool:
+    def ends_on(self, limits: DeviceLimits) -> bool:
         """Whether a device holds it when its growth ends."""
         return self.limit_on(limits) >= self.most
 
-    def refusal(self, limits: Limits) -> str:
+    def refusal(self, limits: DeviceLimits) -> str:
         """Return why no device takes it; limits: of the one that holds most."""
         return (
             f"no device of the sweep holds it; of the largest, {self.plan(limits).text(self.first)}; offer a larger "

@@ -11,7 +11,7 @@ from clsplat.core.files import METRICS, write_text
 from clsplat.core.page import duration, render
 from clsplat.core.reading import read_json
 from clsplat.runs.results import read_metrics
-from clsplat.sweeps.store import CELLS, SILENT, SPEC, Attempt, CellFolder, Store
+from clsplat.sweeps.store import CELLS, SILENT, SPEC, CellAttempt, CellFolder, Store
 from clsplat.training.status import read_status
 
 GONE = 60.0  # seconds without a beat after which a run may have ended
@@ -79,7 +79,7 @@ def _figures(folder: CellFolder) -> dict[str, Any]:
     return {}
 
 
-def _attempt(attempt: Attempt, now: float) -> dict[str, Any]:
+def _attempt(attempt: CellAttempt, now: float) -> dict[str, Any]:
     """The state of a cell by its last attempt."""
     status = read_status(attempt.path)
     silent = now - attempt.beaten
@@ -122,7 +122,7 @@ ORDER = ("published", "running", "waiting", "stopped", "silent", "failed")
 
 
 @dataclass(frozen=True)
-class Row:
+class StatusRow:
     """A cell in the table."""
 
     cell: dict[str, Any]
@@ -186,6 +186,6 @@ def store_page(found: dict[str, Any]) -> str:
         subtitle=f"{found['store']}, {time.strftime('%Y-%m-%d %H:%M:%S', time.gmtime(found['time']))} UTC",
         level="error" if "failed" in counts else "ready" if is_done else "note",
         verdict=f"{len(cells)} cells: {verdict}" if cells else "no cells",
-        rows=[Row(cell) for cell in cells],
+        rows=[StatusRow(cell) for cell in cells],
         events=found["events"],
     )

@@ -53,7 +53,7 @@ from clsplat.core.machine import Owner
 from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.formats.table import CODECS
 from clsplat.runs.state import sum_of
-from clsplat.sweeps.cell import Cell
+from clsplat.sweeps.cell import CellRun
 from clsplat.training import checkpoint
 from clsplat.training.status import read_status
 
@@ -108,7 +108,7 @@ class LeaseLost(OutputError):
     """The folder of an attempt was removed while its run went on."""
 
 
-class Attempt:
+class CellAttempt:
     """A folder below `attempts`, written by one process."""
 
     def __init__(self, path: Path) -> None:
@@ -178,7 +178,7 @@ class Attempt:
                 return path.stat().st_mtime
         return math.inf
 
-    def go_on_from(self, others: Iterable["Attempt"]) -> None:
+    def go_on_from(self, others: Iterable["CellAttempt"]) -> None:
         """Take what the attempt with the newest checkpoint that is whole has written: links where that is possible.
 
         A damaged checkpoint counts as none: the one before it is taken, of whatever attempt.  Raises OutputError.
@@ -225,7 +225,7 @@ class Attempt:
         return values
 
 
-def whole(attempts: Iterable[Attempt]) -> Iterator[tuple[Rank, Path, Attempt]]:
+def whole(attempts: Iterable[CellAttempt]) -> Iterator[tuple[Rank, Path, CellAttempt]]:
     """Yield the checkpoints of attempts that can be read, from the newest on: rank, file, and whose it is."""
     found = [(_rank_of(path.name), path, one) for one in attempts for path in checkpoint.saved(one.path)]
     for rank, path, one in sorted(found, key=lambda entry: entry[0], reverse=True):
@@ -320,14 +320,14 @@ class CellFolder:
             os.rename(self.result, self.path / ATTEMPTS / uuid.uuid4().hex)
         return None
 
-    def attempts(self) -> list[Attempt]:
+    def attempts(self) -> list[CellAttempt]:
         """Return the attempts that are there."""
         found = (self.path / ATTEMPTS).glob("*")
-        return [Attempt(path) for path in found if NAME.fullmatch(path.name) and path.is_dir()]
+        return [CellAttempt(path) for path in found if NAME.fullmatch(path.name) and path.is_dir()]
 
-    def begin(self, worker: str, since: float) -> Attempt:
+    def begin(self, worker: str, since: float) -> CellAttempt:
         """Make a new attempt, which goes on from the newest checkpoint of all that is whole.  Raises OutputError."""
-        attempt = Attempt(self.path / ATTEMPTS / uuid.uuid4().hex)
+        attempt = CellAttempt(self.path / ATTEMPTS / uuid.uuid4().hex)
         with told_as(attempt.path):
             make_folder(attempt.path)
             (self.path / FAILED).unlink(missing_ok=True)  # it is tried again
@@ -335,13 +335,13 @@ class CellFolder:
         attempt.go_on_from(other for other in self.attempts() if other.path != attempt.path)
         return attempt
 
-    def failures(self, since: float) -> list[Attempt]:
+    def failures(self, since: float) -> list[CellAttempt]:
         """Return the attempts of callers since a time that have failed and left no newer checkpoint that is whole."""
         attempts = self.attempts()
         newest = next((rank for rank, *_ in whole(attempts)), (False, 0))
         return [one for one in attempts if one.has_failed and one.since >= since and one.begun_at >= newest]
 
-    def publish(self, attempt: Attempt) -> dict[str, Any]:
+    def publish(self, attempt: CellAttempt) -> dict[str, Any]:
         """Rename an attempt with its manifest to the result; return the manifest of the result.
 
         Where another attempt came first, their bits are compared.
@@ -481,7 +481,7 @@ class Store:
                 found.append((str(values["name"]), cells))
         return found
 
-    def add(self, cell: Cell) -> CellFolder:
+    def add(self, cell: CellRun) -> CellFolder:
         """Return the folder of a cell, with its spec.json.  Raises OutputError where that is another one's."""
         folder = self.folder(cell.key)
         folder.write_spec(cell.spec)

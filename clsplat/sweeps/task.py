@@ -18,9 +18,9 @@ from clsplat.core.errors import (
 )
 from clsplat.core.files import INPUTS, NOTE, PREPARED, UNDISTORTED, make_folder, write_text
 from clsplat.core.reading import read_json
-from clsplat.sweeps.cell import Cell
+from clsplat.sweeps.cell import CellRun
 from clsplat.sweeps.child import Command, supervise
-from clsplat.sweeps.store import ATTEMPTS, PIPELINE_FILE, Attempt, CellFolder, Different, LeaseLost, Store
+from clsplat.sweeps.store import ATTEMPTS, PIPELINE_FILE, CellAttempt, CellFolder, Different, LeaseLost, Store
 
 LOG = logging.getLogger("clsplat")
 FINAL = (ConfigError.exit_code, DataError.exit_code, MemoryLimitError.exit_code)  # the same run would end so again
@@ -48,7 +48,7 @@ class Terms:
 
 
 def run_cell(
-    cell: Cell, store: Store, command: Command, terms: Terms, is_stopped: Callable[[], bool] = lambda: False
+    cell: CellRun, store: Store, command: Command, terms: Terms, is_stopped: Callable[[], bool] = lambda: False
 ) -> Outcome:
     """Run a cell, unless it is published; return how it ended, whatever happens to it.
 
@@ -62,7 +62,7 @@ def run_cell(
         return Outcome("failed", "", error.exit_code, one_line(error))
 
 
-def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopped: Callable[[], bool]) -> Outcome:
+def _run_cell(cell: CellRun, store: Store, command: Command, terms: Terms, is_stopped: Callable[[], bool]) -> Outcome:
     folder = store.add(cell)
 
     def stopped() -> bool:
@@ -103,7 +103,7 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
         LOG.warning("cell %s: %s; it is tried again", cell.name, message)
 
 
-def _equip(cell: Cell, store: Store, folder: CellFolder, attempt: Attempt) -> None:
+def _equip(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt) -> None:
     """Write the pipeline file of an attempt, and let it find what other cells have made of the scene.
 
     That is what `prepare` makes, and undistorted photographs.  Without links each cell makes its own.  Raises
@@ -121,7 +121,7 @@ def _equip(cell: Cell, store: Store, folder: CellFolder, attempt: Attempt) -> No
                 link.symlink_to(os.path.relpath(target, link.parent), target_is_directory=True)
 
 
-def _require_same_scene(cell: Cell, attempt: Attempt) -> None:
+def _require_same_scene(cell: CellRun, attempt: CellAttempt) -> None:
     """Raise DataError where the photographs, or other files, are not those that the cell was named by."""
     cell.require_files()
     for name, key in ((NOTE, "inputs"), (INPUTS, "digest")):
@@ -134,7 +134,7 @@ def _require_same_scene(cell: Cell, attempt: Attempt) -> None:
         return
 
 
-def _published(store: Store, folder: CellFolder, attempt: Attempt) -> Outcome:
+def _published(store: Store, folder: CellFolder, attempt: CellAttempt) -> Outcome:
     manifest = folder.publish(attempt)
     is_first = manifest["attempt"] == attempt.path.name
     store.tell("publish" if is_first else "second", cell=folder.key, attempt=attempt.path.name, bits=manifest["bits"])

@@ -13,7 +13,7 @@ from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients
 from clsplat.gaussians.deferred import Deferred
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.sh_offload import defines_of, slots_of
-from clsplat.gaussians.structs import Gradients, Waiting, moment_tables
+from clsplat.gaussians.structs import GaussianGradients, Waiting, moment_tables
 from clsplat.opencl.device import Array, constants
 from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.training.motion import MotionRates, update_motion
@@ -156,7 +156,7 @@ class Adam:
         self,
         model: DeviceModel,
         frame: Frame,
-        gradients: Gradients,
+        gradients: GaussianGradients,
         rates: dict[str, float],
         without: Collection[str] = (),
         rows: Rows = "all",

@@ -74,7 +74,7 @@ class MemoryPlan:
             )
 
 
-class Limits(Protocol):
+class DeviceLimits(Protocol):
     """What a device holds."""
 
     @property
@@ -90,7 +90,7 @@ class Limits(Protocol):
         """Whether it is the host's memory."""
 
 
-def last_place(harmonics: Harmonics, limits: Limits) -> Where:
+def last_place(harmonics: Harmonics, limits: DeviceLimits) -> Where:
     """Return where harmonics may lie at last.  A device whose memory is the host's has nothing to move them to."""
     return "host" if harmonics == "host" or (harmonics == "auto" and not limits.unified) else "device"
 
@@ -117,7 +117,7 @@ def first_tables(degree: int, motion: int = 0) -> dict[str, int]:
 
 
 def plan(
-    limits: Limits,
+    limits: DeviceLimits,
     components: Mapping[str, int],
     photographs: int,
     pixels: int,

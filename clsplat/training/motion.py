@@ -10,7 +10,7 @@ from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, divided
 from clsplat.core.settings import Settings
 from clsplat.formats.splats import MOTION, fields_of
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.gaussians.structs import Gradients, moment_tables
+from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.opencl.device import Array, constants
 
 LONGEST = 15.0  # log of a duration: nothing changes beyond it
@@ -58,7 +58,7 @@ class MotionRates(Settings):
 
 def update_motion(
     gaussians: Gaussians,
-    gradients: Gradients,
+    gradients: GaussianGradients,
     depth_key: Array,
     rates: Mapping[str, float],
     updates: int,

@@ -22,7 +22,7 @@ from clsplat.opencl.device import Device
 from clsplat.photos.exposure_estimate import Exposures
 from clsplat.photos.photographs import Photographs, texture_quantile
 from clsplat.render.filters import FilterViews, ModelSettings, measure_intervals
-from clsplat.render.painter import Painter, Splats
+from clsplat.render.painter import Painter, SplatPainter
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene, scene_name
@@ -106,7 +106,7 @@ class Run:
         """Return what renders views, with another rasterizer than the training's.  Raises ConfigError as `model`."""
         if self.learned_field:
             return self.learned_field.painter
-        return Splats(rasterizer or self.rasterizer, self.model, self.photographs.background)
+        return SplatPainter(rasterizer or self.rasterizer, self.model, self.photographs.background)
 
     @property
     def gaussians(self) -> int | None:

@@ -55,7 +55,6 @@ class Stage(Settings):
     takes: ClassVar[frozenset[str]] = frozenset()  # parts that do not exist afterwards
     edits: ClassVar[bool] = False  # changes the model; inside `during` it acts between two steps
     changes_last: ClassVar[bool] = False  # says by run.changing() where its edit begins; else all of it is an edit
-    reads_harmonics: ClassVar[bool] = False  # of all Gaussians, with a kernel
 
     stage: str
     """Name of the stage."""
@@ -92,6 +91,12 @@ class Stage(Settings):
         changing = run.changing() if self.edits and not self.changes_last else nullcontext()
         with run.status.stage(self.stage), changing, run.records.of_a_stage():
             self.run(run)
+
+
+ON_HOST = "harmonics on the host"
+ALL_HARMONICS = {
+    ON_HOST: "it changes those of all Gaussians on the device; set rasterizer.harmonics: device, or leave it out"
+}
 
 
 class Scheduled(Stage):

@@ -21,20 +21,20 @@ from clsplat.photos.photographs import Photograph, apply_mask, known_gradient
 from clsplat.photos.transforms import PhotographTransform
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.modules.base import ModuleState, Step
+from clsplat.training.modules.base import ModuleState, TrainingStep
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
 
 @dataclass
-class Trainer:
+class StepTrainer:
     """The objects of a training step; pipelines, benchmarks and notebooks call the same `step`.
 
     A loop of one's own, on the training views of a scene, from a model of `clsplat.load`:
 
         model = model.upload(device)
         photographs = Photographs(device, scene.background)
-        trainer = Trainer(
+        trainer = StepTrainer(
             Rasterizer(device),
             model,
             Adam(model.gaussians),
@@ -96,7 +96,7 @@ class Trainer:
         """
         content = content_of(self.losses, step)
         workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings
-        now = Step(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
+        now = TrainingStep(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
         now.modules = self.modules
         for module in now.modules:
             module.before_render(now)

@@ -58,7 +58,7 @@ from clsplat.sweeps.store import Store
 from clsplat.workflows.block_pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
 from clsplat.workflows.finetune import claimed, is_trained, trained
 from clsplat.workflows.folder import COARSE, MERGED, RECORD
-from clsplat.workflows.partition import SIGHT, Block, Cell, Partition, Partitioner
+from clsplat.workflows.partition import SIGHT, Block, Partition, PartitionCell, Partitioner
 
 # How long the training of each block takes, roughly.
 
@@ -96,7 +96,7 @@ COVERED = 0.5  # of a pixel, from which on its depth counts
 Floats = NDArray[np.floating]
 
 
-def write_seams(cells: list[Cell], model: Model, scene: Scene, device: Device, run: Path) -> None:
+def write_seams(cells: list[PartitionCell], model: Model, scene: Scene, device: Device, run: Path) -> None:
     """Write, for each test view, which pixels show what lies near a face between blocks: 255 there, else 0.
 
     run: the folder of the merged model; masks go into its folder `seams`.  Raises OutputError.
@@ -121,7 +121,7 @@ def places(view: View, depth: Floats) -> Floats:
     return np.asarray((rays * depth[:, :, None] - pose[:, 3]) @ pose[:, :3])
 
 
-def is_near(points: Floats, cells: list[Cell]) -> NDArray[np.bool_]:
+def is_near(points: Floats, cells: list[PartitionCell]) -> NDArray[np.bool_]:
     """Return which points, [N, 3], lie near a face of the cell that holds them, [N].
 
     Near is `NEAR_FACE` of the cell's size along the axis: half as far as growth goes beyond a face.
@@ -142,7 +142,7 @@ Steps = Literal["each", "shared"]
 
 
 @dataclass(frozen=True)
-class Plan:
+class BlocksPlan:
     """What is asked for."""
 
     pipeline: str = "blocks"
@@ -166,7 +166,7 @@ class Blocks:
     """The work in a folder."""
 
     def __init__(
-        self, scene: Path, out: Path, plan: Plan, device: str | Device | None, execution: Execution | None = None
+        self, scene: Path, out: Path, plan: BlocksPlan, device: str | Device | None, execution: Execution | None = None
     ) -> None:
         """execution: where blocks are trained; without it one after the other in this process."""
         if execution is not None and execution.keeps is None:
@@ -290,7 +290,7 @@ class Blocks:
 def train_in_blocks(
     scene: Path,
     out: Path,
-    plan: Plan | None = None,
+    plan: BlocksPlan | None = None,
     device: str | Device | None = None,
     *,
     only_plan: bool = False,
@@ -301,7 +301,7 @@ def train_in_blocks(
     What an earlier call has finished is left alone, and what it has begun goes on.  only_plan: stop after the
     partition; execution: where blocks are trained as cells of a store.  Raises ClsplatError; one of a block names it.
     """
-    work = Blocks(scene, out, plan or Plan(), device, execution)
+    work = Blocks(scene, out, plan or BlocksPlan(), device, execution)
     with claimed(out, work.question(), RECORD, "a scene in blocks", "another --out"):
         partition = work.partition()
         if only_plan:
@@ -380,7 +380,7 @@ def plan_blocks(
         model = Path(made, "points.ply")
         tables = from_points(points, Init().opacity, settings.model.sh_degree)
         Model(**tables, rendering=NUMBERS, sky=None).save(model)
-        work = Blocks(scene, Path(made), Plan(pipeline, str(model), blocks), device)
+        work = Blocks(scene, Path(made), BlocksPlan(pipeline, str(model), blocks), device)
         try:
             return work.plan_of(work.partition())
         except DataError as error:

@@ -98,7 +98,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Target:
+class CompressionTarget:
     """A size, or a PSNR that is not to be missed."""
 
     text: str
@@ -106,7 +106,7 @@ class Target:
     change: float | None = None  # dB, of the PSNR of the model
 
     @classmethod
-    def of(cls, text: str) -> "Target":
+    def of(cls, text: str) -> "CompressionTarget":
         """Read '5MB' (1 MB = 10^6 bytes; MiB = 2^20) or '-0.1dB'.  Raises ConfigError."""
         found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*([a-z]+)\s*", text, re.IGNORECASE | re.ASCII)
         unit = found[2].lower() if found else ""
@@ -184,7 +184,7 @@ def table(found: dict[str, Any]) -> str:
 
 
 def page(
-    target: Target,
+    target: CompressionTarget,
     source: Point,
     points: Sequence[Point],
     chosen: Point | None,
@@ -206,7 +206,7 @@ def page(
     )
 
 
-def _verdict(target: Target, source: Point, chosen: Point | None) -> str:
+def _verdict(target: CompressionTarget, source: Point, chosen: Point | None) -> str:
     if chosen is None:
         return f"No file meets the target {target.text} so far."
     return (
@@ -215,7 +215,7 @@ def _verdict(target: Target, source: Point, chosen: Point | None) -> str:
     )
 
 
-def _lines(target: Target, source: Point, points: Sequence[Point]) -> list[Line]:
+def _lines(target: CompressionTarget, source: Point, points: Sequence[Point]) -> list[Line]:
     """A line for each share of the Gaussians, and the target."""
     shares = dict.fromkeys(point.keep for point in points)
     lines = [
@@ -244,7 +244,7 @@ class Search:
     """A search in its folder: what was measured so far."""
 
     out: Path
-    target: Target
+    target: CompressionTarget
     question: dict[str, Any]  # what is compressed, and how
     source: Point  # the model itself
     split: str  # views that are measured
@@ -293,7 +293,7 @@ def compress(
     Raises ConfigError for a target that no file meets, after the page is written; OutputError where another process
     searches in `out`.
     """
-    wanted, shares = Target.of(target), checked_keeps(keeps)
+    wanted, shares = CompressionTarget.of(target), checked_keeps(keeps)
     if steps is not None:
         require_steps(steps)
     if form not in get_args(Format):

@@ -21,9 +21,9 @@ from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.stretching import stretched
 from clsplat.pipeline.yaml_file import Document, read_yaml
-from clsplat.render.painter import Splats
+from clsplat.render.painter import SplatPainter
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.runs.model_file import ModelFile, Source
+from clsplat.runs.model_file import ModelFile, ModelSource
 from clsplat.runs.run_folder import Start
 from clsplat.runs.state import changed, is_done_with
 from clsplat.scene.identity import Identity, decode_all, require_whole
@@ -40,7 +40,7 @@ class Tuning:
     """With which photographs models are trained, as one is rendered, and how long."""
 
     name: str  # of the pipelines that are run
-    source: Source
+    source: ModelSource
     model: Model
     steps: int | None  # None: those of the recipe
     device: Device
@@ -227,7 +227,7 @@ class Measurer:
     def figures(self, model: Model) -> tuple[float, float]:
         """Return PSNR, dB, and SSIM."""
         views = self.opened.scene.split(self.split)
-        painter = Splats(self.rasterizer, model.upload(self.opened.device), self.photographs.background)
+        painter = SplatPainter(self.rasterizer, model.upload(self.opened.device), self.photographs.background)
         results = measure(painter, views, self.photographs)
         averages = mean(results)
         return averages["psnr"], averages["ssim"]

@@ -33,7 +33,7 @@ RECORD = "lod.json"
 
 
 @dataclass(frozen=True)
-class Plan:
+class LodPlan:
     """What is asked for."""
 
     levels: int = 4
@@ -57,7 +57,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Level:
+class DetailLevel:
     """One level; PSNR in dB, before it is quantised, where there are photographs."""
 
     model: Model
@@ -65,10 +65,10 @@ class Level:
     psnr: float | None = None
 
 
-class Training:
+class LevelTrainer:
     """Trains and measures levels."""
 
-    def __init__(self, opened: ModelFile, place: Path, plan: Plan) -> None:
+    def __init__(self, opened: ModelFile, place: Path, plan: LodPlan) -> None:
         self.place, self.plan, self.source = place, plan, opened.source
         self.steps = STEPS if plan.steps is None else plan.steps
         self.measurer = Measurer(opened)
@@ -83,12 +83,12 @@ class Training:
         question["photographs"] = self.measurer.identity()
         return claimed(self.place, question, RECORD, "the training of levels", "the name of another folder")
 
-    def measured(self, model: Model) -> Level:
+    def measured(self, model: Model) -> DetailLevel:
         """Return a level that is not trained."""
         psnr = self.measurer.figures(model)[0]
-        return Level(model, psnr, psnr)
+        return DetailLevel(model, psnr, psnr)
 
-    def trained(self, number: int, model: Model) -> Level:
+    def trained(self, number: int, model: Model) -> DetailLevel:
         """Return a level after its training."""
         merged = self.measured(model)
         if not self.steps:
@@ -98,7 +98,7 @@ class Training:
         size = {"scene.downscale": self.plan.downscale} if self.plan.downscale else {}
         pipeline = self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), **size})
         found = load(self.tuning.trained(pipeline, self.place / f"level_{number}"))
-        return Level(found, merged.psnr, self.measured(found).psnr)
+        return DetailLevel(found, merged.psnr, self.measured(found).psnr)
 
 
 NEIGHBOURS = 8  # of a Gaussian, among which its partner is
@@ -202,14 +202,14 @@ FEW = 1_000_000  # Gaussians, below which PlayCanvas advises one SOG
 
 
 def levels_of_detail(
-    model: Path, folder: Path, scene: Path | None = None, plan: Plan | None = None, device: Any = None
+    model: Path, folder: Path, scene: Path | None = None, plan: LodPlan | None = None, device: Any = None
 ) -> dict[str, Any]:
     """Write the levels of a model as streamed SOG; return its `folder`, `bytes`, the `split` measured, and `levels`.
 
     Where photographs are known, each coarser level is trained before the next one is merged from it, in run folders in
     FOLDER.training: what was interrupted goes on.  Raises ConfigError, DataError, OutputError.
     """
-    plan = plan or Plan()
+    plan = plan or LodPlan()
     require_free(folder)
     opened, first = _opened(model, scene, plan, device)
     if not len(first):
@@ -219,7 +219,7 @@ def levels_of_detail(
     if len(first) < FEW:
         told = amount(len(first), "Gaussian")
         LOG.warning("%s: has %s; below a million one SOG is better: `clsplat convert`", model, told)
-    training = Training(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
+    training = LevelTrainer(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
     with new_folder(folder) as place:
         with training.held() if training else nullcontext():
             levels = _levels(first, plan, training)
@@ -236,7 +236,7 @@ def levels_of_detail(
     }
 
 
-def _opened(model: Path, scene: Path | None, plan: Plan, device: Any) -> tuple[ModelFile | None, Model]:
+def _opened(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tuple[ModelFile | None, Model]:
     """The model with its photographs, or alone where there are none, and its Gaussians."""
     run = run_of(model) if scene is None else None
     if scene is None and run is None:
@@ -256,7 +256,7 @@ def _opened(model: Path, scene: Path | None, plan: Plan, device: Any) -> tuple[M
     return opened, opened.gaussians.baked()
 
 
-def _alone(model: Path, plan: Plan, device: Any, why: str) -> Model:
+def _alone(model: Path, plan: LodPlan, device: Any, why: str) -> Model:
     """The Gaussians of a model without photographs.  Raises ConfigError for what needs them."""
     alone = load(model).baked()
     given = {"--steps": plan.steps, "--downscale": plan.downscale, "--device": device}
@@ -274,16 +274,16 @@ def _fault_of_photographs(run: Path) -> DataError | None:
     return None
 
 
-def _levels(first: Model, plan: Plan, training: Training | None) -> list[Level]:
-    levels = [training.measured(first) if training else Level(first)]
+def _levels(first: Model, plan: LodPlan, training: LevelTrainer | None) -> list[DetailLevel]:
+    levels = [training.measured(first) if training else DetailLevel(first)]
     for number in range(1, plan.levels):
         fewer = decimated(levels[-1].model, plan.keep)
         LOG.info("level %d: %s", number, amount(len(fewer), "Gaussian"))
-        levels.append(training.trained(number, fewer) if training else Level(fewer))
+        levels.append(training.trained(number, fewer) if training else DetailLevel(fewer))
     return levels
 
 
-def _figures(folder: Path, number: int, level: Level) -> dict[str, Any]:
+def _figures(folder: Path, number: int, level: DetailLevel) -> dict[str, Any]:
     """Counts, size and PSNR of a level that was written."""
     size = sum(file.stat().st_size for file in folder.glob(f"{number}_*/*"))
     figures = {"level": number, "gaussians": len(level.model), "bytes": size}

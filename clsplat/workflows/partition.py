@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, amount
 from clsplat.core.files import write_text
 from clsplat.density.control import Box
-from clsplat.density.survey import WEIGHT, Look
+from clsplat.density.survey import WEIGHT, SurveyView
 from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import BUDGET_SHARE, Photographs
@@ -31,7 +31,7 @@ DIGITS = 9  # of a cut: more than single precision has
 
 
 @dataclass(frozen=True)
-class Cell:
+class PartitionCell:
     """A part of space, and the size of what lies in it."""
 
     box: Box
@@ -45,7 +45,7 @@ class Cell:
         return Box(low=low, high=high)
 
 
-def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[Cell]:
+def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[PartitionCell]:
     """Return `count` cells, each with about the same share of the weights, [N], of Gaussians at `means`, [N, 3].
 
     A cell of several shares is cut across its longest side.  Raises DataError where so many are not to be had.
@@ -56,7 +56,7 @@ def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[Cell
     return _cut(means.astype(np.float64), weights, Box(), count)
 
 
-def owners(means: NDArray[np.floating], found: list[Cell]) -> NDArray[np.int64]:
+def owners(means: NDArray[np.floating], found: list[PartitionCell]) -> NDArray[np.int64]:
     """Return the number of the cell in which each of the points, [N, 3], lies, [N].
 
     Raises DataError for points that are not numbers, which lie in none.
@@ -77,12 +77,12 @@ def quantile(values: Floats, weights: Floats, share: float) -> float:
     return float(values[order[min(int(np.searchsorted(total, share * total[-1])), len(order) - 1)]])
 
 
-def _cut(means: Floats, weights: Floats, box: Box, count: int) -> list[Cell]:
+def _cut(means: Floats, weights: Floats, box: Box, count: int) -> list[PartitionCell]:
     """The cells of a box, in which these Gaussians lie."""
     bounds = np.array([[quantile(means[:, axis], weights, share) for axis in range(3)] for share in CORE])
     size = bounds[1] - bounds[0]
     if count == 1:
-        return [Cell(box, size)]
+        return [PartitionCell(box, size)]
     axis, first = int(size.argmax()), count // 2
     place = _short(quantile(means[:, axis], weights, first / count))
     below = means[:, axis] < place
@@ -143,7 +143,7 @@ class Membership:
         return "sight" if self.share[view, block] > self.sight else "best"
 
 
-def pairs_of(looks: Iterable[Look], count: int, tile: int) -> Floats:
+def pairs_of(looks: Iterable[SurveyView], count: int, tile: int) -> Floats:
     """Return the (tile, Gaussian) pairs of N = `count` Gaussians over views, [N]: what their training costs.
 
     It is an estimate by the radius of a splat, which an image's sides bound.
@@ -156,7 +156,7 @@ def pairs_of(looks: Iterable[Look], count: int, tile: int) -> Floats:
     return total
 
 
-def share_of(look: Look, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
+def share_of(look: SurveyView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the share of a view's pixels that the Gaussians of each block make, [B], and which are seen, [N].
 
     owner: the block of each Gaussian, [N].  Pixels that a mask leaves out do not count.
@@ -177,7 +177,7 @@ class Block:
     """One part of the scene."""
 
     number: int
-    cell: Cell
+    cell: PartitionCell
     gaussians: int  # of the coarse model that it owns
     pairs: float  # share of those of the whole
     start: Bits  # [N] the Gaussians that it starts from: its own, and those that its views see, or none
@@ -260,7 +260,7 @@ class Partitioner:
         memory = self._memory(total, range(len(self.views)))
         return Partition(blocks, self.model, coarse, self.extent, memory, len(self.views))
 
-    def _members(self, owner: NDArray[np.int64], found: list[Cell], sight: float) -> tuple[Membership, Bits]:
+    def _members(self, owner: NDArray[np.int64], found: list[PartitionCell], sight: float) -> tuple[Membership, Bits]:
         """The views of each block, and the Gaussians that these see, or no view sees, [B, N]."""
         places = np.stack([view.position for view in self.views])
         inside = np.stack([cell.grown(NEAR_CELL).holds(places) for cell in found], axis=1)
@@ -274,9 +274,9 @@ class Partitioner:
             seen[block] |= share_of(look, owner, len(found))[1]
         return members, seen | ~seen.any(axis=0)  # what is hidden from all views may come to light in any
 
-    def _looks(self, views: Sequence[View]) -> Iterator[Look]:
+    def _looks(self, views: Sequence[View]) -> Iterator[SurveyView]:
         photographs = (self.photographs.get(view) for view in views)
-        return Look.each(self._rasterizer, self._uploaded, photographs, self.photographs.background)
+        return SurveyView.each(self._rasterizer, self._uploaded, photographs, self.photographs.background)
 
     def _listed(self, members: Membership, block: int) -> list[dict[str, Any]]:
         """The views of a block, in the order of the scene, with reasons."""

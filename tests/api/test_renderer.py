@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.api import device as devices
+from clsplat.api import renderer as devices
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.core.errors import NumericError

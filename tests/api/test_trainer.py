@@ -188,14 +188,14 @@ def test_folders_that_are_missing_or_taken_are_refused(tiny_scene, tmp_path):
 
 
 def test_the_lines_of_a_loop_of_ones_own_run(tiny_scene, device, capsys):
-    lines = inspect.getdoc(steps.Trainer).split("clsplat.load`:\n\n")[1].split("\n\nBetween")[0]
+    lines = inspect.getdoc(steps.StepTrainer).split("clsplat.load`:\n\n")[1].split("\n\nBetween")[0]
     from clsplat.render.rasterizer import Rasterizer
     from clsplat.training.adam import Adam, Rates
 
     scene = clsplat.read_scene(tiny_scene)
     scene = replace(scene, train=scene.train[:1] * 8)  # the same view in each step
     names = {"Adam": Adam, "Rates": Rates, "Rasterizer": Rasterizer, "SplatStats": SplatStats, "L1": L1, "Dssim": Dssim}
-    names |= {"Photographs": Photographs, "Trainer": steps.Trainer, "device": device, "scene": scene}
+    names |= {"Photographs": Photographs, "StepTrainer": steps.StepTrainer, "device": device, "scene": scene}
     names["model"] = clsplat.Trainer(scene, "smoke").model
     capsys.readouterr()
     exec(textwrap.dedent(lines), names)

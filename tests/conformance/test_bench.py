@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.bench.cases import Case, Peaks, Result, Work, case, run_bench, synthetic
+from clsplat.conformance.bench.cases import BenchCase, BenchResult, Peaks, Work, case, run_bench, synthetic
 from clsplat.conformance.bench.measurement import beside, read_measurement, table
 from clsplat.core.errors import ConfigError
 from clsplat.core.text_table import text_table
@@ -57,7 +57,7 @@ def test_a_case_that_moves_changes_nothing(device, rng):
     parameters[MOTION] = rng.normal(0, 0.3, (SIZE[2], 5)).astype(np.float32)
     pixels = rng.integers(0, 256, (3, SIZE[1], SIZE[0]), dtype=np.uint8)
     photograph = Photograph(upload_camera(device, replace(view, time=0.5)), device.upload(pixels))
-    timed = Case(device, parameters, photograph, "black", load("dynamic_7k").settings)
+    timed = BenchCase(device, parameters, photograph, "black", load("dynamic_7k").settings)
     np.testing.assert_allclose(timed.trainer.model.gaussians.get(MOTION), parameters[MOTION], rtol=0, atol=1e-20)
 
 
@@ -130,7 +130,7 @@ def test_a_table_in_text_is_plain_and_never_cut(monkeypatch):
 
 
 def test_the_table_of_a_scene_has_a_row_for_each_stage():
-    result = Result(
+    result = BenchResult(
         work=Work(gaussians=1000, pairs=2000, rows=3, pixels=4),
         stages={"project": 1.2, "blend": 30.0},
         floors={"project": 0.5},

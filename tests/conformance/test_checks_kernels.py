@@ -41,7 +41,7 @@ def test_the_figures_of_a_check_hold(device, check):
     worker._print(out, end=check.name, seconds=0.0)
     for line in out.getvalue().splitlines():
         lines.put(line)
-    told = supervision.Result(check.name, check.kernels)
+    told = supervision.CheckResult(check.name, check.kernels)
     assert supervision._fill(told, lines, 1) is None
     assert told.failures == []
     assert (len(told.figures), len(told.notes)) == (

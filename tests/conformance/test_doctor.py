@@ -16,7 +16,7 @@ from clsplat.conformance import doctor, reference, supervision
 from clsplat.conformance.check import Check, Figure, Note
 from clsplat.conformance.checks import BY_NAME, KERNELS, SPEED, whole
 from clsplat.conformance.doctor import DeviceReport, examine, judge, report_page
-from clsplat.conformance.supervision import Result, supervised
+from clsplat.conformance.supervision import CheckResult, supervised
 from clsplat.core.errors import ConfigError, MemoryLimitError, OutputError
 from clsplat.core.machine import is_alive
 from clsplat.opencl import runtimes
@@ -33,8 +33,8 @@ def checks(*names: str) -> list[Check]:
     return [Check(name, ("blend_backward",), None) for name in names]
 
 
-def result(*figures: Figure, fault: str | None = None) -> list[Result]:
-    return [Result("a check", ("blend_backward",), 1.0, list(figures), fault=fault)]
+def result(*figures: Figure, fault: str | None = None) -> list[CheckResult]:
+    return [CheckResult("a check", ("blend_backward",), 1.0, list(figures), fault=fault)]
 
 
 VERDICTS = {
@@ -195,7 +195,7 @@ def test_wide_is_tried_where_somebody_would_use_it(monkeypatch, info, empty_cach
     assert list(examine(device).schedules) == schedules
 
 
-def report_of(info, **schedules: list[Result]) -> DeviceReport:
+def report_of(info, **schedules: list[CheckResult]) -> DeviceReport:
     return DeviceReport(info, "wide", schedules, seconds=2.0)
 
 
@@ -212,7 +212,7 @@ def test_a_report_is_json_whatever_the_values_are(info):
 
 
 def test_the_page_shows_every_figure_and_the_head_of_a_build_log(info):
-    broken = Result("projection", ("project_forward",), fault="project.cl does not build", log="error: <unknown>")
+    broken = CheckResult("projection", ("project_forward",), fault="project.cl does not build", log="error: <unknown>")
     page = report_page(report_of(info, wide=[*result(WRONG, RIGHT), broken], simt=result(RIGHT)))
     assert Page(page).text
     for text in (
@@ -238,7 +238,7 @@ def memory_of(monkeypatch, largest: int, figure: Figure = RIGHT) -> tuple[list[s
     info = SimpleNamespace(memory=2**33, allocation=2**30 + 4)
     found = list(whole.memory(SimpleNamespace(info=info), None))
     figures, notes = ([one for one in found if isinstance(one, kind)] for kind in (Figure, Note))
-    once = [Result("memory", ("fill_words",), 1.0, figures, notes)]
+    once = [CheckResult("memory", ("fill_words",), 1.0, figures, notes)]
     return once[0].failures, DeviceReport(info, "wide", {"wide": result(RIGHT)}, once)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.conformance.reference import Camera, nerf
+from clsplat.conformance.reference import PinholeCamera, nerf
 
 SAMPLES, STEP = 5, 1e-5
 
@@ -17,11 +17,11 @@ def some_cones(rng: np.random.Generator, count: int = 3) -> np.ndarray:
     """Rays of a camera that is turned and moved."""
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     pose = np.column_stack([turn * np.linalg.det(turn), [0.3, -0.2, 4.0]])
-    return nerf.cones(Camera(pose, 20.0, 24.0, 7.5, 5.0, 16, 12), rng.integers(0, 192, count))
+    return nerf.cones(PinholeCamera(pose, 20.0, 24.0, 7.5, 5.0, 16, 12), rng.integers(0, 192, count))
 
 
 def test_ray_meets_pixel_center_and_cone_has_its_width(rng):
-    camera = Camera(np.eye(3, 4), 20.0, 24.0, 8.0, 6.0, 16, 12)
+    camera = PinholeCamera(np.eye(3, 4), 20.0, 24.0, 8.0, 6.0, 16, 12)
     (ray,) = nerf.cones(camera, np.array([3 * 16 + 5]))
     np.testing.assert_allclose(ray[3:6], [(5.5 - 8) / 20, (3.5 - 6) / 24, 1])
     neighbour = nerf.cones(camera, np.array([3 * 16 + 6]))[0]
@@ -82,7 +82,7 @@ def test_drawn_coarse_edges_keep_their_order(rng):
 
 @pytest.mark.parametrize("skip", [None, 0, 1])
 def test_the_gradient_of_a_field_is_that_of_finite_differences(rng, skip):
-    network, rays, width, position, direction = nerf.Network(3, skip), 2, 4, 6, 5
+    network, rays, width, position, direction = nerf.DenseNetwork(3, skip), 2, 4, 6, 5
     joined = [position if i - 1 == skip and skip is not None else 0 for i in range(3)]
     shapes = [(position, width), (width + joined[1], width), (width + joined[2], width)]
     shapes += [(width, 1), (width, width), (width + direction, width), (width, 3)]

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from clsplat.conformance.reference import nerf
-from clsplat.conformance.reference.nerf import Level
+from clsplat.conformance.reference.nerf import HashLevel
 from clsplat.nerf.shape import FEATURES, FieldShape, GridShape
 
 STEP = 1e-6
@@ -18,10 +18,10 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(5)
 
 
-@pytest.mark.parametrize("level", [Level(3, 64), Level(7, 16)], ids=["dense", "shared"])
+@pytest.mark.parametrize("level", [HashLevel(3, 64), HashLevel(7, 16)], ids=["dense", "shared"])
 def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
     """Through a network that reads the position twice, for samples inside and outside of the cube."""
-    samples, network = 12, nerf.Network(2, 0)
+    samples, network = 12, nerf.DenseNetwork(2, 0)
     at, variances = rng.uniform(-0.2, 1.2, (samples, 3)), rng.uniform(1e-3, 1e-1, samples)
     table, sines, direction = (
         rng.normal(size=(level.entries, 2)),
@@ -56,7 +56,7 @@ def test_gradient_of_grid_and_network_is_that_of_differences(rng, level):
 
 def test_a_linear_function_is_kept_by_the_mean_of_the_corners(rng):
     """Where a level tells all: entries that are the coordinates give the place, also at the faces of the cube."""
-    level = Level(5, 6**3)
+    level = HashLevel(5, 6**3)
     corners = np.stack(np.meshgrid(*3 * [np.arange(6)], indexing="ij"), axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
     at = np.concatenate([rng.random((20, 3)), [[0, 0, 0], [1, 1, 1], [1, 0, 0.5]]])
     np.testing.assert_allclose(level.forward(corners / 5, at, np.full(23, 1e-9)), at, atol=1e-12)
@@ -64,14 +64,14 @@ def test_a_linear_function_is_kept_by_the_mean_of_the_corners(rng):
 
 def test_places_outside_of_the_cube_have_no_features(rng):
     outside = np.array([[-1e-9, 0.5, 0.5], [0.5, 1 + 1e-9, 0.5], [0.5, 0.5, 7.0]])
-    np.testing.assert_array_equal(Level(4, 16).forward(rng.normal(size=(16, 4)), outside, np.ones(3)), 0.0)
+    np.testing.assert_array_equal(HashLevel(4, 16).forward(rng.normal(size=(16, 4)), outside, np.ones(3)), 0.0)
 
 
 def test_the_weight_of_a_level_is_nearly_that_of_the_paper():
     """erf(1 / sqrt(8 v n^2)), and so half of a cell's width under a normal distribution of the sample's size."""
     variances = 10.0 ** np.linspace(-8, 2, 60)
     expected = [math.erf(1 / math.sqrt(8 * v * 16**2)) for v in variances]
-    np.testing.assert_allclose(Level(16, 16).weights(variances), expected, atol=0.0071)
+    np.testing.assert_allclose(HashLevel(16, 16).weights(variances), expected, atol=0.0071)
 
 
 def test_levels_are_dense_while_corners_fit_and_are_contiguous():

@@ -20,14 +20,14 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(7)
 
 
-def simple_camera(width: int = WIDTH, height: int = HEIGHT, focal: float = 40.0) -> ref.Camera:
+def simple_camera(width: int = WIDTH, height: int = HEIGHT, focal: float = 40.0) -> ref.PinholeCamera:
     """At the origin, looking along z, principal point in the middle."""
-    return ref.Camera(np.eye(3, 4), focal, focal, width / 2, height / 2, width, height)
+    return ref.PinholeCamera(np.eye(3, 4), focal, focal, width / 2, height / 2, width, height)
 
 
-def isotropic(mean: list[float], scale: float, opacity: float, colour: list[float]) -> ref.Gaussians:
+def isotropic(mean: list[float], scale: float, opacity: float, colour: list[float]) -> ref.RawGaussians:
     """One round Gaussian of constant colour."""
-    return ref.Gaussians(
+    return ref.RawGaussians(
         means=[mean],
         quats=[[1, 0, 0, 0]],
         log_scales=[[np.log(scale)] * 3],
@@ -83,7 +83,9 @@ def check_gradients(analytic: dict[str, np.ndarray], holder: object, function) -
     return errors
 
 
-def check_chain(rng, gaussians: ref.Gaussians, camera: ref.Camera, degree: int, **screen) -> dict[str, np.ndarray]:
+def check_chain(
+    rng, gaussians: ref.RawGaussians, camera: ref.PinholeCamera, degree: int, **screen
+) -> dict[str, np.ndarray]:
     """Finite differences of parameters -> image -> weighted sum, with all thresholds off."""
     weights = rng.normal(0, 1, (3, camera.height, camera.width))
 
@@ -319,7 +321,7 @@ def test_jacobian_is_the_derivative_of_the_projection(rng):
 
 def test_limits_of_the_ray():
     """0.3 of half the field of view beyond the image's edges, wherever the principal point is."""
-    camera = ref.Camera(np.eye(3, 4), fx=40, fy=60, cx=10, cy=20, width=40, height=30)
+    camera = ref.PinholeCamera(np.eye(3, 4), fx=40, fy=60, cx=10, cy=20, width=40, height=30)
     expected = [[-(10 / 40 + 0.15), 30 / 40 + 0.15], [-(20 / 60 + 0.075), 10 / 60 + 0.075]]
     np.testing.assert_allclose(ref.ray_limits(camera), expected, rtol=1e-14)
     half = 1.3 * np.array([0.5, 0.375])  # the 1.3 tan of the centred camera
@@ -391,7 +393,7 @@ def test_order_of_gaussians_does_not_matter(rng):
     camera = general_camera()
     gaussians = random_gaussians(rng, camera, 1)
     shuffle = np.array([3, 0, 4, 1, 2])
-    shuffled = ref.Gaussians(
+    shuffled = ref.RawGaussians(
         **{
             name: np.take(values, shuffle, axis=0) if np.ndim(values) else values
             for name, values in vars(gaussians).items()

@@ -15,7 +15,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.data_tools import fetch as fetching
-from clsplat.data_tools.fetch import Source, fetch, named
+from clsplat.data_tools.fetch import WebArchive, fetch, named
 from tests.support.refusals import refusal
 
 
@@ -76,7 +76,7 @@ def archive(path: Path, names: tuple[str, ...] = ("scene/a.txt", "scene/ü/b.txt
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def quietly(source: Source, out: Path) -> list[str]:
+def quietly(source: WebArchive, out: Path) -> list[str]:
     lines: list[str] = []
     fetch(source, out, lines.append)
     return lines
@@ -85,10 +85,10 @@ def quietly(source: Source, out: Path) -> list[str]:
 def test_fetched(web, tmp_path):
     folder, address, server = web
     checksum = archive(folder / "d.zip")
-    quietly(Source(f"{address}/d.zip", "free", checksum), tmp_path / "data" / "d")
+    quietly(WebArchive(f"{address}/d.zip", "free", checksum), tmp_path / "data" / "d")
     assert (tmp_path / "data" / "d" / "scene" / "ü" / "b.txt").stat().st_size == 3000
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["d"]
-    assert quietly(Source(f"{address}/d.zip", "free"), tmp_path / "data" / "d")[0].endswith("nothing to do")
+    assert quietly(WebArchive(f"{address}/d.zip", "free"), tmp_path / "data" / "d")[0].endswith("nothing to do")
     assert len(server.asked) == 1
 
 
@@ -97,7 +97,7 @@ def test_a_broken_download_goes_on(web, tmp_path, ranges):
     folder, address, server = web
     checksum = archive(folder / "d.zip")
     server.breaks, server.ranges = 3, ranges
-    quietly(Source(f"{address}/d.zip", "free", checksum), tmp_path / "d")
+    quietly(WebArchive(f"{address}/d.zip", "free", checksum), tmp_path / "d")
     assert (tmp_path / "d" / "scene" / "a.txt").is_file()
     assert server.asked == ["", "bytes=1000-", "bytes=2000-", "bytes=3000-"] if ranges else ["", *["bytes=1000-"] * 3]
 
@@ -106,7 +106,7 @@ def test_a_download_that_breaks_for_good_is_kept(web, tmp_path):
     folder, address, server = web
     checksum = archive(folder / "d.zip")
     server.breaks = 5
-    source = Source(f"{address}/d.zip", "free", checksum)
+    source = WebArchive(f"{address}/d.zip", "free", checksum)
     assert "run it again to continue from 5000 bytes" in refusal(quietly, source, tmp_path / "d")
     assert [path.name for path in tmp_path.iterdir() if path.name != "web"] == ["d.d.zip.part"]
     quietly(source, tmp_path / "d")
@@ -116,17 +116,17 @@ def test_a_download_that_breaks_for_good_is_kept(web, tmp_path):
 def test_a_wrong_checksum(web, tmp_path):
     folder, address, _ = web
     archive(folder / "d.zip")
-    message = refusal(quietly, Source(f"{address}/d.zip", "free", "0" * 64), tmp_path / "d")
+    message = refusal(quietly, WebArchive(f"{address}/d.zip", "free", "0" * 64), tmp_path / "d")
     assert "expected 0000" in message
     assert [path.name for path in tmp_path.iterdir()] == ["web"]
-    assert any("no checksum is known" in line for line in quietly(Source(f"{address}/d.zip", ""), tmp_path / "d"))
+    assert any("no checksum is known" in line for line in quietly(WebArchive(f"{address}/d.zip", ""), tmp_path / "d"))
 
 
 @pytest.mark.parametrize("name", ["../evil.txt", "/evil.txt", "C:\\evil.txt", "a/../../evil.txt"])
 def test_archives_that_reach_out_of_their_folder(web, tmp_path, name):
     folder, address, _ = web
     archive(folder / "d.zip", ("scene/a.txt", name))
-    assert "outside of its folder" in refusal(quietly, Source(f"{address}/d.zip", ""), tmp_path / "d")
+    assert "outside of its folder" in refusal(quietly, WebArchive(f"{address}/d.zip", ""), tmp_path / "d")
     assert not (tmp_path / "d").exists()
     assert not list(tmp_path.rglob("evil.txt"))
 
@@ -140,15 +140,15 @@ def test_tar_links_are_left_out(web, tmp_path):
         link = tarfile.TarInfo("scene/link")
         link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
         tarred.addfile(link)
-    quietly(Source(f"{address}/d.tar.gz", ""), tmp_path / "d")
+    quietly(WebArchive(f"{address}/d.tar.gz", ""), tmp_path / "d")
     assert [path.name for path in (tmp_path / "d" / "scene").iterdir()] == ["a.txt"]
 
 
 def test_what_cannot_be_fetched(web, tmp_path):
     folder, address, _ = web
     (folder / "page.html").write_text("hello")
-    assert "the server sent 404" in refusal(quietly, Source(f"{address}/none.zip", ""), tmp_path / "d")
-    assert "expected a ZIP or TAR archive" in refusal(quietly, Source(f"{address}/page.html", ""), tmp_path / "d")
+    assert "the server sent 404" in refusal(quietly, WebArchive(f"{address}/none.zip", ""), tmp_path / "d")
+    assert "expected a ZIP or TAR archive" in refusal(quietly, WebArchive(f"{address}/page.html", ""), tmp_path / "d")
     with pytest.raises(ConfigError, match="no data set named 'garden'; there are mipnerf360"):
         named("garden")
     assert not (tmp_path / "d").exists()

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from clsplat import cli
 from clsplat.core.errors import DataError, OutputError
 from clsplat.data_tools import synthetic
-from clsplat.data_tools.shapes import Box, Cylinder, Shape, Sphere
+from clsplat.data_tools.shapes import Cuboid, Cylinder, Shape, Sphere
 from clsplat.data_tools.still_life import SCENE
-from clsplat.data_tools.synthetic import STILL_LIFE, Options, write_dataset
+from clsplat.data_tools.synthetic import STILL_LIFE, SyntheticOptions, write_dataset
 from clsplat.scene.points import read_points_ply
 
 Array = NDArray[Any]
 
-TINY = Options(size=24, train=4, test=2)
+TINY = SyntheticOptions(size=24, train=4, test=2)
 
 
 def plain(points: Array) -> Array:
@@ -56,7 +56,7 @@ def test_sphere_distance_is_closed_form() -> None:
 
 
 def test_box_faces_turn_with_it() -> None:
-    box = Box(centre=(1, 2, 3), half=(0.5, 0.25, 0.1), paint=plain, yaw=30)
+    box = Cuboid(centre=(1, 2, 3), half=(0.5, 0.25, 0.1), paint=plain, yaw=30)
     side, top = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0]), np.array([0, 0, 1])
     points = np.stack([[1, 2, 3] + 0.5 * side, [1, 2, 3] + 0.1 * top], axis=1)
     outward = np.stack([side, top], axis=1)
@@ -116,7 +116,7 @@ def test_alpha_is_the_silhouette(dataset: Path) -> None:
 
 
 def test_test_cameras_stand_between_the_training_cameras() -> None:
-    for options in (TINY, Options()):
+    for options in (TINY, SyntheticOptions()):
         train, test = (np.array(poses)[:, :3, 2] for poses in options.poses().values())
         assert np.degrees(np.arccos((test @ train.T).max())) > 4
         assert np.degrees(np.arcsin(test[:, 2])).min() > 10
@@ -130,7 +130,7 @@ def distance_to_surface(shape: Shape, points: Array) -> Array:
             return np.asarray(np.linalg.norm(p, axis=0) - shape.radius)
         case Cylinder():
             q = np.stack([np.hypot(p[0], p[1]) - shape.radius, p[2] - shape.half])
-        case Box():
+        case Cuboid():
             q = p - np.array(shape.half)[:, None]
     return np.asarray(np.linalg.norm(np.maximum(q, 0), axis=0) + np.minimum(q.max(axis=0), 0))
 
@@ -158,7 +158,7 @@ def test_a_finished_data_set_is_kept(dataset: Path) -> None:
     assert "complete already" in write_dataset(dataset, TINY)
     assert before == {p: p.stat().st_mtime_ns for p in dataset.rglob("*")}
     with pytest.raises(DataError, match="not this data set"):
-        write_dataset(dataset, Options(size=24, train=4, test=2, seed=1))
+        write_dataset(dataset, SyntheticOptions(size=24, train=4, test=2, seed=1))
 
 
 def test_other_folders_are_refused_and_not_touched(
@@ -180,5 +180,5 @@ def test_a_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(synthetic, "write_points_ply", full)
     with pytest.raises(OutputError, match="No space left"):
-        write_dataset(tmp_path / "out", Options(size=8, train=1, test=1), workers=1)
+        write_dataset(tmp_path / "out", SyntheticOptions(size=8, train=1, test=1), workers=1)
     assert not list(tmp_path.iterdir())

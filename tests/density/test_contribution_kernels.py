@@ -7,14 +7,14 @@ from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.checks.density import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.importance import contributions
-from clsplat.density.survey import Look
+from clsplat.density.survey import SurveyView
 from clsplat.opencl.device import Device
-from clsplat.render.rasterizer import Budget, Rasterizer
+from clsplat.render.rasterizer import Rasterizer, RenderLimits
 from tests.support.devices import on_devices, on_one_setting
 
 
 def weights(rasterizer, model, photographs):
-    looks = Look.each(rasterizer, model, photographs, rasterizer.device.zeros(3))
+    looks = SurveyView.each(rasterizer, model, photographs, rasterizer.device.zeros(3))
     return contributions(looks, model.gaussians.count)
 
 
@@ -50,7 +50,7 @@ def test_sums_over_views_in_bands_have_the_same_bits(device, rng):
     case = random_case(rng, 60, 70, 50)
     photographs = [photograph_of(device, case)] * 3
     whole = weights(Rasterizer(device, "radix"), case.model(device), photographs)
-    bands = weights(Rasterizer(device, "radix", Budget(60, 3)), case.model(device), photographs)
+    bands = weights(Rasterizer(device, "radix", RenderLimits(60, 3)), case.model(device), photographs)
     np.testing.assert_array_equal(whole, bands)
     once = weights(Rasterizer(device, "radix"), case.model(device), photographs[:1])
     np.testing.assert_allclose(whole, 3 * once, rtol=1e-6)

@@ -12,7 +12,7 @@ from clsplat.density.thresholds import SceneScale
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import moment_tables
-from clsplat.methods.adc import Clone, PruneFaint, PruneLarge, Split
+from clsplat.methods.adc import Clone, PruneFaint, PruneLarge, SplitLarge
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
@@ -20,7 +20,7 @@ from tests.support.devices import each_once, on_devices, on_one_setting
 
 RULES = [
     Clone(gradient_above=2e-4, size_below=0.01),
-    Split(gradient_above=2e-4, size_above=0.01, children=2, shrink=1.6),
+    SplitLarge(gradient_above=2e-4, size_above=0.01, children=2, shrink=1.6),
     PruneFaint(opacity_below=0.005),
     PruneLarge(size_above=0.1, start=3000),
 ]
@@ -95,7 +95,7 @@ def test_rows_sharing_an_opacity_transmit_as_much_as_one_did(device, rng, count,
     for name in (SCREEN_GRAD, SEEN):
         gaussians.set(name, np.ones((count, 1)))
     large = np.exp(gaussians.get("log_scales")).max(axis=1) > 0.05
-    rules = [Clone(size_below=0.05, opacity="shared"), Split(size_above=0.05, children=children, opacity="shared")]
+    rules = [Clone(size_below=0.05, opacity="shared"), SplitLarge(size_above=0.05, children=children, opacity="shared")]
     edit = Edit(gaussians, stats, SceneScale(1.0), step=700, seed=1)
     densify(edit, rules, Rasterizer(device, "radix").tiler)
     rows = np.where(large, children, 2)
@@ -124,7 +124,7 @@ def test_children_follow_their_parents_distribution(device, rng):
     for name in (SCREEN_GRAD, SEEN):
         gaussians.set(name, np.ones((count, 1)))
     edit = Edit(gaussians, stats, SceneScale(1.0), step=700, seed=1)
-    densify(edit, [Split(size_above=1e-6)], Rasterizer(device, "radix").tiler)
+    densify(edit, [SplitLarge(size_above=1e-6)], Rasterizer(device, "radix").tiler)
     assert gaussians.count == 2 * count
     q = p["quats"][0].astype(np.float64)
     rotation = ref.rotation_matrix(q / np.linalg.norm(q))
@@ -155,7 +155,7 @@ def test_everything_may_be_pruned(device, rng):
 @on_one_setting
 def test_capacity_grows_when_needed(device, rng):
     _, gaussians, change = edited(
-        device, rng, 64, 600, rules=[Split(gradient_above=1e-12, size_above=1e-9, children=8)]
+        device, rng, 64, 600, rules=[SplitLarge(gradient_above=1e-12, size_above=1e-9, children=8)]
     )
     assert change.after > 64
     assert gaussians.capacity >= change.after

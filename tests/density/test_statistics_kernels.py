@@ -13,7 +13,7 @@ from clsplat.density.edit import Edit
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.losses.base import ViewGradients
-from clsplat.methods.adc import Clone, PruneFaint, Split
+from clsplat.methods.adc import Clone, PruneFaint, SplitLarge
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from tests.support.devices import on_devices, on_one_setting, product
@@ -139,7 +139,7 @@ def test_absgs_splits_where_gradients_cancel(device):
     """Clone by the ordinary gradient, split by the absolute one, divided at 0.001 of the extent."""
     rules = [
         Clone(gradient_above=2e-4, size_below=0.001),
-        Split(statistic="screen_grad_abs", gradient_above=4e-4, size_above=0.001),
+        SplitLarge(statistic="screen_grad_abs", gradient_above=4e-4, size_above=0.001),
         PruneFaint(),
     ]
     cases = [

@@ -9,24 +9,26 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.density.importance import sensitivities
-from clsplat.density.survey import BLENDED, SQUARE, WEIGHT, Look, Survey
+from clsplat.density.survey import BLENDED, SQUARE, WEIGHT, Survey, SurveyView
 from clsplat.losses.image import L1, Dssim
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Mask, Photograph
-from clsplat.render.rasterizer import PIXEL_SUMS, Budget, Rasterizer
+from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer, RenderLimits
 from tests.support.devices import on_devices, on_one_setting
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 SIZES = [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 24, 24)]
 
 
-def look_at(device: Device, case: Case, rng=None, mask: Mask | None = None, budget: Budget | None = None) -> Look:
+def look_at(
+    device: Device, case: Case, rng=None, mask: Mask | None = None, budget: RenderLimits | None = None
+) -> SurveyView:
     """The view of a case, with a random photograph."""
     camera, (width, height) = case.device_camera(device), case.size
     colours = np.zeros((3, height, width)) if rng is None else rng.integers(0, 256, (3, height, width))
     uploaded = None if mask is None else device.upload(mask[None].astype(np.uint8))
     photograph = Photograph(camera, device.upload(colours.astype(np.uint8)), uploaded)
-    return Look.at(Rasterizer(device, "radix", budget), case.model(device), photograph, device.upload(BACKGROUND))
+    return SurveyView.at(Rasterizer(device, "radix", budget), case.model(device), photograph, device.upload(BACKGROUND))
 
 
 def squares(case: Case) -> np.ndarray:
@@ -52,7 +54,7 @@ def test_numbers_of_flagged_pixels_are_exact(device, rng, count, width, height):
 def test_squares_are_those_of_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     look = look_at(device, case)
-    looks = Look.each(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
+    looks = SurveyView.each(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
     found = sensitivities(looks, look.model.gaussians.count)
     assert found.shape == (count,)
     expected = 2 * squares(case)
@@ -95,7 +97,7 @@ def test_other_sums_do_not_change(device, rng):
 def test_bands_and_repetitions_have_the_same_bits(device, rng):
     case = random_case(rng, 60, 70, 50)
     flags = rng.random((50, 70)) < 0.5
-    looks = [look_at(device, case), look_at(device, case, budget=Budget(60, 3)), look_at(device, case)]
+    looks = [look_at(device, case), look_at(device, case, budget=RenderLimits(60, 3)), look_at(device, case)]
     for number, plane, channel in ((BLENDED, flags, None), (WEIGHT, None, None), (SQUARE, None, 1)):
         found = [look.sum(number, plane, channel) for look in looks]
         assert found[0].any()

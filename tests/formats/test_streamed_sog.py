@@ -14,7 +14,7 @@ from clsplat.core.files import new_folder
 from clsplat.formats import streamed_sog
 from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import SplatFile, Writing
-from clsplat.formats.streamed_sog import Limits, half_boxes, tree, write_lod
+from clsplat.formats.streamed_sog import LeafLimits, half_boxes, tree, write_lod
 from clsplat.formats.table import bytes_of, detect, read, write
 from clsplat.gaussians.conversion import convert
 from clsplat.gaussians.model import load
@@ -24,7 +24,7 @@ from tests.support.models import assert_close, interop, splats
 from tests.support.runs import NO_PROCESS
 
 BOUND = (-13.10682, -4.463487, -3.914306), (10.55131, 2.742857, 14.0425)  # of its root
-SMALL = Limits(splats=300, extent=4.0, few=50)
+SMALL = LeafLimits(splats=300, extent=4.0, few=50)
 
 
 def levels(rng: np.random.Generator, counts: tuple[int, ...] = (700, 300, 100)) -> list[SplatFile]:
@@ -95,7 +95,7 @@ def test_the_finest_level_comes_back(written):
 
 def test_a_leaf_is_divided_while_it_has_too_many_or_is_too_wide(rng):
     parameters = splats(rng, 700).parameters
-    for limits in (SMALL, Limits(100, 1e9, 1), Limits(1000, 1.0, 20)):
+    for limits in (SMALL, LeafLimits(100, 1e9, 1), LeafLimits(1000, 1.0, 20)):
         found = list(tree([parameters], limits).leaves())
         for leaf in found:
             span = np.ptp(parameters["means"][leaf.rows[0]], axis=0).max()

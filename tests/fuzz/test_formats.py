@@ -12,7 +12,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.formats.splats import Reading, Writing
-from clsplat.formats.streamed_sog import Limits, write_lod
+from clsplat.formats.streamed_sog import LeafLimits, write_lod
 from clsplat.formats.table import CODECS, bytes_of, detect, read, write
 from clsplat.gaussians.validate import examine
 from tests.fuzz.mutation import damaged, fuzzed, misbuilt, one_of
@@ -119,7 +119,7 @@ def test_a_damaged_part_of_a_sog_is_read_or_refused(folder: Path):
 def test_a_damaged_tree_of_levels_is_read_or_refused(folder: Path):
     """The parts are whole; their lod-meta.json is not, or is another tree."""
     levels = [splats(RNG, count, 1) for count in (60, 20)]
-    write_lod(folder / "levels", levels, limits=Limits(40, 2.0, 10))
+    write_lod(folder / "levels", levels, limits=LeafLimits(40, 2.0, 10))
     path = folder / "levels" / "lod-meta.json"
     whole = path.read_bytes()
 

@@ -7,7 +7,7 @@ import numpy as np
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.training import DROPOUT, dropout_figures, hidden_figures
 from clsplat.conformance.scenes import random_case, with_world_filter
-from clsplat.gaussians.gaussians import Dropout
+from clsplat.gaussians.gaussians import DropoutMask
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.devices import on_devices, on_one_setting
 from tests.support.figures import hold
@@ -47,7 +47,7 @@ def test_the_mean_of_many_pictures_is_the_picture(device, rng):
     plain = rasterizer.forward(model, camera, device.zeros(3)).image.get().astype(np.float64)
     total, steps = np.zeros_like(plain), 500
     for step in range(steps):
-        drawn = replace(model, dropout=Dropout(0.2, 3, step))
+        drawn = replace(model, dropout=DropoutMask(0.2, 3, step))
         total += rasterizer.forward(drawn, camera, device.zeros(3)).image.get()
     assert abs(total.sum() / steps / plain.sum() - 1) < 0.01
     assert plain.sum() > 10

@@ -51,7 +51,7 @@ def test_reference_gradient_is_that_of_finite_differences(rng):
     gaussians, camera, weights = case.gaussians(), case.camera(), rng.normal(size=(20, 24))
     numbers = {**case.numbers(), "thresholds": ref.SMOOTH}
 
-    def loss(moved: ref.Gaussians) -> float:
+    def loss(moved: ref.RawGaussians) -> float:
         splats = ref.project(moved, camera, case.degree, **numbers)
         return float((weights * ref.inverse_depth(splats, 24, 20, ref.SMOOTH)).sum())
 

@@ -12,12 +12,12 @@ from clsplat.metrics.views import render_floats
 from clsplat.photos.depths import PointDepths
 from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import upload_camera
-from clsplat.render.painter import Splats
+from clsplat.render.painter import SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import Tracks
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.depth_supervision import KnownDepthsState
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 from tests.support.devices import on_one_setting
 
 DEPTH, BEGUN, STEPS, NAMES = 4.0, 3.4, 160, ["0", "1", "2"]
@@ -39,7 +39,7 @@ def error_after(device, weight: float) -> float:
     for number in range(len(NAMES)):
         pose = np.column_stack([np.eye(3), [0.3 * number - 0.3, 0, 0]]).astype(np.float32)
         camera = replace(upload_camera(device, replace(case.view, world_to_camera=pose)), view=number)
-        values = np.clip(render_floats(Splats(rasterizer, model, black), camera), 0, 1)
+        values = np.clip(render_floats(SplatPainter(rasterizer, model, black), camera), 0, 1)
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
         photographs.append(Photograph(camera, device.upload(pixels)))
     points = tables["means"][plain].astype(np.float64)
@@ -47,7 +47,7 @@ def error_after(device, weight: float) -> float:
     begun[plain] *= BEGUN / DEPTH
     model.gaussians.set("means", begun)
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians), black
-    trainer = Trainer(*parts, [L1(weight=0.8), InverseDepth(weight=weight)], RATES)
+    trainer = StepTrainer(*parts, [L1(weight=0.8), InverseDepth(weight=weight)], RATES)
     tracks = Tracks(points, {name: np.arange(len(points)) for name in NAMES})
     trainer.modules = [KnownDepthsState(PointDepths(device, tracks, NAMES, 2.0))]
     for step in range(1, STEPS + 1):

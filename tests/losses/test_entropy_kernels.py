@@ -15,7 +15,7 @@ from clsplat.losses.base import Comparison
 from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, WeightEntropy
 from clsplat.opencl.device import Device
-from clsplat.render.rasterizer import PIXEL_SUMS, Budget, Rasterizer
+from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer, RenderLimits
 from clsplat.stages.optimize import Optimize
 from tests.support.device_images import SIZES, trainer_of
 from tests.support.devices import on_devices, on_one_setting, product
@@ -35,7 +35,7 @@ def entropy_of(device: Device, case: Case, sort: str = "radix") -> np.ndarray:
     return found[3, :height, :width]
 
 
-def pixel_sums_of(device: Device, case: Case, weights: np.ndarray, budget: Budget | None = None) -> np.ndarray:
+def pixel_sums_of(device: Device, case: Case, weights: np.ndarray, budget: RenderLimits | None = None) -> np.ndarray:
     """Sums over each Gaussian's pixels under the loss Σ weights · (image, entropy), [N, PIXEL_SUMS]."""
     rasterizer, model, camera = Rasterizer(device, "radix", budget), case.model(device), case.device_camera(device)
     frame = rasterizer.forward(model, camera, device.upload(BACKGROUND), "entropy")
@@ -119,7 +119,7 @@ def test_schedules_sorts_and_bands_give_the_same(device, rng):
     weights = rng.normal(size=(4, 70, 50)).astype(np.float32)
     entropy, sums = entropy_of(device, case), pixel_sums_of(device, case, weights)
     np.testing.assert_array_equal(entropy_of(device, case, "bitonic"), entropy)
-    np.testing.assert_array_equal(pixel_sums_of(device, case, weights, Budget(250, 3)), sums)
+    np.testing.assert_array_equal(pixel_sums_of(device, case, weights, RenderLimits(250, 3)), sums)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
     same_of_schedules(device, entropy_of(other, case), entropy)
     assert relative_error(pixel_sums_of(other, case, weights), sums) < 1e-5

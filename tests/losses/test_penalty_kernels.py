@@ -6,7 +6,7 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
 from clsplat.gaussians.gaussians import INTERVAL2
-from clsplat.gaussians.structs import Gradients
+from clsplat.gaussians.structs import GaussianGradients
 from clsplat.losses.base import LossValue, PenaltyInputs
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
 from clsplat.render.workspace import Workspace
@@ -21,7 +21,7 @@ def inputs_of(device, rng, count: int) -> tuple[PenaltyInputs, np.ndarray]:
     case = random_case(rng, count)
     case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
     gaussians = case.model(device).gaussians
-    gradients = Gradients(gaussians)
+    gradients = GaussianGradients(gaussians)
     for name in ("log_scales", "logit_opacity"):
         planes = np.zeros((gaussians.tables[name].components, gaussians.capacity), np.float32)
         planes[:, :count] = 0.25

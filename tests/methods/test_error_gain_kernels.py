@@ -17,7 +17,7 @@ from clsplat.methods.adc import Clone
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 from tests.support.devices import on_devices, on_one_setting
 
 SIZES = ((1, 1), (5, 3), (16, 16), (17, 33), (255, 12), (257, 9), (600, 4))
@@ -51,7 +51,7 @@ def stats_of(device, count, exposure, losses, mask=None, views=1) -> SplatStats:
     model, background = case.model(device), device.upload(np.full(3, 0.4 * exposure, np.float32))
     stats = SplatStats(model.gaussians, COLUMNS)
     rates = Rates(means=0.0, log_scales=0.0, quats=0.0, logit_opacity=0.0, sh_base=0.0, sh_rest=0.0)
-    trainer = Trainer(
+    trainer = StepTrainer(
         Rasterizer(device, "radix"), model, Adam(model.gaussians), stats, background, losses=losses, rates=rates
     )
     for step in range(1, views + 1):

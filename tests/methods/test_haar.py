@@ -20,7 +20,7 @@ from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 from tests.support.devices import each_once, on_devices, on_one_setting, product
 from tests.support.figures import hold
 from tests.support.runs import train
@@ -118,12 +118,12 @@ def test_the_loss_of_the_filter_and_its_derivatives(learn):
 # ---- in a training step
 
 
-def trainer_of(device, rng, losses, masked: bool = True, **settings) -> tuple[Trainer, HaarState, Photograph]:
+def trainer_of(device, rng, losses, masked: bool = True, **settings) -> tuple[StepTrainer, HaarState, Photograph]:
     case = random_case(rng, 60, 41, 30)
     model = case.model(device)
     parts = Adam(model.gaussians), SplatStats(model.gaussians), device.zeros(3)
     haar = HaarState(Haar(**settings))
-    trainer = Trainer(Rasterizer(device, "radix"), model, *parts, losses, Rates(), modules=[haar])
+    trainer = StepTrainer(Rasterizer(device, "radix"), model, *parts, losses, Rates(), modules=[haar])
     colours = rng.integers(0, 256, (3, 30, 41)).astype(np.uint8)
     mask = device.upload((rng.random((1, 30, 41)) < 0.7).astype(np.uint8)) if masked else None
     return trainer, haar, Photograph(case.device_camera(device), device.upload(colours), mask)

@@ -107,7 +107,7 @@ def test_scene_matrix_holds_where_perspective_is_constant(rng, far, bound):
     camera = replace(eye, world_to_camera=away, fx=far * eye.fx, fy=far * eye.fy)
 
     def projected(moved: np.ndarray) -> ref.Splats:
-        own = ref.Gaussians(scene.means + moved, scene.quats, scene.log_scales, scene.logit_opacity, scene.sh)
+        own = ref.RawGaussians(scene.means + moved, scene.quats, scene.log_scales, scene.logit_opacity, scene.sh)
         return ref.project(own, camera, 0, thresholds=ref.SMOOTH)
 
     still = projected(np.zeros(3))

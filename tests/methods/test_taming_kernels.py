@@ -15,7 +15,7 @@ from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
-from clsplat.methods.adc import Clone, Split
+from clsplat.methods.adc import Clone, SplitLarge
 from clsplat.methods.taming import GrowScored, Parabola, PruneScored, by_median, view_scores
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
@@ -87,7 +87,7 @@ def edit_of(device, rng, sizes, opacity=0.5, losses=1.0, gradient=1.0) -> Edit:
 def test_growth_keeps_to_the_budget_and_to_the_shares(device, rng, limit):
     """60 to clone and 30 to split in two: the room is divided two to one."""
     edit = edit_of(device, rng, np.repeat([0.005, 0.05, 0.005], [60, 30, 10]), gradient=np.repeat([1.0, 0.0], [90, 10]))
-    rules = [Clone(size_below=0.01), Split(size_above=0.01), GrowScored()]
+    rules = [Clone(size_below=0.01), SplitLarge(size_above=0.01), GrowScored()]
     change = densify(edit, rules, Rasterizer(device, "radix").tiler, limit)
     room = 90 if limit is None else min(90, max(0, limit - 100))
     assert change.after == 100 + room

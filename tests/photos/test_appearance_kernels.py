@@ -16,7 +16,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, Gain, change_colours
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 from tests.support.devices import on_devices, on_one_setting, product
 from tests.support.figures import hold
 
@@ -48,7 +48,7 @@ class Case:
         camera = replace(case.device_camera(device), view=1)
         self.photograph = Photograph(camera, device.upload(pixels), mask)
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
-        self.trainer = Trainer(*parts, device.upload(BACKGROUND), losses, Rates(), numbers=self.numbers)
+        self.trainer = StepTrainer(*parts, device.upload(BACKGROUND), losses, Rates(), numbers=self.numbers)
         if colours:
             state, gains = ExposureState(Exposure(model=colours), ("a", "b")), np.array([0.3, 0.1, -0.2])
             state.rate, state.numbers = 0.01, self.numbers

@@ -15,12 +15,12 @@ from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import DeviceCamera, upload_camera
-from clsplat.render.painter import Splats
+from clsplat.render.painter import SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState
 from clsplat.training.modules.exposure import ColourState, Exposure, ExposureState, Gain
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 
 VIEWS, STEPS = 8, 240
 NAMES = [str(number) for number in range(VIEWS)]
@@ -59,21 +59,21 @@ class Capture:
 
     def rendered(self, camera: DeviceCamera) -> np.ndarray:
         """The model's own colours, [H, W, 3]."""
-        return render_floats(Splats(self.rasterizer, self.model, self.background), camera)
+        return render_floats(SplatPainter(self.rasterizer, self.model, self.background), camera)
 
     @property
     def white(self) -> float:
         """The share of values that are white."""
         return float(np.mean([photograph.image() == 255 for photograph in self.photographs]))
 
-    def trained(self, rng: np.random.Generator, state: ColourState) -> Trainer:
+    def trained(self, rng: np.random.Generator, state: ColourState) -> StepTrainer:
         """Train from other colours; return the trainer, whose module is the state."""
         gaussians = self.model.gaussians
         gaussians.set("sh_base", self.colours + rng.normal(0, 0.3, self.colours.shape).astype(np.float32))
         state.rate = state.settings.rate_of(STEPS, VIEWS, False)
         state.begin_with({})
         parts = self.rasterizer, self.model, Adam(gaussians), SplatStats(gaussians, []), self.background
-        trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), RATES, modules=[state])
+        trainer = StepTrainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), RATES, modules=[state])
         for step in range(1, STEPS + 1):
             trainer.step(self.photographs[(step * 3) % VIEWS], step)
         return trainer
@@ -84,13 +84,13 @@ class Capture:
         self.trained(rng, state)
         return np.log([np.diag(state.matrix(number)) for number in range(VIEWS)])
 
-    def shown(self, trainer: Trainer, number: int) -> np.ndarray:
+    def shown(self, trainer: StepTrainer, number: int) -> np.ndarray:
         """The image of a training view in the colours of its photograph, [H, W, 3]."""
         view = trainer.compare(self.photographs[number], STEPS)
         height, width = view.frame.camera.height, view.frame.camera.width
         return view.comparison.image.get()[:3, :height, :width].transpose(1, 2, 0)
 
-    def fit(self, trainer: Trainer) -> float:
+    def fit(self, trainer: StepTrainer) -> float:
         """The mean PSNR at the training views in the colours of their photographs, dB."""
         pairs = ((self.shown(trainer, number), one.image()) for number, one in enumerate(self.photographs))
         return float(np.mean([psnr(image, photograph) for image, photograph in pairs]))

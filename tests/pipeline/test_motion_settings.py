@@ -1,33 +1,29 @@
 """Settings that do not go together with Gaussians that move are refused, with what to write instead."""
 
 import re
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import pytest
 
 from clsplat.core.errors import ConfigError
+from clsplat.core.settings import rebuild
+from clsplat.losses.base import Penalty
 from clsplat.pipeline.loading import load
 
 PIXELS = "optimize.losses=[l1, {type: covariance_trace, pixels: 2.0}]"
 
 
 @pytest.mark.parametrize(
-    ("override", "what", "remedy"),
+    ("override", "what"),
     [
-        (
-            "model.world_filter=smoothing",
-            "model.world_filter.type 'smoothing'",
-            "set `world_filter: {type: none}`",
-        ),
-        (
-            "densify.rules=[merge_neighbours]",
-            "stages[1] optimize: the rule 'merge_neighbours'",
-            "give densify.rules without merge_neighbours",
-        ),
-        (PIXELS, "stages[1] optimize: the loss 'covariance_trace' with `pixels`", "remove the loss"),
+        ("model.world_filter=smoothing", "model.world_filter: 'smoothing'"),
+        ("densify.rules=[merge_neighbours]", "stages[1].optimize.during[1].densify.rules[0]: 'merge_neighbours'"),
+        (PIXELS, "stages[1].optimize.losses[1]: 'covariance_trace'"),
     ],
 )
-def test_what_reads_places_at_rest_is_refused_beside_motion(override, what, remedy):
-    with pytest.raises(ConfigError, match=f"{re.escape(what)} reads .* beside model.time: {re.escape(remedy)}, or"):
+def test_what_reads_places_at_rest_is_refused_beside_motion(override, what):
+    with pytest.raises(ConfigError, match=f"{re.escape(what)} does not go together with .* \\(model.time\\): it reads"):
         load("dynamic_7k", [override])
     load("splat_7k", [override])
 
@@ -35,16 +31,16 @@ def test_what_reads_places_at_rest_is_refused_beside_motion(override, what, reme
 @pytest.mark.parametrize(
     ("stage", "words"),
     [
-        ("cleanup", r"the rule 'prune_far', which it has by default, reads .*: give cleanup.rules without prune_far"),
-        ("cleanup: {rules: [prune_far]}", r"the rule 'prune_far' reads .*: give cleanup.rules without prune_far"),
-        ("reinit_from_depth", "a depth is of one moment; expected Gaussians that stand still: remove the stage"),
+        ("cleanup", r".rules\[\d\]: 'prune_far' does not go .*: it reads .*; leave one of them out"),
+        ("cleanup: {rules: [prune_far]}", r".rules\[0\]: 'prune_far' does not go .*: it reads"),
+        ("reinit_from_depth", ": 'reinit_from_depth' does not go .*: a depth is of one moment; leave the stage"),
     ],
 )
 def test_stages_that_need_rest_are_refused_on_reading(tmp_path, stage, words):
     path = tmp_path / "x.yaml"
     text = f"name: x\nmodel: {{time: {{}}}}\nstages:\n  - init\n  - {stage}\n  - export\n"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=rf"stages\[1\] {stage.partition(':')[0]}: {words}"):
+    with pytest.raises(ConfigError, match=rf"x.yaml: stages\[1\].{stage.partition(':')[0]}{words}"):
         load(str(path))
     path.write_text(text.replace("model: {time: {}}\n", ""))
     load(str(path))
@@ -69,3 +65,26 @@ def test_numbers_that_no_training_survives_are_refused(pipeline, override, bound
 
 def test_filters_and_rules_that_read_no_positions_allow_motion():
     load("dynamic_7k", ["model.screen_filter=mip", "densify.rules=[clone, split_saddle, prune_unimportant]"])
+
+
+def test_a_class_of_a_plugin_declares_a_conflict_in_its_stage(tmp_path, without_plugins):
+    class Wave(Penalty):
+        conflicts: ClassVar[Mapping[str, str]] = {"l2": "both are smooth", "sky": "it has no size; leave one out"}
+        type: Literal["wave"] = "wave"
+
+        def add(self, inputs): ...
+
+    rebuild()
+    losses = "optimize.losses=[l1, wave]"
+    load("smoke", [losses])
+    with pytest.raises(
+        ConfigError, match=r"losses\[1\]: 'wave' .* with sky \(model.background\): it has .*; leave one"
+    ):
+        load("smoke", [losses, "model.background=directions"])
+    stage = "  - optimize: {steps: 1, losses: [%s]}\n"
+    path = tmp_path / "x.yaml"
+    path.write_text("name: x\nstages:\n  - init\n" + stage % "l1, wave" + stage % "l1, l2")
+    load(str(path))
+    path.write_text("name: x\nstages:\n  - init\n" + stage % "l2, wave")
+    with pytest.raises(ConfigError, match=r"with l2 \(stages\[1\].*: both are smooth; leave one of them out"):
+        load(str(path))

@@ -9,7 +9,7 @@ import pytest
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import MemoryLimitError
 from clsplat.opencl.device import Device
-from clsplat.render.rasterizer import MAX_PAIRS, Budget, Rasterizer
+from clsplat.render.rasterizer import MAX_PAIRS, Rasterizer, RenderLimits
 from clsplat.render.tiles import Band, Footprints, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
 from tests.support.devices import each_once, on_devices, on_one_setting
@@ -30,13 +30,13 @@ def results(device, case, weights, budget=None, sort="radix", rasterizer=None):
     "budget, bands, sort",
     each_once(
         [
-            (Budget(MAX_PAIRS), 1),
-            (Budget(600), 2),
-            (Budget(250), 4),
-            (Budget(1), 5),
-            (Budget(MAX_PAIRS, 3), 1),
-            (Budget(1, 1), 5),
-            (Budget(250, 1000), 4),
+            (RenderLimits(MAX_PAIRS), 1),
+            (RenderLimits(600), 2),
+            (RenderLimits(250), 4),
+            (RenderLimits(1), 5),
+            (RenderLimits(MAX_PAIRS, 3), 1),
+            (RenderLimits(1, 1), 5),
+            (RenderLimits(250, 1000), 4),
         ],
         ["radix", "bitonic"],
     ),
@@ -58,7 +58,7 @@ def test_image_and_sums_over_pixels_are_the_same_bits(device, rng, budget, bands
 @on_one_setting
 def test_nothing_in_a_band(device, rng):
     case = random_case(rng, 0, 40, 64)
-    image, _, _ = results(device, case, 0.0, Budget(1, 2))
+    image, _, _ = results(device, case, 0.0, RenderLimits(1, 2))
     np.testing.assert_allclose(image[:, :64, :40], np.broadcast_to([[[0.2]], [[0.5]], [[0.9]]], (3, 64, 40)), rtol=1e-6)
 
 

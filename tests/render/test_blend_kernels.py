@@ -99,13 +99,13 @@ def test_depth_and_alpha_are_sums_of_blend_weights(device, rng, count):
 
 @on_one_setting
 def test_depth_in_bands_is_the_same(device, rng):
-    from clsplat.render.rasterizer import Budget
+    from clsplat.render.rasterizer import RenderLimits
 
     case = random_case(rng, 120, 48, 64)
     model, camera = case.model(device), case.device_camera(device)
     whole, banded = (
         Rasterizer(device, budget=budget).forward(model, camera, device.zeros(3), "depth").image.get()
-        for budget in (None, Budget(60))
+        for budget in (None, RenderLimits(60))
     )
     np.testing.assert_array_equal(whole, banded)
 

@@ -17,7 +17,7 @@ from clsplat.gaussians.model import Model
 from clsplat.metrics.views import render_view
 from clsplat.photos.sampling import Code, Sampler, ViewSettings
 from clsplat.pipeline.loading import load
-from clsplat.render.painter import Splats
+from clsplat.render.painter import SplatPainter
 from clsplat.runs import opening, runner
 from clsplat.runs.model_file import ModelFile
 from clsplat.training.run import Run
@@ -139,9 +139,11 @@ def test_files_render_as_the_run_does(finished, tiny_scene, name):
         difference = np.abs(images[0] - images[1])
         assert np.quantile(difference, 0.999) < 2e-5
         assert difference.max() < 2 / 255
-        eight_bits = render_view(Splats(finished.rasterizer, finished.model, finished.photographs.background), camera)
+        eight_bits = render_view(
+            SplatPainter(finished.rasterizer, finished.model, finished.photographs.background), camera
+        )
         other = render_view(
-            Splats(finished.rasterizer, on_device(finished, opened), finished.photographs.background), camera
+            SplatPainter(finished.rasterizer, on_device(finished, opened), finished.photographs.background), camera
         )
         assert np.abs(eight_bits.astype(int) - other).max() <= 1
     measured = opened.evaluate([1, 2, 4])["test"]

@@ -32,10 +32,10 @@ def around(case: Case, rng: np.random.Generator, count: int) -> list[View]:
     return views
 
 
-def oracle(view: View) -> ref.Camera:
+def oracle(view: View) -> ref.PinholeCamera:
     c = view.camera
     pose = np.float64(np.float32(view.world_to_camera))
-    return ref.Camera(pose, *(float(np.float32(value)) for value in (c.fx, c.fy, c.cx, c.cy)), c.width, c.height)
+    return ref.PinholeCamera(pose, *(float(np.float32(value)) for value in (c.fx, c.fy, c.cx, c.cy)), c.width, c.height)
 
 
 def refreshed(device: Device, case: Case, views: list[View], settings: Smoothing) -> np.ndarray:

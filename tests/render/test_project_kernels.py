@@ -16,7 +16,7 @@ from clsplat.conformance.checks.projection import (
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.gaussians.gaussians import HIDDEN_VIEWS, hide
 from clsplat.render.camera import CAMERA
-from clsplat.render.rasterizer import RECORD, Budget, Rasterizer
+from clsplat.render.rasterizer import RECORD, Rasterizer, RenderLimits
 from tests.support.devices import each_once, on_devices, on_one_setting
 from tests.support.figures import hold
 
@@ -62,7 +62,7 @@ def test_bands_leave_out_the_same(device, rng):
     model, camera = case.model(device), replace(case.device_camera(device), view=1)
     hide(model.gaussians, rng.random((2, 60)) < 0.5)
     sums = []
-    for budget in (None, Budget(40)):
+    for budget in (None, RenderLimits(40)):
         rasterizer = Rasterizer(device, "radix", budget)
         frame = rasterizer.forward(model, camera, device.zeros(3))
         gradient = device.upload(np.ones((3, camera.rows, camera.stride), np.float32))

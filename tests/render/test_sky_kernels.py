@@ -16,7 +16,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.sky import Skies
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.sky import LearnedSky
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 from tests.support.devices import on_devices, on_one_setting
 from tests.support.figures import hold
 
@@ -47,7 +47,7 @@ class Scene:
         mask = None if share is None else device.upload((rng.random((1, 36, 50)) < share).astype(np.uint8))
         self.photograph = Photograph(camera, device.upload(np.rint(255 * pixels).astype(np.uint8)), mask)
         parts = rasterizer, self.model, Adam(self.model.gaussians), SplatStats(self.model.gaussians, [])
-        self.trainer = Trainer(*parts, black, (L2(),), Rates(), modules=[LearnedSky(settings, sky)])
+        self.trainer = StepTrainer(*parts, black, (L2(),), Rates(), modules=[LearnedSky(settings, sky)])
         sky.texels.set(np.clip(sky.texels.get() + rng.normal(0, 0.01, sky.texels.shape), 0, 1).astype(np.float32))
 
     def loss(self) -> float:

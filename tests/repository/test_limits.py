@@ -40,6 +40,16 @@ def test_modules_and_functions_have_a_useful_size():
     assert not faults, "\n".join(faults)
 
 
+def test_class_names_are_unique():
+    places = defaultdict(list)
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                places[node.name].append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    faults = [f"{name}: {', '.join(found)}; rename all but one" for name, found in places.items() if len(found) > 1]
+    assert not faults, "\n".join(faults)
+
+
 def test_the_wheel_holds_every_package():
     """What pyproject.toml lists is what lies on disk, and the folders that it maps exist."""
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]

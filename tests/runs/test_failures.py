@@ -12,7 +12,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.opencl.device import Kernel
 from clsplat.photos.photographs import Photographs
 from clsplat.stages.evaluate import Evaluate
-from clsplat.stages.report import Report
+from clsplat.stages.report import HtmlReport
 from clsplat.sweeps.experiment import Job
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile
@@ -100,7 +100,7 @@ def test_a_failure_is_recorded_once(tiny_scene, tmp_path, monkeypatch):
         raise ZeroDivisionError
 
     monkeypatch.setattr(StatusFile, "end", recorded)
-    monkeypatch.setattr(Report, "run", fail)
+    monkeypatch.setattr(HtmlReport, "run", fail)
     with pytest.raises(InternalError, match="ZeroDivisionError"):
         Job.open("smoke", tiny_scene, tmp_path, FEW).run()
     assert states == ["failed"]
@@ -110,7 +110,7 @@ def test_a_report_that_fails_is_written_when_the_run_goes_on(tiny_scene, tmp_pat
     def fail(stage, run):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(Report, "run", fail)
+    monkeypatch.setattr(HtmlReport, "run", fail)
     with pytest.raises(Exception, match="ZeroDivisionError"):
         train(tiny_scene, tmp_path, *FEW)
     monkeypatch.undo()

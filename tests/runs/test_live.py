@@ -15,10 +15,10 @@ import pytest
 from clsplat.core.errors import ConfigError, Interrupted, MemoryLimitError
 from clsplat.core.progress import Progress
 from clsplat.metrics.views import render_view
-from clsplat.render.painter import Splats
+from clsplat.render.painter import SplatPainter
 from clsplat.runs.live import live as module
 from clsplat.runs.live.live import Live
-from clsplat.runs.live.preview import AIMS, MAX_POINTS, QUALITY, SIDES, Budget, Curves, Order, Preview
+from clsplat.runs.live.preview import AIMS, MAX_POINTS, QUALITY, SIDES, Credit, Curves, PageCamera, Preview
 from clsplat.scene.detect import read_scene
 from clsplat.sweeps.experiment import Job
 from tests.support.live import beside, trained
@@ -57,7 +57,7 @@ class Client:
 @pytest.fixture
 def live():
     with Live() as opened:
-        opened.desk.budget = Budget(1e9, 1e9)  # pictures at every step
+        opened.desk.budget = Credit(1e9, 1e9)  # pictures at every step
         yield opened
 
 
@@ -155,7 +155,7 @@ def test_undrawable_image_is_reported_and_training_continues(live, tiny_scene, t
 
 def test_pictures_wait_for_their_share_of_the_time(live, tiny_scene, tmp_path):
     """Without credit no picture is drawn, however often it is asked for."""
-    live.desk.budget = Budget(0.0, 1.0)
+    live.desk.budget = Credit(0.0, 1.0)
     client, answers = Client(live), []
 
     def look():
@@ -192,9 +192,9 @@ def test_a_port_in_use_ends_the_run_before_it_begins(live, tiny_scene, tmp_path)
 def test_a_picture_of_a_view_is_its_render(live, tiny_scene, tmp_path):
     run = trained(live, tiny_scene, tmp_path / "run")
     for view in run.scene.views[:3]:
-        jpeg = Preview(run).draw(Order(1, view, "still")).jpeg
+        jpeg = Preview(run).draw(PageCamera(1, view, "still")).jpeg
         photograph = run.photographs.get(view)
-        render = render_view(Splats(run.rasterizer, run.model, run.photographs.background), photograph.camera)
+        render = render_view(SplatPainter(run.rasterizer, run.model, run.photographs.background), photograph.camera)
         assert np.ptp(render) > 60
         _, data = cv2.imencode(".jpg", np.ascontiguousarray(render[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         assert jpeg == data.tobytes()

@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.runs.live import server as module
-from clsplat.runs.live.preview import MOST, Budget, Order, Orders, Picture
+from clsplat.runs.live.preview import MOST, Credit, EncodedPicture, Orders, PageCamera
 from clsplat.runs.live.server import LONGEST, Answer, Server
 
 
@@ -155,7 +155,7 @@ def test_answers_are_paced(server):
 
 def test_budget_grows_to_a_limit_and_owes_what_was_too_much():
     now = [100.0]
-    budget = Budget(0.05, 1.0, lambda: now[0])
+    budget = Credit(0.05, 1.0, lambda: now[0])
     assert budget.credit == 0
     now[0] += 10
     assert budget.credit == pytest.approx(0.5)
@@ -171,7 +171,7 @@ def test_budget_grows_to_a_limit_and_owes_what_was_too_much():
     assert budget.credit == 0
 
 
-def asked(orders: Orders, *wanted: Order) -> list[threading.Thread]:
+def asked(orders: Orders, *wanted: PageCamera) -> list[threading.Thread]:
     threads = [threading.Thread(target=orders.ask, args=(order, 10)) for order in wanted]
     for number, thread in enumerate(threads, 1):
         thread.start()
@@ -181,10 +181,10 @@ def asked(orders: Orders, *wanted: Order) -> list[threading.Thread]:
 
 
 def test_motion_comes_before_rest_and_the_queue_is_short():
-    orders, picture = Orders(), Picture(b"", 1)
-    wanted = [Order(page, None, "again" if page < 2 else "moving") for page in range(MOST)]
+    orders, picture = Orders(), EncodedPicture(b"", 1)
+    wanted = [PageCamera(page, None, "again" if page < 2 else "moving") for page in range(MOST)]
     threads = asked(orders, *wanted)
-    assert not orders.ask(Order(99, None, "moving"), 0)
+    assert not orders.ask(PageCamera(99, None, "moving"), 0)
     for order in (wanted[2], wanted[3], wanted[0], wanted[1]):
         assert orders.first() is order
         orders.deliver(order, picture)
@@ -194,18 +194,18 @@ def test_motion_comes_before_rest_and_the_queue_is_short():
 
 
 def test_a_page_that_asks_again_takes_its_own_place():
-    orders, first, second = Orders(), Order(1, None, "moving"), Order(1, None, "still")
+    orders, first, second = Orders(), PageCamera(1, None, "moving"), PageCamera(1, None, "still")
     (thread,) = asked(orders, first)
     others = asked(orders, second)
     thread.join(5)
     assert first.picture is None
     assert orders.first() is second
-    orders.deliver(second, Picture(b"x", 2))
+    orders.deliver(second, EncodedPicture(b"x", 2))
     others[0].join(5)
 
 
 def test_who_has_waited_too_long_waits_no_more():
-    orders, order = Orders(), Order(1, None, "moving")
+    orders, order = Orders(), PageCamera(1, None, "moving")
     assert orders.ask(order, 0)
     assert order.picture is None
     assert not orders

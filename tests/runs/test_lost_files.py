@@ -13,8 +13,8 @@ from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.runs import state
-from clsplat.runs.model_file import Source
-from clsplat.stages.report import Report
+from clsplat.runs.model_file import ModelSource
+from clsplat.stages.report import HtmlReport
 from clsplat.sweeps.experiment import run_matrix
 from clsplat.training.status import read_status
 from clsplat.workflows.finetune import Tuning
@@ -136,7 +136,7 @@ def test_stopped_resume_takes_no_damaged_file_as_complete(raised, saved_late, tm
         raise raised
 
     with monkeypatch.context() as patch:
-        patch.setattr(Report, "run", stop)
+        patch.setattr(HtmlReport, "run", stop)
         with pytest.raises((Interrupted, InternalError)):
             clsplat.resume(out)
     assert read_status(out)["state"] in ("interrupted", "failed")
@@ -260,7 +260,7 @@ def test_a_cell_without_a_checkpoint_that_lost_a_file_is_kept(tiny_scene, tmp_pa
 @pytest.mark.parametrize("content", [None, b"", b"ply\n"])
 def test_a_rung_that_lost_its_model_is_trained_again(content, few_steps, info, tmp_path):
     """Compress and lod would publish a damaged one."""
-    source = Source.of(few_steps, None)
+    source = ModelSource.of(few_steps, None)
     model = load_model(source.file)
     tuning = Tuning("rungs", source, model, 3, Device(info))
     pipeline = tuning.pipeline(("init", "optimize"), {"init.file": str(source.file.resolve())})

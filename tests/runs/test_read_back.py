@@ -16,7 +16,7 @@ from clsplat.pipeline.loading import load
 from clsplat.runs import opening, outputs, runner, verify
 from clsplat.scene.images import write_image
 from clsplat.stages.render import image_paths
-from clsplat.stages.report import Report
+from clsplat.stages.report import HtmlReport
 from clsplat.sweeps.experiment import Job
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage
@@ -120,7 +120,7 @@ def test_model_written_before_a_kill_is_the_one_written(damage, tiny_scene, tmp_
         raise ZeroDivisionError
 
     with monkeypatch.context() as patch:
-        patch.setattr(Report, "run", fail)
+        patch.setattr(HtmlReport, "run", fail)
         with pytest.raises(InternalError):
             Job.open("smoke", tiny_scene, out, few).run()
     whole = {name: (out / name).read_bytes() for name in ("early.ply", "point_cloud.ply")}

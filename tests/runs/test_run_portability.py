@@ -10,7 +10,7 @@ import clsplat
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.gaussians.model import load
 from clsplat.prepare.gather import photographs_text
-from clsplat.runs.model_file import Source, photographs_of, run_of
+from clsplat.runs.model_file import ModelSource, photographs_of, run_of
 from clsplat.runs.status import summary
 from clsplat.sweeps.experiment import Job
 from tests.support.html_page import Page
@@ -40,14 +40,14 @@ def test_a_run_is_a_model(done):
 
 def test_a_model_of_a_run_has_its_scene(done, tiny_scene):
     for model in (done, done / "models/last.ply"):
-        source = Source.of(model, None)
+        source = ModelSource.of(model, None)
         assert (source.file.name, source.folder, source.settings.downscale) == ("last.ply", tiny_scene, 2)
     copy = done.parent / "copy.ply"
     shutil.copy(done / "models/last.ply", copy)
     with pytest.raises(ConfigError, match="does not name its scene"):
-        Source.of(copy, None)
-    assert Source.of(copy, done).settings.downscale == 2, "as the run read it"
-    assert Source.of(copy, tiny_scene).settings.downscale == 1
+        ModelSource.of(copy, None)
+    assert ModelSource.of(copy, done).settings.downscale == 2, "as the run read it"
+    assert ModelSource.of(copy, tiny_scene).settings.downscale == 1
 
 
 def test_a_run_is_a_scene(done, tiny_scene, tmp_path):

@@ -128,8 +128,8 @@ def test_inspect_says_what_the_recipe_for_photographs_does():
 @pytest.mark.parametrize(
     ("of_step", "reason"),
     [
-        ("optimize.modules.random_background={}", "'random_background' does not go with sky: "),
-        ("optimize.modules.camera_optimizer={start: 1}", "'camera_optimizer' does not go with sky: "),
+        ("optimize.modules.random_background={}", "'random_background' does not go together with sky: "),
+        ("optimize.modules.camera_optimizer={start: 1}", "'camera_optimizer' does not go together with sky: "),
     ],
 )
 def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rng, caplog):
@@ -144,7 +144,7 @@ def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
     for recipe in ("smoke", "photos"):  # whose choices have a key for either
         with pytest.raises(ConfigError, match="not learned together with poses"):
             load(recipe, ["optimize.modules.camera_optimizer={start: 1}", "model.background=directions"])
-        with pytest.raises(ConfigError, match="'random_background' does not go with sky"):
+        with pytest.raises(ConfigError, match="'random_background' does not go together with sky"):
             load(recipe, ["optimize.modules.random_background={}", "model.background=directions"])
     load("photos", ["model.background=directions"])  # whose choices may learn poses
 
@@ -162,7 +162,7 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
     assert written.training.modules[0] == CameraOptimizer(start=500)
     background = written.model.background
     assert background.chosen == "off"
-    assert background.reason.startswith("'camera_optimizer' does not go with sky: ")
+    assert background.reason.startswith("'camera_optimizer' does not go together with sky: ")
     assert (tmp_path / "run" / "view_poses.json").is_file()
 
 
@@ -174,7 +174,7 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
         (["optimize.losses=[l1, {type: inverse_depth, folder: nosuch}]"], "no such file; expected the depth map of"),
         (
             ["optimize.losses=[l1, inverse_depth]", "optimize.modules.camera_optimizer={start: 1}"],
-            "does not go with inverse_depth",
+            "does not go together with inverse_depth",
         ),
         ([f"choices=[{OF_POSES}]", "model.background=directions"], "not learned together with poses"),
     ],

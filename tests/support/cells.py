@@ -4,10 +4,10 @@ import os
 from pathlib import Path
 
 from clsplat.pipeline.loading import load
-from clsplat.sweeps.cell import Cell, Scenes
+from clsplat.sweeps.cell import CellRun, Scenes
 from clsplat.sweeps.child import FILE, OUT, PYTHON
-from clsplat.sweeps.devices import Place
-from clsplat.sweeps.engines import Lost, Wanted
+from clsplat.sweeps.devices import DeviceSlot
+from clsplat.sweeps.engines import CellLost, Wanted
 from clsplat.sweeps.task import Outcome
 
 KILLS = int(os.environ.get("CLSPLAT_KILLS", "0"))
@@ -16,7 +16,7 @@ KILLS = int(os.environ.get("CLSPLAT_KILLS", "0"))
 SPEC = {"pipeline": {"name": "a", "seed": 0}, "scene": "s", "code": "c", "bits": "b"}
 
 
-CELL = Cell("first", SPEC, "name: a\n")
+CELL = CellRun("first", SPEC, "name: a\n")
 
 
 WRITES = "import sys, pathlib; pathlib.Path(sys.argv[2], 'point_cloud.ply').write_bytes(b'bits')"
@@ -29,13 +29,15 @@ def command(code: str) -> list[str]:
 
 def keys(pipeline: str, scene: Path, folder: Path, *changes: str) -> str:
     checked = load(pipeline, [f"scene.path={scene}", *changes])
-    return Cell.of("x", checked, Scenes(folder).known(checked).digest, "b").key
+    return CellRun.of("x", checked, Scenes(folder).known(checked).digest, "b").key
 
 
 class Fake:
     """An engine whose cells end as they were told to; a Lost is raised."""
 
-    def __init__(self, *ends: Outcome | type[Lost], places: tuple[Place, ...] = (Place("w", "d", "b"),)) -> None:
+    def __init__(
+        self, *ends: Outcome | type[CellLost], places: tuple[DeviceSlot, ...] = (DeviceSlot("w", "d", "b"),)
+    ) -> None:
         self.ends, self._places, self.started = list(ends), places, []
 
     def places(self):
@@ -50,12 +52,12 @@ class Fake:
 
         class Ticket:
             def outcome(self):
-                if end is Lost:
-                    raise Lost
+                if end is CellLost:
+                    raise CellLost
                 return end
 
         return Ticket()
 
 
 def wanted(*costs: float) -> list[Wanted]:
-    return [Wanted(Cell(f"{cost:g}", {**SPEC, "scene": str(cost)}, ""), cost) for cost in costs]
+    return [Wanted(CellRun(f"{cost:g}", {**SPEC, "scene": str(cost)}, ""), cost) for cost in costs]

@@ -12,7 +12,7 @@ from clsplat.photos.transforms import Planes
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 
 
 def planes_of(device, image: np.ndarray, mask: np.ndarray | None = None) -> Planes:
@@ -50,11 +50,11 @@ def gradient_of(comparison: Comparison) -> np.ndarray:
     return planes[:, : camera.height, : camera.width]
 
 
-def trainer_of(device: Device, rng: np.random.Generator, losses: list[Loss]) -> tuple[Trainer, Photograph]:
+def trainer_of(device: Device, rng: np.random.Generator, losses: list[Loss]) -> tuple[StepTrainer, Photograph]:
     """A trainer of a few Gaussians, and a photograph of noise of which a third is masked."""
     case = random_case(rng, 60, 40, 30)
     model = case.model(device)
-    trainer = Trainer(
+    trainer = StepTrainer(
         Rasterizer(device, "radix"),
         model,
         Adam(model.gaussians),

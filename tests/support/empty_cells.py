@@ -12,9 +12,9 @@ import psutil
 
 from clsplat.pipeline.execution import Execution
 from clsplat.sweeps import dask
-from clsplat.sweeps.cell import Cell
+from clsplat.sweeps.cell import CellRun
 from clsplat.sweeps.child import OUT
-from clsplat.sweeps.devices import Place
+from clsplat.sweeps.devices import DeviceSlot
 from clsplat.sweeps.engines import Drive, Wanted
 from clsplat.sweeps.store import Store
 from clsplat.sweeps.task import Terms
@@ -23,15 +23,15 @@ from tests.support.cells import SPEC
 
 def measure(cells: int, workers: int, folder: Path) -> None:
     """Print the time a cell, the memory of the driver along the way, and the events."""
-    places = [Place("local", f"device {number}", "b") for number in range(workers)]
+    places = [DeviceSlot("local", f"device {number}", "b") for number in range(workers)]
     dask.places = lambda worker, devices, packing: places
     store, memory, process = Store(folder), [], psutil.Process()
     engine = dask.engine(Execution(engine="local"), store, None)
     engine.command_of = lambda device: ["touch", OUT]
-    wanted = [Wanted(Cell(f"cell {i}", {**SPEC, "scene": str(i)}, ""), 1) for i in range(cells)]
+    wanted = [Wanted(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), 1) for i in range(cells)]
     drive = Drive(store, engine, True, Terms(store.now()))
 
-    def ended(cell: Cell, outcome: object) -> None:
+    def ended(cell: CellRun, outcome: object) -> None:
         if len(memory) % max(1, cells // 10) == 0:
             print(f"{len(memory)} cells, driver {process.memory_info().rss >> 20} MiB")
         memory.append(process.memory_info().rss)

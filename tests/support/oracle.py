@@ -10,23 +10,25 @@ WIDTH, HEIGHT = 40, 30
 BACKGROUND = np.array([0.2, 0.5, 0.9])
 
 
-def general_camera() -> ref.Camera:
+def general_camera() -> ref.PinholeCamera:
     """Rotated, moved, off-centre, fx != fy."""
     rotation = ref.rotation_matrix(np.array([0.9, 0.2, -0.3, 0.15]))
-    return ref.Camera(np.column_stack([rotation, [0.3, -0.2, 0.5]]), 37.0, 43.0, 17.0, 16.5, WIDTH, HEIGHT)
+    return ref.PinholeCamera(np.column_stack([rotation, [0.3, -0.2, 0.5]]), 37.0, 43.0, 17.0, 16.5, WIDTH, HEIGHT)
 
 
-def to_world(camera: ref.Camera, point: np.ndarray) -> np.ndarray:
+def to_world(camera: ref.PinholeCamera, point: np.ndarray) -> np.ndarray:
     return (point - camera.translation) @ camera.rotation
 
 
-def random_gaussians(rng: np.random.Generator, camera: ref.Camera, degree: int, count: int = 5) -> ref.Gaussians:
+def random_gaussians(
+    rng: np.random.Generator, camera: ref.PinholeCamera, degree: int, count: int = 5
+) -> ref.RawGaussians:
     """Gaussians a few pixels wide that overlap in the middle of the image; all 16 harmonics' worth of storage."""
     z = rng.uniform(2, 4, count)
     x, y = rng.uniform(-0.25, 0.25, (2, count)) * z
     sh = rng.normal(0, 0.2, (count, 16, 3))
     sh[:, 0] += 1.5  # far from the clamp at zero
-    return ref.Gaussians(
+    return ref.RawGaussians(
         means=to_world(camera, np.stack([x, y, z], axis=1)),
         quats=rng.normal(0, 1, (count, 4)) * 1.7,
         log_scales=np.log(rng.uniform(0.1, 0.5, (count, 3))),

@@ -11,7 +11,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.stages.init import Init
 from clsplat.sweeps.batch import wanted_cell
 from clsplat.sweeps.cell import Scenes
-from clsplat.sweeps.devices import Place
+from clsplat.sweeps.devices import DeviceSlot
 from clsplat.sweeps.engines import Drive
 from clsplat.sweeps.memory_need import Need
 from clsplat.sweeps.store import Store
@@ -22,10 +22,10 @@ from tests.support.cells import WRITES, Fake, command, wanted
 NEED = Need(degree=3, photographs=1 << 20, budget=None, pixels=1 << 16, first=1000, most=100_000)
 
 
-def held(gaussians: int, name: str, bits: str = "x") -> Place:
+def held(gaussians: int, name: str, bits: str = "x") -> DeviceSlot:
     """A device that holds about so many Gaussians."""
     memory = 8192 * gaussians + (14 << 20)
-    return Place("w", name, bits, memory=memory, allocation=memory)
+    return DeviceSlot("w", name, bits, memory=memory, allocation=memory)
 
 
 def test_cell_runs_where_its_memory_is_and_others_go_on(store, terms):

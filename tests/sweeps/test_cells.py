@@ -18,10 +18,10 @@ from clsplat.runs.opening import undistorted_folder
 from clsplat.sweeps import child
 from clsplat.sweeps.batch import place_copy
 from clsplat.sweeps.cell import Scenes
-from clsplat.sweeps.devices import Place
-from clsplat.sweeps.engines import Drive, Inline, Lost, Wanted
+from clsplat.sweeps.devices import DeviceSlot
+from clsplat.sweeps.engines import CellLost, Drive, InlineEngine, Wanted
 from clsplat.sweeps.status import overview_text, store_page, store_status
-from clsplat.sweeps.store import ATTEMPTS, LEASE, MANIFEST, Attempt, Different, Store
+from clsplat.sweeps.store import ATTEMPTS, LEASE, MANIFEST, CellAttempt, Different, Store
 from clsplat.sweeps.task import Outcome, Terms, run_cell
 from tests.support.cells import CELL, SPEC, WRITES, Fake, command, keys, wanted
 from tests.support.html_page import HOSTILE, Page
@@ -162,7 +162,7 @@ def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, ter
 
 
 def test_failure_beside_a_newer_damaged_checkpoint_counts(few_steps, store, terms):
-    old = Attempt(store.add(CELL).path / ATTEMPTS / ("a" * 32))
+    old = CellAttempt(store.add(CELL).path / ATTEMPTS / ("a" * 32))
     shutil.copytree(few_steps, old.path)
     newest = max((old.path / CHECKPOINTS).glob("step_*.npz"))
     newest.write_bytes(newest.read_bytes()[:-100])
@@ -174,7 +174,7 @@ def test_failure_beside_a_newer_damaged_checkpoint_counts(few_steps, store, term
 @pytest.mark.parametrize("damage", ["cut", "flipped"])
 def test_attempt_resumes_from_the_newest_intact_checkpoint(few_steps, store, terms, damage):
     folder = store.add(CELL)
-    old = Attempt(folder.path / ATTEMPTS / ("a" * 32))
+    old = CellAttempt(folder.path / ATTEMPTS / ("a" * 32))
     shutil.copytree(few_steps, old.path)
     (old.path / "run.lock").write_text("{}")
     *_, before, newest = sorted((old.path / CHECKPOINTS).glob("step_*.npz"))
@@ -328,14 +328,14 @@ def test_undistorted_photographs_are_shared_by_cells_of_a_scene(store, terms):
 
 def test_the_longest_cell_is_first_and_a_lost_one_starts_again(store, terms):
     done = Outcome("published")
-    engine = Fake(Lost, done, done, done)
+    engine = Fake(CellLost, done, done, done)
     ended = []
     Drive(store, engine, True, terms, ended=lambda cell, outcome: ended.append(cell.name)).run(wanted(1, 3, 2))
     assert [name for name, *_ in engine.started] == ["3", "3", "2", "1"]
     assert ended == ["3", "2", "1"]
 
 
-PLACES = (Place("w", "one", "x"), Place("w", "two", "y"), Place("w", "three", "y"))
+PLACES = (DeviceSlot("w", "one", "x"), DeviceSlot("w", "two", "y"), DeviceSlot("w", "three", "y"))
 
 
 def test_a_sweep_stays_in_the_bits_class_of_most_devices(store, terms):
@@ -413,7 +413,7 @@ def test_a_signal_stops_a_sweep(store, terms):
 
 def test_the_engine_of_this_process_runs_a_cell(store, terms, monkeypatch):
     monkeypatch.setattr("clsplat.sweeps.engines.run_command", lambda device, plugins: command(WRITES))
-    engine = Inline(store, PLACES[0], lambda: False)
+    engine = InlineEngine(store, PLACES[0], lambda: False)
     ticket = engine.start(CELL, PLACES[0], terms)
     assert ticket.outcome().state == "published"
 

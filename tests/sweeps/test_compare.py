@@ -20,7 +20,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.view import load_image
 from clsplat.sweeps.compare import crops
-from clsplat.sweeps.compare.comparison import Comparison, differing, flat, read_published
+from clsplat.sweeps.compare.comparison import RunComparison, differing, flat, read_published
 from clsplat.sweeps.compare.page import write_comparison
 from tests.support.commands import clsplat
 from tests.support.html_page import HOSTILE, Page
@@ -72,7 +72,7 @@ def page_of(tmp_path: Path, *folders: Path) -> str:
 def test_seeds_are_one_row_with_mean_and_deviation(make_run, tmp_path):
     seeds = [make_run(f"seed{i}", f"seed={i}", psnr=20.0 + i) for i in range(3)]
     other = make_run("other", "init.opacity=0.3", psnr=24.0)
-    comparison = Comparison.read([*seeds, other])
+    comparison = RunComparison.read([*seeds, other])
     (rows,) = comparison.scenes.values()
     assert [len(row.runs) for row in rows] == [3, 1]
     assert [row.variant.letter for row in rows] == ["A", "B"]
@@ -167,7 +167,7 @@ def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):
     one, two = make_run("one", psnr=20), make_run("two", f"scene.path='{tmp_path / 'second'}'", psnr=30)
     half = make_run("half", "scene.downscale=2", psnr=40)
     shutil.rmtree(half / "renders")
-    comparison = Comparison.read([one, two, half])
+    comparison = RunComparison.read([one, two, half])
     assert list(comparison.scenes) == ["tiny", "second", "tiny at 1/2"]
     assert len(comparison.variants) == 1, "the scene does not make a variant"
     page = page_of(tmp_path, one, two, half)
@@ -196,7 +196,7 @@ def test_the_page_shows_the_differing_settings_only(make_run, tmp_path):
     assert rows == [("optimize.densify.every", "10", "20")]
 
 
-def crops_of(*folders: Path) -> list[crops.Crop]:
+def crops_of(*folders: Path) -> list[crops.ImageCrop]:
     runs = [RunFolder.read(folder) for folder in folders]
     return crops.find_crops(runs, *runs[0].scene.read(runs[0].photographs))
 

@@ -14,7 +14,7 @@ from clsplat.pipeline.loading import load
 from clsplat.stages.video import Video
 from clsplat.sweeps import cell as fingerprint
 from clsplat.sweeps.batch import wanted_cell
-from clsplat.sweeps.cell import Cell, Scenes
+from clsplat.sweeps.cell import CellRun, Scenes
 from clsplat.sweeps.task import run_cell
 from tests.support.cells import CELL, WRITES, command, keys
 from tests.support.runs import FEW, killed, train
@@ -65,9 +65,9 @@ def test_a_list_of_names_is_the_one_in_the_folder_of_the_dataset(tiny_scene, tmp
     (tmp_path / "list.txt").write_text("train/r_000\n")
     monkeypatch.chdir(tmp_path)
     checked = load("smoke", [f"scene.path={scene}", "scene.holdout={file: list.txt}"])
-    cell = Cell.of("x", checked, "s", "b")
+    cell = CellRun.of("x", checked, "s", "b")
     (tmp_path / "list.txt").write_text("train/r_001\n")
-    assert Cell.of("x", checked, "s", "b").key == cell.key
+    assert CellRun.of("x", checked, "s", "b").key == cell.key
     assert cell.files.keys() == {str(scene / "list.txt")}
 
 
@@ -89,7 +89,7 @@ def test_a_cell_reads_the_same_files_in_whatever_folder_it_runs(tiny_scene, stor
         (folder / "m.ply").write_bytes(text)
     monkeypatch.chdir(tmp_path)
     options = [f"scene.path={os.path.relpath(tiny_scene)}", "init.source=model", "init.file=m.ply"]
-    cell = Cell.from_json(Cell.of("x", load("smoke", options), "s", "b").json())
+    cell = CellRun.from_json(CellRun.of("x", load("smoke", options), "s", "b").json())
     monkeypatch.chdir("elsewhere")
     placed = load(str(write(tmp_path / "cell.yaml", cell.text))).settings
     assert Path(placed.stages[0].file) == tmp_path / "m.ply"
@@ -133,5 +133,5 @@ def test_libraries_that_change_results_are_in_keys(tiny_scene, tmp_path, monkeyp
     assert fingerprint.tools_digest.__wrapped__() != tools
     shutil.copytree(tiny_scene / "train", tmp_path / "photographs")
     scenes = [tmp_path / "photographs", tiny_scene]
-    specs = [Cell.of("x", load("photos", [f"scene.path={scene}"]), "s", "b").spec for scene in scenes]
+    specs = [CellRun.of("x", load("photos", [f"scene.path={scene}"]), "s", "b").spec for scene in scenes]
     assert ["tools" in spec for spec in specs] == [True, False]

@@ -19,7 +19,7 @@ from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.sweeps import devices
 from clsplat.sweeps.child import supervise
 from clsplat.sweeps.devices import places, shares_of
-from clsplat.sweeps.store import Attempt
+from clsplat.sweeps.store import CellAttempt
 
 CPU = DeviceInfo("a", "b", "CPU", "1", 4, 1 << 30, 1 << 29, 1 << 15, 64, 8, (0, 0))
 SIZE = (64, 48, 300)  # width, height, Gaussians
@@ -121,7 +121,7 @@ def test_a_process_that_says_nothing_is_told(monkeypatch):
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system keeps no process to cores")
 def test_the_run_of_a_cell_is_kept_to_its_cores(tmp_path):
-    attempt, own = Attempt(tmp_path / "attempt"), (machine.usable()[-1],)
+    attempt, own = CellAttempt(tmp_path / "attempt"), (machine.usable()[-1],)
     attempt.path.mkdir()
     attempt.take_lease("a", 0.0)
     code = "import os, sys, json, time; time.sleep(0.3)\n"

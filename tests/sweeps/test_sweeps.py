@@ -18,8 +18,8 @@ from clsplat.pipeline.execution import Execution, Tls, options, values_of
 from clsplat.pipeline.recipes import json_schema
 from clsplat.sweeps import batch, engines
 from clsplat.sweeps import batch as single
-from clsplat.sweeps.cell import Cell, code_digest
-from clsplat.sweeps.devices import Place
+from clsplat.sweeps.cell import CellRun, code_digest
+from clsplat.sweeps.devices import DeviceSlot
 from clsplat.sweeps.engines import Drive, Wanted
 from clsplat.sweeps.experiment import Job
 from clsplat.sweeps.status import store_status
@@ -31,7 +31,7 @@ from tests.support.pipelines import STAGES
 
 psutil = pytest.importorskip("psutil", exc_type=ImportError)  # of Dask
 
-PLACE = Place("inline", "a device", "b")
+PLACE = DeviceSlot("inline", "a device", "b")
 
 
 @pytest.fixture
@@ -315,7 +315,7 @@ def test_a_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, start
     monkeypatch.setattr(client, "submit", lambda *words, **options: sent.append(options["workers"]))
     found, starts = [PLACE] if starter == "this machine" else None, starter != "nobody"
     scheduler.Cluster(client, Store(tmp_path), object() if starts else None, found).start(
-        Cell("a", SPEC, ""), PLACE, Terms(0.0)
+        CellRun("a", SPEC, ""), PLACE, Terms(0.0)
     )
     assert sent == [None if found else [PLACE.worker]], "the workers of this machine have the same devices"
 
@@ -335,7 +335,7 @@ def test_a_scheduler_that_ended_is_told_with_what_to_do(tmp_path):
     client = FakeClient()
     cluster = scheduler.Cluster(client, Store(tmp_path))
     client.info, client.status = {}, "closed"
-    for call in (cluster.places, lambda: cluster.start(Cell("a", SPEC, ""), PLACE, Terms(0.0))):
+    for call in (cluster.places, lambda: cluster.start(CellRun("a", SPEC, ""), PLACE, Terms(0.0))):
         with pytest.raises(DeviceError, match=r"the scheduler ended; .* with --resume"):
             call()
 
@@ -352,14 +352,14 @@ def listening() -> set[str]:
 def test_local_engine_runs_cells_in_parallel_on_loopback_alone(tmp_path, monkeypatch):
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     library = pytest.importorskip("clsplat.sweeps.dask")
-    places = [Place("local", "one", "b"), Place("local", "two", "b")]
+    places = [DeviceSlot("local", "one", "b"), DeviceSlot("local", "two", "b")]
     monkeypatch.setattr(scheduler, "places", lambda worker, devices, packing: places)
     store, ended, seen = Store(tmp_path / "store"), [], set()
     before = {key: library.dask.config.get(key) for key in library.SETTINGS}
     cluster = scheduler.engine(Execution(engine="local"), store, None)
     try:
         cluster.command_of = lambda device: command(WRITES + f"; print({device!r})")
-        cells = [Wanted(Cell(f"cell {i}", {**SPEC, "scene": str(i)}, ""), i) for i in range(4)]
+        cells = [Wanted(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), i) for i in range(4)]
         drive = Drive(store, cluster, True, Terms(store.now()), ended=lambda *end: ended.append(end))
         drive.look = lambda: seen.update(listening())
         drive.run(cells)

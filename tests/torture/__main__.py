@@ -17,7 +17,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from clsplat.core.resources import __version__
-from clsplat.data_tools.synthetic import Options, write_dataset
+from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from tests.torture.kills import kills
 
 ROOT = Path(__file__).parents[2]
@@ -53,7 +53,7 @@ class Row:
 def killed(count: int, folder: Path) -> Row:
     """`kill -9` at random moments of runs on a tiny scene."""
     start, scene = time.perf_counter(), folder / "scene"
-    write_dataset(scene, Options(size=40, train=8, test=2, seed=0), workers=1)
+    write_dataset(scene, SyntheticOptions(size=40, train=8, test=2, seed=0), workers=1)
     for tally in kills(scene, folder / "runs", count):
         print(f"\r{dict(tally)}", end="", flush=True)
     print()

@@ -8,7 +8,7 @@ from clsplat.conformance.checks.training import average_figures, behind_each_fif
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import DeviceModel
-from clsplat.gaussians.structs import Gradients, moment_tables
+from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.training import adam as average
@@ -118,7 +118,7 @@ def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree
 def test_bands_above_the_active_degree_stay(device, rng):
     case = random_case(rng, 20, degree=1)
     model = case.model(device)
-    adam, gradients = Adam(model.gaussians), Gradients(model.gaussians)
+    adam, gradients = Adam(model.gaussians), GaussianGradients(model.gaussians)
     gradients["sh_rest"].fill(1)
     adam.step(model, frame_of(device, case, model), gradients, Rates().at(1, 1.0))
     moved = model.gaussians.get("sh_rest") != case.parameters["sh_rest"]
@@ -154,7 +154,7 @@ def test_bands_whose_rate_is_0_stay_with_their_moments(device, rng, count):
 def test_parameters_left_out_stay(device, rng):
     case = random_case(rng, 20)
     model = case.model(device)
-    adam, gradients = Adam(model.gaussians), Gradients(model.gaussians)
+    adam, gradients = Adam(model.gaussians), GaussianGradients(model.gaussians)
     for array in gradients.arrays.values():
         array.fill(1)
     adam.step(model, frame_of(device, case, model), gradients, Rates().at(1, 1.0), without={"means"})

@@ -14,7 +14,7 @@ from clsplat.pipeline.loading import load
 from clsplat.runs import opening, run_folder
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.state import has_ended
-from clsplat.sweeps.compare.comparison import Comparison
+from clsplat.sweeps.compare.comparison import RunComparison
 from clsplat.sweeps.compare.page import main_table
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
@@ -67,7 +67,7 @@ def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few
 
 def test_a_comparison_has_a_column_for_them(with_gains, few_steps):
     tables = [
-        main_table(next(iter(Comparison.read(folders).scenes.values()))) for folders in ([with_gains], [few_steps])
+        main_table(next(iter(RunComparison.read(folders).scenes.values()))) for folders in ([with_gains], [few_steps])
     ]
     headings = [[column.heading for group in table.groups for column in group.columns] for table in tables]
     assert ["PSNR, colours fitted ↑" in found for found in headings] == [True, False]

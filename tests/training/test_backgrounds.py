@@ -70,7 +70,7 @@ def test_a_run_repeats_to_the_bit(tiny_scene, tmp_path):
 
 @pytest.mark.slow
 def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
-    with pytest.raises(ConfigError, match="does not go with sky"):
+    with pytest.raises(ConfigError, match="does not go together with sky"):
         train(tiny_scene, tmp_path / "run", RANDOM, "model.background=directions", "optimize.steps=2")
     asked = load(
         "smoke",
@@ -80,5 +80,5 @@ def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
             "model.background=directions",
         ],
     )
-    with pytest.raises(ConfigError, match="does not go with sky"):
+    with pytest.raises(ConfigError, match="does not go together with sky"):
         describe(asked, tmp_path / "other", None, "new")

@@ -8,7 +8,7 @@ from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.core.errors import ConfigError
 from clsplat.gaussians.deferred import Deferred
 from clsplat.gaussians.gaussians import DeviceModel
-from clsplat.gaussians.structs import Gradients
+from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
@@ -135,7 +135,7 @@ def test_rows_that_no_view_sees_wait(device, rng):
     frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
     keys = np.where(np.arange(model.gaussians.capacity) < 16, 7, 0xFFFFFFFF).astype(np.uint32)
     frame.depth_key.set(keys)
-    of_loss = Gradients(model.gaussians)
+    of_loss = GaussianGradients(model.gaussians)
     planes = np.zeros(of_loss["sh_rest"].shape, np.float32)
     planes[:, :150] = gradients.T
     of_loss["sh_rest"].set(planes)
@@ -147,7 +147,7 @@ def test_rows_that_no_view_sees_wait(device, rng):
 
 @on_one_setting
 def test_a_penalty_on_harmonics_that_wait_is_refused(device, rng):
-    gradients = Gradients(random_case(rng, 5).model(device).gaussians)
+    gradients = GaussianGradients(random_case(rng, 5).model(device).gaussians)
     assert gradients.without_deferred()["means"] is gradients["means"]
     with pytest.raises(ConfigError, match="`update: all` with"):
         gradients.without_deferred()["sh_rest"]

@@ -14,7 +14,6 @@ from clsplat.formats.ply import write_ply
 from clsplat.formats.table import read as read_ply
 from clsplat.losses.base import LossValue, Penalty
 from clsplat.opencl.device import Device
-from clsplat.pipeline.checks import harmonics_of
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import opening, run_folder, runner
@@ -180,7 +179,7 @@ def test_harmonics_stay_where_the_host_is_no_help(tiny_scene, info):
     """A stage needs them on the device, there are none, or the device's memory is the host's."""
     own = f"scene.path='{tiny_scene}'"
     average = "optimize.during=[{add_to_average: {every: 2}}]"
-    found = [harmonics_of(load("smoke", [own, *more]).settings) for more in ([], [average], ["model.sh_degree=0"])]
+    found = [load("smoke", [own, *more]).settings.harmonics for more in ([], [average], ["model.sh_degree=0"])]
     assert found == ["auto", "device", "device"]
     apart, shared = (replace(info, unified=unified) for unified in (False, True))
     found = [last_place("auto", apart), last_place("auto", shared), last_place("host", shared)]
@@ -207,7 +206,7 @@ def test_device_holds_what_a_view_sees_of_host_harmonics(spread, tiny_scene, tmp
 def test_what_needs_all_harmonics_on_the_device_is_refused(tiny_scene):
     own = f"scene.path='{tiny_scene}'", "optimize.during=[{add_to_average: {every: 2}}]"
     assert load("smoke", own)
-    with pytest.raises(ConfigError, match=r"stages\[1\] optimize: add_to_average changes the harmonics of all"):
+    with pytest.raises(ConfigError, match=r"add_to_average: .* harmonics on the host \(rasterizer\): it changes those"):
         load("smoke", [*own, HOST])
 
 

@@ -16,7 +16,7 @@ from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
-from clsplat.training.modules.base import Step
+from clsplat.training.modules.base import TrainingStep
 from clsplat.training.modules.distractors import NEAR, Distractors, DistractorsState, first_tables
 from tests.support.runs import FEW, ONE_CORE, digest, train
 
@@ -48,7 +48,7 @@ class Pair:
         """The step with what the photograph has in front of it."""
         camera = self.camera(number)
         pixels = self.device.upload(np.zeros((3, 36, 50), np.uint8))
-        step = Step(at, self.rasterizer, Photograph(camera, pixels), self.model, self.black, (), ())
+        step = TrainingStep(at, self.rasterizer, Photograph(camera, pixels), self.model, self.black, (), ())
         step.frame = self.rasterizer.forward(self.model, camera, self.black)
         step.image = step.frame.image
         self.own.after_render(step)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.data_tools.synthetic import Options, write_dataset
+from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.metrics.views import colour_figures
 from clsplat.training.modules.exposure import Gain
 from tests.support.runs import train
@@ -28,7 +28,7 @@ GAIN = "optimize.modules.exposure={}"
 @pytest.fixture(scope="module")
 def as_they_are(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("scene") / "as_they_are"
-    write_dataset(folder, Options(size=48, train=12, test=3, seed=0), workers=1)
+    write_dataset(folder, SyntheticOptions(size=48, train=12, test=3, seed=0), workers=1)
     return folder
 
 

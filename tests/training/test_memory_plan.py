@@ -4,7 +4,7 @@ import pytest
 
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import MemoryLimitError
-from clsplat.gaussians.structs import Gradients
+from clsplat.gaussians.structs import GaussianGradients
 from clsplat.training import memory
 from clsplat.training.memory import FRAME_GAUSSIAN, MemoryPlan
 from tests.support.commands import clsplat
@@ -21,7 +21,7 @@ def test_bytes_come_from_the_tables(device, rng):
 
     gaussians = random_case(rng, 100).model(device).gaussians
     parameters = 4 * (3 + 4 + 3 + 1 + 3 + 45 + 1)  # with the filter's variance
-    gradients = Gradients(gaussians)
+    gradients = GaussianGradients(gaussians)
     held = sum(array.nbytes for array in (*gradients.arrays.values(), gradients.mean2d))
     frame = FRAME_GAUSSIAN + 4 * 9 + held // gaussians.capacity
     assert plan(gaussians, 0, 0).gaussian == parameters + frame

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.data_tools.synthetic import Options, write_dataset
+from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from tests.support.runs import train
 
 SIZE, PHOTOGRAPHS, SHARE, AREA = 40, 14, 0.4, 0.1  # a share of them has a rectangle, which covers a part
@@ -52,7 +52,7 @@ def measure(scene: Path, out: Path, *overrides: str) -> float:
 @pytest.mark.slow
 def test_rectangles_cost_little_where_something_takes_them_up(tmp_path):
     clean = tmp_path / "clean"
-    write_dataset(clean, Options(size=SIZE, train=PHOTOGRAPHS, test=3, seed=0), workers=1)
+    write_dataset(clean, SyntheticOptions(size=SIZE, train=PHOTOGRAPHS, test=3, seed=0), workers=1)
     occluded = occlude(clean)
     kinds = {"none": (), "transients": (TRANSIENTS,), "distractors": (DISTRACTORS,)}
     before = {kind: measure(clean, tmp_path / f"clean {kind}", *more) for kind, more in kinds.items()}

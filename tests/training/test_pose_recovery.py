@@ -14,12 +14,12 @@ from clsplat.metrics.views import render_floats
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import upload_camera
-from clsplat.render.painter import Splats
+from clsplat.render.painter import SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.camera_optimizer import DEPTHS, CameraOptimizer, CameraState, Move
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 
 VIEWS, STEPS, ANGLE, DEPTH = 6, 300, np.radians(0.3), 3.0
 STILL = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=0, sh_rest=0)  # cameras alone are unknown
@@ -57,7 +57,7 @@ def learned(
         for view, turn, shift in zip(truth, turns, shifts, strict=True)
     ]
     for number, (view, given) in enumerate(zip(truth, views, strict=True)):
-        values = np.clip(render_floats(Splats(rasterizer, model, background), upload_camera(device, view)), 0, 1)
+        values = np.clip(render_floats(SplatPainter(rasterizer, model, background), upload_camera(device, view)), 0, 1)
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
         photographs.append(Photograph(replace(upload_camera(device, given), view=number), device.upload(pixels)))
     rate = Decay(initial=2e-3, final=2e-5, over=STEPS)
@@ -68,7 +68,7 @@ def learned(
         table.begin(poses.numbers, {})
     poses.numbers |= {f"{DEPTHS}/{view.name}": DEPTH for view in views}
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians, []), background
-    trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), STILL, modules=[poses])
+    trainer = StepTrainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), STILL, modules=[poses])
     for step in range(1, STEPS + 1):
         trainer.step(photographs[step % VIEWS], step)
     given = [view.world_to_camera for view in views]

@@ -24,7 +24,7 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.training.modules.skip_backward import Skip, SkipState
 from clsplat.training.run import Run
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 from tests.support.runs import FEW, digest, train
 
 pytestmark = pytest.mark.slow
@@ -203,10 +203,10 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
         next(steps)
     before = state(run), dict(run.modules["skip"].numbers)
 
-    def broken(trainer: Trainer, view: ViewLosses) -> ViewGradients:
+    def broken(trainer: StepTrainer, view: ViewLosses) -> ViewGradients:
         raise MemoryError
 
-    monkeypatch.setattr(Trainer, "backward", broken)
+    monkeypatch.setattr(StepTrainer, "backward", broken)
     with pytest.raises(MemoryError):
         next(steps)
     assert (run.step, (state(run), dict(run.modules["skip"].numbers))) == (9, before)

@@ -15,7 +15,7 @@ from clsplat.core.reading import sha256
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.sky import Sky, keep_sky, sampled, sky_beside, texel_directions
 from clsplat.metrics.images import psnr
-from clsplat.photos.sky_detection import Seen, looked_at, panorama
+from clsplat.photos.sky_detection import SkyEvidence, looked_at, panorama
 from clsplat.pipeline.capture_choice import without_choices
 from clsplat.pipeline.loading import load
 from clsplat.render.backdrops import Auto
@@ -107,7 +107,7 @@ def test_a_sky_does_not_go_on_below_the_horizon(pitch, rows, share):
     mask = np.repeat(np.arange(12)[:, None] < rows, 16, axis=1)
     down = np.sin(np.radians(-pitch))
     view = View.looking_at(np.zeros(3), np.array([0, down, np.cos(np.radians(pitch))]), UP, CAMERA)
-    assert Seen(view, np.zeros((12, 16, 3), np.uint8), mask, np.ones_like(mask), UP).share == share
+    assert SkyEvidence(view, np.zeros((12, 16, 3), np.uint8), mask, np.ones_like(mask), UP).share == share
 
 
 def test_a_choice_is_written_with_its_reason(learned):

@@ -7,7 +7,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.formats.table import read as read_ply
-from clsplat.gaussians.gaussians import Dropout
+from clsplat.gaussians.gaussians import DropoutMask
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import choose
@@ -71,7 +71,7 @@ def test_a_gaussian_that_is_left_out_counts_as_not_seen(rng):
     device = Device(choose())
     case = random_case(rng, 40)
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device)
-    model.dropout = Dropout(0.5, 1, 2)
+    model.dropout = DropoutMask(0.5, 1, 2)
     stats = SplatStats(model.gaussians, ("screen_grad",))
     frame = rasterizer.forward(model, camera, device.zeros(3))
     sums = device.upload(np.ones((rasterizer.pixel_sums(model, frame, frame.image)).shape, np.float32))

@@ -26,7 +26,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs import opening
 from clsplat.scene.detect import read_scene
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 from tests.support.device_images import gradient_of, trainer_of
 
 STEPS = 8  # of smoke, before its first edit
@@ -60,7 +60,7 @@ def test_steps_of_a_trainer_are_those_of_a_pipeline(tiny_scene, tmp_path, overri
         views = FilterViews(device, scene.split("train"))
         measure_intervals(gaussians, views, views.focal, 0.2, 1.0, gaussians[INTERVAL2])
     photographs = Photographs(device, scene.background)
-    trainer = Trainer(
+    trainer = StepTrainer(
         Rasterizer(device),
         DeviceModel(gaussians, degree=0),
         Adam(gaussians),

@@ -13,16 +13,16 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.sweeps.compare.crops import find_seams
 from clsplat.workflows.blocks import is_near, places
-from clsplat.workflows.partition import Cell
+from clsplat.workflows.partition import PartitionCell
 
 SIZE = np.array([10.0, 10.0, 10.0])
-CELLS = [Cell(Box(high=[2.0, None, None]), SIZE), Cell(Box(low=[2.0, None, None]), SIZE)]
+CELLS = [PartitionCell(Box(high=[2.0, None, None]), SIZE), PartitionCell(Box(low=[2.0, None, None]), SIZE)]
 
 
 def test_a_point_is_near_a_face_of_its_own_cell():
     points = np.array([[1.4, 0, 0], [1.6, 9, 9], [2.0, 0, 0], [2.4, -7, 0], [2.6, 0, 0], [np.nan, 0, 0]])
     assert is_near(points, CELLS).tolist() == [False, True, True, True, False, False]
-    assert not is_near(points, [Cell(Box(), SIZE)]).any(), "a whole has no borders"
+    assert not is_near(points, [PartitionCell(Box(), SIZE)]).any(), "a whole has no borders"
 
 
 def test_pixels_lie_where_the_camera_sees_them():

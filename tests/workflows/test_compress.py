@@ -20,10 +20,10 @@ from clsplat.gaussians.model import Rendering
 from clsplat.gaussians.sky import Sky
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs import model_file, runner
-from clsplat.runs.model_file import Source, evaluate
+from clsplat.runs.model_file import ModelSource, evaluate
 from clsplat.training.run import Run
 from clsplat.workflows import compress
-from clsplat.workflows.compress import FITTING, Ladder, Point, Target, checked_keeps, page, table
+from clsplat.workflows.compress import FITTING, CompressionTarget, Ladder, Point, checked_keeps, page, table
 from clsplat.workflows.finetune import Tuning
 from tests.support.html_page import Page
 from tests.support.runs import NO_PROCESS
@@ -57,14 +57,14 @@ def searched(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_targets(text, most, change):
-    found = Target.of(text)
+    found = CompressionTarget.of(text)
     assert (found.most, found.change) == (most, change)
 
 
 @pytest.mark.parametrize("text", ["", "5", "MB", "-5MB", "0MB", "0.5B", "0.1dB", "1e3MB", "-0.1 dB\n5MB", "٥MB"])
 def test_what_is_no_target_is_refused(text):
     with pytest.raises(ConfigError, match="expected a size such as 5MB"):
-        Target.of(text)
+        CompressionTarget.of(text)
 
 
 def test_a_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
@@ -76,21 +76,21 @@ def test_a_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
 
 def test_the_best_of_a_size_and_the_smallest_of_a_loss():
     points = [point(900, 30.0), point(700, 29.95), point(500, 29.5)]
-    assert Target.of("800B").best(points, 30) is points[1]
-    assert Target.of("-0.1dB").best(points, 30) is points[1]
-    assert Target.of("-0.6dB").best(points, 30) is points[2]
-    assert Target.of("0dB").best(points, 31) is None
-    assert Target.of("400B").best(points, 30) is None
-    assert Target.of("400B").nearest(points) is points[2]
-    assert Target.of("0dB").nearest(points) is points[0]
+    assert CompressionTarget.of("800B").best(points, 30) is points[1]
+    assert CompressionTarget.of("-0.1dB").best(points, 30) is points[1]
+    assert CompressionTarget.of("-0.6dB").best(points, 30) is points[2]
+    assert CompressionTarget.of("0dB").best(points, 31) is None
+    assert CompressionTarget.of("400B").best(points, 30) is None
+    assert CompressionTarget.of("400B").nearest(points) is points[2]
+    assert CompressionTarget.of("0dB").nearest(points) is points[0]
 
 
 def test_the_search_goes_down_until_it_cannot_be_better():
     rung = [point(900, 30.0), point(500, 29.5)]
-    assert not Target.of("600B").ends(rung, 30), "fewer Gaussians let more settings fit"
-    assert Target.of("1kB").ends(rung, 30), "all fit"
-    assert not Target.of("-0.1dB").ends(rung, 30)
-    assert Target.of("0dB").ends(rung, 31), "none is good enough"
+    assert not CompressionTarget.of("600B").ends(rung, 30), "fewer Gaussians let more settings fit"
+    assert CompressionTarget.of("1kB").ends(rung, 30), "all fit"
+    assert not CompressionTarget.of("-0.1dB").ends(rung, 30)
+    assert CompressionTarget.of("0dB").ends(rung, 31), "none is good enough"
 
 
 def test_unsearched_format_is_refused_before_anything_is_opened():
@@ -137,13 +137,13 @@ def test_the_page_names_the_scene_and_leads_to_the_file(searched, few_steps, tin
     assert f"<title>{tiny_scene.name} · point_cloud.ply, compressed to " in text
     assert str(few_steps / "point_cloud.ply") in text
     assert '<a href="compressed.sog">compressed.sog</a>' in text
-    before = page(Target.of("-1dB"), point(2000, 31), [point(900, 30.5)], None, "test", "fox", "a.ply")
+    before = page(CompressionTarget.of("-1dB"), point(2000, 31), [point(900, 30.5)], None, "test", "fox", "a.ply")
     assert "<a" not in before, "as long as none is written"
 
 
 def test_names_of_files_are_escaped():
     source = point(2000, 31)
-    text = page(Target.of("-1dB"), source, [point(900, 30.5)], None, "test", "a<b>", "a<b>.ply")
+    text = page(CompressionTarget.of("-1dB"), source, [point(900, 30.5)], None, "test", "a<b>", "a<b>.ply")
     assert "a<b>" not in text
     assert "a&lt;b&gt;" in text
     assert "No file meets the target" in text
@@ -294,7 +294,7 @@ def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
     """A mip model keeps its filter, and photographs are read as the model's run read them."""
     model = clsplat.load(few_steps / "point_cloud.ply")
     mip = replace(model, rendering=Rendering(near=0.05, screen_variance=0.1, compensate=1.0, background="white"))
-    ladder = Ladder(tmp_path, Tuning("compress", Source.of(few_steps, None), mip, 20, None))
+    ladder = Ladder(tmp_path, Tuning("compress", ModelSource.of(few_steps, None), mip, 20, None))
     settings = ladder.pipeline(few_steps / "point_cloud.ply", 0.7).settings
     screen = settings.model.screen_filter
     assert (settings.model.near, screen.variance, screen.compensate) == (0.05, 0.1, 1)
@@ -307,7 +307,7 @@ def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
 def test_averages_of_a_palette_begin_amid_its_trainings(steps, lengths, starts, few_steps, tmp_path):
     """Their steps count from the first stage that is run, not from that of the recipe."""
     model = clsplat.load(few_steps / "point_cloud.ply")
-    tuning = Tuning("compress", Source.of(few_steps, None), model, steps, None)
+    tuning = Tuning("compress", ModelSource.of(few_steps, None), model, steps, None)
     settings = tuning.pipeline(FITTING, {"init.file": str(few_steps / "point_cloud.ply")}).settings
     trainings = [stage for stage in settings.stages if stage.stage == "optimize"]
     assert tuple(training.steps for training in trainings) == lengths

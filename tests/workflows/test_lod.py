@@ -17,7 +17,7 @@ from clsplat.gaussians.sky import Sky
 from clsplat.runs import runner
 from clsplat.runs.model_file import evaluate
 from clsplat.workflows import lod
-from clsplat.workflows.lod import Plan, decimated, table
+from clsplat.workflows.lod import LodPlan, decimated, table
 from tests.support.runs import NO_PROCESS
 
 pytestmark = pytest.mark.slow
@@ -56,7 +56,7 @@ def test_levels_are_trained_and_measured(trained, few_steps, tiny_scene):
 def test_numbers_are_told_as_elsewhere(monkeypatch, caplog):
     caplog.set_level("INFO")
     monkeypatch.setattr(lod, "decimated", lambda model, keep: range(1200))
-    lod._levels(range(2400), Plan(levels=2), None)
+    lod._levels(range(2400), LodPlan(levels=2), None)
     assert "level 1: 1,200 Gaussians" in caplog.text
 
 
@@ -250,7 +250,7 @@ def test_without_steps_levels_are_measured_alone(few_steps, tmp_path):
 )
 def test_what_cannot_be_asked_is_refused(plan, message):
     with pytest.raises(ConfigError, match=message):
-        Plan(**plan)
+        LodPlan(**plan)
 
 
 def test_an_empty_model_and_a_folder_in_use_are_refused(few_steps, tmp_path):

@@ -33,7 +33,7 @@ from clsplat.training.adam import Adam, Rates
 from clsplat.training.memory import plan
 from clsplat.training.motion import MotionRates
 from clsplat.training.records import stage_milliseconds
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 
 # Peak rates of a device, from which the floors of stages are computed.
 
@@ -128,7 +128,7 @@ LEAST_RATE = 1e-30  # changes nothing, so that every step does the same work; at
 
 
 @dataclass
-class Result:
+class BenchResult:
     """One scene's figures, in milliseconds."""
 
     work: Work
@@ -141,7 +141,7 @@ class Result:
     planned: int  # bytes, from the memory plan of training
 
 
-class Case:
+class BenchCase:
     """One scene for training steps with a pipeline's losses, statistics and rendering.
 
     An exported model has the world filter in its scales, so the filter takes no time here.
@@ -160,7 +160,7 @@ class Case:
         model = settings.model.model(gaussians, gaussians.sh_degree)
         least: dict[str, Any] = dict.fromkeys(PARAMETERS, LEAST_RATE)
         motion = MotionRates(**dict.fromkeys(MotionRates.model_fields, LEAST_RATE))
-        self.trainer = Trainer(
+        self.trainer = StepTrainer(
             Rasterizer(device, "radix"),
             model,
             Adam(gaussians),
@@ -204,14 +204,14 @@ class Case:
         self.device.finish()
         self.densify.append(1e3 * (time.perf_counter() - start))
 
-    def result(self, peaks: Peaks) -> Result:
+    def result(self, peaks: Peaks) -> BenchResult:
         """Return the medians of all times, with the floors for `peaks`."""
         work = self._work()
         stages = {name: statistics.median(times) for name, times in self.stages.items()}
         clock = statistics.median(self.clock)
         host = clock - sum(stages.values())
         densify_ms, planned = statistics.median(self.densify[1:]), self._planned()
-        return Result(work, stages, floors(work, peaks), clock, densify_ms, host, self.memory, planned)
+        return BenchResult(work, stages, floors(work, peaks), clock, densify_ms, host, self.memory, planned)
 
     def _planned(self) -> int:
         camera = self.photograph.camera
@@ -234,7 +234,7 @@ class Case:
         return Work(self.trainer.model.gaussians.count, lists.pairs, rows, camera.width * camera.height)
 
 
-def run_bench(cases: dict[str, Case], peaks: Peaks, repeats: int) -> dict[str, Result]:
+def run_bench(cases: dict[str, BenchCase], peaks: Peaks, repeats: int) -> dict[str, BenchResult]:
     """Time every scene `repeats` times, one scene after the other; return the results by name."""
     for _ in range(repeats):
         for case in cases.values():
@@ -275,24 +275,24 @@ def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[
     return parameters, View("bench", camera, np.eye(4)[:3], Path("bench"))
 
 
-def case(device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE) -> Case:
+def case(device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE) -> BenchCase:
     """Return a synthetic scene with a noise image as its photograph."""
     parameters, view = synthetic(width, height, count, size)
     camera = upload_camera(device, view)
     shape = (3, height, width)
     pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
-    return Case(device, parameters, Photograph(camera, device.upload(pixels)), "black", settings)
+    return BenchCase(device, parameters, Photograph(camera, device.upload(pixels)), "black", settings)
 
 
-def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> Case:
+def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> BenchCase:
     """Return a splat PLY, or the Gaussians that `init` makes of a point cloud, at a scene's first training view."""
     opened, background = settings.scene.read(scene)
     photographs = Photographs(device, background)
     parameters = load(model).tables() if detect(model) else from_points(read_points_ply(model), 0.1, 3)
-    return Case(device, parameters, photographs.get(opened.split("train")[0]), background, settings)
+    return BenchCase(device, parameters, photographs.get(opened.split("train")[0]), background, settings)
 
 
-def grown(device: Device, settings: PipelineFile) -> Iterator[Case]:
+def grown(device: Device, settings: PipelineFile) -> Iterator[BenchCase]:
     """Yield scenes of 50 000 to a million Gaussians over one image; their total area is constant."""
     width, height, largest = SIZES["C"]
     for count in GROWTH_COUNTS:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from clsplat.conformance.bench.cases import SIZES, Peaks, Result, case, grown, measure_peaks, real_case, run_bench
+from clsplat.conformance.bench.cases import SIZES, BenchResult, Peaks, case, grown, measure_peaks, real_case, run_bench
 from clsplat.conformance.bench.packing import Packings, measure_packings, task_of
 from clsplat.core.errors import ConfigError, quoted
 from clsplat.core.files import write_text
@@ -91,7 +91,7 @@ SVG_ATTRIBUTES = 'xmlns="http://www.w3.org/2000/svg" width="460" height="220"'
 STYLE = "<style>text{font:11px sans-serif;fill:#4a5568}.grid{stroke:#e2e8f0}</style>"
 
 
-def table(name: str, result: Result, earlier: dict[str, Any] | None) -> str:
+def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str:
     """Return one scene as text; `earlier` is the same scene of an earlier run's JSON."""
     work, mib = result.work, 2**20
     counts = f"{work.gaussians:,} Gaussians, {work.pairs:,} pairs, {work.rows:,} rows, {work.pixels:,} pixels"
@@ -111,7 +111,7 @@ def table(name: str, result: Result, earlier: dict[str, Any] | None) -> str:
     return f"scene {name}: {counts}\n" + textwrap.indent(f"{text_table(cells, left=1)}\n{memory}", "  ")
 
 
-def growth_table(results: Sequence[Result]) -> str:
+def growth_table(results: Sequence[BenchResult]) -> str:
     """Return the milliseconds of steps as text, for growing numbers of Gaussians and pairs, and ns for each."""
     rows = [("Gaussians", "pairs", "ms", "ns each")]
     for result in results:
@@ -121,7 +121,7 @@ def growth_table(results: Sequence[Result]) -> str:
     return text_table(rows)
 
 
-def growth_chart(results: Sequence[Result]) -> str:
+def growth_chart(results: Sequence[BenchResult]) -> str:
     """Return the milliseconds of a step over Gaussians + pairs, as SVG."""
     points = [((r.work.gaussians + r.work.pairs) / 1e6, r.step) for r in results]
     slope, x_max = statistics.median(y / x for x, y in points), max(x for x, _ in points)
@@ -137,7 +137,7 @@ class Measurement:
     device: str
     pipeline: str
     peaks: Peaks
-    results: dict[str, Result]
+    results: dict[str, BenchResult]
 
     def data(self) -> dict[str, Any]:
         """Return everything as plain data."""

@@ -29,7 +29,7 @@ from clsplat.losses.depth import InverseDepth
 from clsplat.opencl.device import Device
 from clsplat.photos.depths import KnownDepths
 from clsplat.render.overlay import lay_over, look_behind
-from clsplat.render.rasterizer import INVERSE_DEPTHS, PIXEL_SUMS, RECORD, Budget, Frame, Rasterizer
+from clsplat.render.rasterizer import INVERSE_DEPTHS, PIXEL_SUMS, RECORD, Frame, Rasterizer, RenderLimits
 from clsplat.render.tiles import Sort
 from clsplat.render.workspace import Workspace
 
@@ -63,7 +63,7 @@ def pixel_sums_of(
     weights: NDArray[Any],
     count: int = PIXEL_SUMS,
     sort: Sort = "radix",
-    budget: Budget | None = None,
+    budget: RenderLimits | None = None,
     texture: NDArray[Any] | None = None,
 ) -> NDArray[Any]:
     """Sums over each Gaussian's pixels under the loss Σ weights · image, [N, count]."""
@@ -230,7 +230,7 @@ def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.G
     yield equal("sort_tiles", "pixels, against the radix sort", render(device, case, "bitonic").image.get(), image)
     again = pixel_sums_of(device, case, weights, sort="bitonic")
     yield equal("sort_tiles", "sums over pixels, against the radix sort", again, sums)
-    banded = pixel_sums_of(device, case, weights, budget=Budget(250, 3))
+    banded = pixel_sums_of(device, case, weights, budget=RenderLimits(250, 3))
     yield equal("blend_backward", "sums over pixels, against bands of tiles", banded, sums)
     yield equal("blend_backward", "sums over pixels, a second time", pixel_sums_of(device, case, weights), sums)
 
@@ -241,7 +241,7 @@ Floats = NDArray[Any]
 
 
 def gradients_of(
-    device: Device, case: Case, weights: Floats, budget: Budget | None = None
+    device: Device, case: Case, weights: Floats, budget: RenderLimits | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Image [4, H, W], sums over pixels [N, PIXEL_SUMS], those of inverse depths [N], and the gradient of the means
     [N, 3], under the loss Σ weights · (image, inverse depth)."""
@@ -291,7 +291,7 @@ def inverse_depths(device: Device, rng: np.random.Generator) -> Iterator[Figure 
         )
         image, *sums = gradients_of(device, case, weights)
         yield equal("blend_forward", f"colours, {what}", image[:3], plain.image.get()[:, :height, :width])
-        for one, other in zip(sums, gradients_of(device, case, weights, Budget(40, 3))[1:], strict=True):
+        for one, other in zip(sums, gradients_of(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
             yield equal("sum_inverse_depths", f"against bands of tiles, {what}", other, one)
 
 

@@ -15,14 +15,14 @@ from clsplat.density.control import cap_opacity, densify
 from clsplat.density.edit import Edit
 from clsplat.density.importance import contributions, sensitivities
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
-from clsplat.density.survey import Look
+from clsplat.density.survey import SurveyView
 from clsplat.density.thresholds import SceneScale
 from clsplat.formats.palette import LEVELS
 from clsplat.gaussians import clusters as cluster_tables
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
-from clsplat.methods.adc import Clone, PruneFaint, PruneLarge, Split
+from clsplat.methods.adc import Clone, PruneFaint, PruneLarge, SplitLarge
 from clsplat.methods.binocular import decay_opacity
 from clsplat.methods.mcmc import add_noise
 from clsplat.opencl.device import Device, constants
@@ -32,7 +32,7 @@ from clsplat.training.adam import Adam
 
 CHECKS = Checks()
 COUNTS = (1, 15, 17, 65, 200)
-GROWTH = (Clone(size_below=0.01, opacity="shared"), Split(size_above=0.01))
+GROWTH = (Clone(size_below=0.01, opacity="shared"), SplitLarge(size_above=0.01))
 RULES = (*GROWTH, PruneFaint(opacity_below=0.005), PruneLarge(size_above=0.1))
 EXTENT = 5.0
 SEED, STEP = 3, 3100
@@ -249,9 +249,9 @@ def contribution(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
         yield by_norm("blend_backward", f"squared changes of the image by {count} Gaussians", found, squares, GRADIENT)
 
 
-def _looks(device: Device, case: Case, photographs: list[Photograph], background: NDArray[Any]) -> Iterator[Look]:
+def _looks(device: Device, case: Case, photographs: list[Photograph], background: NDArray[Any]) -> Iterator[SurveyView]:
     """The views of photographs, by a new rasterizer and model."""
-    return Look.each(Rasterizer(device, "radix"), case.model(device), photographs, device.upload(background))
+    return SurveyView.each(Rasterizer(device, "radix"), case.model(device), photographs, device.upload(background))
 
 
 def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from clsplat.conformance.check import CONIC, SUM, Checks, Figure, Note, by_eleme
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.formats.splats import MOTION, STILL, WIDTHS, fields_of, width_of
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.gaussians.structs import Gradients, moment_tables
+from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import PenaltyInputs
 from clsplat.methods.dynamic import Brevity, Travel
 from clsplat.opencl.device import Device
@@ -60,7 +60,7 @@ def moment_figures(device: Device, rng: np.random.Generator, count: int, width: 
     yield by_element("move_forward", f"logits, {what}", drawn.get("logit_opacity")[there, 0], logits[there], 1e-5, 1.0)
     yield by_element("turn_forward", f"quaternions, {what}", drawn.get("quats"), quats, 1e-6, floor=1.0)
 
-    gradients = Gradients(model.gaussians)
+    gradients = GaussianGradients(model.gaussians)
     given = {name: rng.normal(size=p[name].shape).astype(np.float32) for name in ("means", "quats", "logit_opacity")}
     for name, values in given.items():
         values[~there] = 0
@@ -107,7 +107,7 @@ def step_figures(
     each = np.concatenate([np.full(c.stop - c.start, rates[name]) for name, c in fields_of(width).items()])
     for step in (1, 2):
         gradient = rng.normal(size=(count, width)).astype(np.float32)
-        gradients = Gradients(gaussians)
+        gradients = GaussianGradients(gaussians)
         planes = np.zeros(gradients[MOTION].shape, np.float32)
         planes[:, :count] = gradient.T
         gradients[MOTION].set(planes)
@@ -143,7 +143,7 @@ def penalties_of_motion(device: Device, rng: np.random.Generator) -> Iterator[Fi
             (Brevity(weight=3.0, below=0.4), ref.brevity(table.astype(np.float64), 0.4)),
         ):
             gaussians = Gaussians(device, {**random_case(rng, count).parameters, MOTION: table})
-            gradients, what = Gradients(gaussians), f"{count} Gaussians"
+            gradients, what = GaussianGradients(gaussians), f"{count} Gaussians"
             gradients[MOTION].fill(0.25)
             inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
             found = np.array([penalty.add(inputs).value()])

@@ -13,7 +13,7 @@ from clsplat.conformance.reference import nerf as ref_cones
 from clsplat.conformance.reference import nerf as ref_field
 from clsplat.conformance.reference import nerf as ref_grid
 from clsplat.conformance.scenes import random_case
-from clsplat.nerf.field import Draw, Field, Level, Levels, Rays, Target
+from clsplat.nerf.field import Draw, Field, Levels, Rays, RayTarget, SampleLevel
 from clsplat.nerf.network import PLACE_ROWS
 from clsplat.nerf.shape import FEATURES, SAMPLES, FieldShape
 from clsplat.nerf.training import AdamStep, LearnedField
@@ -42,7 +42,7 @@ EDGES = 2e-6  # of the distances, in shares of the farthest
 class GridLevel:
     """A level of a grid, and where its entries lie among the parameters."""
 
-    level: ref_grid.Level
+    level: ref_grid.HashLevel
     first: int
 
     def of(self, parameters: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -52,7 +52,7 @@ class GridLevel:
 
 
 @dataclass(frozen=True)
-class Case:
+class FieldCase:
     """Random parameters, and a camera before a random photograph."""
 
     shape: FieldShape
@@ -64,7 +64,7 @@ class Case:
     cones: NDArray[np.float64]  # with those that fill tiles
 
     @classmethod
-    def of(cls, device: Device, rng: np.random.Generator, rays: int, draw: Draw, **keys: Any) -> "Case":
+    def of(cls, device: Device, rng: np.random.Generator, rays: int, draw: Draw, **keys: Any) -> "FieldCase":
         """Return a case of drawn rays."""
         shape = FieldShape.model_validate({**SHAPE.model_dump(), **keys})
         parameters = shape.first_parameters(int(rng.integers(100)))
@@ -116,7 +116,8 @@ class Case:
         """The levels of the grid; none without one."""
         table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.of_network
         return [
-            GridLevel(ref_grid.Level(cells, entries), first + FEATURES * before) for cells, before, entries, _ in table
+            GridLevel(ref_grid.HashLevel(cells, entries), first + FEATURES * before)
+            for cells, before, entries, _ in table
         ]
 
 
@@ -129,7 +130,7 @@ def rows_of(table: Array, first: int, count: int) -> NDArray[Any]:
 def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     """Pixels, rays and where they are cut, drawn and even."""
     for count in RAYS:
-        case = Case.of(device, rng, count, Draw(7, 11, 5))
+        case = FieldCase.of(device, rng, count, Draw(7, 11, 5))
         pixels = ref_cones.drawn_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
         yield equal("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
         yield by_element("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
@@ -137,7 +138,7 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure
             yield from _edge_figures(replace(case, rays=rays), f"{count} rays, {'drawn' if rays.draw else 'even'}")
 
 
-def _edge_figures(case: Case, what: str) -> Iterator[Figure]:
+def _edge_figures(case: FieldCase, what: str) -> Iterator[Figure]:
     coarse, fine = ((level.edges.get(), level.weights.get()) for level in case.levels.render(case.on_device, case.rays))
     shape, (edges, weights) = case.shape, coarse
     drawn, again = case.units(shape.coarse_samples, ref_cones.COARSE), case.units(shape.fine_samples, ref_cones.FINE)
@@ -155,7 +156,7 @@ def _edge_figures(case: Case, what: str) -> Iterator[Figure]:
 def encodings(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     """What the network reads of a sample."""
     for count in RAYS:
-        case = Case.of(device, rng, count, Draw(1, 2, 0))
+        case = FieldCase.of(device, rng, count, Draw(1, 2, 0))
         level = next(case.levels.render(case.on_device, case.rays))
         position, direction = case.encoded(level.edges.get())
         (table, first), (seen, row) = (
@@ -193,14 +194,14 @@ CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, place
 def grids_of_features(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     """Where samples are in a grid, what a network reads of it there, and derivatives by its numbers."""
     for count in RAYS:
-        case = Case.of(device, rng, count, Draw(1, 2, 0), grid=GRID)
+        case = FieldCase.of(device, rng, count, Draw(1, 2, 0), grid=GRID)
         level = next(case.levels.render(case.on_device, case.rays))
         at, variances = case.places(level.edges.get())
         found = rows_of(case.levels.encoding.places(level.raw_colours.shape[0]), 0, PLACE_ROWS)
         yield by_element("grid_places", f"means of {count} rays", found[:, :3], at, 1e-5, 1.0)
         yield by_element("grid_places", f"variances of {count} rays", found[:, 3], variances, 1e-3)
     for tiles, ends, keys in CASES:
-        case = Case.of(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
+        case = FieldCase.of(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
         yield from _grid_figures(device, rng, case, _places(rng, tiles, ends))
 
 
@@ -217,7 +218,7 @@ def _by_sample(table: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _grid_figures(
-    device: Device, rng: np.random.Generator, case: Case, places: NDArray[np.float32]
+    device: Device, rng: np.random.Generator, case: FieldCase, places: NDArray[np.float32]
 ) -> Iterator[Figure]:
     shape, encoding, tiles = case.shape, case.levels.encoding, len(places)
     assert shape.grid is not None
@@ -266,7 +267,7 @@ FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
 def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     """Colours of rays and derivatives by all parameters, through both levels."""
     for count, keys in FIELDS_CASES:
-        case = Case.of(device, rng, count, Draw(3, 4, 2), **keys)
+        case = FieldCase.of(device, rng, count, Draw(3, 4, 2), **keys)
         gradient = device.zeros(case.shape.parameters)
         errors, expected = device.zeros(2 + count), list[ref_field.Weights]()
         by_entries = [np.zeros_like(own.of(case.parameters)) for own in case.grid_levels()]
@@ -274,7 +275,7 @@ def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
         for scale, level in zip((0.1, 1.0), case.levels.render(parameters, case.rays), strict=True):
             comparison = _Comparison.of(case, level, scale)
             yield from comparison.figures(f"{count} rays, {level.samples} samples")
-            case.levels.differentiate(parameters, level, Target(case.planes, scale, errors), gradient)
+            case.levels.differentiate(parameters, level, RayTarget(case.planes, scale, errors), gradient)
             squares = (comparison.differences[:count] ** 2).sum(axis=1)
             yield by_element("composite_backward", f"squares of {count} rays", errors.get()[2:], squares, SUM, 1e-3)
             by_weights, by_position = comparison.backward(count)
@@ -310,9 +311,9 @@ def _gradient_figures(
 class _Comparison:
     """A level in double precision."""
 
-    level: Level
+    level: SampleLevel
     scale: float
-    network: ref_field.Network
+    network: ref_field.DenseNetwork
     weights: ref_field.Weights
     raw: tuple[NDArray[np.float64], NDArray[np.float64]]
     inputs: ref_field.Inputs
@@ -320,8 +321,11 @@ class _Comparison:
     differences: NDArray[np.float64]
 
     @classmethod
-    def of(cls, case: Case, level: Level, scale: float) -> "_Comparison":
-        network, weights = ref_field.Network(case.shape.depth, case.shape.skip), case.shape.weights(case.parameters)
+    def of(cls, case: FieldCase, level: SampleLevel, scale: float) -> "_Comparison":
+        network, weights = (
+            ref_field.DenseNetwork(case.shape.depth, case.shape.skip),
+            case.shape.weights(case.parameters),
+        )
         edges, samples = level.edges.get().astype(np.float64), level.samples
         colours, densities, inputs = network.forward(weights, *case.encoded(edges))
         lengths = np.diff(edges, axis=1) * case.cones[:, 7:8]
@@ -353,7 +357,7 @@ class _Comparison:
 @CHECKS.add("place_colours")
 def pictures_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     """A whole picture: the pixels in their places, zeros around them."""
-    case = Case.of(device, rng, 1, Draw(0, 1, 0))
+    case = FieldCase.of(device, rng, 1, Draw(0, 1, 0))
     field = Field(case.shape, case.on_device, device.upload(BACKGROUND))
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)
     *_, fine = case.levels.render(case.on_device, case.levels.cast(case.rays.camera, device.upload(pixels)))

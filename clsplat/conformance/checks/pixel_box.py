@@ -23,7 +23,7 @@ from clsplat.conformance.checks.training import fused_figures
 from clsplat.conformance.scenes import Case, random_case, safe_case, with_world_filter
 from clsplat.density.survey import SQUARE
 from clsplat.opencl.device import Device
-from clsplat.render.rasterizer import Budget
+from clsplat.render.rasterizer import RenderLimits
 
 CHECKS = Checks()
 BOX: dict[str, Any] = {"variance": 0.0, "pixel_box": 1.0}
@@ -78,5 +78,5 @@ def the_pixel_box_in_bands(device: Device, rng: np.random.Generator) -> Iterator
         "sort_tiles", "pixels over their box, by the other sort", render(device, case, "bitonic").image.get(), image
     )
     sums = pixel_sums_of(device, case, weights)
-    banded = pixel_sums_of(device, case, weights, budget=Budget(250, 3))
+    banded = pixel_sums_of(device, case, weights, budget=RenderLimits(250, 3))
     yield equal("blend_backward", "sums over pixels over their box, against bands of tiles", banded, sums)

@@ -31,7 +31,7 @@ def wide_case(rng: np.random.Generator, width: int, height: int) -> Case:
     return replace(case, view=replace(case.view, camera=camera, world_to_camera=pose))
 
 
-class View:
+class SkyView:
     """A camera before a random map, with what splats leave of each pixel."""
 
     def __init__(self, device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> None:
@@ -60,7 +60,7 @@ def planes_in_rows(texels: NDArray[Any]) -> NDArray[np.float32]:
 
 def sky_figures(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Figure]:
     """Compare a picture and the derivative by the map; finished pixels have a negative transmittance."""
-    view, what = View(device, rng, width, height, side), f"{width} x {height} px, {side} texels a side"
+    view, what = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels a side"
     image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
     planes = view.planes(image)
     view.skies.paint(view.sky, view.camera, planes, view.transmittance)
@@ -80,7 +80,7 @@ def sky_figures(device: Device, rng: np.random.Generator, width: int, height: in
 
 def cover_figures(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Figure]:
     """Compare the loss of what covers the sky; photographs are far from the difference that decides."""
-    view, what, difference, weight = View(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
+    view, what, difference, weight = SkyView(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
     sky = ref.sky_image(view.texels.astype(np.float64), view.directions)
     far = np.where(rng.random((height, width)) < 0.3, 2.0, 0.4) * difference
     photograph = (sky + far * np.where(rng.random(sky.shape) < 0.5, -1, 1)).astype(np.float32)
@@ -115,7 +115,7 @@ def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Figur
 def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     """Three updates; texels that the view does not show stay."""
     side = 16
-    view, texels = View(device, rng, 9, 7, side), side**2
+    view, texels = SkyView(device, rng, 9, 7, side), side**2
     shown = view.skies.runs(view.camera, side).shown.get()
     moments = {name: device.zeros((width, texels)) for name, width in (("moment1", 3), ("moment2", 3), ("biases", 2))}
     moments["free"], free = view.learned, view.free.ravel()[shown]

@@ -15,8 +15,8 @@ from clsplat.conformance.checks.projection import expected_gradients, gradient_f
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.deferred import Deferred
-from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, Dropout, Gaussians, hide
-from clsplat.gaussians.structs import Gradients, moment_tables
+from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, DropoutMask, Gaussians, hide
+from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import Penalty, PenaltyInputs
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
 from clsplat.opencl.device import Array, Device, constants
@@ -40,7 +40,7 @@ def step_figures(device: Device, rng: np.random.Generator, count: int) -> Iterat
     values = {name: case.parameters[name].astype(np.float64) for name in PARAMETERS}
     moments = {name: [np.zeros_like(v), np.zeros_like(v)] for name, v in values.items()}
     for step in range(1, 4):
-        gradients = Gradients(model.gaussians)
+        gradients = GaussianGradients(model.gaussians)
         for name in PARAMETERS:
             shape = values[name].shape
             gradient = (rng.normal(size=shape) * rng.choice([1e-7, 1e-3, 1], shape)).astype(np.float32)
@@ -170,7 +170,7 @@ def penalty_figures(
     if interval is not None:
         gaussians.add(INTERVAL2, 1)
         gaussians.set(INTERVAL2, interval[:, None] ** 2)
-    gradients = Gradients(gaussians)
+    gradients = GaussianGradients(gaussians)
     gradients[parameter].fill(0.25)
     inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
     found = penalty.add(inputs).value()
@@ -265,7 +265,7 @@ def trained(
         keys = np.full(gaussians.capacity, CULLED, np.uint32)
         keys[: gaussians.count][mask] = 7
         of_view = replace(frame, depth_key=device.upload(keys))
-        of_loss = Gradients(gaussians)
+        of_loss = GaussianGradients(gaussians)
         planes = np.zeros(of_loss["sh_rest"].shape, np.float32)
         planes[:, : gaussians.count] = gradient.T
         of_loss["sh_rest"].set(planes)
@@ -340,7 +340,7 @@ def average_figures(device: Device, rng: np.random.Generator, count: int) -> Ite
 # dropout.cl: what a step leaves out, and what projection makes of the others.
 
 SEED, STEP = 0x9E3779B9, 700
-DROPOUT = Dropout(0.3, SEED, STEP)
+DROPOUT = DropoutMask(0.3, SEED, STEP)
 
 
 def dropout_figures(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Figure]:

@@ -19,13 +19,13 @@ from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.losses.image import L1, Dssim
-from clsplat.methods.adc import Clone, PruneFaint, Split
+from clsplat.methods.adc import Clone, PruneFaint, SplitLarge
 from clsplat.opencl.device import Array, Device
 from clsplat.photos.photographs import Photograph
 from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import StepTrainer
 
 CHECKS = Checks()
 SPEED = Checks()  # needed once for a device, not for each schedule
@@ -55,14 +55,14 @@ def train(
     gaussians, rasterizer = model.gaussians, Rasterizer(device, "radix")
     adam, stats = Adam(gaussians), SplatStats(gaussians)
     losses = [L1(weight=0.8), Dssim(weight=0.2)]
-    trainer = Trainer(rasterizer, model, adam, stats, device.zeros(3), losses, Rates(sh_base=0.03))
+    trainer = StepTrainer(rasterizer, model, adam, stats, device.zeros(3), losses, Rates(sh_base=0.03))
     values: list[float] = []
     began = time.monotonic()
     for step in range(1, steps + 1):
         values.append(trainer.step(photograph, step).loss)
         if step == STEPS // 2:
             edit = Edit(gaussians, stats, SceneScale(4.0), step, seed=0)
-            densify(edit, [Clone(gradient_above=1e-3), Split(gradient_above=1e-3), PruneFaint()], rasterizer.tiler)
+            densify(edit, [Clone(gradient_above=1e-3), SplitLarge(gradient_above=1e-3), PruneFaint()], rasterizer.tiler)
         if time.monotonic() - began > PATIENCE and len(values) < steps:
             break
     return values, {name: gaussians.get(name) for name in gaussians.tables}

@@ -52,8 +52,8 @@ from clsplat.conformance.reference.images import (
 )
 from clsplat.conformance.reference.kinds import (
     SMOOTH,
-    Camera,
-    Gaussians,
+    PinholeCamera,
+    RawGaussians,
     Splats,
     Thresholds,
 )
@@ -109,8 +109,8 @@ __all__ = [
     "PRUNE",
     "SMOOTH",
     "SPLIT",
-    "Camera",
-    "Gaussians",
+    "PinholeCamera",
+    "RawGaussians",
     "Splats",
     "Thresholds",
     "adam_step",

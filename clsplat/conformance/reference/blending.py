@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.reference.kinds import Camera, Gaussians, SplatGradients, Splats, Thresholds
+from clsplat.conformance.reference.kinds import PinholeCamera, RawGaussians, SplatGradients, Splats, Thresholds
 from clsplat.conformance.reference.projection import project, project_backward
 
 # The mean of a Gaussian over the box of a pixel, as the kernels approximate it (cl_kernels/pixel_box.h).
@@ -283,7 +283,7 @@ def _relative_gap(values: NDArray[Any], threshold: float) -> float:
     return float(np.min(np.abs(values / threshold - 1), initial=np.inf)) if threshold > 0 else np.inf
 
 
-class Frame(NamedTuple):
+class RenderOutput(NamedTuple):
     """What `render` returns."""
 
     image: NDArray[Any]  # [3,H,W]
@@ -293,8 +293,8 @@ class Frame(NamedTuple):
 
 
 def render(
-    gaussians: Gaussians,
-    camera: Camera,
+    gaussians: RawGaussians,
+    camera: PinholeCamera,
     background: NDArray[Any],
     degree: int,
     near: float = 0.2,
@@ -302,15 +302,15 @@ def render(
     compensate: float = 0.0,
     thresholds: Thresholds = Thresholds(),
     pixel_box: float = 0.0,
-) -> Frame:
+) -> RenderOutput:
     """Project and blend."""
     splats = project(gaussians, camera, degree, near, variance, compensate, thresholds, pixel_box)
-    return Frame(*blend(splats, camera.width, camera.height, background, thresholds), splats)
+    return RenderOutput(*blend(splats, camera.width, camera.height, background, thresholds), splats)
 
 
 def render_backward(
-    gaussians: Gaussians,
-    camera: Camera,
+    gaussians: RawGaussians,
+    camera: PinholeCamera,
     background: NDArray[Any],
     degree: int,
     splats: Splats,

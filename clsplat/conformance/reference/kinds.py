@@ -23,7 +23,7 @@ SMOOTH = Thresholds(alpha_min=0.0, transmittance_min=0.0)
 
 
 @dataclass(frozen=True)
-class Camera:
+class PinholeCamera:
     """Pinhole camera; `fx, fy, cx, cy` in px."""
 
     world_to_camera: NDArray[Any]  # [3,4]
@@ -48,7 +48,7 @@ class Camera:
 
 
 @dataclass
-class Gaussians:
+class RawGaussians:
     """Raw parameters, as optimised."""
 
     means: NDArray[Any]  # [N,3]

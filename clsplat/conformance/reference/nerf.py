@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.reference.kinds import Camera
+from clsplat.conformance.reference.kinds import PinholeCamera
 from clsplat.conformance.reference.random import philox
 
 Floats = NDArray[np.float64]
@@ -16,7 +16,7 @@ Inputs = list[Floats]  # of each layer, [S, inputs]
 
 
 @dataclass(frozen=True)
-class Network:
+class DenseNetwork:
     """Layers in their order: `depth` of the trunk, of which the one after `skip` reads the position again, density,
     bottleneck, condition, colour."""
 
@@ -121,7 +121,7 @@ def drawn_pixels(count: int, rays: int, first: int, seed: int, step: int) -> NDA
     return np.array([philox((first + i, step, PIXELS, 0), (seed, 0))[0] * count >> 32 for i in range(rays)], np.int64)
 
 
-def cones(camera: Camera, pixels: NDArray[np.int64]) -> Floats:
+def cones(camera: PinholeCamera, pixels: NDArray[np.int64]) -> Floats:
     """Origin, direction with depth 1, radius at a distance of 1 and length of the direction, [R, 8]."""
     x = (pixels % camera.width + 0.5 - camera.cx) / camera.fx
     y = (pixels // camera.width + 0.5 - camera.cy) / camera.fy
@@ -210,7 +210,7 @@ def places(means: Floats, variances: Floats, corner: Floats, side: float) -> tup
 
 
 @dataclass(frozen=True)
-class Level:
+class HashLevel:
     """A cube of n^3 cells whose corners share `entries` where they are fewer."""
 
     cells: int

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.reference.kinds import PARAMETERS, RADIUS_TILE, Camera, Gaussians, Splats, Thresholds
+from clsplat.conformance.reference.kinds import PARAMETERS, RADIUS_TILE, PinholeCamera, RawGaussians, Splats, Thresholds
 
 # Spherical harmonics up to degree 3 in the sign convention of 3DGS, and their derivatives.
 
@@ -70,7 +70,7 @@ def rotation_matrix(quat: NDArray[Any]) -> NDArray[Any]:
     )
 
 
-def ray_limits(camera: Camera) -> NDArray[Any]:
+def ray_limits(camera: PinholeCamera) -> NDArray[Any]:
     """Limits of x/z and y/z in the Jacobian, for any principal point: [[x_lo, x_hi], [y_lo, y_hi]]."""
     tan_x, tan_y = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
     return np.array(
@@ -81,7 +81,7 @@ def ray_limits(camera: Camera) -> NDArray[Any]:
     )
 
 
-def clamped_ray(camera: Camera, point: NDArray[Any]) -> NDArray[Any]:
+def clamped_ray(camera: PinholeCamera, point: NDArray[Any]) -> NDArray[Any]:
     """(tx, ty) of 2.1 step 3 for a camera-space point."""
     limits = ray_limits(camera)
     return point[2] * np.clip(point[:2] / point[2], limits[:, 0], limits[:, 1])
@@ -110,7 +110,7 @@ class Footprint:
     dilated: NDArray[Any]  # [2,2] V1 = V + variance I
 
 
-def footprint(gaussians: Gaussians, n: int, camera: Camera, variance: float) -> Footprint:
+def footprint(gaussians: RawGaussians, n: int, camera: PinholeCamera, variance: float) -> Footprint:
     """2.1 steps 1-4 with the world filter of 8.1."""
     point = camera.rotation @ gaussians.means[n] + camera.translation
     rotation = rotation_matrix(gaussians.quats[n])
@@ -133,14 +133,14 @@ def opacity_factors(logit: float, foot: Footprint, compensate: float) -> tuple[f
     return 1 / (1 + np.exp(-logit)), np.prod(foot.scale / foot.filtered), kappa
 
 
-def view_direction(camera: Camera, mean: NDArray[Any]) -> tuple[NDArray[Any], Any]:
+def view_direction(camera: PinholeCamera, mean: NDArray[Any]) -> tuple[NDArray[Any], Any]:
     """Unit vector from the camera to the Gaussian, and their distance."""
     offset = mean - camera.position
     distance = np.linalg.norm(offset)
     return offset / distance, distance
 
 
-def unclamped_colour(gaussians: Gaussians, n: int, camera: Camera, degree: int) -> NDArray[Any]:
+def unclamped_colour(gaussians: RawGaussians, n: int, camera: PinholeCamera, degree: int) -> NDArray[Any]:
     """Σ Y_k(d) c_k + 0.5: [3]."""
     basis = sh_basis(view_direction(camera, gaussians.means[n])[0], degree)
     return basis @ gaussians.sh[n, : len(basis)] + 0.5
@@ -159,8 +159,8 @@ def vanilla_radius(mean2d: NDArray[Any], dilated: NDArray[Any], width: int, heig
 
 
 def project(
-    gaussians: Gaussians,
-    camera: Camera,
+    gaussians: RawGaussians,
+    camera: PinholeCamera,
     degree: int,
     near: float = 0.2,
     variance: float = 0.3,
@@ -225,7 +225,9 @@ def quat_gradient(quat: NDArray[Any], h: NDArray[Any]) -> NDArray[Any]:
     return (grad_unit - unit * (unit @ grad_unit)) / norm
 
 
-def point_gradient(camera: Camera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any]) -> NDArray[Any]:
+def point_gradient(
+    camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any]
+) -> NDArray[Any]:
     """dL/d(camera-space point), through the screen position and through J with its clamped ray."""
     x, y, z = foot.point
     fx, fy = camera.fx, camera.fy
@@ -271,8 +273,8 @@ def covariance_gradient(
 
 
 def project_backward(
-    gaussians: Gaussians,
-    camera: Camera,
+    gaussians: RawGaussians,
+    camera: PinholeCamera,
     degree: int,
     variance: float,
     compensate: float,
@@ -325,7 +327,7 @@ def project_backward(
 
 
 def sampling_interval(
-    means: NDArray[Any], cameras: list[Camera], focal: list[float], near: float = 0.2, margin: float = 0.15
+    means: NDArray[Any], cameras: list[PinholeCamera], focal: list[float], near: float = 0.2, margin: float = 0.15
 ) -> NDArray[Any]:
     """Smallest depth / focal length over the cameras that see each mean; the largest of them where none does: [N]."""
     intervals = np.full(len(means), np.inf)
@@ -357,7 +359,7 @@ def filtered(
 # Gradients by the place and the focal length of a camera, one Gaussian at a time, in the axes of the camera.
 
 
-def moved_camera(camera: Camera, shift: NDArray[Any], turn: NDArray[Any], zoom: float = 0.0) -> Camera:
+def moved_camera(camera: PinholeCamera, shift: NDArray[Any], turn: NDArray[Any], zoom: float = 0.0) -> PinholeCamera:
     """The camera after W' = exp([turn]x) W, t' = exp([turn]x) t + shift, and focal lengths times exp(zoom)."""
     angle = np.linalg.norm(turn)
     x, y, z = turn
@@ -368,12 +370,12 @@ def moved_camera(camera: Camera, shift: NDArray[Any], turn: NDArray[Any], zoom: 
     pose = rotation @ camera.world_to_camera
     pose[:, 3] += shift
     fx, fy = np.exp(zoom) * camera.fx, np.exp(zoom) * camera.fy
-    return Camera(pose, fx, fy, camera.cx, camera.cy, camera.width, camera.height)
+    return PinholeCamera(pose, fx, fy, camera.cx, camera.cy, camera.width, camera.height)
 
 
 def pose_gradient(
-    gaussians: Gaussians,
-    camera: Camera,
+    gaussians: RawGaussians,
+    camera: PinholeCamera,
     degree: int,
     variance: float,
     compensate: float,
@@ -414,7 +416,7 @@ def pose_gradient(
 
 
 def focal_gradient(
-    camera: Camera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any], axis: int
+    camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any], axis: int
 ) -> float:
     """dL/dfx (axis 0) or dL/dfy (1), through the screen position and through J.
 

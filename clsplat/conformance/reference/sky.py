@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.reference.kinds import Camera
+from clsplat.conformance.reference.kinds import PinholeCamera
 
 Entry = tuple[int, int, float]  # row and column of a texel, weight
 
 
-def rays(camera: Camera, width: int, height: int) -> NDArray[Any]:
+def rays(camera: PinholeCamera, width: int, height: int) -> NDArray[Any]:
     """Directions through the centres of pixels."""
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(height) + 0.5 - camera.cy) / camera.fy

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance.reference.blending import alpha_gradients
-from clsplat.conformance.reference.kinds import Camera, Gaussians, Splats, Thresholds
+from clsplat.conformance.reference.kinds import PinholeCamera, RawGaussians, Splats, Thresholds
 from clsplat.conformance.reference.projection import rotation_matrix
 
 
@@ -202,14 +202,14 @@ def screen_splitting(
     return found
 
 
-def mean_jacobian(camera: Camera, mean: NDArray[Any]) -> NDArray[Any]:
+def mean_jacobian(camera: PinholeCamera, mean: NDArray[Any]) -> NDArray[Any]:
     """d(projected mean)/d(mean): [2,3] px by scene unit."""
     x, y, z = camera.rotation @ mean + camera.translation
     perspective = np.array([[camera.fx / z, 0, -camera.fx * x / z**2], [0, camera.fy / z, -camera.fy * y / z**2]])
     return perspective @ camera.rotation
 
 
-def splitting(gaussians: Gaussians, camera: Camera, on_screen: NDArray[Any]) -> NDArray[Any]:
+def splitting(gaussians: RawGaussians, camera: PinholeCamera, on_screen: NDArray[Any]) -> NDArray[Any]:
     """Lift matrices on the screen, [N,2,2], to the scene, with a form of the splat that stays: [N,3,3]."""
     found = np.zeros((len(on_screen), 3, 3))
     for n in np.flatnonzero(on_screen.any(axis=(1, 2))):

@@ -75,7 +75,7 @@ STEP = 2.0  # brightness of a photograph by that of the one before: at most 1.4 
 
 
 @dataclass(frozen=True)
-class Look:
+class PhotographMeasures:
     """What is measured of one photograph."""
 
     sharpness: NDArray[np.float64]  # both
@@ -131,7 +131,7 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
     )
 
 
-def _look(file: Path) -> Look | DataError:
+def _look(file: Path) -> PhotographMeasures | DataError:
     """Measure a photograph; or return why it cannot be read."""
     try:
         grey = read_grey(file, SIDE)[0]
@@ -139,7 +139,7 @@ def _look(file: Path) -> Look | DataError:
         return error
     small = cv2.resize(grey, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
     brightness = np.maximum([grey.mean(), np.median(grey)], 1.0)
-    return Look(both_sharpnesses(grey), brightness, small.astype(np.float32).ravel())
+    return PhotographMeasures(both_sharpnesses(grey), brightness, small.astype(np.float32).ravel())
 
 
 def _steps(brightness: Mapping[str, NDArray[np.float64]], told: Container[str]) -> list[tuple[str, str, float]]:

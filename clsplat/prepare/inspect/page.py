@@ -131,7 +131,7 @@ MAX_VIEWS = 8  # in the table of those that see the fewest points
 
 
 @dataclass(frozen=True)
-class Seen:
+class PointVisibility:
     """How many points the views see."""
 
     charts: list[Markup]
@@ -171,13 +171,13 @@ def inspection_page(inspection: Inspection) -> str:
     )
 
 
-def _seen(inspection: Inspection) -> Seen | None:
+def _seen(inspection: Inspection) -> PointVisibility | None:
     """A histogram, and the views that see the fewest points; None where the dataset has no such counts."""
     seen = inspection.facts.seen
     if not seen:
         return None
     fewest = sorted(seen.items(), key=lambda item: item[1])[:MAX_VIEWS]
-    return Seen(charts([histogram("views by their number of points", list(seen.values()))]), fewest)
+    return PointVisibility(charts([histogram("views by their number of points", list(seen.values()))]), fewest)
 
 
 def _lists(inspection: Inspection) -> list[NameList]:

@@ -11,7 +11,7 @@ import numpy as np
 from clsplat.core.errors import ClsplatError
 from clsplat.core.progress import Progress
 from clsplat.photos.photographs import BACKGROUNDS
-from clsplat.runs.live.preview import RESERVE, Curves, Desk, Order, Pictures, Preview, Shown
+from clsplat.runs.live.preview import RESERVE, Curves, Desk, PageCamera, Pictures, Preview, ShownRun
 from clsplat.runs.live.server import LOOPBACK, Answers, Server, scene_data
 from clsplat.scene.viewpoint import Stand
 from clsplat.training.run import Run
@@ -101,7 +101,7 @@ class Live:
         background = BACKGROUNDS[photographs.background_name]
         pictures = Pictures(scene.views, background, photographs.undistorted, desk.budget)
         desk.step, desk.fault = 0, ""
-        desk.shown = Shown(number, title, scene.views, data, pictures, Curves([]))
+        desk.shown = ShownRun(number, title, scene.views, data, pictures, Curves([]))
         self._preview = Preview(run)
         run.between = lambda: self._between(run)
         desk.budget.skip()
@@ -141,7 +141,7 @@ class Live:
         if not free:
             self.desk.budget.spend(time.perf_counter() - started)
 
-    def _deliver(self, order: Order, preview: Preview) -> None:
+    def _deliver(self, order: PageCamera, preview: Preview) -> None:
         """Draw an order; what fails is told on the page, and the training goes on."""
         try:
             self.desk.orders.deliver(order, preview.draw(order))

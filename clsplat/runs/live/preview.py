@@ -18,8 +18,8 @@ from clsplat.core.page import shrunk
 from clsplat.core.progress import Progress
 from clsplat.metrics.views import render_view
 from clsplat.render.camera import upload_camera
-from clsplat.render.rasterizer import Budget as Limits
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.rasterizer import RenderLimits as Limits
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.view import View
 from clsplat.training.run import Run
@@ -33,7 +33,7 @@ Pace = Literal["moving", "still", "again"]  # in motion; at rest for the first t
 
 
 @dataclass(frozen=True)
-class Picture:
+class EncodedPicture:
     """An encoded picture, and the step that it shows."""
 
     jpeg: bytes
@@ -41,24 +41,24 @@ class Picture:
 
 
 @dataclass(eq=False)
-class Order:
+class PageCamera:
     """A camera that a page looks through."""
 
     page: int  # a number that tells pages apart
     view: View
     pace: Pace
     done: threading.Event = field(default_factory=threading.Event)
-    picture: Picture | None = None
+    picture: EncodedPicture | None = None
 
 
 class Orders:
     """A short queue between the threads that answer and the one that trains."""
 
     def __init__(self) -> None:
-        self._waiting: deque[Order] = deque()
+        self._waiting: deque[PageCamera] = deque()
         self._changed = threading.Condition()
 
-    def ask(self, order: Order, seconds: float) -> bool:
+    def ask(self, order: PageCamera, seconds: float) -> bool:
         """Wait for the picture of an order, in the place of one that its page still waits for.
 
         Returns False where too many wait; the order has no picture when the time was too short.
@@ -76,17 +76,17 @@ class Orders:
         self._drop(order)
         return True
 
-    def _drop(self, order: Order) -> None:
+    def _drop(self, order: PageCamera) -> None:
         with self._changed:
             if order in self._waiting:
                 self._waiting.remove(order)
 
-    def first(self) -> Order | None:
+    def first(self) -> PageCamera | None:
         """The order that has waited longest for a picture of a camera in motion, else of one at rest."""
         with self._changed:
             return min(self._waiting, key=lambda order: order.pace == "again", default=None)
 
-    def deliver(self, order: Order, picture: Picture | None) -> None:
+    def deliver(self, order: PageCamera, picture: EncodedPicture | None) -> None:
         """End the wait."""
         self._drop(order)
         order.picture = picture
@@ -127,7 +127,7 @@ class Preview:
         """Return the estimated time of the next picture, s."""
         return self._estimate(self._side(pace))
 
-    def draw(self, order: Order) -> Picture:
+    def draw(self, order: PageCamera) -> EncodedPicture:
         """Draw what an order asks for.  Raises MemoryLimitError where the device has no room beside the training."""
         side, rasterizer = self._side(order.pace), self._opened()
         started = time.perf_counter()
@@ -136,7 +136,7 @@ class Preview:
         image = render_view(self.run.painter(rasterizer), camera)
         _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         self._costs[side] = time.perf_counter() - started
-        return Picture(data.tobytes(), self.run.step)
+        return EncodedPicture(data.tobytes(), self.run.step)
 
     def release(self) -> None:
         """Give the memory back."""
@@ -175,7 +175,7 @@ def fitted(view: View, side: int) -> View:
 # A share of the time, saved up to a limit.
 
 
-class Budget:
+class Credit:
     """Credit that grows with time: who asks before an expense spends no more than `share` of the time that passed."""
 
     def __init__(self, share: float, most: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -221,7 +221,7 @@ class Pictures:
     """Reads one photograph at a time.  Its time on all processors counts as that of a drawn picture."""
 
     def __init__(
-        self, views: Sequence[View], background: tuple[float, float, float], undistorted: Path | None, budget: Budget
+        self, views: Sequence[View], background: tuple[float, float, float], undistorted: Path | None, budget: Credit
     ) -> None:
         self.views, self._background, self._undistorted, self._budget = views, background, undistorted, budget
         self._kept: OrderedDict[tuple[Kind, int], bytes] = OrderedDict()  # least recently used first
@@ -296,7 +296,7 @@ RESERVE = 0.3  # s of those that pictures of a camera at rest leave alone
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownRun:
     """What a page needs to know of one run; another run of a matrix has another number."""
 
     number: int
@@ -312,9 +312,9 @@ class Desk:
     """The state of a live preview; each field is written by one side and replaced as a whole."""
 
     orders: Orders = field(default_factory=Orders)
-    budget: Budget = field(default_factory=lambda: Budget(SHARE, SAVED))
+    budget: Credit = field(default_factory=lambda: Credit(SHARE, SAVED))
     status: StatusFile | None = None
-    shown: Shown | None = None
+    shown: ShownRun | None = None
     step: int = 0  # of the model that can be drawn; 0: none can
     paused: bool = False
     ended: bool = False

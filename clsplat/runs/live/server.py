@@ -22,7 +22,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.page import inline, render
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.formats.splats import EXPECTED, is_moment
-from clsplat.runs.live.preview import Budget, Desk, Kind, Order, Pace, Shown
+from clsplat.runs.live.preview import Credit, Desk, Kind, Pace, PageCamera, ShownRun
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Stand
@@ -145,7 +145,7 @@ class Server(socketserver.ThreadingTCPServer):
     def __init__(self, port: int, token: str, answer: Callable[[Request], Answer]) -> None:
         """port: 0 takes the first one from PORT on that is free.  Raises ConfigError where it is in use."""
         self.token, self.answer = token, answer
-        self._slots, self._rate = threading.Semaphore(CONNECTIONS), Budget(RATE, BURST)
+        self._slots, self._rate = threading.Semaphore(CONNECTIONS), Credit(RATE, BURST)
         self._rate.spend(-BURST)
         self.ended, self._open, self._lock = False, set[Any](), threading.Lock()
         super().__init__((LOOPBACK, 0), _Connection, bind_and_activate=False)
@@ -348,7 +348,7 @@ class Answers:
             view = camera(request.query.get("camera", ""))
             if "time" in request.query:
                 view = replace(view, time=moment(request.query["time"]))
-        order = Order(request.number("page", 0, 1 << 40), view, cast(Pace, pace))
+        order = PageCamera(request.number("page", 0, 1 << 40), view, cast(Pace, pace))
         if not desk.orders.ask(order, WAIT):
             raise Refused(503, "too many pictures are waited for")
         if order.picture is None:
@@ -373,7 +373,7 @@ class Answers:
             self.desk.pause(paused)
         return Answer.json({"paused": self.desk.paused})
 
-    def _shown(self) -> Shown:
+    def _shown(self) -> ShownRun:
         if self.desk.shown is None:
             raise Refused(503, "no scene yet")
         return self.desk.shown

@@ -19,6 +19,7 @@ from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs.results import RunFolder, read_settings
 from clsplat.scene.scene import scene_name
+from clsplat.training.settings_diff import differences
 from clsplat.viewer.charts import COLOURS
 
 # The settings in which resolved pipelines differ.
@@ -37,9 +38,9 @@ def flat(settings: dict[str, Any]) -> dict[str, str]:
 
 
 def differing(settings: Sequence[dict[str, str]]) -> list[str]:
-    """Return the places whose values differ between flat settings, in order of their first occurrence."""
-    places = list(dict.fromkeys(place for one in settings for place in one))
-    return [place for place in places if len({one.get(place) for one in settings}) > 1]
+    """Return the places at which some of flat settings differ from the first."""
+    first, *others = settings
+    return list(dict.fromkeys(one.place for other in others for one in differences(first, other)))
 
 
 def _add(found: dict[str, str], place: str, value: Any) -> None:
@@ -87,7 +88,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Row:
+class VariantRow:
     """The runs of one variant on one scene, by seed."""
 
     variant: Variant
@@ -112,13 +113,13 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class RunComparison:
     """All runs, sorted into variants and rows."""
 
     runs: list[RunFolder]
 
     @classmethod
-    def read(cls, paths: Sequence[Path]) -> "Comparison":
+    def read(cls, paths: Sequence[Path]) -> "RunComparison":
         """Read run folders; the folder of a matrix means its finished cells.
 
         Raises DataError for a folder that is missing, unfinished or damaged, ConfigError for none, for one given twice
@@ -147,7 +148,7 @@ class Comparison:
         ]
 
     @cached_property
-    def scenes(self) -> dict[str, list[Row]]:
+    def scenes(self) -> dict[str, list[VariantRow]]:
         """Rows by the scene's name, in the order of the runs."""
         grouped: dict[str, list[RunFolder]] = {}
         for run in self.runs:
@@ -159,10 +160,10 @@ class Comparison:
         """Return the variant of a run."""
         return next(variant for variant in self.variants if variant.settings == _settings(run))
 
-    def _rows(self, runs: Sequence[RunFolder]) -> Iterator[Row]:
+    def _rows(self, runs: Sequence[RunFolder]) -> Iterator[VariantRow]:
         for variant in self.variants:
             if own := [run for run in runs if self.variant(run) is variant]:
-                yield Row(variant, sorted(own, key=lambda run: run.metrics.seed))
+                yield VariantRow(variant, sorted(own, key=lambda run: run.metrics.seed))
 
 
 def _cells(path: Path) -> list[Path]:

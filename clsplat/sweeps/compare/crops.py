@@ -26,7 +26,7 @@ OVERVIEW_WIDTH = 340  # px
 
 
 @dataclass(frozen=True)
-class Crop:
+class ImageCrop:
     """A square of one view."""
 
     view: str
@@ -75,13 +75,13 @@ class Crop:
         return np.ascontiguousarray(image[self.y : self.y + self.side, self.x : self.x + self.side])
 
 
-def find_crops(runs: Sequence[RunFolder], scene: Scene, background: Background) -> list[Crop]:
+def find_crops(runs: Sequence[RunFolder], scene: Scene, background: Background) -> list[ImageCrop]:
     """Return crops of the views that all runs of one scene rendered, where the renders differ most.
 
     Raises DataError when a render or a photograph is damaged.
     """
     rendered = [view for view in scene.views if all(_file(run, view).is_file() for run in runs)]
-    chosen: list[Crop] = []  # these and one more view are in memory at a time
+    chosen: list[ImageCrop] = []  # these and one more view are in memory at a time
     for view in rendered:
         renders = [load_image(replace(view, image_path=_file(run, view), lens=None)) for run in runs]  # a pinhole's
         chosen.append(_crop(view.name, load_image(view, BACKGROUNDS[background]), renders))
@@ -93,7 +93,7 @@ def _file(run: RunFolder, view: View) -> Path:
     return image_path(run.renders, view.name)
 
 
-def _crop(view: str, photograph: Image, renders: list[Image]) -> Crop:
+def _crop(view: str, photograph: Image, renders: list[Image]) -> ImageCrop:
     """The crop in which the renders differ most from each other, or a single one from the photograph."""
     images = np.stack(renders if len(renders) > 1 else [*renders, photograph])
     difference = (images.max(axis=0) - images.min(axis=0)).mean(axis=2, dtype=np.float32)
@@ -102,7 +102,7 @@ def _crop(view: str, photograph: Image, renders: list[Image]) -> Crop:
     means = cv2.boxFilter(difference, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
     inside = means[: height - side + 1, : width - side + 1]
     y, x = np.unravel_index(int(inside.argmax()), inside.shape)
-    return Crop(view, photograph, renders, int(x), int(y), side, float(inside.max()))
+    return ImageCrop(view, photograph, renders, int(x), int(y), side, float(inside.max()))
 
 
 # What a model that was trained in blocks shows near their borders, beside the rest of the same views.

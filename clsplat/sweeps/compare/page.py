@@ -15,8 +15,8 @@ from clsplat.core.files import write_text
 from clsplat.core.page import charts, duration, embedded, render
 from clsplat.pipeline.file import SceneSettings
 from clsplat.runs.results import Points, RunFolder, RunMetrics
-from clsplat.sweeps.compare.comparison import Comparison, PublishedTable, Row, Variant, differing
-from clsplat.sweeps.compare.crops import Crop, Seams, find_crops, find_seams
+from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing
+from clsplat.sweeps.compare.crops import ImageCrop, Seams, find_crops, find_seams
 from clsplat.training.records import VIEWS, over_views
 from clsplat.viewer.charts import COLOURS, Line, curve
 
@@ -40,7 +40,7 @@ MAX_SEEDS = 3  # named one by one
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """A mean as text, with the standard deviation where there are several runs."""
 
     text: str
@@ -53,7 +53,7 @@ class Column:
     """A figure of each row."""
 
     heading: str
-    cells: list[Cell]
+    cells: list[TableCell]
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Table:
+class MetricTable:
     """A row for each variant."""
 
     variants: list[Variant]
@@ -73,39 +73,39 @@ class Table:
     seeds: list[str] = field(default_factory=list)  # by row; empty: not shown
 
 
-def main_table(rows: Sequence[Row]) -> Table:
+def main_table(rows: Sequence[VariantRow]) -> MetricTable:
     """Return test metrics at the training size, and the costs."""
     costs = [
         *_cost(rows, "Gaussians", lambda metrics: metrics.gaussians),
         *_cost(rows, "parameters", lambda metrics: metrics.parameters),
         Column("steps", _cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
-        Column("training", [Cell(duration(fmean(run.metrics.train_seconds for run in row.runs))) for row in rows]),
+        Column("training", [TableCell(duration(fmean(run.metrics.train_seconds for run in row.runs))) for row in rows]),
         *_cost(rows, "CPU seconds", lambda metrics: metrics.cpu_seconds),
         *_cost(rows, "device memory, MB", lambda metrics: metrics.device_memory and metrics.device_memory / 1e6),
     ]
     return _table(rows, [*_trained_on(rows), Group("", costs)])
 
 
-def _cost(rows: Sequence[Row], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
+def _cost(rows: Sequence[VariantRow], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
     """A column of what not all runs note; none where no run does."""
     found = [[cost(run.metrics) for run in row.runs] for row in rows]
     values = [[value for value in row if value is not None] for row in found]
     return [Column(heading, _cells(values, 0))] if any(values) else []
 
 
-def other_table(rows: Sequence[Row]) -> Table | None:
+def other_table(rows: Sequence[VariantRow]) -> MetricTable | None:
     """Return the metrics of all other sizes and views; None when there are none."""
     groups = [_group(rows, *one) for one in _measured(rows) if one != ("test", rows[0].downscale)]
     return _table(rows, groups) if groups else None
 
 
-def downscales(rows: Sequence[Row], split: str) -> list[str]:
+def downscales(rows: Sequence[VariantRow], split: str) -> list[str]:
     """Return the divisors of the image sizes that any row was measured at, from full size down."""
     found = {downscale for row in rows for downscale in row.downscales(split)}
     return sorted(found, key=lambda text: (float(text), text))
 
 
-def means_over_scenes(comparison: Comparison) -> Table | None:
+def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
     """Return means over the scenes, for variants that ran on all of them; None when there is no such figure."""
     scenes = list(comparison.scenes.values())
     everywhere = [[row for rows in scenes for row in rows if row.variant is v] for v in comparison.variants]
@@ -117,7 +117,7 @@ def means_over_scenes(comparison: Comparison) -> Table | None:
         ]
         if means and all(len(values) == len(scenes) for values in means):
             columns.append(Column(heading, _cells([[fmean(values)] for values in means], digits, best)))
-    return Table([rows[0].variant for rows in complete], [Group("", columns)]) if columns else None
+    return MetricTable([rows[0].variant for rows in complete], [Group("", columns)]) if columns else None
 
 
 def differing_settings(variants: Sequence[Variant]) -> dict[str, list[str]]:
@@ -126,7 +126,7 @@ def differing_settings(variants: Sequence[Variant]) -> dict[str, list[str]]:
     return {place: [variant.settings.get(place, "–") for variant in variants] for place in places}
 
 
-def differing_conditions(rows: Sequence[Row]) -> Iterable[str]:
+def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
     """Yield sentences about conditions that differ, so that figures of a column are not comparable."""
     splits = [split for row in rows for run in row.runs for split in (run.metrics.test, run.metrics.train)]
     averages = [one for split in splits for one in split.values()]
@@ -142,18 +142,18 @@ def differing_conditions(rows: Sequence[Row]) -> Iterable[str]:
             yield f"The {name} is not the same in all runs ({', '.join(map(str, sorted(counts)))})."
 
 
-def _measured(rows: Sequence[Row]) -> list[tuple[str, str]]:
+def _measured(rows: Sequence[VariantRow]) -> list[tuple[str, str]]:
     """The splits and the divisors of the image sizes that any row was measured at."""
     return [(split, downscale) for split in ("test", "train") for downscale in downscales(rows, split)]
 
 
-def _trained_on(rows: Sequence[Row]) -> list[Group]:
+def _trained_on(rows: Sequence[VariantRow]) -> list[Group]:
     """The test metrics at the training size, where they were measured."""
     downscale = rows[0].downscale
     return [_group(rows, "test", downscale)] if downscale in downscales(rows, "test") else []
 
 
-def _group(rows: Sequence[Row], split: str, downscale: str) -> Group:
+def _group(rows: Sequence[VariantRow], split: str, downscale: str) -> Group:
     columns = [
         Column(heading, _cells([row.figures(split, downscale, name) for row in rows], digits, best))
         for name, (heading, digits, best) in METRICS.items()
@@ -162,21 +162,21 @@ def _group(rows: Sequence[Row], split: str, downscale: str) -> Group:
     return Group(_title(rows, split, downscale), columns)
 
 
-def _title(rows: Sequence[Row], split: str, downscale: str) -> str:
+def _title(rows: Sequence[VariantRow], split: str, downscale: str) -> str:
     size = "full size" if downscale == "1" else f"1/{downscale}"
     return f"{split} views" + ("" if downscale == rows[0].downscale == "1" else f" at {size}")
 
 
-def _table(rows: Sequence[Row], groups: list[Group]) -> Table:
-    return Table([row.variant for row in rows], groups, [_seeds(row) for row in rows])
+def _table(rows: Sequence[VariantRow], groups: list[Group]) -> MetricTable:
+    return MetricTable([row.variant for row in rows], groups, [_seeds(row) for row in rows])
 
 
-def _seeds(row: Row) -> str:
+def _seeds(row: VariantRow) -> str:
     seeds = [str(run.metrics.seed) for run in row.runs]
     return ", ".join(seeds) if len(seeds) <= MAX_SEEDS else f"{len(seeds)} seeds"
 
 
-def _cells(values: Sequence[list[float]], digits: int, best: Callable[..., float] | None = None) -> list[Cell]:
+def _cells(values: Sequence[list[float]], digits: int, best: Callable[..., float] | None = None) -> list[TableCell]:
     """A cell for each list of values; `best` of the means, as they are shown, is marked."""
     means = [round(fmean(row), digits) if row else None for row in values]
     present = [mean for mean in means if mean is not None]
@@ -184,11 +184,11 @@ def _cells(values: Sequence[list[float]], digits: int, best: Callable[..., float
     return [_cell(row, mean, digits, mean == top) for row, mean in zip(values, means, strict=True)]
 
 
-def _cell(values: list[float], mean: float | None, digits: int, best: bool) -> Cell:
+def _cell(values: list[float], mean: float | None, digits: int, best: bool) -> TableCell:
     if mean is None:
-        return Cell("–")
+        return TableCell("–")
     deviation = stdev(values) if len(values) > 1 else 0.0
-    return Cell(f"{mean:,.{digits}f}", f"{deviation:,.{digits}f}" if deviation > 0 else "", best)
+    return TableCell(f"{mean:,.{digits}f}", f"{deviation:,.{digits}f}" if deviation > 0 else "", best)
 
 
 # The charts of a comparison: quality and Gaussians over steps and CPU seconds, and quality over image sizes.
@@ -196,7 +196,7 @@ def _cell(values: list[float], mean: float | None, digits: int, best: bool) -> C
 MOST_LINES = len(COLOURS)  # that are told apart one by one
 
 
-def curves(rows: Sequence[Row]) -> list[Markup]:
+def curves(rows: Sequence[VariantRow]) -> list[Markup]:
     """PSNR and Gaussians over steps, a line for each run, or, of many, for each variant; then quality over sizes."""
     downscale = rows[0].runs[0].scene.downscale
     are_many = sum(len(row.runs) for row in rows) > MOST_LINES
@@ -238,7 +238,7 @@ def _mean(lines: Sequence[Points]) -> Points:
     return [(fmean(x for x, _ in points), fmean(y for _, y in points)) for points in zip(*lines, strict=False)]
 
 
-def _names(row: Row) -> list[str]:
+def _names(row: VariantRow) -> list[str]:
     """The names of a row's lines where it has several runs: their seeds, or the folders of runs with one seed."""
     runs = row.runs
     if len(runs) == 1:
@@ -252,7 +252,7 @@ def _names(row: Row) -> list[str]:
     return [f"{row.variant.letter} {name}" for name in names]
 
 
-def _size_charts(rows: Sequence[Row], split: str) -> list[str]:
+def _size_charts(rows: Sequence[VariantRow], split: str) -> list[str]:
     """PSNR and SSIM over image sizes, a line for each variant."""
     sizes = downscales(rows, split)
     if len(sizes) < 2:
@@ -302,8 +302,8 @@ class SceneSection:
     several_seeds: bool
     explanations: list[str]  # of the tables
     remarks: list[str]
-    main: Table
-    other: Table | None
+    main: MetricTable
+    other: MetricTable | None
     curves: list[Markup]
     crops: list[CropFigure]
     no_crops: str  # the reason
@@ -318,7 +318,7 @@ def write_comparison(
     published: Sequence[PublishedTable] = (),
 ) -> int:
     """Write the page on some run folders; return the number of runs on it.  Raises what Comparison.read raises."""
-    comparison = Comparison.read(paths)
+    comparison = RunComparison.read(paths)
     faults = [fault for run in comparison.runs for fault in run.missing_plugins]
     for fault in faults:
         LOG.warning("%s", fault)
@@ -328,7 +328,7 @@ def write_comparison(
 
 
 def comparison_page(
-    comparison: Comparison,
+    comparison: RunComparison,
     title: str,
     remarks: Sequence[str],
     folder: Path,
@@ -364,7 +364,7 @@ def _links(run: RunFolder, folder: Path) -> dict[str, str]:
     }
 
 
-def _section(name: str, rows: Sequence[Row]) -> SceneSection:
+def _section(name: str, rows: Sequence[VariantRow]) -> SceneSection:
     crops, no_crops, seams = _pictures(rows)
     several_seeds = any(len(row.runs) > 1 for row in rows)
     explanations = ["mean ± standard deviation over seeds"] if several_seeds else []
@@ -391,7 +391,7 @@ def _sizes(scene: SceneSettings) -> list[str]:
     return [f"sizes are shares of the photographs' own; trained at {', '.join([first, *more])}"]
 
 
-def _pictures(rows: Sequence[Row]) -> tuple[list[Crop], str, Seams | None]:
+def _pictures(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str, Seams | None]:
     """Crops of each row's first run, or why there are none, such as missing photographs; and seams of blocks."""
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene
@@ -406,7 +406,7 @@ def _pictures(rows: Sequence[Row]) -> tuple[list[Crop], str, Seams | None]:
     return crops, reason, find_seams(runs, scene, background)
 
 
-def _seam_figure(seams: Seams, rows: Sequence[Row]) -> SeamFigure:
+def _seam_figure(seams: Seams, rows: Sequence[VariantRow]) -> SeamFigure:
     text = (
         f"{100 * seams.share:.1f} % of the pixels of {amount(seams.views, 'view')} show what lies near a border of "
         f"blocks; red in {seams.view}"
@@ -416,7 +416,7 @@ def _seam_figure(seams: Seams, rows: Sequence[Row]) -> SeamFigure:
     return SeamFigure(text, found, embedded(seams.picture))
 
 
-def _figure(crop: Crop) -> CropFigure:
+def _figure(crop: ImageCrop) -> CropFigure:
     """The crop for the page; PNG keeps every bit of its squares."""
     return CropFigure(
         view=crop.view,

@@ -33,7 +33,7 @@ Numbers = dict[str, float]
 
 
 @dataclass
-class Step:
+class TrainingStep:
     """One training step while it is done; each hook finds what those before it have left."""
 
     number: int  # global, from 1
@@ -112,14 +112,14 @@ class ModuleState:
         """Come to the beginning of a training up to a global step.  trained: False: it acts, and learns no more."""
 
     # in a step: forward in the order of the list, backward in reverse
-    def before_render(self, step: Step) -> None: ...
-    def after_render(self, step: Step) -> None: ...
-    def before_losses(self, step: Step) -> None: ...
-    def after_losses(self, step: Step) -> None: ...
-    def backward(self, step: Step) -> None: ...
-    def after_backward(self, step: Step) -> None: ...
-    def update(self, step: Step) -> None: ...
-    def update_skipped(self, step: Step) -> None: ...
+    def before_render(self, step: TrainingStep) -> None: ...
+    def after_render(self, step: TrainingStep) -> None: ...
+    def before_losses(self, step: TrainingStep) -> None: ...
+    def after_losses(self, step: TrainingStep) -> None: ...
+    def backward(self, step: TrainingStep) -> None: ...
+    def after_backward(self, step: TrainingStep) -> None: ...
+    def update(self, step: TrainingStep) -> None: ...
+    def update_skipped(self, step: TrainingStep) -> None: ...
 
     # outside steps
     def complete(self, model: DeviceModel) -> None:
@@ -150,9 +150,7 @@ class TrainingModule(Settings):
     is a number, not names of other modules, so that one that no other knows has its place too."""
     outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "no"
     """What outlasts its training: its numbers, for measurements; or it acts in later trainings too."""
-    conflicts: ClassVar[Mapping[str, str]] = {}  # why it does not go with another module, a part of the model or a loss
     files: ClassVar[Mapping[str, str]] = {}  # side files in the run folder, which begin with `view_`, and their titles
-    family: ClassVar[str] = ""  # of those that exclude each other; "": those of the same type
 
     planes: ClassVar[int] = 0  # of floats on the device, of the largest view's size
 
@@ -201,9 +199,8 @@ class TrainingModule(Settings):
         """Whether it does anything with the photographs of a scene; without one, whether it does with any."""
         return True
 
-    def excludes(self, other: str, scene: Scene | None = None) -> bool:
-        """Whether it does not go with another module or a part of the model; without a scene, in any scene."""
-        return other in self.conflicts and self.is_active(scene)
+    def excluded(self) -> Mapping[str, str]:
+        return self.conflicts if self.is_active() else {}
 
     def check_losses(self, losses: Sequence[Loss]) -> None:
         """Raise ConfigError for losses that it does not go with."""
@@ -238,7 +235,7 @@ class TrainingModule(Settings):
 
 
 def check_list(modules: Sequence[TrainingModule]) -> None:
-    """Raise ValueError for modules out of order, twice, or that exclude each other."""
+    """Raise ValueError for modules out of order, or of which two have the same kin."""
     kin = [one.kin for one in modules]
     for before, after in itertools.pairwise(modules):
         if after.place < before.place:
@@ -246,9 +243,6 @@ def check_list(modules: Sequence[TrainingModule]) -> None:
     for i, one in enumerate(modules):
         if (first := kin.index(one.kin)) < i:
             raise ValueError(f"'{one.type}' and '{modules[first].type}' exclude each other; leave one out")
-        for other in kin:
-            if one.excludes(other):
-                raise ValueError(f"'{one.type}' does not go with '{other}': {one.conflicts[other]}; leave one out")
 
 
 def attached(modules: Sequence[TrainingModule], run: Run, last: int) -> list[ModuleState]:

@@ -15,7 +15,7 @@ from clsplat.photos.appearance import ADAM, IDENTITY, LUMINANCE, MEANING, Floats
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.view import View
-from clsplat.training.modules.base import Numbers, Step, Tables
+from clsplat.training.modules.base import Numbers, Tables, TrainingStep
 from clsplat.training.modules.exposure import (
     TABLE,
     VIEW_COLOURS,
@@ -133,7 +133,7 @@ class GridState(ColourState):
         """Return the row of a training view by its number."""
         return self.names.index(self.views[view])
 
-    def after_render(self, step: Step) -> None:
+    def after_render(self, step: TrainingStep) -> None:
         if step.view is None:
             return
         image = step.image
@@ -142,12 +142,12 @@ class GridState(ColourState):
         step.own_losses.append(LossValue("colours", lambda: float(shares.get().sum(dtype=np.float64))))
         step.keep(self, (image, []))
 
-    def backward(self, step: Step) -> None:
+    def backward(self, step: TrainingStep) -> None:
         if (kept := step.kept(self)) and step.view is not None:
             step.gradient, by_grid = self.differentiated(step.workspace, step.camera, kept[0], step.gradient, step.view)
             kept[1].append(by_grid)
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         if (kept := step.kept(self)) and step.view is not None:
             self.learn(step.workspace, step.view, kept[1][0], step.number)
 

@@ -26,7 +26,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.reprojection import with_cameras
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, zooms
-from clsplat.training.modules.base import ModuleState, Numbers, Step, TrainingModule
+from clsplat.training.modules.base import ModuleState, Numbers, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 Floats = NDArray[np.float64]
@@ -194,16 +194,16 @@ class CameraState(ModuleState):
         if focal:
             require_zoom(run.original)
 
-    def before_render(self, step: Step) -> None:
+    def before_render(self, step: TrainingStep) -> None:
         if step.view is not None and step.number > self.settings.start:
             zoom, pose = self.factor(self.views[step.view].name), self.pose(step.view)
             step.photograph = replace(step.photograph, camera=moved_camera(step.camera, pose, zoom))
 
-    def after_backward(self, step: Step) -> None:
+    def after_backward(self, step: TrainingStep) -> None:
         if step.view is not None and step.number > self.settings.start:
             step.keep(self, pose_gradient(step.workspace, step.model, step.frame, step.pixel_sums))
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         if not (wait := step.kept(self)) or step.view is None:
             return
         sums, name, (turns, shifts), number = wait(), self.views[step.view].name, self.tables_of, step.number

@@ -7,7 +7,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.losses.depth import InverseDepth
 from clsplat.photos.depths import DepthMaps, PointDepths
 from clsplat.scene.reprojection import within
-from clsplat.training.modules.base import ModuleState, Step, TrainingModule
+from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 
@@ -62,5 +62,5 @@ class KnownDepthsState(ModuleState):
         super().__init__()
         self.depths = depths
 
-    def before_losses(self, step: Step) -> None:
+    def before_losses(self, step: TrainingStep) -> None:
         step.comparison.depths = self.depths.at(step.camera)

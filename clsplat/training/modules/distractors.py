@@ -24,7 +24,7 @@ from clsplat.render.overlay import lay_over, look_behind
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.base import ModuleState, Numbers, Step, Tables, TrainingModule
+from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 UPDATES = "updates"
@@ -103,7 +103,7 @@ class DistractorsState(ModuleState):
         found = {name: np.concatenate([adam.gaussians.get(name) for adam in self.adams]) for name in names}
         return {**found, UPDATES: np.array([[adam.updates["means"]] for adam in self.adams], np.float32)}
 
-    def after_render(self, step: Step) -> None:
+    def after_render(self, step: TrainingStep) -> None:
         if step.view is None or step.number <= self.settings.start:
             return
         camera, gaussians = step.camera, self.adams[self._rows[step.view]].gaussians
@@ -115,7 +115,7 @@ class DistractorsState(ModuleState):
         step.own_losses.append(LossValue("distractors", layer.loss))
         step.keep(self, (layer, []))
 
-    def backward(self, step: Step) -> None:
+    def backward(self, step: TrainingStep) -> None:
         if not (kept := step.kept(self)):
             return
         layer, sums = kept
@@ -123,7 +123,7 @@ class DistractorsState(ModuleState):
         sums += [frame, self.rasterizer.pixel_sums(frame.drawn, frame, step.gradient, behind=layer.behind)]
         look_behind(step.workspace, frame, step.gradient)
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         if (kept := step.kept(self)) and step.view is not None:
             frame, pixel_sums = kept[1]
             self.adams[self._rows[step.view]].update(frame.drawn, frame, pixel_sums, RATES)

@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import ClassVar, Literal
 
 from clsplat.core.schedule import Probability, at_step
-from clsplat.gaussians.gaussians import Dropout as Drawn
-from clsplat.training.modules.base import ModuleState, Step, TrainingModule
+from clsplat.gaussians.gaussians import DropoutMask as Drawn
+from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 
@@ -32,6 +32,6 @@ class _Dropping(ModuleState):
         super().__init__()
         self.settings, self.seed = settings, seed
 
-    def before_render(self, step: Step) -> None:
+    def before_render(self, step: TrainingStep) -> None:
         if probability := at_step(self.settings.probability, step.number):
             step.model = replace(step.model, dropout=Drawn(probability, self.seed, step.number))

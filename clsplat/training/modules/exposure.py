@@ -32,7 +32,7 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.training.modules.base import ModuleState, Numbers, Step, Tables, TrainingModule
+from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -322,7 +322,7 @@ class ExposureState(ColourState):
         of_gains = self.settings.model.of_gains
         self.table.begin(self.numbers, {view: of_gains(gains) for view, gains in log_gains.items()})
 
-    def after_render(self, step: Step) -> None:
+    def after_render(self, step: TrainingStep) -> None:
         if step.view is None:
             return
         row = self.table.row(self.numbers, self.views[step.view])
@@ -331,13 +331,13 @@ class ExposureState(ColourState):
         step.image = change_colours(step.workspace, step.camera, image, matrix)
         step.own_losses.append(LossValue("colours", lambda: penalty))
 
-    def backward(self, step: Step) -> None:
+    def backward(self, step: TrainingStep) -> None:
         if kept := step.kept(self):
             image, matrix, waits = kept
             step.gradient, wait = change_back(step.workspace, step.camera, image, matrix, step.gradient)
             waits.append(wait)
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         if not (kept := step.kept(self)) or step.view is None:
             return
         self.learn(step.view, kept[2][0](), step.number)

@@ -9,7 +9,7 @@ import numpy as np
 from clsplat.opencl.device import Array, Device
 from clsplat.scene.quality import background_shows
 from clsplat.scene.scene import Scene
-from clsplat.training.modules.base import ModuleState, Step, TrainingModule
+from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -41,7 +41,7 @@ class _Drawing(ModuleState):
         super().__init__()
         self.device, self.seed = device, seed
 
-    def before_render(self, step: Step) -> None:
+    def before_render(self, step: TrainingStep) -> None:
         step.background = drawn_background(self.device, self.seed, step.number)
 
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from clsplat.core.settings import in_one_sentence
 from clsplat.scene.view import View
-from clsplat.training.modules.base import ModuleState, Step, TrainingModule
+from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -86,7 +86,7 @@ class SkipState(ModuleState):
         super().__init__()
         self.settings, self.names = settings, [view.name for view in views]
 
-    def after_losses(self, step: Step) -> None:
+    def after_losses(self, step: TrainingStep) -> None:
         if step.number <= self.settings.start or step.view is None:
             return
         camera = step.camera
@@ -95,7 +95,7 @@ class SkipState(ModuleState):
         step.skipped |= visit.skipped
         step.keep(self, visit)
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         self.numbers.update(visit.numbers if (visit := step.kept(self)) else {})
 
     update_skipped = update

@@ -7,19 +7,19 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.schedule import at_step
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.sky import SIDES, DeviceSky, Sky
 from clsplat.losses.base import LossValue
 from clsplat.photos.photographs import apply_mask
-from clsplat.photos.sky_detection import Seen, looked_at, panorama
+from clsplat.photos.sky_detection import SkyEvidence, looked_at, panorama
 from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.render.filters import ModelSettings
 from clsplat.scene.quality import Measure, is_transparent
 from clsplat.scene.scene import Scene
-from clsplat.training.modules.base import ModuleState, Numbers, Step, Tables, TrainingModule
+from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -55,12 +55,17 @@ class SkyModule(TrainingModule):
 
     @classmethod
     def settled_model(cls, run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
-        """Return the settings with the choice of a sky, where it is open: none where a module does not go with it."""
+        """Return the settings with the choice of a sky, where it is open: none where a module does not go with it.
+
+        Raises ConfigError where one does not go with a sky that is chosen.
+        """
         background = settings.background
+        rival = next((one for one in modules if SKY in one.conflicts and one.is_active(run.scene)), None)
+        against = rival and f"'{rival.type}' does not go together with sky: {rival.conflicts[SKY]}"
+        if against and _in_use(background):
+            raise ConfigError(f"model.background: {against}; leave one of them out")
         if not isinstance(background, Auto) or background.chosen is not None:
             return settings
-        excluding = next((one for one in modules if one.excludes(SKY, run.scene)), None)
-        against = excluding and f"'{excluding.type}' does not go with sky: {excluding.conflicts[SKY]}"
         chosen, reason = ("off", against) if against else _choice(background, run)
         LOG.info("model.background: %s, since %s", chosen, reason)
         return settings.model_copy(
@@ -165,7 +170,7 @@ def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]
     return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 
 
-def _seen(run: Run, scene: Scene) -> list[Seen]:
+def _seen(run: Run, scene: Scene) -> list[SkyEvidence]:
     """What each training photograph of a scene, at the first size that it has, shows of the sky."""
     views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
     counted = run.status.counted(views, "photographs", len(views))
@@ -201,7 +206,7 @@ class LearnedSky(ModuleState):
         arrays = {TEXELS: self.sky.texels, **self._arrays}
         return {name: np.ascontiguousarray(array.get().T) for name, array in arrays.items()}
 
-    def before_losses(self, step: Step) -> None:
+    def before_losses(self, step: TrainingStep) -> None:
         """Add the loss of what covers the sky, where it has a weight."""
         camera, comparison = step.camera, step.comparison
         if not (weight := at_step(self.settings.cover, step.number)):
@@ -216,12 +221,12 @@ class LearnedSky(ModuleState):
         value = LossValue(SKY, lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
         step.own_losses.append(value)
 
-    def backward(self, step: Step) -> None:
+    def backward(self, step: TrainingStep) -> None:
         """By the texels that the view shows, [3, shown], from the gradient by its image."""
         frame = step.frame
         step.keep(self, step.rasterizer.skies.by_texels(self.sky, frame.camera, frame.transmittance, step.gradient))
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         """Change the texels that a view shows by Adam."""
         rate = at_step(self.settings.rate, step.number)
         step.rasterizer.skies.update(self.sky, step.frame.camera, step.kept(self), self._arrays, rate)

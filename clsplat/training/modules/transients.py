@@ -14,7 +14,7 @@ from pydantic import Field
 from clsplat.opencl.device import Array, constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
-from clsplat.training.modules.base import ModuleState, Numbers, Step, TrainingModule
+from clsplat.training.modules.base import ModuleState, Numbers, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 _NAMES = constants("transients.cl")
@@ -79,7 +79,7 @@ class TransientsState(ModuleState):
         super().__init__()
         self.settings = settings
 
-    def after_render(self, step: Step) -> None:
+    def after_render(self, step: TrainingStep) -> None:
         workspace, camera, planes = step.workspace, step.camera, step.planes
         residuals, counts = measure_residuals(workspace, camera, step.image, planes.colours, planes.mask)
         if (threshold := self.settings.threshold(self.numbers, step.number)) is not None:
@@ -87,7 +87,7 @@ class TransientsState(ModuleState):
             step.planes = replace(planes, mask=mask_transients(workspace, camera, residuals, threshold, reach))
         step.keep(self, counts)
 
-    def update(self, step: Step) -> None:
+    def update(self, step: TrainingStep) -> None:
         self.settings.learn(self.numbers, step.kept(self)())
 
 

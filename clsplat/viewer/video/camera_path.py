@@ -24,7 +24,7 @@ from clsplat.scene import camera_files
 from clsplat.scene.camera import Camera
 from clsplat.scene.camera_files import centre_lost, width_lost
 from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
-from clsplat.scene.transforms_json import Frame, opengl_matrix, pose_of
+from clsplat.scene.transforms_json import JsonFrame, opengl_matrix, pose_of
 from clsplat.scene.view import View
 from clsplat.viewer.video.paths import MAX_FRAMES, Floats, Size, around, checked_rate, checked_size, even_size, placed
 
@@ -65,15 +65,15 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
     if (kind := table.get("camera_type", "perspective")) != "perspective":
         raise DataError(f"{path}: camera_type is {quoted(kind)}; expected perspective: export the path again")
-    size, rate = _size_and_rate(Frame(path.parent, str(path), table))
+    size, rate = _size_and_rate(JsonFrame(path.parent, str(path), table))
     move = _world(path, scene, known=table.get("world") == "scene")
     views = []
     for i, own in enumerate(frames):
-        frame = Frame(path.parent, f"{path}: camera_path[{i}]", own)
+        frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", own)
         fov = frame.number("fov")
         if fov is None or not 0.01 <= fov < 179:
             raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0.01 to 179")
-        pose = pose_of(Frame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
+        pose = pose_of(JsonFrame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
         time = frame.number("render_time")
         if time is not None and not is_moment(time):
             raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1: export the path again")
@@ -172,7 +172,7 @@ def _camera(size: Size, fov: float) -> Camera:
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2)
 
 
-def _size_and_rate(whole: Frame) -> tuple[Size, float]:
+def _size_and_rate(whole: JsonFrame) -> tuple[Size, float]:
     """The size of the pictures, in even numbers, and how many a second: the usual ones where a file says none."""
     sides, fps = [whole.number(key) for key in ("render_width", "render_height")], whole.number("fps")
     width, height = (1280, 720) if sides == [None, None] else (int(side or 0) // 2 * 2 for side in sides)
@@ -217,7 +217,7 @@ def _world(path: Path, scene: Path | None, known: bool) -> Any:
 def _affine(file: Path) -> tuple[Floats, float]:
     """The rotation with its shift, [3, 4], and the scale of a file WORLD.  Raises DataError."""
     table = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
-    frame = Frame(file.parent, str(file), table if isinstance(table, dict) else {})
+    frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
     scale = frame.number("scale")
     return _rigid(frame, "transform"), _positive(file, scale)
 
@@ -228,7 +228,7 @@ def _positive(file: Path, scale: float | None) -> float:
     return scale
 
 
-def _rigid(frame: Frame, key: str) -> Floats:
+def _rigid(frame: JsonFrame, key: str) -> Floats:
     """A rotation and a shift, [3, 4].  Raises DataError."""
     try:
         matrix = np.array(frame.value(key), np.float64)[:3]
@@ -245,5 +245,5 @@ def _applied(scene: Path | None) -> Floats:
     if file is None or not file.is_file():
         return np.eye(3, 4)
     table = read_json(file, "cameras in JSON", limit=MAX_BYTES)
-    frame = Frame(file.parent, str(file), table if isinstance(table, dict) else {})
+    frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
     return np.eye(3, 4) if frame.value("applied_transform") is None else _rigid(frame, "applied_transform")
