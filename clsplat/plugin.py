@@ -22,6 +22,7 @@ from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import GaussianGradients
 from clsplat.losses.base import Comparison, ImageLoss, LossValue, Penalty, PenaltyInputs, ViewGradients
 from clsplat.opencl.device import Array, Device
+from clsplat.photos.appearance import Floats, ViewTable
 from clsplat.photos.sampling import Order, ViewPool
 from clsplat.photos.transforms import PhotographTransform, Planes
 from clsplat.prepare.steps import Step
@@ -52,6 +53,7 @@ __all__ = [
     "DeviceError",
     "Edit",
     "FilterViews",
+    "Floats",
     "GaussianGradients",
     "Gaussians",
     "ImageLoss",
@@ -87,6 +89,7 @@ __all__ = [
     "View",
     "ViewGradients",
     "ViewPool",
+    "ViewTable",
     "Workspace",
     "WorldFilter",
     "at_step",

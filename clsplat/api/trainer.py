@@ -34,6 +34,7 @@ from clsplat.scene.view import NO_FILE
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.checkpoint import saved_on_failure
+from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import host_model
 from clsplat.training.status import StatusFile
 
@@ -201,7 +202,7 @@ class Trainer:
         psnr is in dB; a split without views has `views` alone.  Raises ValueError for a split that there is not.
         """
         run = self._run
-        views = run.scene.downscaled(run.downscale).split(split)
+        views = learned_scene(run).downscaled(run.downscale).split(split)
         if not views:
             return {"views": 0}
         return mean(measure(run.painter(), views, run.photographs.fresh(), trained=run.scene.split("train")))

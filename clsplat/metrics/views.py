@@ -297,9 +297,10 @@ def render_view(painter: Painter, camera: DeviceCamera) -> Image:
     return to_8_bits(render_floats(painter, camera))
 
 
-def render_floats(painter: Painter, camera: DeviceCamera) -> NDArray[np.float32]:
-    """Render to floats, [height, width, 3], as they are."""
-    planes = painter.paint(camera).get()
+def render_floats(painter: Painter, camera: DeviceCamera, response: Any = None) -> NDArray[np.float32]:
+    """Render to floats, [height, width, 3], as they are, or as a camera with that response takes them."""
+    picture = painter.paint(camera)
+    planes = (response(painter.workspace, camera, picture) if response else picture).get()
     return np.ascontiguousarray(planes[:, : camera.height, : camera.width].transpose(1, 2, 0))
 
 
@@ -345,7 +346,7 @@ def measure(
         if photograph.empty:
             LOG.warning("%s: not measured, since its mask leaves out every pixel; look at the mask", view.name)
             continue
-        floats = render_floats(painter, photograph.camera)
+        floats = render_floats(painter, photograph.camera, view.response)
         if finite:
             require_finite(floats, view)
         rendered = to_8_bits(floats)

@@ -1,12 +1,17 @@
 """What is common to the colours of photographs, and tables of numbers with a row for each photograph."""
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.errors import DataError
+from clsplat.core.files import write_text
+from clsplat.core.reading import read_json
 from clsplat.opencl.device import constants
 
 Floats = NDArray[np.float64]
@@ -47,6 +52,7 @@ class ViewTable:
     name: str
     views: tuple[str, ...]  # names of the training views, each once
     columns: tuple[str, ...]
+    is_centered: bool = True  # whether the mean of each column over the views stays 0
 
     def keys(self, view: str) -> list[str]:
         """Return the names of a row's numbers."""
@@ -68,10 +74,11 @@ class ViewTable:
         self.centre(numbers)
 
     def update(self, numbers: dict[str, float], view: str, gradient: Floats, rate: float) -> None:
-        """Change the row of a view by Adam, with a count of updates of its own, then `centre`."""
-        values = {key: numbers[key] for key in self.keys(view)}
+        """Change the row of a view by Adam, with a count of updates of its own, then `centre` where it is centered."""
+        values = {key: numbers.get(key, 0.0) for key in self.keys(view)}
         adam_step(numbers, values, dict(zip(values, map(float, gradient), strict=True)), rate)
-        self.centre(numbers)
+        if self.is_centered:
+            self.centre(numbers)
 
     def centre(self, numbers: dict[str, float]) -> None:
         """Subtract from each column its mean over the views; the sum is exact, so that no order matters."""
@@ -79,3 +86,26 @@ class ViewTable:
             mean = math.fsum(numbers[key] for key in column) / len(column)
             for key in column:
                 numbers[key] -= mean
+
+    def write(self, path: Path, rows: Mapping[str, Floats]) -> None:
+        """Write rows by the name of a view as a side file."""
+        named = {view: dict(zip(self.columns, map(float, row), strict=True)) for view, row in rows.items()}
+        write_text(path, json.dumps({"photographs": named}, indent=1) + "\n")
+
+    def read(self, path: Path) -> dict[str, Floats]:
+        """Return the rows of a side file by the name of a view; none where there is no file.
+
+        Raises DataError where it is damaged.
+        """
+        if not path.is_file():
+            return {}
+        try:
+            named = read_json(path, f"{self.name} of photographs")["photographs"].items()
+            rows = {view: np.array([float(row[column]) for column in self.columns]) for view, row in named}
+        except (AttributeError, KeyError, TypeError, ValueError):
+            rows = {"": np.array([np.nan])}
+        if not all(np.isfinite(row).all() for row in rows.values()):
+            raise DataError(
+                f"{path}: expected {len(self.columns)} finite numbers of each photograph; train again, or remove it"
+            )
+        return rows

@@ -135,6 +135,12 @@ class Scene:
         train, test, validation = (tuple(splits[name]) for name in SPLITS)
         return replace(self, views=tuple(views), train=train, test=test, validation=validation)
 
+    @property
+    def cameras(self) -> dict[str, str]:
+        """The camera of each view, by name: the name of the first view with an equal lens, or pinhole camera."""
+        first: dict[object, str] = {}
+        return {view.name: first.setdefault(view.lens or view.camera, view.name) for view in self.views}
+
     def __repr__(self) -> str:
         fold = f", {len(self.validation)} for validation" if self.validation else ""
         return f"Scene({self.path.name}: {len(self.train)} training and {len(self.test)} test views{fold})"

@@ -78,6 +78,7 @@ class View:
     downscale: float = 1  # divisor of the original photograph's size
     time: float | None = None  # in [0, 1], of the scene's first to last moment; None: the scene does not move
     static_path: Path | None = None  # an image of the photograph's size, white in pixels that show nothing that moves
+    response: Callable[..., Any] | None = None  # workspace, camera, planes -> those as the camera takes them; measured
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "world_to_camera", checked_pose(self.name, self.world_to_camera))

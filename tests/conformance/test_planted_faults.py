@@ -135,6 +135,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "sort_tiles": ("sort_bitonic.cl", "key > other ||", "key < other ||"),
     "radix_count": ("sort_radix.cl", "blocks + block] = sum;", "blocks + block] = sum / 2;"),
     "radix_scatter": ("sort_radix.cl", "first_pass ? i : values[i]", "i"),
+    "camera_response": ("camera_response.cl", "(2.0f * numbers[1]", "(numbers[1]"),
     "lay_over": ("layer.cl", "total += inside * (1.0f - t)", "total += 1.0f - t"),
     "look_behind": ("layer.cl", "t * VLOAD(values)", "VLOAD(values)"),
     "measure_residuals": ("transients.cl", "(red + green + blue)", "(red + green + green)"),
@@ -147,6 +148,7 @@ OPEN = "ANY((one.t > 0.0f) | (other.t > 0.0f))"
 MORE = {  # that smaller pictures do not show
     "colours_backward, what is cut": ("colours.cl", "+ g1 < 1.0f ? inside : zero", "+ g1 < 1.0f ? inside : inside"),
     "colours_backward, a sum of another": ("colours.cl", "total[9] += passed_b * g", "total[9] += passed_b * r"),
+    "camera_response, light beyond white": ("camera_response.cl", "larger(light - one, zero)", "zero"),
     "colour_grid_backward, what is cut": ("colour_grid.cl", "(changed < 1.0f ? inside : zero)", "inside"),
     "colour_grid_backward, through the luminance": ("colour_grid.cl", "(float)(nz - 1) * between", "between"),
     "colour_grid_centre, one photograph": ("colour_grid_table.cl", "own[p * each + i] -= mean", "own[i] -= mean"),

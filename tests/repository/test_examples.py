@@ -39,6 +39,7 @@ TESTED = {  # where
     "csv_reader.py": "scene/test_csv_reader.py",
     "random_pruning.py": "pipeline/test_plugins.py",
     "learned_cameras.yaml": "training/test_learned_cameras.py",
+    "lens_and_curves.py": "training/test_lens_and_curves.py",
     "test_opacity_entropy.py": "repository/test_docs.py",
 }
 PAGES = ("README.md", "docs/python.md")

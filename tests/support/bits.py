@@ -89,6 +89,7 @@ NAMED = {
         command=("blocks", "{blocks}", "--scene", "{still}", "--coarse", "{model}", "--blocks", "3", "--out", "{out}")
     ),
     "blur": sets("optimize.views.transforms=[{type: blur, sigma: [[0, 3.0], [30, 0.5], [45, 0.0]]}]"),
+    "camera_response": sets("optimize.modules.camera_response={}"),
     "city": sets(scene="city"),
     "compress_command": Case(
         command=("compress", "{model}", "--scene", "{still}", "--keep", "0.5", "--steps", "20", "--out", "{out}")
@@ -135,6 +136,9 @@ NAMED = {
     "pair_budget": sets("rasterizer.pair_budget=1", same_as="splat_7k"),
     "plugin_blur": sets(
         "optimize.views={transforms: [{type: box_blur, reach: [[0, 3], [40, 0]]}]}", plugin="box_blur.py"
+    ),
+    "plugin_response": sets(
+        "optimize.modules.lens_and_curves={}", plugin="lens_and_curves.py", same_as="camera_response"
     ),
     "poses": sets("optimize.modules.camera_optimizer={start: 4}"),
     "random_points": sets("init.source=random", "init.count=3000"),

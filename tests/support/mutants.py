@@ -162,7 +162,8 @@ def is_killed(copy: Path, mutant: Mutant, tests: list[str], limit: float) -> boo
 def _environment(copy: Path) -> dict[str, str]:
     import os
 
-    return {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    path = os.pathsep.join([str(copy), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def main() -> None:
@@ -177,6 +178,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "checkout"
         subprocess.run(["git", "clone", "-q", ROOT, copy], check=True)  # what is committed
+        collect = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-p", "no:cacheprovider"]
+        done = subprocess.run(collect, cwd=copy, capture_output=True, text=True, env=_environment(copy))
+        if done.returncode:  # all faults would seem to be killed
+            sys.exit(f"the tests of the copy cannot be collected:\n{done.stdout}{done.stderr}")
         for mutant in draw(options.seed, options.count):
             killed = is_killed(copy, mutant, tests_of(mutant), options.limit)
             if not killed and options.whole:

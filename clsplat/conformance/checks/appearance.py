@@ -1,6 +1,7 @@
 """The colours of a photograph by place and luminance: a change of an image, its derivatives, and the tables."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,14 @@ from numpy.typing import NDArray
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import SUM, Checks, Figure, Note, by_element, equal
 from clsplat.conformance.checks.images import SIZES, camera_of, outside, planes_of
+from clsplat.conformance.reference import appearance
 from clsplat.conformance.reference.appearance import changed_by_grid
 from clsplat.opencl.device import Device
 from clsplat.photos.appearance import IDENTITY, LUMINANCE
+from clsplat.render.camera import CAMERA
 from clsplat.render.workspace import Workspace
 from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState, row_length
+from clsplat.training.modules.camera_response import by_numbers, taken
 from clsplat.training.modules.exposure import change_back, change_colours
 
 CHECKS = Checks()
@@ -175,3 +179,45 @@ def colours(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]
     for width, height in SIZES:
         yield from colour_figures(device, rng, width, height)
     yield from colour_figures(device, rng, 33, 18, channels=4)
+
+
+# What a camera makes of light.
+
+
+def response_figures(
+    device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3
+) -> Iterator[Figure]:
+    """Compare what a camera makes of an image with values below black and beyond white, its gradient, and that by the
+    numbers."""
+    what, kernel = f"{width} x {height} px", "camera_response"
+    row = np.concatenate([rng.normal(0, 0.1, 5), rng.normal(0, 0.4, 12)])
+    image = rng.uniform(-0.3, 1.5, (channels, height, width)).astype(np.float32)
+    gradient = rng.normal(size=image.shape).astype(np.float32)
+    values = np.zeros((), CAMERA)
+    values["cx"], values["cy"] = middle = 0.625 * width, 0.375 * height
+    camera, workspace = replace(camera_of(device, width, height), values=values), Workspace(device)
+    for name in ("response", "grad_response"):
+        workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
+    planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
+    found, passed = taken(workspace, camera, planes, row).get(), taken(workspace, camera, planes, row, uploaded).get()
+    sums = workspace.array("response sums", (20, camera.rows)).get()
+    exact, given = image[:3].astype(np.float64), gradient[:3].astype(np.float64)
+    expected = appearance.taken(exact, row, middle)
+    yield by_element(kernel, f"colors, {what}", found[:3, :height, :width], expected, 3e-6, floor=1.0)
+    yield equal(kernel, f"pixels outside the image, {what}", outside(camera, found[:3]), 0.0)
+    by_image, by_row = appearance.taken_backward(exact, row, middle, given)
+    largest = max(float(np.abs(by_image).max()), 1.0)
+    yield by_element(kernel, f"gradient, {what}", passed[:3, :height, :width], by_image, 1e-5, floor=largest)
+    yield equal(kernel, f"gradient outside the image, {what}", outside(camera, passed[:3]), 0.0)
+    floor = float(np.sqrt(gradient.size))
+    yield by_element(kernel, f"gradient by the numbers, {what}", by_numbers(row, sums), by_row, SUM, floor=floor)
+    if channels > 3:
+        yield equal(kernel, f"fourth plane, {what}", found[3], planes.get()[3])
+        yield equal(kernel, f"gradient of the fourth plane, {what}", passed[3], uploaded.get()[3])
+
+
+@CHECKS.add("camera_response")
+def responses(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height in SIZES:
+        yield from response_figures(device, rng, width, height)
+    yield from response_figures(device, rng, 33, 18, channels=4)

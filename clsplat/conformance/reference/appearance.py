@@ -114,3 +114,66 @@ def gain_gradient(exposure: float, red: float, blue: float, grad_matrix: NDArray
 def _changed(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
     """E c + b of every pixel."""
     return np.asarray(np.einsum("ab,bhw->ahw", matrix[:, :3], image) + matrix[:, 3, None, None])
+
+
+# What a camera makes of light, of 17 numbers: its center [2], a, b, c, and four of the curve of each channel.
+
+
+def taken(image: NDArray[Any], row: NDArray[Any], middle: tuple[float, float]) -> NDArray[Any]:
+    """f(v x) of every pixel x; middle: the principal point, px."""
+    light = image * _falloff(image, row, middle)[0]
+    return np.stack([_curve(light[i], _slopes(row, i)) for i in range(3)])
+
+
+def taken_backward(
+    image: NDArray[Any], row: NDArray[Any], middle: tuple[float, float], gradient: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Derivatives of sum(gradient * taken) by the image and by the numbers."""
+    falloff, q, away = _falloff(image, row, middle)
+    light, by_light, by_row = image * falloff, np.zeros(image.shape), np.zeros(17)
+    for i in range(3):
+        slopes = _slopes(row, i)
+        begin, d = _piece(light[i])
+        by_light[i] = gradient[i] * (slopes[begin] + 4 * (slopes[begin + 1] - slopes[begin]) * d)
+        by_slope = np.array([(gradient[i] * _curve(light[i], unit)).sum() for unit in np.eye(5)])
+        areas = np.array([_curve(np.ones(1), unit)[0] for unit in np.eye(5)])
+        by_logs = (np.diag(slopes) - np.outer(slopes, areas * slopes)).T @ by_slope
+        by_row[5 + 4 * i : 9 + 4 * i] = np.delete(by_logs, 2)
+    by_falloff = (by_light * image).sum(axis=0)
+    by_row[2:5] = [(by_falloff * q**power).sum() for power in (1, 2, 3)]
+    a, b, c = row[2:5]
+    by_row[:2] = [(by_falloff * (a + 2 * b * q + 3 * c * q**2) * -2 * one).sum() for one in away]
+    return by_light * falloff, by_row
+
+
+def _falloff(
+    image: NDArray[Any], row: NDArray[Any], middle: tuple[float, float]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """v, q, and what leads from the center to each pixel, [2, H, W], in half diagonals."""
+    _, height, width = image.shape
+    half = np.hypot(width, height) / 2
+    y, x = np.mgrid[:height, :width] + 0.5
+    away = np.stack([(x - middle[0]) / half - row[0], (y - middle[1]) / half - row[1]])
+    q = (away**2).sum(axis=0)
+    return 1 + row[2] * q + row[3] * q**2 + row[4] * q**3, q, away
+
+
+def _slopes(row: NDArray[Any], channel: int) -> NDArray[Any]:
+    """The slopes of a curve at 0, 1/4, 1/2, 3/4 and 1, of which it rises from 0 to 1."""
+    slopes = np.exp(np.insert(row[5 + 4 * channel : 9 + 4 * channel], 2, 0.0))
+    return np.asarray(slopes / _curve(np.ones(1), slopes))
+
+
+def _piece(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Which quarter a value lies in, and how far from its beginning; of those outside the nearest."""
+    inside = np.clip(x, 0, 1)
+    begin = np.minimum((4 * inside).astype(int), 3)
+    return begin, inside - begin / 4
+
+
+def _curve(x: NDArray[Any], slopes: NDArray[Any]) -> NDArray[Any]:
+    """The integral from 0 of slopes that are linear between quarters, and constant below 0 and above 1."""
+    begin, d = _piece(x)
+    at_begin = np.concatenate([[0], np.cumsum(slopes[1:] + slopes[:-1]) / 8])[begin]
+    inside = at_begin + slopes[begin] * d + 2 * (slopes[begin + 1] - slopes[begin]) * d**2
+    return np.asarray(inside + slopes[0] * np.minimum(x, 0) + slopes[4] * np.maximum(x - 1, 0))

@@ -1,0 +1,130 @@
+"""What each camera makes of light: the falloff of its lens, and a response curve of each channel."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from clsplat.core.schedule import NonNegative, at_step
+from clsplat.losses.base import LossValue
+from clsplat.opencl.device import Array
+from clsplat.photos.appearance import Floats, ViewTable
+from clsplat.render.camera import DeviceCamera
+from clsplat.render.workspace import Workspace
+from clsplat.scene.scene import Scene
+from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
+from clsplat.training.run import Run
+
+KERNEL, FILE = "camera_response.cl", "view_responses.json"
+CURVES = [f"{channel}_{node}" for channel in ("red", "green", "blue") for node in (0, 1, 3, 4)]
+AREAS = np.array([0.5, 1, 1, 1, 0.5]) / 4  # what a slope of 1 at a node adds to f(1)
+TABLE = ViewTable("responses", (), ("center_x", "center_y", "a", "b", "c", *CURVES), is_centered=False)
+
+
+class CameraResponse(TrainingModule):
+    """Vignetting and response curves of each camera, learned with the Gaussians; all its photographs share them.
+
+    A pixel x of the scene becomes f(v x) before the losses.  v = 1 + a q + b q² + c q³ is the falloff of the lens
+    (Goldman and Chen 2005): q is the squared distance from a center, in half diagonals of the image; center_x and
+    center_y lead to it from the principal point.  f is a monotone spline of each channel (Ramsay 1988), f(0) = 0 and
+    f(1) = 1.  Its slope is piecewise linear; red_0, 1, 3 and 4 are its logarithms at 0, 1/4, 3/4 and 1, less that at
+    1/2.  PPISP (Deutsch et al. 2026) has such a falloff, and a curve of powers.  All numbers begin at 0, which
+    changes nothing.
+
+    Views have one camera where the dataset gives them the same lens, or the same pinhole camera.  Test views are
+    measured as their camera takes them; a camera without a photograph in the training changes nothing.  The model, and
+    all pictures of it, stay as the scene shows them.
+    """
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
+    place: ClassVar[int] = 25  # before the colors of a photograph, which cut white
+    planes: ClassVar[int] = 8  # the image as the camera takes it, its gradient, and what the sums need
+    outlasts: ClassVar[Literal["numbers"]] = "numbers"
+    conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
+    files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
+
+    type: Literal["camera_response"] = "camera_response"
+    rate: NonNegative = 1e-3
+    """Learning rate of the numbers of a camera, by Adam, by step; a training of a few hundred steps needs 5e-3."""
+    weight: NonNegative = 1e-2
+    """Weight of the sum of the squared numbers of the step's camera among the losses, by step: what all photographs
+    have in common the Gaussians can show as well."""
+
+    def state(self, run: Run) -> ModuleState:
+        return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)
+
+    @classmethod
+    def beside(cls, model: Path, scene: Scene) -> Scene:
+        return with_rows(scene, TABLE.read(model.with_name(FILE)))
+
+
+class CameraResponseState(ModuleState):
+    """The numbers of each camera, by the name of the first view that has it."""
+
+    def __init__(self, settings: CameraResponse, views: Sequence[str], cameras: dict[str, str]) -> None:
+        """views: the names of the training views, by number; cameras: of each view, by name."""
+        super().__init__()
+        self.settings, self.views, self.cameras = settings, views, cameras
+
+    def row(self, view: str) -> Floats:
+        """Return the numbers of a view's camera, [17]."""
+        return TABLE.row(self.numbers, self.cameras[view])
+
+    def after_render(self, step: TrainingStep) -> None:
+        if step.view is not None:
+            row, weight = self.row(self.views[step.view]), at_step(self.settings.weight, step.number)
+            step.own_losses.append(LossValue("response", lambda: weight * float(row @ row)))
+            step.keep(self, (step.image, row, 2 * weight * row, []))
+            step.image = taken(step.workspace, step.camera, step.image, row)
+
+    def backward(self, step: TrainingStep) -> None:
+        if kept := step.kept(self):
+            step.gradient = taken(step.workspace, step.camera, kept[0], kept[1], step.gradient)
+            kept[3].append(step.workspace.array("response sums", (20, step.camera.rows)).get_later())
+
+    def update(self, step: TrainingStep) -> None:
+        if (kept := step.kept(self)) and step.view is not None:
+            gradient, rate = by_numbers(kept[1], kept[3][0]()) + kept[2], at_step(self.settings.rate, step.number)
+            TABLE.update(self.numbers, self.cameras[self.views[step.view]], gradient, rate)
+
+    def scene(self, scene: Scene) -> Scene:
+        return with_rows(scene, {view: self.row(view) for view in self.cameras})
+
+    def write(self, run: Run) -> None:
+        TABLE.write(run.out / FILE, {view: self.row(view) for view in self.cameras})
+
+
+def with_rows(scene: Scene, rows: Mapping[str, Floats]) -> Scene:
+    """Return a scene whose views are measured as their cameras take them; rows: numbers by the name of a view, [17]."""
+    responses = {view: partial(taken, row=row) for view, row in rows.items()}
+    return replace(scene, views=tuple(replace(view, response=responses.get(view.name)) for view in scene.views))
+
+
+def slopes_of(row: Floats) -> Floats:
+    """Return the slopes of the curves at the nodes, [3, 5]."""
+    slopes = np.exp(np.insert(row[5:].reshape(3, 4), 2, 0, axis=1))
+    return np.asarray(slopes / (slopes @ AREAS)[:, None])
+
+
+def by_numbers(row: Floats, sums: Floats) -> Floats:
+    """Return derivatives by a camera's numbers, [17], from the sums of rows of pixels, [20, rows]."""
+    found, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], slopes_of(row)
+    by_logs = slopes * found[5:].reshape(3, 5)
+    by_logs -= slopes * AREAS * by_logs.sum(axis=1, keepdims=True)
+    return np.concatenate([found[:5], np.delete(by_logs, 2, axis=1).ravel()])
+
+
+def taken(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, back: Array | None = None) -> Array:
+    """Return what a camera makes of an image, [3 or 4, rows, stride]; or, back from a gradient by that, the gradient by
+    the image, with the sums of rows in the workspace."""
+    result = workspace.array("grad_response" if back else "response", image.shape)
+    sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2
+    numbers = workspace.device.upload(np.concatenate([row[2:5], slopes_of(row).ravel()]).astype(np.float32))
+    center = {f"center_{x}": float(camera.values[f"c{x}"] + half * shift) for x, shift in zip("xy", row, strict=False)}
+    given: dict[str, Any] = {"image": image, "gradient": back or image, "found": result, "row_sums": sums, **center}
+    given |= {"numbers": numbers, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
+    workspace.device.program(KERNEL).camera_response(groups=(1, camera.rows), **given, **camera.plane_arguments())
+    return result

@@ -1,0 +1,60 @@
+/* What a camera makes of light: y = f(v c) of every pixel c, with the falloff v of its lens and the curve f of each
+ * channel, and back.
+ *
+ * v = 1 + a q + b q^2 + c q^3; q is the squared distance from a center; 1 is that of a corner from the middle.
+ * The slope of f is piecewise linear between NODES places from 0 to 1, and constant beyond them; f(0) = 0.
+ * A fourth plane is copied.  Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image.
+ * One group of TEAM items = one row; each sum is written once.  Deterministic. */
+#include "planes.h"
+
+#define NODES 5
+#define SUMS (5 + 3 * NODES)  // derivatives by the center, by a, b, c, and by the slopes of each channel
+
+/* What the camera makes of an image; or, back, the gradient by the image from that by what the camera made of it, and
+ * the sums of a row that give the derivatives.  numbers: a, b, c, then the slopes of each channel; center: px; per_px:
+ * px^-1, the inverse of a corner's distance.  Local memory: TEAM * SUMS * 4 bytes. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void camera_response(
+    __global const float *restrict image, __global const float *restrict gradient,  // [channels,H',stride] 3 or 4
+    __global float *restrict found, __global float *restrict row_sums,  // [channels,H',stride]; [SUMS,H']
+    __global const float *restrict numbers, const float center_x, const float center_y, const float per_px,  // [18]
+    const uint back, const uint channels, const uint width, const uint height, const uint rows, const uint stride)
+{
+    __local float sums[SUMS][TEAM];
+    const uint item = get_local_id(0), y = get_group_id(1), columns = y < height ? width : 0;
+    const float dy = ((float)y + 0.5f - center_y) * per_px;
+    VF total[SUMS] = {(VF)(0.0f)}, zero = (VF)(0.0f), one = (VF)(1.0f);
+    for (uint x = item * LANES; x < stride; x += TEAM * LANES) {
+        const VF dx = (to_VF(LANE_INDEX + (int)x) + 0.5f - center_x) * per_px, q = dx * dx + dy * dy;
+        const VF falloff = one + q * (numbers[0] + q * (numbers[1] + q * numbers[2])), inside = inside_row(x, columns);
+        VF by_falloff = zero;
+        for (uint i = 0; i < 3; i++) {
+            const uint at = (i * rows + y) * stride + x, first = 3 + NODES * i;
+            const VF c = VLOAD(image + at), light = falloff * c, passed = inside * VLOAD(gradient + at);
+            const VF scaled = (float)(NODES - 1) * smaller(larger(light, zero), one);
+            VF value = zero, slope = zero;
+            for (uint k = 0; k < NODES; k++) {
+                const VF t = smaller(larger(scaled - (float)k, -one), one), hat = one - magnitude(t);
+                const VF beyond = k == 0 ? smaller(light, zero) : k == NODES - 1 ? larger(light - one, zero) : zero;
+                const VF part = beyond + (0.5f * t * (one + hat) + (k > 0 ? 0.5f : 0.0f)) / (float)(NODES - 1);
+                value += numbers[first + k] * part;
+                slope += numbers[first + k] * hat;
+                total[2 + first + k] += passed * part;
+            }
+            by_falloff += passed * slope * c;
+            VSTORE(back ? passed * slope * falloff : inside * value, found + at);
+        }
+        if (channels > 3)
+            VSTORE(VLOAD((back ? gradient : image) + (3 * rows + y) * stride + x), found + (3 * rows + y) * stride + x);
+        const VF by_q = by_falloff * (numbers[0] + q * (2.0f * numbers[1] + q * 3.0f * numbers[2]));
+        total[0] -= 2.0f * dx * by_q;
+        total[1] -= 2.0f * dy * by_q;
+        for (uint k = 2; k < 5; k++)
+            total[k] += by_falloff *= q;
+    }
+    for (uint k = 0; k < SUMS; k++)
+        sums[k][item] = sum_lanes(total[k]);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint k = item; k < SUMS; k += TEAM)
+        row_sums[k * rows + y] = sum_items(sums[k]);
+}
