@@ -35,7 +35,7 @@ class CameraResponse(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
     place: ClassVar[int] = 25  # before the colors of a photograph, which cut white
-    planes: ClassVar[int] = 8  # the image as the camera takes it, its gradient, and what the sums need
+    planes: ClassVar[int] = 8  # the image as the camera takes it, and its gradient, each with a fourth plane
     outlasts: ClassVar[Literal["numbers"]] = "numbers"
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
     files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
