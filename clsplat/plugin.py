@@ -24,7 +24,7 @@ from clsplat.losses.base import Comparison, ImageLoss, LossValue, Penalty, Penal
 from clsplat.opencl.device import Array, Device
 from clsplat.photos.appearance import Floats, ViewTable
 from clsplat.photos.sampling import Order, ViewPool
-from clsplat.photos.transforms import LearnedTransform, PhotographTransform, Planes
+from clsplat.photos.transforms import PhotographTransform, Planes
 from clsplat.prepare.steps import Step
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.filters import FilterViews, ScreenFilter, WorldFilter
@@ -57,7 +57,6 @@ __all__ = [
     "GaussianGradients",
     "Gaussians",
     "ImageLoss",
-    "LearnedTransform",
     "LossValue",
     "MemoryLimitError",
     "ModuleState",

@@ -10,7 +10,7 @@ import numpy as np
 
 # isort: off
 from clsplat.plugin import Array, DeviceCamera, Floats, LossValue, ModuleState, NonNegative, Run, Scene, TrainingModule
-from clsplat.plugin import TrainingStep, View, ViewTable, Workspace, at_step
+from clsplat.plugin import TrainingStep, ViewTable, Workspace, at_step
 
 KERNEL, FILE = Path(__file__).with_suffix(".cl"), "view_responses.json"
 CURVES = [f"{channel}_{node}" for channel in ("red", "green", "blue") for node in (0, 1, 3, 4)]
@@ -35,6 +35,7 @@ class CameraResponse(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
     place: ClassVar[int] = 25  # before the colors of a photograph, which cut white
+    planes: ClassVar[int] = 8  # the image as the camera takes it, and its gradient, each with a fourth plane
     outlasts: ClassVar[Literal["numbers"]] = "numbers"
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
     files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
@@ -48,9 +49,6 @@ class CameraResponse(TrainingModule):
 
     def state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)
-
-    def device_bytes(self, views: Sequence[View], tile: int) -> int:
-        return max(4 * 8 * (view.camera.width + tile) * (view.camera.height + tile) for view in views)
 
     @classmethod
     def beside(cls, model: Path, scene: Scene) -> Scene:

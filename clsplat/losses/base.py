@@ -1,8 +1,8 @@
 """The base of losses and penalties: each adds to a gradient and returns its value, which is read on request."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from clsplat.core.errors import ConfigError
@@ -12,7 +12,6 @@ from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Array
 from clsplat.photos.depths import KnownDepths
-from clsplat.photos.transforms import PhotographTransform, learned_of, name_of
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Content, Frame
 from clsplat.render.workspace import Workspace
@@ -100,7 +99,7 @@ class ImageLoss(Loss):
     """A loss that compares the rendered image with the photograph."""
 
     symmetric: ClassVar[bool] = False
-    """Whether it has the same value with image and photograph exchanged; a transform that learns needs that."""
+    """Whether it has the same value with image and photograph exchanged; the module `haar` needs that."""
     reads_photograph: ClassVar[bool] = True
     """Whether it compares; one that does not needs no symmetry, and is no loss to train on alone."""
 
@@ -111,35 +110,6 @@ class ImageLoss(Loss):
     @abstractmethod
     def add(self, comparison: Comparison) -> LossValue:
         """Add weight · d(loss)/d(image) to the gradient."""
-
-
-def require_symmetric(losses: Iterable[Loss], transforms: Sequence[PhotographTransform]) -> None:
-    """Raise ConfigError where a transform learns, and a loss has no gradient by the photograph."""
-    if not learned_of(transforms):
-        return
-    for loss in losses:
-        if isinstance(loss, ImageLoss) and loss.reads_photograph and not loss.symmetric:
-            name = getattr(loss, "type", getattr(loss, "name", type(loss).__name__))
-            raise ConfigError(
-                f"the loss '{name}', where '{name_of(transforms[-1])}' learns: expected losses that are the same with "
-                "image and photograph exchanged, such as l1, l2 and dssim; the class of one says `symmetric = True`"
-            )
-
-
-def gradient_by_photograph(losses: Iterable[Loss], comparison: Comparison) -> Array:
-    """Return the gradient of symmetric losses by the photograph, [3, rows, stride]; the image's is left as it is.
-
-    It comes before that of the image: a loss keeps the sums of its last call, which its value is read from.
-    """
-    gradient = comparison.workspace.array("grad_photograph", comparison.photograph.shape)
-    image, photograph = comparison.photograph, comparison.image
-    exchanged = replace(comparison, image=image, photograph=photograph, gradient=gradient, accumulate=False)
-    compared = [loss for loss in losses if isinstance(loss, ImageLoss) and loss.reads_photograph]
-    if not compared:
-        gradient.fill(0)
-    for loss in compared:
-        loss.add(exchanged)
-    return gradient
 
 
 @dataclass(frozen=True)

@@ -145,6 +145,19 @@ class Fitted(Protocol):
         """Return the matrix, [3, 4], that brings an image nearest to a photograph, pixels [M, 3]."""
 
 
+class Gains:
+    """Gains of red, green and blue."""
+
+    fitted_to_a_channel: ClassVar[int] = 1
+
+    def fitted(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the matrix, [3, 4], of the gains that bring an image nearest to a photograph by least squares, pixels
+        [M, 3]."""
+        squares, products = (image * image).sum(axis=0), (image * photograph).sum(axis=0)
+        gains = np.where((squares > 0) & (products > 0), products / np.where(squares > 0, squares, 1), 1.0)
+        return np.column_stack([np.diag(gains), np.zeros(3)])
+
+
 def colour_figures(
     image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: Fitted
 ) -> dict[str, float]:

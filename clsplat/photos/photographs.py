@@ -1,6 +1,6 @@
 """Photographs on the device, 8 bits a channel, and the float planes that losses compare with."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,19 +50,17 @@ class Photograph:
         workspace: Workspace,
         transforms: Sequence[PhotographTransform] = (),
         step: int = 0,
-        numbers: Mapping[str, float] | None = None,
         backgrounds: tuple[Array, Array] | None = None,
     ) -> Planes:
         """Return the photograph as float planes of whole tiles, after the transforms of a global step.
 
-        numbers: those of a transform that learns; without them it has its first ones.  backgrounds: that of the
-        photographs, and what is behind transparent pixels in its place; each [3] in [0, 1].
+        backgrounds: that of the photographs, and what is behind transparent pixels in its place; each [3] in [0, 1].
         """
         colours = unpack(workspace, self.camera, self.colours, 1 / 255, "photograph")
         if backgrounds and self.transparency:
             change_background(workspace, self.camera, colours, self.transparency, *backgrounds)
         mask = unpack(workspace, self.camera, self.mask, 1.0, "mask") if self.mask else None
-        planes = Planes(workspace, self.camera, colours, mask, numbers or {})
+        planes = Planes(workspace, self.camera, colours, mask)
         for transform in transforms:
             planes = transform.apply(planes, step)
         return planes

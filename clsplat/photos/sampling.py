@@ -8,13 +8,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import AtLeastOne, Points, at_step, explained
 from clsplat.core.settings import OneOf, Settings
 from clsplat.photos.detail import DetailDivisor, course
-from clsplat.photos.transforms import PhotographTransform, learned_of
+from clsplat.photos.transforms import PhotographTransform
 from clsplat.scene.view import View
 
 # The view of each training step: it depends on the seed and the step alone, so a resumed run uses the same views.
@@ -98,13 +98,7 @@ class ViewSettings(Settings):
     resolution: Annotated[DetailDivisor | AtLeastOne, explained(", or {follows: detail, until, …}")] = 1.0
     """Divisor of the photographs' size beside `scene.downscale`, at least 1: by step, or from their detail."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
-    """Transforms of the photograph, in order; one that learns stands last."""
-
-    @field_validator("transforms")
-    @classmethod
-    def _learning_at_the_end(cls, transforms: list[PhotographTransform]) -> list[PhotographTransform]:
-        learned_of(transforms)
-        return transforms
+    """Transforms of the photograph, in order."""
 
     def settled(self, photographs: Callable[[], Iterable[NDArray[np.uint8]]]) -> "ViewSettings":
         """Return settings in which what follows from the training photographs, each [height, width, 3], is a number by

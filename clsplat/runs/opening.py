@@ -13,13 +13,11 @@ from clsplat.core.progress import Listener, heard_by
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.choices import choose
-from clsplat.pipeline.file import PipelineFile, SceneSettings
+from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.input_files import contents
 from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.pipeline.stretching import of_trainings
 from clsplat.prepare.cache import Planned, facts, note, noted, prepare
-from clsplat.render.backdrops import Auto as AutoSky
-from clsplat.render.backdrops import Directions
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.preflight import check_preparation
 from clsplat.runs.run_folder import Start
@@ -27,9 +25,8 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity, decode_all, require_whole
 from clsplat.scene.quality import measured, nearest_points
 from clsplat.scene.scene import SPLITS, Background, Scene
-from clsplat.stages.init import settled as settled_sky
-from clsplat.stages.init import share_with_sky
 from clsplat.stages.optimize import Optimize
+from clsplat.training.modules.base import unlisted
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
@@ -214,8 +211,10 @@ def _by_capture(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pi
     if not still_open:
         return pipeline
     measures = measured(run.scene)
-    if any(one.depends("sky", measures) for one in still_open) and (share := share_with_sky(run)) is not None:
-        measures["sky"] = share
+    for kind in unlisted().values():
+        asked = kind.measure and any(one.depends(kind.measure, measures) for one in still_open)
+        if kind.measure and asked and (found := kind.measured(run)) is not None:
+            measures[kind.measure] = found
     chosen = replace(pipeline, settings=choose(pipeline.settings, measures))
     if chosen.settings.scene.validation != pipeline.settings.scene.validation:
         run.divide(chosen.settings.scene.split.with_validation(run.original.with_fold()))
@@ -233,32 +232,16 @@ def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
 
 
 def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
-    """The pipeline with what its modules and its sky choose."""
+    """The pipeline with what its modules choose."""
 
     def chosen(training: Optimize) -> Optimize:
         modules = [module.settled(run) for module in training.modules]
         return training if modules == training.modules else training.model_copy(update={"modules": modules})
 
-    settings = _with_sky(of_trainings(pipeline.settings, Optimize, chosen), run)
-    return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)
-
-
-def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
-    """Settings with the choice of a sky, where it is open: none beside what it does not go with."""
-    background, reason = settings.model.background, _against_a_sky(settings, run)
-    if reason and isinstance(background.in_use if isinstance(background, AutoSky) else background, Directions):
-        raise ConfigError(f"model.background: {reason}; leave one of them out")
-    if reason and isinstance(background, AutoSky) and background.chosen is None:
-        background = background.model_copy(update={"chosen": "off", "reason": reason})
-        LOG.info("model.background: off, since %s", reason)
-    background = settled_sky(background, run)
-    if background is settings.model.background:
-        return settings
-    return settings.model_copy(update={"model": settings.model.model_copy(update={"background": background})})
-
-
-def _against_a_sky(settings: PipelineFile, run: Run) -> str:
-    """What a sky does not go with, of what the trainings do; "" where there is nothing."""
+    settings = of_trainings(pipeline.settings, Optimize, chosen)
     modules = [one for stage in settings.stages if isinstance(stage, Optimize) for one in stage.modules]
-    rival = next((one for one in modules if "sky" in one.conflicts and one.is_active(run.scene)), None)
-    return f"'{rival.type}' does not go together with sky: {rival.conflicts['sky']}" if rival else ""
+    model = settings.model
+    for kind in unlisted().values():
+        model = kind.settled_model(run, model, modules)
+    settings = settings.model_copy(update={"model": model})
+    return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)

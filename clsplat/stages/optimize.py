@@ -14,7 +14,7 @@ from clsplat.core.progress import Progress
 from clsplat.core.schedule import place
 from clsplat.core.settings import OneOf
 from clsplat.density.statistics import SplatStats
-from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses, require_symmetric
+from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses
 from clsplat.metrics.views import distribution
 from clsplat.photos.sampling import Sampler, ViewSettings
 from clsplat.stages.densify import Densify
@@ -266,7 +266,8 @@ class Optimize(Keeping):
         return modules
 
     def check(self) -> None:
-        require_symmetric(self.losses, self.views.transforms)
+        for module in self.modules:
+            module.check_losses(self.losses)
         super().check()
 
     def outputs(self, out: Path) -> list[Path]:
@@ -343,7 +344,7 @@ class Optimize(Keeping):
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates = self.rates.settled(views.full_size(last))
         states: list[ModuleState] = attached(self.modules, run, last)
-        trained = self.losses, rates, run.scene.extent, run.numbers, self.update
+        trained = self.losses, rates, run.scene.extent, self.update
         return StepTrainer(*parts, *trained, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:

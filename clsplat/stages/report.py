@@ -18,15 +18,13 @@ from clsplat.core.files import PIPELINE, write_text
 from clsplat.core.page import charts, duration, embedded, render
 from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
-from clsplat.metrics.views import SHARES, ViewMetrics, measure, render_view
+from clsplat.metrics.views import SHARES, Gains, ViewMetrics, measure, render_view
 from clsplat.prepare.gather import photographs_text
-from clsplat.render.backdrops import Auto, Backdrop
 from clsplat.scene.scene import SPLITS
 from clsplat.scene.view import View, some_of
 from clsplat.scene.viewpoint import across, closest_point, upward
 from clsplat.training.best_model import Measured
-from clsplat.training.modules.base import learned_scene, measured_as
-from clsplat.training.modules.exposure import Gain
+from clsplat.training.modules.base import learned_scene, measured_as, unlisted
 from clsplat.training.records import VIEWS, over_views
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
@@ -51,14 +49,14 @@ def advice(run: Run) -> list[str]:
     views = learned_scene(run).downscaled(run.downscale).split("train")
     chosen = some_of(views, MOST)
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
-    found = measure(run.painter(), chosen, run.photographs, colours=Gain(), counted=counted)
+    found = measure(run.painter(), chosen, run.photographs, colours=Gains(), counted=counted)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
     return [
         *of_training_views(found, has_colours=measured_as(run) is not None),
         *of_test_views(test),
         *of_capture(views, run.original.views),
-        *of_sky(run.model_settings.background),
+        *(sentence for kind in unlisted().values() for sentence in kind.advice(run)),
     ]
 
 
@@ -92,13 +90,6 @@ def of_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
     if gap := widest_gap(views):
         degrees, one, other = gap
         yield f"no photograph is from the {degrees:.0f}° between {one} and {other}; take some there"
-
-
-def of_sky(background: Backdrop | None) -> Iterator[str]:
-    """What a sky means that was chosen by the photographs."""
-    if isinstance(background, Auto) and background.in_use is not None:
-        why, _, _ = background.reason.partition(";")
-        yield f"a sky was added, since {why}; other viewers show it where `export` has `sky: splats`"
 
 
 def far_below(psnr: Mapping[str, float]) -> list[str]:

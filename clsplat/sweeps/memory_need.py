@@ -13,7 +13,16 @@ from clsplat.scene.scene import Scene
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
-from clsplat.training.memory import DeviceLimits, Harmonics, MemoryPlan, first_tables, last_place, plan
+from clsplat.training.memory import (
+    DeviceLimits,
+    Harmonics,
+    MemoryPlan,
+    bytes_of_modules,
+    first_tables,
+    last_place,
+    most_pixels,
+    plan,
+)
 from clsplat.training.stage import Stage
 
 TILE = 16  # px a side, the larger of those that devices take
@@ -31,6 +40,7 @@ class Need:
     most: int  # Gaussians at which its growth ends; where nothing says so, those that it begins with
     motion: int = 0  # columns of the motion; 0 where nothing moves
     harmonics: Harmonics = "device"
+    modules: int = 0  # bytes that modules of a training take
 
     @classmethod
     def of(cls, pipeline: Pipeline, scene: Scene) -> "Need | None":
@@ -42,26 +52,27 @@ class Need:
         if first is None:
             return None
         settings, trainings = pipeline.settings, [one for one in pipeline.stages if isinstance(one, Optimize)]
-        sizes = [view.camera for view in scene.downscaled(settings.scene.downscale).split("train")]
+        views = scene.downscaled(settings.scene.downscale).split("train")
         budget, begins = settings.scene.image_budget, first.expected_count(scene)
         steps = sum(stage.steps for stage in trainings)
         ends = [at_step(one.max_gaussians, steps) for one in _densities(trainings) if one.max_gaussians is not None]
         return cls(
             settings.model.sh_degree,
-            sum(4 * camera.width * camera.height for camera in sizes),
+            sum(4 * view.camera.width * view.camera.height for view in views),
             None if budget is None else budget << 20,
-            max(-(-camera.width // TILE) * -(-camera.height // TILE) * TILE**2 for camera in sizes),
+            most_pixels(views, TILE),
             begins,
             max(begins, int(max(ends, default=0))),
             settings.model.time.width if settings.model.time else 0,
             settings.harmonics,
+            bytes_of_modules(trainings, views, TILE),
         )
 
     def plan(self, limits: DeviceLimits) -> MemoryPlan:
         """Return the plan of its training on a device."""
         budget = int(limits.memory * BUDGET_SHARE) if self.budget is None else self.budget
-        tables, photographs = first_tables(self.degree, self.motion), min(budget, self.photographs)
-        return plan(limits, tables, photographs, self.pixels, harmonics=last_place(self.harmonics, limits))
+        tables, held = first_tables(self.degree, self.motion), min(budget, self.photographs) + self.modules
+        return plan(limits, tables, held, self.pixels, harmonics=last_place(self.harmonics, limits))
 
     def limit_on(self, limits: DeviceLimits) -> int:
         """Return the largest number of Gaussians that a device holds."""

@@ -114,6 +114,7 @@ class Adam:
         gaussians.device.program("adam.cl")  # built before the first step
         self._lanes = int(gaussians.device.tuning["LANES"])
         self._vectors = int(gaussians.device.tuning["VECTORS"])
+        self._grad_mean2d: Array | None = None  # allocated at first use
         self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
         for name in gaussians.trained:
             for moment in moment_tables(name):
@@ -124,11 +125,11 @@ class Adam:
     ) -> Array:
         """Update every parameter from the frame's sums over pixels, [PIXEL_SUMS, S].
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.
+        Returns the gradient of the projected means, [2, S] px⁻¹, valid until the next update.
         """
         gaussians = self.gaussians
         rows = self._possible(rows)
-        grad_mean2d = gaussians.device.empty((2, gaussians.capacity))
+        grad_mean2d = self._mean2d()
         arguments: dict[str, Any] = {"sh_base": gaussians["sh_base"]}
         deferred = self._deferred(rows, model, rates)
         for name in PARAMETERS:
@@ -208,6 +209,14 @@ class Adam:
         gaussians.deferred = gaussians.deferred or Deferred(gaussians)
         gaussians.deferred.before(model.degree)
         return gaussians.deferred
+
+    def _mean2d(self) -> Array:
+        """The array of the gradient of the projected means, of another size after edits."""
+        shape = (2, self.gaussians.capacity)
+        if self._grad_mean2d is None or self._grad_mean2d.shape != shape:
+            self._grad_mean2d = None  # released before its successor is allocated
+            self._grad_mean2d = self.gaussians.device.empty(shape)
+        return self._grad_mean2d
 
     def _possible(self, rows: Rows) -> Rows:
         """Harmonics on the host are updated where a view sees them: of `all`, the others later."""

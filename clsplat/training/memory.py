@@ -4,26 +4,25 @@ Bytes are those of the tables for each Gaussian, and those of a frame for each G
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from clsplat.core.errors import MemoryLimitError
 from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients
 from clsplat.gaussians.gaussians import ALIGNMENT, GROWTH
 from clsplat.gaussians.structs import HARMONICS, moment_tables
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
+from clsplat.scene.view import View
 
 SEEN_SHARE = 0.5  # of the Gaussians, in one view, an estimate; their harmonics come to the device
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
 MOVED = 4 * (3 + 4 + 1)  # means, quaternions and logits of a moment
 FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
-FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 2 * 3 + 2 * 3 + 2 + 2)
-# image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; a photograph that is
-# changed and its gradient, or the sums of a blur; the image in the colours of its photograph and its gradient; the
-# entropy of weights and its gradient; residuals, and the mask that leaves out the large ones
-
+FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 4 + 2)
+# image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; the sums of a blur; the
+# entropy of weights and its gradient
 
 Where = Literal["device", "host"]
 Harmonics = Literal["auto", "device", "host"]  # memory of those above band 0; auto: the host where the device is full
@@ -94,6 +93,17 @@ class DeviceLimits(Protocol):
 def last_place(harmonics: Harmonics, limits: DeviceLimits) -> Where:
     """Return where harmonics may lie at last.  A device whose memory is the host's has nothing to move them to."""
     return "host" if harmonics == "host" or (harmonics == "auto" and not limits.unified) else "device"
+
+
+def most_pixels(views: Sequence[View], tile: int) -> int:
+    """Return the pixels of the largest view, whole tiles of so many px."""
+    return max(-(-view.camera.width // tile) * -(-view.camera.height // tile) * tile**2 for view in views)
+
+
+def bytes_of_modules(stages: Iterable[Any], views: Sequence[View], tile: int) -> int:
+    """Return what the modules of trainings take on the device, of the one that takes most."""
+    lists = [getattr(stage, "modules", ()) for stage in stages]
+    return max((sum(one.device_bytes(views, tile) for one in modules) for modules in lists), default=0)
 
 
 def first_tables(degree: int, motion: int = 0) -> dict[str, int]:

@@ -29,12 +29,11 @@ from clsplat.scene.scene import Scene, scene_name
 from clsplat.training.adam import Adam
 from clsplat.training.best_model import Best, Tables
 from clsplat.training.field import TrainedField
-from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, plan
+from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, bytes_of_modules, most_pixels, plan
 from clsplat.training.records import Records, clocks
 from clsplat.training.status import StatusFile
 
 Item = TypeVar("Item")
-SKY = "sky"  # the type of the module of a model's sky
 
 
 @dataclass
@@ -91,16 +90,12 @@ class Run:
         self._texture_quantiles: dict[float, float] = {}
 
     @property
-    def sky(self) -> Any:
-        """The LearnedSky of the model; None where it has none."""
-        return self.modules.get(SKY)
-
-    @property
     def model(self) -> DeviceModel:
         """The model.  Raises ConfigError when no stage has made one."""
         if self._model is None:
             raise ConfigError("no model yet: an init stage must come first")
-        self._model.sky = self.sky.sky if self.sky else None
+        for state in self.modules.values():
+            state.complete(self._model)
         return self._model
 
     @model.setter
@@ -219,9 +214,8 @@ class Run:
         components = components or self.model.gaussians.components
         views, tile = self.scene.split("train"), int(self.device.tuning["TILE"])
         bytes_held = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
-        lists = [getattr(stage, "modules", ()) for stage in getattr(self.settings, "stages", ())]
-        bytes_held += max((sum(one.device_bytes(views, tile) for one in modules) for modules in lists), default=0)
-        pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
+        bytes_held += bytes_of_modules(getattr(self.settings, "stages", ()), views, tile)
+        pixels = most_pixels(views, tile)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
         return plan(self.device.info, components, bytes_held, pixels, pixel_sums, harmonics, seen)
 
@@ -260,12 +254,12 @@ def host_model(run: Run) -> Model:
 
     Raises ConfigError when no stage has made one.
     """
-    gaussians = run.model.gaussians
+    model, gaussians = run.model, run.model.gaussians
     tables = {name: gaussians.get(name) for name in (*gaussians.trained, "filter_variance")}
     if not tables["filter_variance"].any():
         del tables["filter_variance"]
     rendering = Rendering.of({"version": __version__, **_rendering(run)}, "default")
-    return Model(**tables, rendering=rendering, sky=run.sky.sky.host() if run.sky else None)
+    return Model(**tables, rendering=rendering, sky=model.sky.host() if model.sky else None)
 
 
 def _rendering(run: Run) -> dict[str, Any]:
@@ -280,6 +274,6 @@ def _rendering(run: Run) -> dict[str, Any]:
     }
     if model.pixel_box:
         found["pixel_box"] = model.pixel_box
-    if run.sky:
+    if model.sky:
         found["sky"] = "directions"
     return found

@@ -1,7 +1,7 @@
 """One training step: render a view, compare it with its photograph, differentiate, update, count."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.gaussians import DeviceModel
@@ -9,47 +9,21 @@ from clsplat.losses.base import (
     Comparison,
     ImageLoss,
     Loss,
-    LossValue,
     Penalty,
     PenaltyInputs,
     ViewGradients,
     ViewLosses,
     content_of,
-    gradient_by_photograph,
-    require_symmetric,
     returned,
 )
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.photographs import Photograph, apply_mask, known_gradient
-from clsplat.photos.transforms import LearnedTransform, PhotographTransform, learned_of, name_of
+from clsplat.photos.transforms import PhotographTransform
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.modules.base import ModuleState, Numbers, TrainingStep
+from clsplat.training.modules.base import ModuleState, TrainingStep
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
-
-
-class _Learning(ModuleState):
-    """The transform of a step's photograph that learns: it takes part as a module does."""
-
-    def __init__(self, transform: LearnedTransform, numbers: Numbers) -> None:
-        super().__init__()
-        self.transform, self.numbers = transform, numbers
-
-    def before_losses(self, step: TrainingStep) -> None:
-        """A loss keeps the sums of its last call, so that the gradient by the photograph comes before its value."""
-        gradient = gradient_by_photograph(step.losses_asked, step.comparison)
-        if step.planes.mask is not None:
-            apply_mask(step.workspace, step.camera, gradient, step.planes.mask)
-        of_images = self.transform.backward(step.planes, gradient)
-        value, of_numbers = self.transform.penalty(self.transform.now(self.numbers), step.number)
-        step.own_losses.append(LossValue(name_of(self.transform), lambda: value))
-        step.keep(self, (of_images, of_numbers))
-
-    def update(self, step: TrainingStep) -> None:
-        of_images, of_numbers = step.kept(self)
-        gradients = {name: derivative + of_numbers[name] for name, derivative in of_images().items()}
-        self.transform.update(self.numbers, gradients, step.number)
 
 
 @dataclass
@@ -86,7 +60,6 @@ class StepTrainer:
     losses: Sequence[Loss]
     rates: Rates
     extent: float = 1.0  # scene units
-    numbers: dict[str, float] = field(default_factory=dict)  # of a transform that learns, by name; a step changes them
     rows: Rows = "all"  # Gaussians that a step changes
     modules: Sequence[ModuleState] = ()  # that take part in a step: forward in this order, backward in reverse
 
@@ -119,21 +92,19 @@ class StepTrainer:
         """Render one view and compare it with its photograph; nothing is updated.
 
         Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, for two that read different fourth
-        planes, and, where a transform learns, for one that is not symmetric in image and photograph.
+        planes, and for one that a module does not go with.
         """
         content = content_of(self.losses, step)
-        require_symmetric(self.losses, transforms)
         workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings
         now = TrainingStep(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
-        learned = learned_of(transforms)
-        now.modules = [*self.modules, *([_Learning(learned, self.numbers)] if learned else [])]
+        now.modules = self.modules
         for module in now.modules:
             module.before_render(now)
         camera = now.camera
         now.frame = self.rasterizer.forward(now.model, camera, now.background, content)
         timings.section = "loss"
         backgrounds = self.background, now.background
-        now.planes = now.photograph.planes(workspace, transforms, step, self.numbers, backgrounds)
+        now.planes = now.photograph.planes(workspace, transforms, step, backgrounds)
         now.image, now.gradient = now.frame.image, workspace.array("grad_image", now.frame.image.shape)
         for module in now.modules:
             module.after_render(now)

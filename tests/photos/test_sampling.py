@@ -21,7 +21,6 @@ pytestmark = pytest.mark.slow
 
 RESOLUTION = "optimize.views.resolution={points: [[0, 2], [20, 1]], between: steps}"
 BLUR = "optimize.views.transforms=[{type: blur, sigma: [[0, 3.0], [30, 0.5], [45, 0.0]]}]"
-HAAR = "optimize.views.transforms=[{type: haar, rate: 0.02}]"
 FRACTIONS = "optimize.views.resolution=[[1, 3.0], [40, 1.0]]"
 
 
@@ -44,9 +43,7 @@ def test_transforms_come_with_every_sample(tiny_scene):
     assert list(sampler.at(7).transforms) == transforms
 
 
-@pytest.mark.parametrize(
-    "setting", [RESOLUTION, BLUR, FRACTIONS, HAAR], ids=["resolution", "blur", "fractions", "haar"]
-)
+@pytest.mark.parametrize("setting", [RESOLUTION, BLUR, FRACTIONS], ids=["resolution", "blur", "fractions"])
 def test_run_with_changing_views_is_the_same_after_a_stop(tiny_scene, tmp_path, setting):
     few = "optimize.steps=24"
     whole = train(tiny_scene, tmp_path / "whole", few, setting)
@@ -61,9 +58,8 @@ def test_run_with_changing_views_is_the_same_after_a_stop(tiny_scene, tmp_path, 
 
         with pytest.raises(Interrupted):
             runner.execute(checked, run, "resume", stop)
-    resumed = train(tiny_scene, out, few, setting, resume=True)
+    train(tiny_scene, out, few, setting, resume=True)
     assert digest(out) == digest(tmp_path / "whole")
-    assert resumed.numbers == whole.numbers
 
 
 def test_views_change_what_is_trained_and_their_defaults_do_not(tiny_scene, few_steps, tmp_path):

@@ -388,7 +388,7 @@ def test_a_run_looks_for_a_sky_where_a_choice_asks(tmp_path, rng, clear, told):
 
 
 def test_a_run_does_not_look_for_a_sky_in_vain(tmp_path, rng, monkeypatch):
-    monkeypatch.setattr("clsplat.runs.opening.share_with_sky", lambda run: pytest.fail("looked for a sky"))
+    monkeypatch.setattr("clsplat.training.modules.sky.SkyModule.measured", lambda run: pytest.fail("looked for a sky"))
     many = SKY.replace("[20, 0]", "[9, 0]")
     asked = load("smoke", [f"scene.path='{Yard(rng).write(tmp_path / 'yard')}'", f"choices=[{many}]"])
     assert "since 10 training photographs; x" in describe(asked, tmp_path / "run", None, "new")

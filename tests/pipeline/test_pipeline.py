@@ -173,7 +173,7 @@ DASH = {
     *(f"densify.rules.prune_large{key}" for key in ("", ".size_above", ".start")),
     "densify.stop",
 }
-HAAR = {f"views.transforms.haar{key}" for key in ("", ".learn", ".rate", ".weight")}
+HAAR = {f"modules.haar{key}" for key in ("", ".learn", ".rate", ".weight")}
 SADDLE = {
     *(f"densify.rules.{rule}{key}" for rule in ("clone", "split") for key in ("", ".start", ".statistic", ".opacity")),
     *(f"densify.rules.{rule}{key}" for rule in ("clone", "split") for key in (".as_many_as", ".gradient_above")),

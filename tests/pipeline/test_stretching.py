@@ -144,8 +144,8 @@ def test_training_by_detail_is_not_cut_before_the_full_size():
 
 
 def test_rate_of_what_learns_in_n_updates_falls_as_much():
-    (haar,) = in_steps(load("auto_opti3dgs").settings, 7000).training.views.transforms
-    (short,) = load("auto_opti3dgs_7k").settings.training.views.transforms
+    (haar,) = in_steps(load("auto_opti3dgs").settings, 7000).training.modules
+    (short,) = load("auto_opti3dgs_7k").settings.training.modules
     assert haar.rate == pytest.approx(1e-4 * 30 / 7)
     assert short.rate == pytest.approx(haar.rate, rel=0.01)
     (points,) = stretched([haar.model_copy(update={"rate": [[0, 1e-3], [100, 1e-4]]})], 0.5)

@@ -1,6 +1,7 @@
 """Rooms: what each may import, how many there are, and that imports have no circle."""
 
 import ast
+import re
 from collections import defaultdict
 
 from tests.support.sources import FACES, FILES, PATHS, ROOT, imports, own_imports, room
@@ -60,6 +61,18 @@ def test_no_modules_import_each_other():
     for module in sorted(PATHS):
         visit(module, ())
     assert not faults, "\n".join(faults)
+
+
+def test_few_modules_import_from_the_home_files_of_an_idea():
+    """The home files are those that docs/inside.md names."""
+    rows = re.findall(r"^\| (sky|motion|fields) \| (.+) \|$", (ROOT / "docs" / "inside.md").read_text(), re.MULTILINE)
+    assert len(rows) == 3
+    for idea, cell in rows:
+        homes = [ROOT / name for name in re.findall("`([^`]+)`", cell)]
+        assert not [home for home in homes if not home.exists()]
+        own = {module for module, path in PATHS.items() if {path, path.parent} & {*homes}}
+        others = {module for module, _, target in own_imports() if target in own and module not in own}
+        assert len(others) <= 12, f"{idea}: {', '.join(sorted(others))}"
 
 
 def test_rooms_are_few_and_say_their_reason():

@@ -1,15 +1,17 @@
 """What a run's page advises: by figures of views, and by where the cameras stand."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from clsplat.metrics.views import ViewMetrics
-from clsplat.render.backdrops import Auto, Directions
+from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
-from clsplat.stages.report import FEW, far_below, of_capture, of_sky, of_test_views, of_training_views, widest_gap
+from clsplat.stages.report import FEW, far_below, of_capture, of_test_views, of_training_views, widest_gap
+from clsplat.training.modules.sky import SkyModule
 
 CAMERA = Camera(40, 30, 40.0, 40.0, 20.0, 15.0)
 
@@ -60,11 +62,16 @@ def test_test_views_that_are_much_worse_are_named():
     assert text.startswith("b: much worse")
 
 
+def run_with(background: Backdrop | None) -> SimpleNamespace:
+    return SimpleNamespace(model_settings=SimpleNamespace(background=background))
+
+
 def test_a_sky_that_was_added_is_said_with_its_reason():
     added = Auto(chosen="on", reason="25 of 25 photographs show one; 25% of them")
-    (text,) = of_sky(added)
+    (text,) = SkyModule.advice(run_with(added))
     assert text.startswith("a sky was added, since 25 of 25 photographs show one; ")
-    assert not [text for other in (None, Directions(), Auto(), Auto(chosen="off")) for text in of_sky(other)]
+    others = None, Directions(), Auto(), Auto(chosen="off")
+    assert not [text for other in others for text in SkyModule.advice(run_with(other))]
 
 
 def test_few_photographs_are_said():

@@ -109,7 +109,7 @@ NAMED = {
     "fisheye": sets(scene="fisheye"),
     "gain": sets("optimize.modules.exposure={}"),
     "grid": sets("optimize.modules.bilateral_grid={cells: [3, 2, 4]}"),
-    "haar": sets("optimize.views.transforms=[{type: haar, learn: filter}]"),
+    "haar": sets("optimize.modules.haar={learn: filter}"),
     "harmonics_on_host": sets("rasterizer.harmonics=host", same_as="splat_7k"),
     "inside": sets("stages.1.during.1.inside={low: [0, null, null]}"),
     "inverse_depth": sets(DEPTHS, "scene.downscale=8", scene="fox"),

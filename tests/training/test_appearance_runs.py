@@ -21,7 +21,7 @@ from clsplat.training import checkpoint
 from clsplat.training.modules.base import measured_beside
 from clsplat.training.modules.exposure import Exposure
 from tests.support.exposed_wall import Wall
-from tests.support.runs import FEW, digest, killed, train
+from tests.support.runs import FEW, digest, train
 
 pytestmark = pytest.mark.slow
 GAIN = (*FEW, "optimize.modules.exposure={}")
@@ -33,13 +33,6 @@ def with_gains(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     out = tmp_path_factory.mktemp("runs") / "gains"
     train(tiny_scene, out, *GAIN)
     return out
-
-
-def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_gains, tiny_scene, tmp_path):
-    out = killed(with_gains, tmp_path / "run")
-    run = train(tiny_scene, out, *GAIN, resume=True)
-    assert digest(out) == digest(with_gains)
-    assert run.modules["exposure"].numbers == checkpoint.load(checkpoint.saved(with_gains)[-1])[0].modules["exposure"]
 
 
 def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp_path, few_steps):

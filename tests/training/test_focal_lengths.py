@@ -22,7 +22,6 @@ from clsplat.training.modules.base import attached, learned_scene
 from clsplat.training.modules.camera_optimizer import (
     CameraOptimizer,
     CameraState,
-    poses_beside,
     require_zoom,
 )
 from tests.support.camera_rings import FISHEYE, STRONG
@@ -143,7 +142,7 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
     (lengths,) = {tuple(row["focal_lengths"]) for row in rows.values()}
     scene = read_scene(tiny_scene, 5)
     assert lengths[0] != scene.views[0].camera.fx
-    assert poses_beside(with_focals / "point_cloud.ply", scene).views[0].camera.fx == lengths[0]
+    assert CameraOptimizer.beside(with_focals / "point_cloud.ply", scene).views[0].camera.fx == lengths[0]
     cameras.write(with_focals, tmp_path / "cameras", "nerfstudio", "copy")
     for view in read_scene(tmp_path / "cameras", 5).views:
         assert (view.camera.fx, view.camera.fy) == pytest.approx(lengths)
@@ -151,7 +150,7 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
         broken = {name: row for name in rows}
         (tmp_path / "view_poses.json").write_text(json.dumps({"photographs": broken}))
         with pytest.raises(DataError, match=r"view_poses.json: .*no two focal lengths within 10 times"):
-            poses_beside(tmp_path / "point_cloud.ply", scene)
+            CameraOptimizer.beside(tmp_path / "point_cloud.ply", scene)
 
 
 @pytest.mark.slow

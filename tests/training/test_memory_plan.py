@@ -28,7 +28,7 @@ def test_bytes_come_from_the_tables(device, rng):
     assert plan(gaussians, 0, 0, pixel_sums=13).gaussian == parameters + frame + 4 * 4
     gaussians.add("more", 7)
     assert plan(gaussians, 0, 0).gaussian == parameters + frame + 28
-    assert plan(gaussians, 1000, 256).fixed == 1000 + 256 * 160
+    assert plan(gaussians, 1000, 256).fixed == 1000 + 256 * 120
     assert plan(gaussians, 0, 0).largest_table == 180
 
 

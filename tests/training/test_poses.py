@@ -21,7 +21,6 @@ from clsplat.training.modules.camera_optimizer import (
     CameraOptimizer,
     CameraState,
     Move,
-    poses_beside,
 )
 from tests.support.oracle import BACKGROUND, general_camera, random_gaussians, to_world
 from tests.support.runs import FEW, digest, killed, train
@@ -152,7 +151,7 @@ def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tin
     rows = json.loads((with_poses / "view_poses.json").read_text())["photographs"]
     assert sorted(row["learned"] for row in rows.values()) == [False] * 2 + [True] * 8
     scene = read_scene(tiny_scene, 5)
-    moved_views = poses_beside(with_poses / "point_cloud.ply", scene).views
+    moved_views = CameraOptimizer.beside(with_poses / "point_cloud.ply", scene).views
     assert any((a.world_to_camera != b.world_to_camera).any() for a, b in zip(scene.views, moved_views, strict=True))
     cameras.write(with_poses, tmp_path / "cameras", "nerfstudio", "copy")
     written = [view.world_to_camera for view in read_scene(tmp_path / "cameras", 5).views]
@@ -161,7 +160,7 @@ def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tin
     for damage in ("[]", json.dumps({"photographs": {scene.views[0].name: {"world_to_camera": [1, 2]}}})):
         (tmp_path / "view_poses.json").write_text(damage)
         with pytest.raises(DataError, match=r"view_poses.json: .*(expected a mapping|has no pose of 3 rows)"):
-            poses_beside(tmp_path / "point_cloud.ply", scene)
+            CameraOptimizer.beside(tmp_path / "point_cloud.ply", scene)
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.slow
 FROM_5 = (
     "optimize.modules.skip={start: 5, warm_up: 12, least: 0.25}"  # of the fifty steps of smoke, on eight photographs
 )
-HAAR = "optimize.views.transforms=[{type: haar, learn: filter}]"
+HAAR = "optimize.modules.haar={learn: filter}"
 PENALTY = "optimize.losses=[l1, {type: dssim, weight: 0.3}, {type: anisotropy, above: 2.0, weight: 0.01}]"
 NO_EDITS = ("densify.every=1000", "raise_sh.every=1000", "reset_opacity.every=1000", "optimize.evaluate.every=1000")
 
@@ -162,10 +162,11 @@ def state(run: Run) -> dict[str, Any]:
     """All that an update changes."""
     gaussians = run.model.gaussians
     tables = {name: gaussians.get(name).tobytes() for name in gaussians.tables}
-    return {**tables, "updates": dict(run.adam.updates) if run.adam else {}, **run.numbers}
+    of_filter = run.modules["haar"].numbers if "haar" in run.modules else {}
+    return {**tables, "updates": dict(run.adam.updates) if run.adam else {}, **of_filter}
 
 
-@pytest.mark.parametrize("more", [(), (PENALTY,), (HAAR,)], ids=["losses", "a penalty", "a transform that learns"])
+@pytest.mark.parametrize("more", [(), (PENALTY,), (HAAR,)], ids=["losses", "a penalty", "a filter that learns"])
 def test_a_skipped_step_leaves_all_as_it_was(tiny_scene, tmp_path, more):
     run, steps = begun(tiny_scene, tmp_path, FROM_5, *NO_EDITS, *more)
     before, skipped = state(run), []

@@ -1,7 +1,5 @@
 """Whole runs with what holds back a model of few photographs: dropout, and opacities that decay."""
 
-import shutil
-
 import numpy as np
 import pytest
 
@@ -42,13 +40,8 @@ def pipeline(tmp_path):
     return str(tmp_path / "sparse.yaml")
 
 
-def test_a_run_resumes_to_the_bit(tiny_scene, tmp_path, pipeline):
+def test_dropout_changes_the_bits(tiny_scene, tmp_path, pipeline):
     whole = digest(train(tiny_scene, tmp_path / "whole", DROPOUT, pipeline=pipeline).out)
-    again = shutil.copytree(tmp_path / "whole", tmp_path / "again")
-    (again / "checkpoints" / "step_000012.npz").unlink()
-    (again / "point_cloud.ply").unlink()
-    train(tiny_scene, again, DROPOUT, pipeline=pipeline, resume=True)
-    assert digest(again) == whole
     without = [
         digest(train(tiny_scene, tmp_path / n, *s, pipeline=pipeline).out)
         for n, s in (

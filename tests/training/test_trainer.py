@@ -262,3 +262,12 @@ def test_a_loss_that_returns_nothing_is_named():
 
     with pytest.raises(ConfigError, match="the loss Silent: expected a LossValue from 'add', got NoneType"):
         returned(Silent(), Silent().add(None))
+
+
+@pytest.mark.parametrize("more", [[], [Anisotropy(above=1.0)]], ids=["losses", "a penalty"])
+def test_later_steps_allocate_nothing_on_the_device(device, rng, monkeypatch, more):
+    trainer, photograph = trainer_of(device, rng, [L1(weight=0.8), Dssim(weight=0.2), *more])
+    for step in (1, 2):
+        trainer.step(photograph, step)
+    monkeypatch.setattr(Device, "empty", lambda self, *shape: pytest.fail(f"{shape} were allocated"))
+    trainer.step(photograph, 3)

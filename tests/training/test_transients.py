@@ -41,17 +41,10 @@ def test_the_distribution_fades():
 
 
 @pytest.mark.slow
-def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(tiny_scene, tmp_path, few_steps):
+def test_a_run_learns_the_distribution_of_residuals(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *ON)
     assert sum(run.modules["transients"].numbers[key] for key in KEYS) > 40 * 40
     assert digest(tmp_path / "run") != digest(few_steps)
-    expected = digest(tmp_path / "run")
-    (tmp_path / "run" / "checkpoints" / "step_000012.npz").unlink()
-    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
-        (tmp_path / "run" / name).unlink()
-    again = train(tiny_scene, tmp_path / "run", *ON, resume=True)
-    assert digest(tmp_path / "run") == expected
-    assert again.modules["transients"].numbers == run.modules["transients"].numbers
     state, _ = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])
     assert state.modules["transients"] == run.modules["transients"].numbers
 

@@ -11,7 +11,7 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Figure, Note, by_element, equal
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, WeightEntropy, view_error
-from clsplat.methods.opti3dgs import Haar
+from clsplat.methods.opti3dgs import apply_filter, filter_gradients
 from clsplat.opencl.device import Array, Device
 from clsplat.photos.photographs import apply_mask, change_background, known_gradient, unpack
 from clsplat.photos.transforms import Blur, Planes
@@ -176,13 +176,12 @@ def haar_figures(
         workspace.array(name, (3, camera.rows, camera.stride)).fill(np.nan)
     counted = None if mask is None else planes_of(device, camera, mask[None])
     numbers = {"haar/scale": (taps[0] - taps[1]) / np.sqrt(2), "haar/leak": taps.sum() / np.sqrt(2)}
-    planes = Planes(workspace, camera, planes_of(device, camera, image), counted, numbers)
-    changed = Haar().apply(planes, step=1)
-    found, exact = changed.colours.get(), image.astype(np.float64)
+    planes = Planes(workspace, camera, planes_of(device, camera, image), counted)
+    found, exact = apply_filter(planes, numbers).colours.get(), image.astype(np.float64)
     expected = ref.haar_filtered(exact, taps, mask)
     yield by_element("haar_forward", what, found[:, :height, :width], expected, 2e-6, floor=1.0)
     yield equal("haar_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)
-    derivatives = Haar().backward(changed, planes_of(device, camera, gradient))()
+    derivatives = filter_gradients(planes, numbers, planes_of(device, camera, gradient))()
     by_taps = ref.haar_gradient(exact, gradient, taps, mask)
     by_both = np.array([by_taps[0] - by_taps[1], by_taps.sum()]) / np.sqrt(2)
     found, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))

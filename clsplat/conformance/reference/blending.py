@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from clsplat.conformance.reference.kinds import PinholeCamera, RawGaussians, SplatGradients, Splats, Thresholds
 from clsplat.conformance.reference.projection import project, project_backward
-from clsplat.conformance.reference.sky import planes_behind
 
 # The mean of a Gaussian over the box of a pixel, as the kernels approximate it (cl_kernels/pixel_box.h).
 
@@ -125,6 +124,12 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
         yield BlendStep(i, dx, dy, falloff, alpha, transmittance, running, candidate, blended)
         running = running & ~stops
         transmittance = np.where(blended, after, transmittance)
+
+
+def planes_behind(background: NDArray[Any]) -> NDArray[Any]:
+    """A background of one colour, [3], or of a picture, [3, H, W], as planes."""
+    array = np.asarray(background)
+    return array if array.ndim == 3 else array[:, None, None]
 
 
 def blend(

@@ -14,12 +14,6 @@ from clsplat.conformance.reference.kinds import PinholeCamera
 Entry = tuple[int, int, float]  # row and column of a texel, weight
 
 
-def planes_behind(background: NDArray[Any]) -> NDArray[Any]:
-    """A background of one colour, [3], or of a picture, [3, H, W], as planes."""
-    array = np.asarray(background)
-    return array if array.ndim == 3 else array[:, None, None]
-
-
 def rays(camera: PinholeCamera, width: int, height: int) -> NDArray[Any]:
     """Directions through the centres of pixels."""
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx

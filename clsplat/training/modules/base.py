@@ -1,7 +1,7 @@
 """A training step as modules see it, and what a module is: settings in a pipeline file, and a state in a training."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -12,16 +12,20 @@ from numpy.typing import NDArray
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.settings import Settings, variants
 from clsplat.gaussians.gaussians import DeviceModel
+from clsplat.gaussians.model import Model
 from clsplat.losses.base import Comparison, Loss, LossValue
 from clsplat.metrics.views import Fitted
 from clsplat.opencl.device import Array
 from clsplat.photos.photographs import Photograph
 from clsplat.photos.transforms import PhotographTransform, Planes
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.filters import ModelSettings
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace
+from clsplat.scene.quality import Measure
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
+from clsplat.training.memory import most_pixels
 from clsplat.training.run import Run
 
 Tables = dict[str, NDArray[np.float32]]
@@ -117,7 +121,10 @@ class ModuleState:
     def update(self, step: TrainingStep) -> None: ...
     def update_skipped(self, step: TrainingStep) -> None: ...
 
-    # after a training
+    # outside steps
+    def complete(self, model: DeviceModel) -> None:
+        """Give a model what it is drawn with besides its Gaussians."""
+
     def finish(self, run: Run) -> None:
         """At the last step, before a better model than that of the last step is put back."""
 
@@ -137,12 +144,18 @@ class ModuleState:
 class TrainingModule(Settings):
     """Something that takes part in a training step next to the Gaussians."""
 
-    place: ClassVar[int] = 0  # in the list: modules stand in ascending order of it
+    place: ClassVar[int] = 0
+    """In the list: modules stand in ascending order of it.  Those below 20 change the camera, the model, the background
+    or the photograph; those below 30 what stands in front of the scene, below 40 colors, below 99 what is compared.  It
+    is a number, not names of other modules, so that one that no other knows has its place too."""
     outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "no"
     """What outlasts its training: its numbers, for measurements; or it acts in later trainings too."""
     files: ClassVar[Mapping[str, str]] = {}  # side files in the run folder, which begin with `view_`, and their titles
 
+    planes: ClassVar[int] = 0  # of floats on the device, of the largest view's size
+
     brought_as: ClassVar[str] = ""  # its type, where no list names it: the model, a loss or the views bring it
+    measure: ClassVar[Measure | None] = None  # what `measured` returns
     by_type: ClassVar[bool] = True
     joins: ClassVar[bool] = False  # a run may go on with it, or without it; bits then no longer compare
 
@@ -160,9 +173,23 @@ class TrainingModule(Settings):
         return None
 
     @classmethod
-    def saved(cls, run: Run) -> "TrainingModule | None":
-        """Return it for a run whose checkpoint holds its state, where it is brought."""
+    def measured(cls, run: Run) -> float | None:
+        """Return a number that `choices` depend on; None where it is not known."""
         return None
+
+    @classmethod
+    def settled_model(cls, run: Run, settings: ModelSettings, modules: "Sequence[TrainingModule]") -> ModelSettings:
+        """Return settings of a model with what follows from the photographs; modules: of the trainings."""
+        return settings
+
+    @classmethod
+    def begin_model(cls, run: Run, source: Model | None) -> None:
+        """Begin what a new model of a run is to have; source: what it was made of, if a model."""
+
+    @classmethod
+    def advice(cls, run: Run) -> Iterator[str]:
+        """Yield sentences for the page of a run."""
+        yield from ()
 
     def settled(self, run: Run) -> "TrainingModule":
         """Return it with what follows from the photographs."""
@@ -175,9 +202,12 @@ class TrainingModule(Settings):
     def excluded(self) -> Mapping[str, str]:
         return self.conflicts if self.is_active() else {}
 
+    def check_losses(self, losses: Sequence[Loss]) -> None:
+        """Raise ConfigError for losses that it does not go with."""
+
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
         """Return what it takes on the device at most.  tile: px of its sides."""
-        return 0
+        return 4 * self.planes * most_pixels(views, tile) if self.planes else 0
 
     def check_in(self, run: Run) -> None:
         """Raise errors that can be known before the first stage."""
@@ -253,10 +283,11 @@ def brought(run: Run, stage: Any = None) -> list[TrainingModule]:
     """Return the modules that no list names, of a stage; None: of that in progress."""
     stages = getattr(run.settings, "stages", ())
     stage = stages[run.cursor] if stage is None and run.cursor < len(stages) else stage
-    return [module for kind in _unlisted().values() if (module := kind.brought(run, stage))]
+    return [module for kind in unlisted().values() if (module := kind.brought(run, stage))]
 
 
-def _unlisted() -> dict[str, type[TrainingModule]]:
+def unlisted() -> dict[str, type[TrainingModule]]:
+    """Return the classes of modules that no list names, by what they are brought as."""
     return {one.brought_as: one for one in Settings.defined if issubclass(one, TrainingModule) and one.brought_as}
 
 
@@ -264,7 +295,7 @@ def restored(run: Run, saved: Mapping[str, tuple[Numbers, Tables]]) -> dict[str,
     """Return the states of a checkpoint, by type."""
     modules, found = modules_of(run), dict[str, ModuleState]()
     for name, (numbers, tables) in saved.items():
-        if module := modules.get(name, kind_of(name).saved(run)):
+        if module := modules.get(name):
             found[name] = state_of(module, run)
             found[name].load(numbers, tables)
     return found
@@ -287,7 +318,7 @@ def scene_beside(model: Path, scene: Scene) -> Scene:
 
 def kind_of(name: str) -> type[TrainingModule]:
     """Return the class of a checkpoint's module.  Raises ConfigError for one that is not known."""
-    if (kind := {**variants(TrainingModule), **_unlisted()}.get(name)) is None:
+    if (kind := {**variants(TrainingModule), **unlisted()}.get(name)) is None:
         raise ConfigError(f"the checkpoint has a module '{name}', which is not known; give its --plugin")
     return kind
 

@@ -62,6 +62,7 @@ class BilateralGrid(Appearance):
     the squared differences of neighbours."""
 
     files: ClassVar[Mapping[str, str]] = {VIEW_COLOURS: "colours", VIEW_GRIDS: "colour grids"}
+    planes: ClassVar[int] = 9  # with the gradient that passes white
 
     def state(self, run: Run) -> "GridState":
         return GridState(self, [view.name for view in run.scene.split("train")], run.device)
@@ -69,9 +70,8 @@ class BilateralGrid(Appearance):
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
         if self.chosen == "off":
             return 0
-        sides = [(-(-view.camera.width // tile) * tile, -(-view.camera.height // tile) * tile) for view in views]
-        rows, pixels = max(height for _, height in sides), max(width * height for width, height in sides)
-        return bytes_of(self.cells, len({view.name for view in views}), rows, pixels)
+        rows = max(-(-view.camera.height // tile) * tile for view in views)
+        return super().device_bytes(views, tile) + bytes_of(self.cells, len({view.name for view in views}), rows)
 
     @classmethod
     def check_saved(cls, numbers: Numbers, tables: Tables) -> None:
@@ -266,7 +266,7 @@ def row_length(cells: Sequence[int]) -> int:
     return ENTRIES * math.prod(cells)
 
 
-def bytes_of(cells: Sequence[int], photographs: int, rows: int, pixels: int) -> int:
-    """Return what grids take on the device.  rows, pixels: of the largest view, whole tiles."""
+def bytes_of(cells: Sequence[int], photographs: int, rows: int) -> int:
+    """Return what grids take on the device.  rows: of the largest view, whole tiles."""
     row, columns = row_length(cells), ENTRIES * cells[0] * cells[2]
-    return 4 * (len(TABLES) * photographs * row + 3 * row + columns * rows + 3 * pixels)
+    return 4 * (len(TABLES) * photographs * row + 3 * row + columns * rows)

@@ -113,7 +113,15 @@ class CameraOptimizer(TrainingModule):
 
     @classmethod
     def beside(cls, model: Path, scene: Scene) -> Scene:
-        return poses_beside(model, scene)
+        """Return a scene, at its full size, with the poses and focal lengths in the table next to a model file."""
+        path = model.with_name(VIEW_POSES)
+        if not path.is_file():
+            return scene
+        data = read_json(path, "poses of photographs")
+        found = data.get("photographs") if isinstance(data, dict) else None
+        if not isinstance(found, dict):
+            raise DataError(f"{path}: expected a mapping 'photographs'; train again, or remove the file")
+        return with_cameras(scene, [_with_pose(path, view, found.get(view.name)) for view in scene.views])
 
 
 @dataclass(frozen=True)
@@ -340,22 +348,6 @@ def _centre(pose: Floats) -> Floats:
 
 def _range(low: float, high: float) -> str:
     return f"{low:.4f}" if low == high else f"{low:.4f} to {high:.4f}"
-
-
-def poses_beside(model: Path, scene: Scene) -> Scene:
-    """Return a scene, at its full size, with the poses and focal lengths that lie beside a model file; the same one
-    without such a table.
-
-    Raises DataError where the table is damaged.
-    """
-    path = model.with_name(VIEW_POSES)
-    if not path.is_file():
-        return scene
-    data = read_json(path, "poses of photographs")
-    found = data.get("photographs") if isinstance(data, dict) else None
-    if not isinstance(found, dict):
-        raise DataError(f"{path}: expected a mapping 'photographs'; train again, or remove the file")
-    return with_cameras(scene, [_with_pose(path, view, found.get(view.name)) for view in scene.views])
 
 
 def _with_pose(path: Path, view: View, row: Any) -> View:

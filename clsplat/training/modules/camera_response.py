@@ -15,7 +15,6 @@ from clsplat.photos.appearance import Floats, ViewTable
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import View
 from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
@@ -42,6 +41,7 @@ class CameraResponse(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
     place: ClassVar[int] = 25  # before the colors of a photograph, which cut white
+    planes: ClassVar[int] = 8  # the image as the camera takes it, and its gradient, each with a fourth plane
     outlasts: ClassVar[Literal["numbers"]] = "numbers"
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
     files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
@@ -55,9 +55,6 @@ class CameraResponse(TrainingModule):
 
     def state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)
-
-    def device_bytes(self, views: Sequence[View], tile: int) -> int:
-        return max(4 * 8 * (view.camera.width + tile) * (view.camera.height + tile) for view in views)
 
     @classmethod
     def beside(cls, model: Path, scene: Scene) -> Scene:

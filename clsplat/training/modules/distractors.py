@@ -34,7 +34,6 @@ SIZE, OPACITY = 0.5, 0.05  # first standard deviation, of the distance of two of
 GOLDEN = (5**0.5 - 1) / 2
 # A photograph has a few dozen steps in a short training: larger rates than the scene's (ours)
 RATES = Rates(means=2e-3, quats=2e-3, log_scales=2e-2, logit_opacity=0.1, sh_base=2e-2, sh_rest=0.0).at(0, 1.0)
-PLANES = 12  # of a view's size, which rendering and comparing them take, at most
 
 
 class Distractors(TrainingModule):
@@ -47,6 +46,7 @@ class Distractors(TrainingModule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     place: ClassVar[int] = 20  # in the colours of the scene
+    planes: ClassVar[int] = 12  # which rendering and comparing them take, at most
 
     type: Literal["distractors"] = "distractors"
     count: Annotated[int, Field(gt=0, le=10_000)] = 200
@@ -62,9 +62,8 @@ class Distractors(TrainingModule):
         return DistractorsState(self, run.scene.split("train"), own)
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
-        tiles = max(-(-one.camera.width // tile) * -(-one.camera.height // tile) for one in views)
         rows = len({view.name for view in views}) * (self.count + 64)  # whole groups
-        return 4 * (rows * (3 * sum(WIDTHS.values()) + 1) + PLANES * tiles * tile**2)
+        return super().device_bytes(views, tile) + 4 * rows * (3 * sum(WIDTHS.values()) + 1)
 
     @classmethod
     def check_saved(cls, numbers: Numbers, tables: Tables) -> None:

@@ -23,6 +23,7 @@ from clsplat.core.reading import read_json
 from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, explained
 from clsplat.core.settings import OneOf, Settings, variants
 from clsplat.losses.base import LossValue
+from clsplat.metrics.views import Gains
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import IDENTITY, LUMINANCE, MEANING, Floats, ViewTable
 from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, measured, noted, with_noted
@@ -71,6 +72,7 @@ class Appearance(TrainingModule):
     outlasts: ClassVar[Literal["numbers"]] = "numbers"
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
     files: ClassVar[Mapping[str, str]] = {VIEW_COLOURS: "colours"}
+    planes: ClassVar[int] = 6  # the image in the colors of its photograph, and its gradient
 
     rate: RateOrAuto = "auto"
     """Learning rate of the numbers, by Adam, by step; auto: 1e-2 to 1e-3, where each photograph is visited 400 times or
@@ -98,6 +100,9 @@ class Appearance(TrainingModule):
 
     def is_active(self, scene: Scene | None = None) -> bool:
         return self.when == "always" or self.chosen == "on"
+
+    def device_bytes(self, views: Sequence[View], tile: int) -> int:
+        return 0 if self.chosen == "off" else super().device_bytes(views, tile)
 
     def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
         """Return the learning rate by step of a training with so many steps and photographs.
@@ -175,7 +180,7 @@ class ColourModel(Settings):
         return 0.0, np.zeros_like(row)
 
 
-class Gain(ColourModel):
+class Gain(Gains, ColourModel):
     """An exposure and a white balance of each photograph.
 
     Channels are multiplied by exp(exposure + (red, green, blue)); green follows from red and blue, so that the
@@ -199,9 +204,6 @@ class Gain(ColourModel):
     def of_gains(self, log_gains: Floats) -> Floats:
         exposure = LUMINANCE @ log_gains
         return np.array([exposure, log_gains[0] - exposure, log_gains[2] - exposure])
-
-    def fitted(self, image: Floats, photograph: Floats) -> Floats:
-        return fitted_gains(image, photograph)
 
 
 class Affine(ColourModel):
@@ -361,16 +363,6 @@ class ExposureState(ColourState):
         meaning = f"{MEANING}; matrix: the rows of [E | b]"
         facts = {"meaning": meaning, "type": self.settings.type, "model": model.type, "photographs": photographs}
         return Written(matrices, facts)
-
-
-def fitted_gains(image: Floats, photograph: Floats) -> Floats:
-    """Return the matrix, [3, 4], of the gains of red, green and blue that bring an image nearest to a photograph.
-
-    By least squares; both are pixels, [M, 3].
-    """
-    squares, products = (image * image).sum(axis=0), (image * photograph).sum(axis=0)
-    gains = np.where((squares > 0) & (products > 0), products / np.where(squares > 0, squares, 1), 1.0)
-    return np.column_stack([np.diag(gains), np.zeros(3)])
 
 
 def exposures_of(run: Run) -> Exposures:

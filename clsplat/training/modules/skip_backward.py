@@ -35,7 +35,7 @@ class Skip(TrainingModule):
     a view has an average of its own; penalties are no part of the loss.
 
     A step that is skipped updates nothing: no parameter, no moment and no count of Adam's updates, no statistic (their
-    means are over the views that were not skipped), no number of a transform that learns; penalties are not computed,
+    means are over the views that were not skipped), no number of another module; penalties are not computed,
     and the loss that is recorded is without them.  It counts as a step: rates, weights, the order of views and all
     stages of `during`, those that edit or add noise too, go on.
     """

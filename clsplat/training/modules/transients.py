@@ -34,6 +34,7 @@ class Transients(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "quantile", "above", "tail", "box", "decay"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
+    planes: ClassVar[int] = 2  # residuals, and the mask that leaves out the large ones
     place: ClassVar[int] = 90  # they compare what all others have made of both images
     outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "numbers"
 

@@ -1,4 +1,4 @@
-"""The Haar transform of photographs and its filter, which is learned (haar.cl, AutoOpti3DGS), in float64."""
+"""The Haar transform of photographs and its learned filter (haar.cl, AutoOpti3DGS): by float64, in a step, in a run."""
 
 from dataclasses import replace
 
@@ -13,15 +13,17 @@ from clsplat.density.statistics import SplatStats
 from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim, WeightEntropy
 from clsplat.losses.penalties import Anisotropy
-from clsplat.methods.opti3dgs import Haar
+from clsplat.methods.opti3dgs import NAMES, Haar, HaarState, apply_filter
 from clsplat.photos.photographs import Photograph, apply_mask
-from clsplat.photos.transforms import Blur, Planes
+from clsplat.photos.transforms import Planes
+from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import StepTrainer
 from tests.support.devices import each_once, on_devices, on_one_setting, product
 from tests.support.figures import hold
+from tests.support.runs import train
 
 SIZES = ((1, 1), (2, 1), (1, 2), (3, 3), (15, 4), (16, 16), (17, 5), (33, 18), (127, 32), (128, 33), (129, 65))
 HAAR = np.array([1.0, -1.0]) / np.sqrt(2)  # the filter that changes nothing
@@ -39,8 +41,8 @@ def through(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> 
     camera = camera_of(device, image.shape[2], image.shape[1])
     counted = None if mask is None else planes_of(device, camera, mask[None])
     numbers = {"haar/scale": HAAR @ taps, "haar/leak": LEAK @ taps}
-    planes = Planes(Workspace(device), camera, planes_of(device, camera, image), counted, numbers)
-    return Haar().apply(planes, step=1).colours.get()[:, : camera.height, : camera.width]
+    planes = Planes(Workspace(device), camera, planes_of(device, camera, image), counted)
+    return apply_filter(planes, numbers).colours.get()[:, : camera.height, : camera.width]
 
 
 @on_devices("width, height, share", each_once(SIZES, [None, 0.7, 0.1]))
@@ -84,21 +86,28 @@ def test_what_is_not_finite_stays_in_its_square(device, rng):
     np.testing.assert_array_equal(np.isnan(through(device, image, (0.2, 0.1))), bad)
 
 
+def course_of(haar: Haar, steps: int) -> list[float]:
+    """The scale after each step, by the filter's own loss alone, from 0 on."""
+    state, course = HaarState(haar), [0.0]
+    for step in range(1, steps + 1):
+        state.learn(haar.penalty(state.filter, step)[1], step)
+        course.append(state.numbers["haar/scale"])
+    assert state.numbers.get("haar/leak", 0.0) == 0
+    return course
+
+
 @pytest.mark.parametrize("learn", ["filter", "scale"])
 def test_the_filter_takes_the_published_course_by_its_own_loss(learn):
     """Adam decides it, whatever the weight."""
     for weight in (0.05, 7.0):
-        haar, numbers = Haar(learn=learn, weight=weight), {}
-        for step in range(1, 15001):
-            haar.update(numbers, haar.penalty(haar.now(numbers), step)[1], step)
-            assert step not in COURSE or numbers["haar/scale"] == pytest.approx(COURSE[step], abs=0.005), step
-        assert numbers.get("haar/leak", 0.0) == 0
+        course = course_of(Haar(learn=learn, weight=weight), 15000)
+        assert {step: course[step] for step in COURSE} == pytest.approx(COURSE, abs=0.005)
 
 
 @pytest.mark.parametrize("learn", ["filter", "scale"])
 def test_the_loss_of_the_filter_and_its_derivatives(learn):
     haar = Haar(learn=learn, weight=0.3)
-    at = dict(zip(haar.first(), (0.2, -0.5), strict=False))
+    at = dict(zip(NAMES[learn], (0.2, -0.5), strict=False))
     value, derivatives = haar.penalty(at, step=1)
     assert value == pytest.approx(0.3 * 2 * ((taps_of(at) - HAAR) ** 2).sum())
     for name in at:
@@ -109,25 +118,25 @@ def test_the_loss_of_the_filter_and_its_derivatives(learn):
 # ---- in a training step
 
 
-def trainer_of(device, rng, losses, masked: bool = True) -> tuple[StepTrainer, Photograph]:
+def trainer_of(device, rng, losses, masked: bool = True, **settings) -> tuple[StepTrainer, HaarState, Photograph]:
     case = random_case(rng, 60, 41, 30)
     model = case.model(device)
     parts = Adam(model.gaussians), SplatStats(model.gaussians), device.zeros(3)
-    trainer = StepTrainer(Rasterizer(device, "radix"), model, *parts, losses, Rates())
+    haar = HaarState(Haar(**settings))
+    trainer = StepTrainer(Rasterizer(device, "radix"), model, *parts, losses, Rates(), modules=[haar])
     colours = rng.integers(0, 256, (3, 30, 41)).astype(np.uint8)
     mask = device.upload((rng.random((1, 30, 41)) < 0.7).astype(np.uint8)) if masked else None
-    return trainer, Photograph(case.device_camera(device), device.upload(colours), mask)
+    return trainer, haar, Photograph(case.device_camera(device), device.upload(colours), mask)
 
 
 @on_devices("learn, masked", product(["filter", "scale"], [False, True]))
 def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked):
     """Finite differences of the float64 losses of the rendered image, by each number."""
     losses = [L1(weight=0.8), Dssim(weight=0.2), L2(weight=3.0), Anisotropy(above=1.0)]
-    trainer, photograph = trainer_of(device, rng, losses, masked)
-    haar = Haar(learn=learn, weight=0.01)
-    trainer.numbers = {name: 0.31 + 0.4 * i for i, name in enumerate(haar.first())}
-    before, counted = dict(trainer.numbers), photograph.counted()
-    view = trainer.differentiate(photograph, 1, [haar])
+    trainer, haar, photograph = trainer_of(device, rng, losses, masked, learn=learn, weight=0.01)
+    haar.numbers = {name: 0.31 + 0.4 * i for i, name in enumerate(NAMES[learn])}
+    before, counted = dict(haar.numbers), photograph.counted()
+    view = trainer.differentiate(photograph, 1)
     image = view.comparison.image.get()[:, :30, :41].astype(np.float64)
     colours = photograph.image().transpose(2, 0, 1) / 255
 
@@ -144,9 +153,9 @@ def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked)
         expected[name] = (up - down) / 2e-6
     trainer.update(view)
     for name, gradient in expected.items():
-        assert trainer.numbers[f"{name}/moment1"] / 0.1 == pytest.approx(gradient, rel=2e-3, abs=1e-5)
-        assert trainer.numbers[name] == pytest.approx(before[name] - 1e-4 * np.sign(gradient), abs=1e-9)
-        assert trainer.numbers[f"{name}/updates"] == 1
+        assert haar.numbers[f"{name}/moment1"] / 0.1 == pytest.approx(gradient, rel=2e-3, abs=1e-5)
+        assert haar.numbers[name] == pytest.approx(before[name] - 1e-4 * np.sign(gradient), abs=1e-9)
+        assert haar.numbers[f"{name}/updates"] == 1
     own = next(loss.value() for loss in view.losses if loss.name == "haar")
     assert view.loss - view.losses[-1].value() == pytest.approx(total(before), rel=1e-4)
     assert own == pytest.approx(0.01 * 2 * ((taps_of(before) - HAAR) ** 2).sum())
@@ -155,8 +164,8 @@ def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked)
 @on_devices("masked", [False, True])
 def test_what_the_filter_needs_changes_no_loss_and_no_gradient(device, rng, masked):
     """Bit for bit those of the changed photograph alone."""
-    trainer, photograph = trainer_of(device, rng, [L1(weight=0.8), L2(), Dssim(weight=0.2)], masked)
-    view = trainer.differentiate(photograph, 1, [Haar()])
+    trainer, _, photograph = trainer_of(device, rng, [L1(weight=0.8), L2(), Dssim(weight=0.2)], masked)
+    view = trainer.differentiate(photograph, 1)
     values, gradient = [loss.value() for loss in view.losses[:-1]], view.comparison.gradient.get()
     alone = replace(view.comparison, workspace=Workspace(device), gradient=device.zeros(gradient.shape))
     alone = replace(alone, accumulate=False)
@@ -168,11 +177,11 @@ def test_what_the_filter_needs_changes_no_loss_and_no_gradient(device, rng, mask
 
 @on_one_setting
 def test_differentiating_changes_no_number(device, rng):
-    trainer, photograph = trainer_of(device, rng, [L1()])
-    trainer.differentiate(photograph, 1, [Haar()])
-    assert trainer.numbers == {}
-    trainer.step(photograph, 1, [Haar()])
-    assert trainer.numbers.keys() > Haar().first().keys()
+    trainer, haar, photograph = trainer_of(device, rng, [L1()])
+    trainer.differentiate(photograph, 1)
+    assert haar.numbers == {}
+    trainer.step(photograph, 1)
+    assert haar.numbers.keys() > {*NAMES["filter"]}
 
 
 @on_devices("masked", [False, True])
@@ -180,17 +189,17 @@ def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
     """The filter's derivatives are those without it, and it adds to the gradient as elsewhere."""
     of_colours, moments = [L1(weight=0.8), Dssim(weight=0.2)], []
     for losses in (of_colours, [WeightEntropy(weight=0.3), *of_colours]):
-        trainer, photograph = trainer_of(device, np.random.default_rng(5), losses, masked)
-        view = trainer.step(photograph, 1, [Haar()])
-        moments.append({name: value for name, value in trainer.numbers.items() if name.endswith("moment1")})
+        trainer, haar, photograph = trainer_of(device, np.random.default_rng(5), losses, masked)
+        view = trainer.step(photograph, 1)
+        moments.append({name: value for name, value in haar.numbers.items() if name.endswith("moment1")})
     assert moments[0] == pytest.approx(moments[1], rel=1e-6)
     assert all(moments[0].values())
     entropy = next(loss.value() for loss in view.losses if loss.name == "weight_entropy")
     sums = view.comparison.image.get()[3].sum(dtype=np.float64)
     assert entropy == pytest.approx(0.3 * sums / (30 * 41), rel=1e-5)
-    trainer.losses, trainer.numbers = [WeightEntropy()], {}
-    trainer.step(photograph, 2, [Haar(weight=0.05)])
-    assert trainer.numbers["haar/scale/moment1"] / 0.1 == pytest.approx(-0.2), "its own loss alone"
+    trainer.losses, haar.numbers = [WeightEntropy()], {}
+    trainer.step(photograph, 2)
+    assert haar.numbers["haar/scale/moment1"] / 0.1 == pytest.approx(-0.2), "its own loss alone"
 
 
 @on_one_setting
@@ -198,12 +207,10 @@ def test_a_loss_that_is_not_symmetric_is_refused(device, rng):
     def brightness(image: np.ndarray, photograph: np.ndarray) -> tuple[float, np.ndarray]:
         return float(image.mean()), np.full(image.shape, 1 / image.size)
 
-    trainer, photograph = trainer_of(device, rng, [L1(), HostLoss(brightness)])
-    trainer.differentiate(photograph, 1, [Blur(sigma=1.0)])
-    with pytest.raises(
-        ConfigError, match=r"^the loss 'brightness', where 'haar' learns: expected .* `symmetric = True`$"
-    ):
-        trainer.differentiate(photograph, 1, [Haar()])
+    trainer, _, photograph = trainer_of(device, rng, [L1(), HostLoss(brightness)])
+    refused = r"^the loss 'brightness', where 'haar' learns: expected .* `symmetric = True`$"
+    with pytest.raises(ConfigError, match=refused):
+        trainer.differentiate(photograph, 1)
 
 
 @on_one_setting
@@ -213,3 +220,35 @@ def test_a_copy_that_was_begun_is_of_what_was_there(device):
     array.fill(3)
     np.testing.assert_array_equal(copied(), np.arange(40))
     np.testing.assert_array_equal(array.get_later()(), 3)
+
+
+# ---- in a run
+
+
+def test_a_loss_that_is_not_symmetric_is_refused_before_a_run():
+    training = load("smoke", ["optimize.modules=[haar]"]).settings.training
+    training.check()
+    other = HostLoss(lambda image, photograph: (0.0, image))
+    with pytest.raises(ConfigError, match="the loss '<lambda>', where 'haar' learns"):
+        training.model_copy(update={"losses": [*training.losses, other]}).check()
+
+
+def test_the_filter_has_the_same_course_in_fewer_steps():
+    """By its own loss: from the mean of squares to the photograph, long before the end."""
+    training = load("auto_opti3dgs_7k").settings.training
+    course = course_of(training.modules[0], training.steps)
+    assert [course[training.steps * n // 100] for n in (5, 10, 20)] == pytest.approx([0.145, 0.28, 0.53], abs=0.03)
+    assert course[training.steps * 6 // 10] == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.slow
+def test_the_recipe_trains(tiny_scene, tmp_path):
+    """The filter leaves zero at its rate, and measured is what photographs are."""
+    short = ("optimize.steps=30", "optimize.evaluate.every=30", "checkpoint.every=30", "optimize.log_every=10")
+    run = train(tiny_scene, tmp_path / "run", *short, pipeline="auto_opti3dgs_7k")
+    numbers = run.modules["haar"].numbers
+    assert numbers["haar/scale"] == pytest.approx(30 * 4.3e-4, rel=0.1)
+    assert abs(numbers["haar/leak"]) < 30 * 4.3e-4
+    plain = train(tiny_scene, tmp_path / "plain", *short, pipeline="splat_7k")
+    psnr = [one.metrics["test"]["1"]["psnr"] for one in (run, plain)]
+    assert psnr[0] == pytest.approx(psnr[1], abs=1.5)
