@@ -183,7 +183,8 @@ def check(
     elif "cells" in found:
         terminal.show(f"{found['path']}: valid; {len(found['cells'])} cells: {', '.join(found['cells'])}")
     else:
-        terminal.show(f"{found['path']}: valid; {', '.join(found['stages'])}")
+        adapts = f"; from the photographs follow {', '.join(found['adapts'])}" if found["adapts"] else ""
+        terminal.show(f"{found['path']}: valid; {', '.join(found['stages'])}{adapts}")
 
 
 def _show_findings(

@@ -2,22 +2,18 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, in_shell
 from clsplat.core.files import CHECKSUMS, METRICS, PIPELINE, STATUS, is_inside
 from clsplat.core.reading import read_json, sha256
 from clsplat.core.settings import variants
-from clsplat.pipeline.capture_choice import without_choices
-from clsplat.pipeline.choices import undone
-from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.loading import Pipeline, load, with_decisions, without_auto
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs.results import read_metrics
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
-from clsplat.training.settings_diff import first_difference
+from clsplat.training.settings_diff import Difference, first_difference
 from clsplat.training.stage import Stage, Training
 from clsplat.training.status import read_status
 
@@ -46,7 +42,7 @@ def is_done(out: Path) -> bool:
 def is_done_with(pipeline: Pipeline, out: Path) -> bool:
     """Whether that was a run of this pipeline."""
     with suppress(ConfigError):  # a damaged file
-        return is_done(out) and _asked(load(str(out / PIPELINE))) == _asked(pipeline)
+        return is_done(out) and _difference(load(str(out / PIPELINE)), pipeline) is None
     return False
 
 
@@ -55,19 +51,23 @@ def has_ended(pipeline: Pipeline, out: Path) -> bool:
     if not is_done(out) or not has_pipeline(out):
         return False
     try:
-        before = _asked(load(str(out / PIPELINE)))
+        before = load(str(out / PIPELINE))
     except ConfigError:
         if out / PIPELINE in changed(out):  # the run writes it again, or says that it cannot go on
             return False
         raise
-    if difference := first_difference(before, _asked(pipeline)):
+    if difference := _difference(before, pipeline):
         raise ConfigError(f"{out}: was run with other settings: {difference}; use another folder, or those settings")
     return True
 
 
-def _asked(pipeline: Pipeline) -> Any:
-    """The resolved pipeline without what a run chose."""
-    return without_choices(replace(pipeline, settings=undone(pipeline.settings)).resolved())
+def _difference(before: Pipeline, now: Pipeline) -> Difference | None:
+    """The first setting in which what was asked of a run is another now, by what the run decided; None: there is none.
+
+    Raises ConfigError.
+    """
+    old, new = (without_auto(one.resolved()) for one in (before, with_decisions(now, before.decisions)))
+    return first_difference({**old, "adapt": None}, {**new, "adapt": None})
 
 
 def restart(out: Path) -> str:

@@ -290,8 +290,7 @@ def rehearsals_of(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsa
         raise ConfigError(f"{pipeline.path}: --minutes: expected one stage that trains, found {trains}; leave it out")
     training = pipeline.settings.training
     if isinstance(training, Keeping) and training.refit:
-        made = [f", chosen by {one.reason}" for one in pipeline.settings.choices if "optimize.refit" in one.keys]
-        told = f"a refit trains twice, for nobody knows how long{''.join(made)}; add --set optimize.refit=false"
+        told = "a refit trains twice, for nobody knows how long; add --set optimize.refit=false"
         raise ConfigError(f"{pipeline.path}: --minutes: {told} to train once, or leave --minutes out")
     first, found, took = min(FIRST, training.rehearsed), list[Rehearsal](), 0.0
     limit = Limit(minutes, time.perf_counter() + 60 * minutes, fewest(training))
