@@ -43,7 +43,7 @@ def run(
     live: LiveOption = None,
     minutes: Annotated[
         float | None,
-        typer.Option(metavar="M", help="The time that it takes: trains in as many steps as fit, which it says before."),
+        typer.Option(metavar="M", help="The time that it takes, within about 15 %: trains in as many steps as fit."),
     ] = None,
     on: OnOption = None,
 ) -> None:
