@@ -113,7 +113,7 @@ def as_cell(asked, out, device, start):
     ],
 )
 def test_split_photographs_lack_is_refused_before_preparation(photos, begin, sets, complaint):
-    asked = load("photos", ["choices=[]", sets, f"scene.path='{photos}'"])  # to check them takes time
+    asked = load("photos", [sets, f"scene.path='{photos}'"])
     with pytest.raises((ConfigError, DataError), match=complaint):
         begin(asked, photos.parent / "runs" / "a", None, "new")
     assert not (photos.parent / "runs" / "prepared").exists()
