@@ -25,6 +25,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.photos.appearance import Floats, ViewTable
 from clsplat.photos.sampling import Order, ViewPool
 from clsplat.photos.transforms import PhotographTransform, Planes
+from clsplat.pipeline.adapt import Adaptation, Decision
 from clsplat.prepare.steps import Step
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.filters import FilterViews, ScreenFilter, WorldFilter
@@ -32,14 +33,17 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.camera import Camera
 from clsplat.scene.colmap import pose_matrix
 from clsplat.scene.images import inside, require_files
+from clsplat.scene.quality import Measures
 from clsplat.scene.reader import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.view import View
+from clsplat.stages.optimize import Optimize
 from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage, path_in_run
 
 __all__ = [
+    "Adaptation",
     "Array",
     "AtLeastOne",
     "Camera",
@@ -48,6 +52,7 @@ __all__ = [
     "ConfigError",
     "Curve",
     "DataError",
+    "Decision",
     "Device",
     "DeviceCamera",
     "DeviceError",
@@ -58,12 +63,14 @@ __all__ = [
     "Gaussians",
     "ImageLoss",
     "LossValue",
+    "Measures",
     "MemoryLimitError",
     "ModuleState",
     "NonNegative",
     "Numbers",
     "NumericError",
     "OneOf",
+    "Optimize",
     "Order",
     "OutputError",
     "Penalty",

@@ -53,6 +53,7 @@ FAMILIES = {  # by the name of the base; any other family gets a page of its own
     "ScreenFilter": Family("filters", "screen filter", "screen_filter", listed=False),
     "Backdrop": Family("filters", "background", "background", listed=False),
     "Step": Family("prepare", "prepare step", "prepare"),
+    "Adaptation": Family("adaptations", "adaptation", "adapt", listed=False),
 }
 
 

@@ -32,6 +32,8 @@ INTRODUCTIONS = {
     "`optimize.modules.TYPE={}` adds it at its place, `optimize.modules.TYPE=null` removes it.",
     "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`.",
     "filters": "Keys of `model`: the two low-pass filters, one in the scene and one on the screen, and the background.",
+    "adaptations": "`adapt` names what decides "
+    "[settings by the photographs](../pipelines.md#settings-that-follow-from-the-photographs).",
     "prepare": "`prepare` is a list: what makes a scene of photographs, once, on the host.",
 }
 WORDS = {"integer": "whole number", "string": "text", "boolean": "true or false", "null": "none", "object": "keys"}

@@ -107,7 +107,8 @@ def status_schema() -> dict[str, Any]:
 
 
 def check(pipeline: PathLike) -> dict[str, Any]:
-    """Validate a pipeline or a matrix; return its `path`, its `name`, and its `stages` or `cells`.
+    """Validate a pipeline or a matrix; return its `path`, its `name`, its `stages` or `cells`, and as
+    `adapts` the keys that its photographs will decide.
 
     Of a run folder, or that of a scene in blocks, return `whole`, its `state`, and `objects`: every file, whether it is
     `whole`, and a `detail`.  Of a model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`,

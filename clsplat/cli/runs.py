@@ -43,7 +43,7 @@ def run(
     live: LiveOption = None,
     minutes: Annotated[
         float | None,
-        typer.Option(metavar="M", help="The time that it takes: trains in as many steps as fit, which it says before."),
+        typer.Option(metavar="M", help="The time that it takes, within about 15 %: trains in as many steps as fit."),
     ] = None,
     on: OnOption = None,
 ) -> None:
@@ -183,7 +183,8 @@ def check(
     elif "cells" in found:
         terminal.show(f"{found['path']}: valid; {len(found['cells'])} cells: {', '.join(found['cells'])}")
     else:
-        terminal.show(f"{found['path']}: valid; {', '.join(found['stages'])}")
+        adapts = f"; from the photographs follow {', '.join(found['adapts'])}" if found["adapts"] else ""
+        terminal.show(f"{found['path']}: valid; {', '.join(found['stages'])}{adapts}")
 
 
 def _show_findings(

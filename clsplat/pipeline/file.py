@@ -16,7 +16,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.files import fault_of_name
 from clsplat.core.settings import OneOf, ReadPath, Settings, nested
 from clsplat.opencl.discovery import Schedule
-from clsplat.pipeline.capture_choice import CaptureChoice
+from clsplat.pipeline.adapt import Adaptation
 from clsplat.prepare.steps import Step
 from clsplat.render.filters import ModelSettings
 from clsplat.render.rasterizer import MAX_PAIRS, RECORD, RenderLimits
@@ -148,7 +148,7 @@ Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$"), AfterValidator(_fold
 class PipelineFile(Settings):
     """The keys of a pipeline file."""
 
-    output_keys: ClassVar[frozenset[str]] = frozenset({"choices"})  # what they set is compared at its place
+    output_keys: ClassVar[frozenset[str]] = frozenset({"adapt"})  # what they set is compared at its place
 
     name: Name
     """Name of the pipeline, and of its run folder."""
@@ -162,8 +162,8 @@ class PipelineFile(Settings):
     """How the device renders."""
     prepare: list[OneOf[Step]] = Field([])
     """Steps from photographs to a scene; their results are kept."""
-    choices: list[CaptureChoice] = Field([])
-    """Settings that follow from the photographs."""
+    adapt: OneOf[Adaptation] | None = None
+    """What decides settings by the photographs, before the first step."""
     stages: Annotated[list[OneOf[Stage]], Field(min_length=1)]
     """Stages, in order."""
     plugins: dict[str, str] = Field(default={})

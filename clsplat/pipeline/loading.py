@@ -2,7 +2,7 @@
 
 import copy
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,14 @@ from clsplat.core.schedule import is_act
 from clsplat.core.settings import nested, variants
 from clsplat.density.edit import Rule
 from clsplat.pipeline import plugins
-from clsplat.pipeline.choices import as_asked, check_choices, held, overridden
+from clsplat.pipeline.adapt import Decision
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
 from clsplat.pipeline.overrides import CADENCE, NoSuchKey, apply, settable, split, suggestion
-from clsplat.pipeline.yaml_file import Document, read_yaml, yaml_text
+from clsplat.pipeline.yaml_file import Document, Place, read_yaml, yaml_text
 from clsplat.prepare.cache import Planned, plan
+from clsplat.scene.quality import Measures
 from clsplat.training.stage import Scheduled, Stage, Training, written_twice
 
 LOG = logging.getLogger("clsplat")
@@ -45,6 +46,18 @@ class Pipeline:
     def stages(self) -> list[Stage]:
         return list(self.settings.stages)
 
+    @property
+    def decisions(self) -> list[Decision]:
+        """What was decided by the photographs."""
+        return (self.settings.adapt and self.settings.adapt.decisions) or []
+
+    @property
+    def undecided(self) -> list[str]:
+        """The keys that are still to be decided by the photographs."""
+        if (adapt := self.settings.adapt) is None or adapt.decisions is not None:
+            return []
+        return [key for key in adapt.keys(self.settings.optimize) if key not in adapt.keep]
+
     def preparation(self, out: Path) -> list[Planned]:
         """Return the steps before a run in `out`, with the reasons to run them.  Raises DataError or ConfigError."""
         settings, folder = self.settings, prepared_folder(out)
@@ -60,7 +73,7 @@ class Pipeline:
         """Return every setting with its value, as plain data in the shape of a file."""
         data = self.settings.model_dump(mode="json")
         data |= {key: [_untagged(stage) for stage in data[key]] for key in STAGE_LISTS}
-        return {key: value for key, value in data.items() if value or key not in ("plugins", "choices")}
+        return {key: value for key, value in data.items() if value or key not in ("plugins", "adapt")}
 
     def text(self) -> str:
         """Return the text of the resolved file."""
@@ -87,7 +100,9 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
     tagged = _tagged_file(document, path)
     try:
-        return _as_needed(Pipeline(path, _validated(overridden(tagged, overrides), path, document)))
+        data = copy.deepcopy(forgotten(tagged) if any(map(_is_of_photographs, overrides)) else tagged)
+        places = [apply(data, override, PipelineFile) for override in overrides]
+        return _as_needed(Pipeline(path, _keeping(_validated(data, path, document), places)))
     except ConfigError:
         _blame(tagged, overrides, path, document)
         raise
@@ -112,8 +127,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
     try:
-        as_asked(settings).check_together()
-        check_choices(settings)
+        settings.check_together()
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
     found = [one for _, one in nested(settings)]
@@ -127,14 +141,10 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
     without: tuple[str, ConfigError] | None = None  # what is not there since an override; a later one may make it
     for override in overrides:
         names, _ = split(override)
-        before = copy.deepcopy(data)
         try:
             place = apply(data, override, PipelineFile)
         except NoSuchKey as error:
             raise OverrideError(override, error.reason + suggestion(names, known)) from error
-        if held(data, [place]):  # whose values need not go together with those of the file
-            data = before
-            continue
         try:
             settings = PipelineFile.model_validate(data)
             _check_order(path, settings)
@@ -148,6 +158,73 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
             without = (without[0] if without else override), error
     if without:
         raise OverrideError(without[0], one_line(without[1]).removeprefix(f"{path}: ")) from without[1]
+
+
+# What follows from the photographs: decided once, like `--set`, and forgotten for other photographs.
+
+AUTO = ("chosen", "reason")  # what a run writes next to a key `auto`
+
+
+def adapted(pipeline: Pipeline, measures: Measures) -> Pipeline:
+    """Return the pipeline with what its `adapt` decides; decisions that are made stay.  Raises ConfigError."""
+    adapt = pipeline.settings.adapt
+    return with_decisions(pipeline, adapt.decide(pipeline.settings.optimize, measures)) if adapt else pipeline
+
+
+def with_decisions(pipeline: Pipeline, decisions: Iterable[Decision]) -> Pipeline:
+    """Return the pipeline with these decisions, but for keys that it keeps; its own stay.  Raises ConfigError."""
+    if (adapt := pipeline.settings.adapt) is None or adapt.decisions is not None:
+        return pipeline
+    data = pipeline.settings.model_dump(mode="json")
+    made = [one for one in decisions if one.key not in adapt.keep]
+    try:
+        for one in made:
+            apply(data, one.override, PipelineFile)
+        data["adapt"]["decisions"] = [one.model_dump() for one in made]
+        return replace(pipeline, settings=_validated(data, pipeline.path, Document(data)))
+    except ConfigError as error:
+        told = f"{one_line(error)}; --set of one of its keys wins: {', '.join(one.key for one in made)}"
+        raise ConfigError(f"adapt: {adapt.type}: {told}") from error
+
+
+def _keeping(settings: PipelineFile, places: Sequence[Place]) -> PipelineFile:
+    """The settings, whose `adapt` keeps what overrides have set.  Raises ConfigError where its keys have no place."""
+    if (adapt := settings.adapt) is None:
+        return settings
+    keep, data = adapt.keep, settings.model_dump(mode="json")
+    for key in adapt.keys(settings.optimize):
+        try:
+            own = apply(copy.deepcopy(data), f"{key}=null", PipelineFile)
+        except OverrideError as error:
+            raise ConfigError(f"adapt: {adapt.type}: {key}: {error.reason}") from error
+        if own[0] not in ("model", "stages"):
+            raise ConfigError(f"adapt: {adapt.type}: {key} is used before photographs are measured")
+        if key not in keep and any(own[: len(place)] == place[: len(own)] for place in places):
+            keep = [*keep, key]
+    decisions = adapt.decisions and [one for one in adapt.decisions if one.key not in keep]
+    return settings.model_copy(update={"adapt": adapt.model_copy(update={"keep": keep, "decisions": decisions})})
+
+
+def forgotten(data: dict[str, Any]) -> dict[str, Any]:
+    """Return a file's data without what a run decided by its photographs: it is decided again."""
+    adapt = data.get("adapt")
+    return {**dict(without_auto(data)), "adapt": {**adapt, "decisions": None} if isinstance(adapt, dict) else adapt}
+
+
+def without_auto(data: Any) -> Any:
+    """Return plain data of a resolved pipeline without what keys `auto` chose."""
+    if isinstance(data, list):
+        return [without_auto(item) for item in data]
+    if not isinstance(data, dict):
+        return data
+    chooses = all(key in data for key in AUTO)
+    return {key: without_auto(value) for key, value in data.items() if not (chooses and key in AUTO)}
+
+
+def _is_of_photographs(override: str) -> bool:
+    """Whether an override sets which photographs are trained with, by which a run may have decided."""
+    names, _ = split(override)
+    return names[0] == "scene" and names[1:2] != ["validation"]
 
 
 def _tagged_file(document: Document, path: Path) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 from clsplat.core.schedule import acts, divided, places
 from clsplat.core.settings import Settings
-from clsplat.pipeline.capture_choice import CaptureChoice
 from clsplat.pipeline.file import PipelineFile
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
@@ -148,12 +147,6 @@ def _stretched(value: Any, axis: Axis) -> Any:
         return _points(value, axis) if is_points else [_stretched(item, axis) for item in value]
     if isinstance(value, dict):
         return {key: _stretched(one, axis) for key, one in value.items()}
-    if isinstance(value, CaptureChoice):  # whose rows begin with what is measured, and not with steps
-        rows = [[bound, *(_stretched(one, axis) for one in row)] for bound, *row in value.values]
-        given = {key: _stretched(one, axis) for key, one in value.given.items()}
-        made = {"chosen": value.chosen, "instead_of": value.instead_of}  # by a run
-        made = {name: values and [_stretched(one, axis) for one in values] for name, values in made.items()}
-        return value.model_copy(update={"values": rows, "given": given, **made})
     if not isinstance(value, Settings):
         return value
     fields = {name: getattr(value, name) for name in type(value).model_fields}

@@ -7,7 +7,6 @@ from pathlib import Path
 from clsplat.core import lock
 from clsplat.core.errors import DataError, amount
 from clsplat.opencl.device import Device
-from clsplat.pipeline.choices import choose
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.estimate import expected
 from clsplat.runs.opening import ReadScene, check_start, open_run, read_run_scene, settle
@@ -62,9 +61,10 @@ def describe(
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
         check_in(pipeline, run)
     names = listed(pipeline, planned, out) if run is None else []
-    measures, head = _known(pipeline, names)
-    choices = _choices(pipeline, measures)
-    lines += [*(head if choices or not measures else []), *choices]
+    measures, refusal = _known(pipeline, names)
+    lines += [*refusal, *(f"  {one.text}" for one in pipeline.decisions)]
+    if undecided := pipeline.undecided:
+        lines.append(f"  adapt          follow from the photographs: {', '.join(undecided)}")
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages if _does(stage, run)]
     lines += _on_host(pipeline, run) if run else []
     if with_time and start != "resume":
@@ -72,23 +72,12 @@ def describe(
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 
 
-def _known(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures, list[str]]:
-    """What is known of named photographs that are to be prepared, and a line for it."""
-    head = f"  choices        if all {len(names)} photographs are placed"
+def _known(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures | None, list[str]]:
+    """What is known of named photographs that are to be prepared; a line where the run will be refused."""
     try:
-        measures = known(pipeline, names)
+        return known(pipeline, names), []
     except DataError as error:
-        return {}, [f"{head}, the run is refused: {error}"]
-    return measures, [f"{head}:"] if measures else []
-
-
-def _choices(pipeline: Pipeline, measures: Measures) -> list[str]:
-    """What was chosen; of photographs that are to be prepared, what follows from their measures, and what may."""
-    open_ones = pipeline.settings.choices
-    made = choose(pipeline.settings, measures).choices if measures else open_ones
-    pairs = zip(open_ones, made, strict=True)
-    told = [after.told if one.is_settled(measures) else one.possible(measures) for one, after in pairs]
-    return [f"  {one}" for one in told]
+        return None, [f"  photographs    if all {len(names)} photographs are placed, the run is refused: {error}"]
 
 
 def tell_of_waiting(out: Path) -> None:

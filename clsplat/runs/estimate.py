@@ -13,8 +13,7 @@ from pathlib import Path
 from clsplat.core.errors import DataError
 from clsplat.core.schedule import values_of
 from clsplat.opencl.device import Device
-from clsplat.pipeline.choices import choose
-from clsplat.pipeline.loading import Pipeline
+from clsplat.pipeline.loading import Pipeline, adapted
 from clsplat.prepare.cache import Planned
 from clsplat.scene.images import image_size
 from clsplat.scene.quality import Measures
@@ -50,7 +49,7 @@ def expected(
     pipeline: Pipeline,
     planned: Sequence[Planned],
     names: Sequence[str],
-    measures: Measures,
+    measures: Measures | None,
     device: Device,
     run: Run | None,
 ) -> list[str]:
@@ -60,7 +59,7 @@ def expected(
     """
     parts = list(_of_preparation(planned, len(names))) if names else []
     if (capture := _capture(pipeline, planned, names, run)) is not None:
-        settings = choose(pipeline.settings, measures) if run is None else pipeline.settings
+        settings = (adapted(pipeline, measures) if measures and run is None else pipeline).settings
         trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
         parts += [_of_training(training, *capture, device.info.units) for training in trainings]
     fields = [stage for stage in pipeline.settings.stages if isinstance(stage, TrainField)]

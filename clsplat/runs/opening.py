@@ -12,10 +12,9 @@ from clsplat.core.machine import Owner
 from clsplat.core.progress import Listener, heard_by
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
-from clsplat.pipeline.choices import choose
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.input_files import contents
-from clsplat.pipeline.loading import Pipeline, prepared_folder
+from clsplat.pipeline.loading import Pipeline, adapted, prepared_folder
 from clsplat.pipeline.stretching import of_trainings
 from clsplat.prepare.cache import Planned, facts, note, noted, prepare
 from clsplat.render.rasterizer import Rasterizer
@@ -183,13 +182,13 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
 
 
 def settle(pipeline: Pipeline, run: Run, tell: Callable[[str], None] = LOG.info) -> Pipeline:
-    """Return the pipeline with what its `choices` and its keys `auto` choose by the photographs of a run, which takes
-    it; log reasons, those of `choices` by `tell`.
+    """Return the pipeline with what its `adapt` and its keys `auto` choose by the photographs of a run, which takes
+    it; log reasons, those of `adapt` by `tell`.
 
     Choices that are made already stay.
     """
     with run.status.stage("choose"):
-        settled_pipeline = _taken(_with_modules(_by_capture(pipeline, run, tell), run), run)
+        settled_pipeline = _taken(_with_modules(_adapted(pipeline, run, tell), run), run)
         if any(isinstance(stage, Optimize) for stage in pipeline.stages):
             _warn_of_near(settled_pipeline.settings.model.near, nearest_points(run.scene))
         return settled_pipeline
@@ -205,23 +204,18 @@ def _warn_of_near(near: float, nearest: float | None) -> None:
         )
 
 
-def _by_capture(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pipeline:
-    """The pipeline with what its `choices` choose."""
-    still_open = [one for one in pipeline.settings.choices if not one.reason]
-    if not still_open:
+def _adapted(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pipeline:
+    """The pipeline with what its `adapt` decides."""
+    if not pipeline.undecided:
         return pipeline
-    measures = measured(run.scene)
-    for kind in unlisted().values():
-        asked = kind.measure and any(one.depends(kind.measure, measures) for one in still_open)
-        if kind.measure and asked and (found := kind.measured(run)) is not None:
-            measures[kind.measure] = found
-    chosen = replace(pipeline, settings=choose(pipeline.settings, measures))
-    if chosen.settings.scene.validation != pipeline.settings.scene.validation:
-        run.divide(chosen.settings.scene.split.with_validation(run.original.with_fold()))
-        run.identity = run.identity and run.identity.divided(run.original)  # as of a run that begins with that split
-    for one in chosen.settings.choices:
-        tell(one.told)
-    return chosen
+    pipeline = adapted(pipeline, measured(run.scene, lambda: _share_with_sky(run)))
+    for one in pipeline.decisions:
+        tell(one.text)
+    return pipeline
+
+
+def _share_with_sky(run: Run) -> float | None:
+    return next((kind.measured(run) for kind in unlisted().values() if kind.measure == "sky"), None)
 
 
 def _taken(pipeline: Pipeline, run: Run) -> Pipeline:

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,24 +56,17 @@ def _check_split(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> N
         _applied(pipeline, names)
 
 
-def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
+def known(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
     """Return the measures that named photographs have if all are placed: how many train, for validation too.
 
-    Raises DataError where the split does not fit all of them.
+    None without names.  Raises DataError where the split does not fit all of them.
     """
-    if not names:
-        return {}
-    return {"photographs": len(_applied(pipeline, names).with_fold().train)}
+    return Measures(len(_applied(pipeline, names).with_fold().train)) if names else None
 
 
 def _applied(pipeline: Pipeline, names: Sequence[str]) -> Scene:
-    """The scene of named photographs, all placed, with the split; without a validation that is still to be chosen.
-
-    Raises DataError.
-    """
+    """The scene of named photographs, all placed, with the split.  Raises DataError."""
     folder, split = pipeline.settings.scene.folder, pipeline.settings.scene.split
-    if any("scene.validation" in one.keys for one in pipeline.settings.choices):
-        split = replace(split, validation=0)
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
     with only(logging.ERROR):

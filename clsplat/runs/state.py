@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
@@ -12,11 +12,9 @@ from clsplat.core.errors import ConfigError, DataError, in_shell, one_line
 from clsplat.core.files import CHECKSUMS, END_STATES, INPUTS, PIPELINE, STATUS, is_inside
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json, sha256
-from clsplat.pipeline.capture_choice import without_choices
-from clsplat.pipeline.choices import undone
-from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.loading import Pipeline, load, with_decisions, without_auto
 from clsplat.training import checkpoint
-from clsplat.training.settings_diff import first_difference
+from clsplat.training.settings_diff import Difference, first_difference
 from clsplat.training.status import read_status
 
 
@@ -85,7 +83,7 @@ class RunState:
     def difference(self, pipeline: Pipeline) -> str:
         """Say in which setting another pipeline differs, or why that of the run cannot be read; "" where in none."""
         try:
-            return str(first_difference(_asked(self.pipeline), _asked(pipeline)) or "")
+            return str(_difference(self.pipeline, pipeline) or "")
         except ConfigError as error:
             return one_line(error)
 
@@ -115,9 +113,13 @@ def has_pipeline(folder: Path) -> bool:
     return (folder / PIPELINE).is_file()
 
 
-def _asked(pipeline: Pipeline) -> Any:
-    """The resolved pipeline without what a run chose."""
-    return without_choices(replace(pipeline, settings=undone(pipeline.settings)).resolved())
+def _difference(before: Pipeline, now: Pipeline) -> Difference | None:
+    """The first setting in which what was asked of a run is another now, by what the run decided; None: there is none.
+
+    Raises ConfigError.
+    """
+    old, new = (without_auto(one.resolved()) for one in (before, with_decisions(now, before.decisions)))
+    return first_difference({**old, "adapt": None}, {**new, "adapt": None})
 
 
 def is_below(file: Path, places: Iterable[Path]) -> bool:

@@ -229,7 +229,8 @@ def lines(found: dict[str, Any]) -> str:
 
 
 def check(pipeline: str) -> dict[str, Any]:
-    """Check a pipeline file, or a shipped one by name: its path, its name, its stages or cells.
+    """Check a pipeline file, or a shipped one by name: its path, its name, its stages or cells, and the keys
+    that its photographs will decide.
 
     Of a run folder and of a model file return what `verify` and `examine` say, of the file of a field its parameters.
     Raises ConfigError; DataError for a folder without a run.
@@ -246,4 +247,5 @@ def check(pipeline: str) -> dict[str, Any]:
     if found := load_experiment(pipeline):
         return {"path": str(found.path), "name": found.name, "cells": [cell.name for cell in found.cells]}
     checked = load(pipeline)
-    return {"path": str(checked.path), "name": checked.settings.name, "stages": checked.names}
+    stages = {"stages": checked.names, "adapts": checked.undecided}
+    return {"path": str(checked.path), "name": checked.settings.name, **stages}

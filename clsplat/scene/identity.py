@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -151,12 +151,6 @@ class Identity:
         """Return the identity of a scene whose image files were decoded."""
         train, test, fold = ({view.name: _row(view, files) for view in scene.split(name)} for name in SPLITS)
         return cls(train, test, _points_hash(scene.points) if scene.points else "", fold)
-
-    def divided(self, scene: Scene) -> "Identity":
-        """Return the identity of the same views in the splits of `scene`."""
-        rows = self._rows
-        train, test, fold = ({view.name: rows[view.name] for view in scene.split(name)} for name in SPLITS)
-        return replace(self, train=train, test=test, validation=fold)
 
     @property
     def digest(self) -> str:

@@ -26,7 +26,7 @@ def require_divisible(pipeline: Pipeline) -> None:
     trainings = [stage for stage in pipeline.stages if isinstance(stage, Optimize)]
     faults = {
         "prepare": (settings.prepare, "run it first, and give the folder of that run as --scene"),
-        "choices": (settings.choices, "each block would choose by its own photographs; write the settings out"),
+        "adapt": (settings.adapt, "each block would decide by its own photographs; write the settings out"),
         "model.time": (settings.model.time, "a cell holds Gaussians at their own time, not at all times; leave it out"),
         "model.background": (settings.model.background, "each block would learn its own sky; leave it out"),
         "scene.levels": (settings.scene.levels > 1, "a block has views of one size; set it to 1"),

@@ -153,11 +153,9 @@ def test_a_description_of_a_run_tells_how_long_its_steps_take(tiny_scene, tmp_pa
 
 def test_a_field_is_trained_in_the_steps_that_fit_into_a_time(tiny_scene, tmp_path, pipeline, monkeypatch):
     """Schedules of the rate are stretched as those of Gaussians, and the pipeline that is written repeats the bits."""
-    monkeypatch.setattr(
-        "clsplat.runs.time_budget.rehearsals_of",
-        lambda *given: [Rehearsal(12, [0.01], during=0.0, after=0.0, growth=0.0)],
-    )
-    monkeypatch.setattr("clsplat.runs.time_budget.most_steps", lambda rehearsals, seconds: 24)
+    found = Rehearsal(12, [0.01], during=0.0, after=0.0)
+    monkeypatch.setattr("clsplat.runs.time_budget.rehearse_enough", lambda *given: found)
+    monkeypatch.setattr(Rehearsal, "steps_in", lambda *given: 24)
     out = clsplat.run(pipeline, tiny_scene, tmp_path / "run", minutes=0.002)
     (stage, *_) = load(str(out / "pipeline.yaml")).stages
     assert stage.warm_up == 4

@@ -21,8 +21,6 @@ from clsplat.sweeps.experiment import Job, run_pipeline
 from clsplat.sweeps.store import Store
 
 COUNT = 23
-SKY = "of the training photographs show a sky"
-KEEP = "choices=[{keys: [optimize.keep, scene.validation], by: photographs, values: [[0, best, auto]], since: x}]"
 
 
 @pytest.fixture
@@ -87,8 +85,8 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
     out = photos.parent / "runs" / "a"
     names = listed(asked, asked.preparation(out), out)
     assert len(names) == COUNT
-    assert known(asked, names) == {"photographs": training}
-    assert known(asked, []) == {}
+    assert known(asked, names).photographs == training
+    assert known(asked, []) is None
 
 
 def as_cell(asked, out, device, start):
@@ -115,7 +113,7 @@ def as_cell(asked, out, device, start):
     ],
 )
 def test_split_photographs_lack_is_refused_before_preparation(photos, begin, sets, complaint):
-    asked = load("photos", ["choices=[]", sets, f"scene.path='{photos}'"])  # to check them takes time
+    asked = load("photos", [sets, f"scene.path='{photos}'"])
     with pytest.raises((ConfigError, DataError), match=complaint):
         begin(asked, photos.parent / "runs" / "a", None, "new")
     assert not (photos.parent / "runs" / "prepared").exists()
@@ -136,7 +134,7 @@ def test_list_is_not_refused_for_what_cameras_will_tell(photos, caplog):
     told = describe(asked, out, None, "new")
     assert "if all 23 photographs are placed, the run is refused:" in told
     assert "'00.png' is held out for testing" in told
-    assert "model.background=null; {" in told, "what may be chosen"
+    assert "follow from the photographs: init.transparent, " in told, "what they will decide"
 
 
 def test_files_that_are_left_out_are_told_once(photos, caplog):
@@ -145,21 +143,12 @@ def test_files_that_are_left_out_are_told_once(photos, caplog):
     assert len([record for record in caplog.records if "HEIC" in record.getMessage()]) == 1
 
 
-def test_dry_run_says_what_can_be_chosen_before_preparation(photos):
+def test_dry_run_says_what_photographs_will_decide(photos):
     asked = load("photos", [f"scene.path='{photos}'", "optimize.modules.dropout={probability: 0.1}"])
     lines = [line.strip() for line in describe(asked, photos.parent / "runs" / "a", None, "new").splitlines()]
-    fixed = [line for line in lines if ", since 20 training photographs; " in line]
-    assert [line.partition("=")[0] for line in fixed] == [
-        "init.transparent",
-        "optimize.modules.dropout",
-        "model.background",
-    ]
-    assert fixed[1].startswith("optimize.modules.dropout=")
-    growth = "stages.1.during.1.per_pixel"
-    assert f"{growth}=0.6; 0.3 if at least 25% {SKY}; 0.1 if at least 50% {SKY}" in lines
-    assert "choices        if all 23 photographs are placed:" in lines
-    together = load("photos", [f"scene.path='{photos}'", KEEP, "scene.validation=0"])
-    assert "with which the rest does not go together" in describe(together, photos.parent / "runs" / "a", None, "new")
+    (found,) = [line for line in lines if line.startswith("adapt ")]
+    assert "follow from the photographs: init.transparent, init.count, " in found
+    assert "dropout" not in found
 
 
 def test_what_is_there_already_takes_no_time(tiny_scene, tmp_path):

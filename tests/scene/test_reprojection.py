@@ -1,20 +1,18 @@
 """How far points are from where photographs show them: measured, kept, and what follows from it."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.pipeline.choices import choose
-from clsplat.pipeline.loading import load
+from clsplat.pipeline.loading import adapted, load
 from clsplat.prepare.inspect.findings import POSES, POSES_ERROR, Inspection
 from clsplat.prepare.undistort import undistort_scene
 from clsplat.runs.describe import describe
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
-from clsplat.scene.quality import measured
+from clsplat.scene.quality import Measures, measured
 from clsplat.scene.reprojection import misses, reprojection_errors, within
 from clsplat.scene.scene import Tracks
 from clsplat.scene.view import View
@@ -28,7 +26,6 @@ from tests.support.runs import FEW
 VECTOR = np.array([1.2, -0.9])  # px, 1.5 long
 OFFSET = np.array([0.1, 0.2, 0.3])
 
-OF_POSES = "{keys: [optimize.modules.camera_optimizer], by: photographs, values: [[0, {start: 1}]], since: x}"
 STATE = ("status.json", "log.txt")  # which tell of the refusal
 
 
@@ -74,14 +71,14 @@ def test_it_is_reported_at_training_size_without_test_views(tmp_path, rng):
     plain = read_scene(Yard(rng).write(tmp_path / "plain"), 6)
     tested = tuple(view.name for view in plain.split("test"))
     again = read_scene(missing(tmp_path / "again", VECTOR, rng, exact=tested), 6)
-    assert measured(again)["reprojection_error"] == pytest.approx(1.5, rel=1e-5)
-    assert measured(again.downscaled(2))["reprojection_error"] == pytest.approx(0.75, rel=1e-5)
-    assert "reprojection_error" not in measured(plain), "places that were computed from cameras tell nothing"
+    assert measured(again).reprojection_error == pytest.approx(1.5, rel=1e-5)
+    assert measured(again.downscaled(2)).reprojection_error == pytest.approx(0.75, rel=1e-5)
+    assert measured(plain).reprojection_error is None, "places that were computed from cameras tell nothing"
 
 
 def test_undistorted_scenes_keep_it(tmp_path, rng):
     undistort_scene(missing(tmp_path / "scene", VECTOR, rng), tmp_path / "small", 32)
-    assert measured(read_scene(tmp_path / "small", 0))["reprojection_error"] == pytest.approx(0.75, rel=1e-5)
+    assert measured(read_scene(tmp_path / "small", 0)).reprojection_error == pytest.approx(0.75, rel=1e-5)
 
 
 def test_places_in_text_that_are_no_numbers_are_not_known(tmp_path):
@@ -97,16 +94,15 @@ def test_places_in_text_that_are_no_numbers_are_not_known(tmp_path):
 
 @pytest.mark.parametrize(("error", "learned"), [(0.4, False), (0.99, False), (1.0, True), (3.0, True)])
 def test_the_recipe_for_photographs_learns_poses_from_a_pixel_on(error, learned):
-    settings = load("photos").settings
-    chosen = choose(settings, {"photographs": 60, "reprojection_error": error})
+    chosen = adapted(load("photos"), Measures(60, error))
+    training = chosen.settings.optimize
     exposure = Exposure(when="auto", **({} if learned else {"above": 0.2}))
-    assert chosen.training.modules == [*([CameraOptimizer(start=500)] if learned else []), exposure]
+    assert training.modules == [*([CameraOptimizer(start=500)] if learned else []), exposure]
     if not learned:
-        assert chosen.training.model_copy(update={"modules": []}) == load("fast").settings.training
-    (told,) = [one.told for one in chosen.choices if "optimize.modules.camera_optimizer" in one.keys]
-    assert f"{error:g} px are between a point and where photographs show it" in told
-    without = choose(settings, {"photographs": 60})
-    assert [one.type for one in without.training.modules] == ["exposure"]
+        assert training.model_copy(update={"modules": []}) == load("fast").settings.training
+    assert f"{error:g} px of mean reprojection error; " in chosen.decisions[-1].reason
+    without = adapted(load("photos"), Measures(60)).settings.optimize
+    assert [one.type for one in without.modules] == ["exposure"]
 
 
 @pytest.mark.parametrize(("length", "level"), [(0.5, None), (1.5, "note"), (2.5, "warning")])
@@ -120,9 +116,10 @@ def test_inspect_says_what_to_set(tmp_path, rng, length, level):
 
 
 def test_inspect_says_what_the_recipe_for_photographs_does():
-    (of_poses,) = [one for one in load("photos").settings.choices if "optimize.modules.camera_optimizer" in one.keys]
-    bound, value, _ = of_poses.values[1]
-    assert (bound, f"optimize.modules.camera_optimizer={{start: {value['start']}}}") == (POSES_ERROR, POSES)
+    for error, learned in ((POSES_ERROR - 0.01, None), (POSES_ERROR, {"start": 500})):
+        (found,) = [one for one in adapted(load("photos"), Measures(9, error)).decisions if one.key in POSES]
+        assert found.value == learned
+    assert POSES == "optimize.modules.camera_optimizer={start: 500}"
 
 
 @pytest.mark.parametrize(
@@ -141,25 +138,26 @@ def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rn
 
 
 def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
-    for recipe in ("smoke", "photos"):  # whose choices have a key for either
+    for recipe in ("smoke", "photos"):  # which may decide either
         with pytest.raises(ConfigError, match="not learned together with poses"):
             load(recipe, ["optimize.modules.camera_optimizer={start: 1}", "model.background=directions"])
         with pytest.raises(ConfigError, match="'random_background' does not go together with sky"):
             load(recipe, ["optimize.modules.random_background={}", "model.background=directions"])
-    load("photos", ["model.background=directions"])  # whose choices may learn poses
+    asked = load("photos", ["model.background=directions"])  # which may learn poses
+    with pytest.raises(ConfigError, match=r"adapt: photos: .*not learned together with poses.*; --set of one"):
+        adapted(asked, Measures(60, 1.0))
 
 
 @pytest.mark.slow
 def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
     """With photographs that choose the steps, and a training on all of them after that."""
     folder = missing(tmp_path / "scene", VECTOR, rng)
-    (of_poses,) = [one for one in load("photos").settings.choices if "optimize.modules.camera_optimizer" in one.keys]
     asked = [f"scene.path='{folder}'", *FEW, "scene.validation=auto", "optimize.keep=best", "optimize.refit=true"]
-    asked += ["model.background={type: auto, photographs: 0.25}"]
-    asked += [f"choices=[{json.dumps(of_poses.undone().model_dump(mode='json', exclude_defaults=True))}]"]
+    asked += ["model.background={type: auto, photographs: 0.25}", "adapt={type: photos, keep: [model.background]}"]
+    asked += ["optimize.modules.random_background=null"]
     run_pipeline(load("smoke", asked), tmp_path / "run", None, "new")
     written = load(str(tmp_path / "run" / "pipeline.yaml")).settings
-    assert written.training.modules[0] == CameraOptimizer(start=500)
+    assert "camera_optimizer" in [one.type for one in written.training.modules]
     background = written.model.background
     assert background.chosen == "off"
     assert background.reason.startswith("'camera_optimizer' does not go together with sky: ")
@@ -176,7 +174,6 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
             ["optimize.losses=[l1, inverse_depth]", "optimize.modules.camera_optimizer={start: 1}"],
             "does not go together with inverse_depth",
         ),
-        ([f"choices=[{OF_POSES}]", "model.background=directions"], "not learned together with poses"),
     ],
 )
 def test_what_a_run_can_know_is_refused_before_anything_changes(changes, fault, tmp_path, rng):

@@ -9,8 +9,7 @@ import pytest
 
 from clsplat.core.errors import DataError
 from clsplat.photos.exposure_estimate import UNKNOWN, Exposures
-from clsplat.pipeline.capture_choice import without_choices
-from clsplat.pipeline.loading import load
+from clsplat.pipeline.loading import load, without_auto
 from clsplat.runs import opening, run_folder
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.state import RunState
@@ -164,5 +163,5 @@ def test_what_a_run_chose_is_no_setting_of_its_pipeline():
     asked = load("smoke", ["optimize.modules.exposure.when=auto"]).resolved()
     chosen = load("smoke", ["optimize.modules.exposure={when: auto, chosen: on, reason: they differ}"]).resolved()
     assert asked != chosen
-    assert without_choices(asked) == without_choices(chosen)
-    assert without_choices(asked) != without_choices(load("smoke").resolved())
+    assert without_auto(asked) == without_auto(chosen)
+    assert without_auto(asked) != without_auto(load("smoke").resolved())

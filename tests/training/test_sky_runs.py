@@ -16,8 +16,7 @@ from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.sky import Sky, keep_sky, sampled, sky_beside, texel_directions
 from clsplat.metrics.images import psnr
 from clsplat.photos.sky_detection import SkyEvidence, looked_at, panorama
-from clsplat.pipeline.capture_choice import without_choices
-from clsplat.pipeline.loading import load
+from clsplat.pipeline.loading import load, without_auto
 from clsplat.render.backdrops import Auto
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.state import RunState
@@ -173,7 +172,7 @@ def test_what_a_run_chose_is_no_setting_of_its_pipeline():
     asked = load("smoke", ["model.background=auto"]).resolved()
     chosen = load("smoke", ["model.background={type: auto, chosen: on, reason: it is blue}"]).resolved()
     assert asked != chosen
-    assert without_choices(asked) == without_choices(chosen)
+    assert without_auto(asked) == without_auto(chosen)
 
 
 def test_directions_without_visible_sky_are_left_to_gaussians(yard):

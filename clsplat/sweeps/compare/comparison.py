@@ -65,6 +65,8 @@ def _named(item: Any) -> tuple[str, Any]:
     """The name of a list's item, and the item without it."""
     if isinstance(item, dict) and "type" in item:
         return str(item["type"]), {key: value for key, value in item.items() if key != "type"}
+    if isinstance(item, dict) and {"key", "reason"} <= item.keys():  # a decision, whose value stands at its place
+        return str(item["key"]), item["reason"]
     if isinstance(item, dict) and len(item) == 1:
         return next(iter(item.items()))
     return (str(item), {}) if not isinstance(item, dict) else ("item", item)

@@ -22,7 +22,6 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.filters import ModelSettings
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace
-from clsplat.scene.quality import Measure
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.training.memory import most_pixels
@@ -155,7 +154,7 @@ class TrainingModule(Settings):
     planes: ClassVar[int] = 0  # of floats on the device, of the largest view's size
 
     brought_as: ClassVar[str] = ""  # its type, where no list names it: the model, a loss or the views bring it
-    measure: ClassVar[Measure | None] = None  # what `measured` returns
+    measure: ClassVar[str | None] = None  # the field of `Measures` that `measured` returns
     by_type: ClassVar[bool] = True
     joins: ClassVar[bool] = False  # a run may go on with it, or without it; bits then no longer compare
 
@@ -174,7 +173,7 @@ class TrainingModule(Settings):
 
     @classmethod
     def measured(cls, run: Run) -> float | None:
-        """Return a number that `choices` depend on; None where it is not known."""
+        """Return a number that settings depend on; None where it is not known."""
         return None
 
     @classmethod

@@ -17,7 +17,7 @@ from clsplat.photos.photographs import apply_mask
 from clsplat.photos.sky_detection import SkyEvidence, looked_at, panorama
 from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.render.filters import ModelSettings
-from clsplat.scene.quality import Measure, is_transparent
+from clsplat.scene.quality import is_transparent
 from clsplat.scene.scene import Scene
 from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import Run
@@ -32,7 +32,7 @@ class SkyModule(TrainingModule):
     """The sky of a model.  The model brings it: no list names it."""
 
     brought_as: ClassVar[str] = SKY
-    measure: ClassVar[Measure | None] = SKY
+    measure: ClassVar[str | None] = SKY
     place: ClassVar[int] = -20
     outlasts: ClassVar[Literal["acts"]] = "acts"
 

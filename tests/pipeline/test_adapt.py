@@ -1,0 +1,169 @@
+"""Settings that follow from the photographs: what is decided, written, kept, and refused; a plug-in's decisions."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import clsplat
+from clsplat.core.errors import ConfigError
+from clsplat.core.schedule import at_step
+from clsplat.pipeline import plugins
+from clsplat.pipeline.loading import adapted, load
+from clsplat.pipeline.stretching import in_steps
+from clsplat.runs.describe import describe
+from clsplat.runs.state import has_ended
+from clsplat.scene.quality import Measures
+from clsplat.stages.densify import Densify
+from clsplat.sweeps.compare.comparison import flat
+from tests.support.outdoor_scene import Yard
+from tests.support.runs import FEW, digest, train
+
+pytestmark = pytest.mark.slow
+PLUGIN = """
+from typing import Literal
+from clsplat.plugin import Adaptation, Decision
+
+class Counted(Adaptation):
+    type: Literal["counted"] = "counted"
+    key: str = "model.sh_degree"
+
+    def decide(self, training, measures):
+        degree = 1 if measures.photographs >= 8 else 0
+        yield Decision(key=self.key, value=degree, reason=f"{measures.photographs} photographs")
+        yield Decision(key="optimize.modules.dropout", value={"probability": 0.1}, reason="so it is")
+"""
+ADAPT = "adapt=counted"
+
+
+@pytest.fixture(autouse=True)
+def plugin(tmp_path: Path, without_plugins: None) -> None:
+    (tmp_path / "counted.py").write_text(PLUGIN)
+    plugins.load_file(tmp_path / "counted.py")
+
+
+def decided(name: str, *overrides: str, count: int = 9, error: float | None = None, sky: float | None = None):
+    return adapted(load(name, list(overrides)), Measures(count, error, look_for_sky=lambda: sky))
+
+
+@pytest.mark.parametrize(
+    ("photographs", "sky", "most"),
+    [(4, None, 0.6), (11, 0.24, 0.6), (12, 0.25, 0.3), (25, 0.49, 0.3), (25, 0.5, 0.1), (39, 1, 0.1), (40, 1, None)],
+)
+def test_photos_decides_by_their_number_and_the_sky(photographs, sky, most):
+    settings = decided("photos", count=photographs, sky=sky).settings
+    few, training, init = photographs < 40, settings.optimize, settings.stages[0]
+    modules = {one.type: one for one in training.modules}
+    assert (init.transparent, init.count) == (("random", 100_000) if few else ("hull", 60_000))
+    assert modules.keys() == {"exposure", *(("dropout", "random_background") if few else ())}
+    if few:
+        assert [at_step(modules["dropout"].probability, step) for step in (0, 730, 1460)] == [0, 0.1, 0.2]
+        assert modules["random_background"].where == "transparent"
+    assert modules["exposure"].above == 0.2
+    assert (settings.model.background is not None) == (12 <= photographs < 40)
+    assert [one.per_pixel for one in training.during if isinstance(one, Densify)] == [most, None]
+    if not few:
+        fast = load("fast").settings
+        alike = [init, training.model_copy(update={"modules": []}), *settings.stages[2:]]
+        assert (alike, settings.model) == (fast.stages, fast.model), "nothing is lost where there are many"
+
+
+def test_photos_in_fewer_steps_ends_its_schedules_earlier():
+    asked = load("photos")
+    short = replace(asked, settings=in_steps(asked.settings, 1700))
+    modules = {one.type: one for one in adapted(short, Measures(9, 2.0)).settings.optimize.modules}
+    assert at_step(modules["dropout"].probability, 730) == 0.2
+    assert (modules["camera_optimizer"].start, modules["exposure"].above) == (250, 0.03)
+
+
+@pytest.mark.parametrize(
+    ("override", "kept"),
+    [
+        ("model.sh_degree=2", ["model.sh_degree"]),
+        ("model={sh_degree: 2}", ["model.sh_degree"]),
+        ("optimize.modules.dropout.probability=0.3", ["optimize.modules.dropout"]),
+        ("optimize.steps=7", []),
+    ],
+)
+def test_a_key_that_is_set_is_kept(override, kept, tmp_path):
+    """Around a key of a decision or inside of it; also where a run has decided."""
+    found = decided("smoke", ADAPT, override)
+    assert found.settings.adapt.keep == kept
+    assert not {one.key for one in found.decisions} & {*kept}
+    (tmp_path / "run.yaml").write_text(decided("smoke", ADAPT).text())
+    again = load(str(tmp_path / "run.yaml"), [override])
+    assert (again.settings.adapt.keep, again.undecided) == (kept, [])
+    assert [one.key for one in again.decisions] == [one.key for one in found.decisions]
+    assert again.settings.model == found.settings.model
+
+
+def test_other_photographs_are_decided_by_again(tmp_path):
+    file = tmp_path / "run.yaml"
+    file.write_text(decided("smoke", ADAPT, "model.background={type: auto, chosen: on, reason: blue}").text())
+    assert adapted(load(str(file)), Measures(3)).settings.model.sh_degree == 1, "what a run decided stays"
+    other = load(str(file), ["scene.path=two"])
+    assert other.undecided == ["model.sh_degree", "optimize.modules.dropout"]
+    assert other.settings.model.background.chosen is None
+    assert adapted(other, Measures(3)).settings.model.sh_degree == 0
+
+
+def test_a_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
+    asked = [f"scene.path='{tiny_scene}'", *FEW, ADAPT]
+    text = describe(load("smoke", asked), tmp_path / "run", None, "new")
+    assert "model.sh_degree=1, since 8 photographs" in text
+    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=[*FEW, ADAPT])
+    assert "model.sh_degree=1, since 8 photographs" in (out / "log.txt").read_text()
+    written = load(str(out / "pipeline.yaml"))
+    assert [one.key for one in written.decisions] == ["model.sh_degree", "optimize.modules.dropout"]
+    assert written.settings.plugins.keys() == {"counted"}
+    plain = train(tiny_scene, tmp_path / "plain", *FEW, "model.sh_degree=1", "optimize.modules.dropout.probability=0.1")
+    assert digest(plain.out) == digest(out)
+    again = clsplat.run(out / "pipeline.yaml", out=tmp_path / "again")
+    assert digest(again) == digest(out)
+    assert has_ended(load("smoke", asked), out), "the same command finds it up to date"
+    with pytest.raises(ConfigError, match=r"model\.sh_degree was 1, is 2"):
+        has_ended(load("smoke", [*asked, "model.sh_degree=2"]), out)
+    assert has_ended(load("smoke", [*asked, "model.sh_degree=1"]), out)
+
+
+def test_before_preparation_it_says_what_is_undecided():
+    found = clsplat.check("photos")
+    assert found["adapts"][:2] == ["init.transparent", "init.count"]
+    assert clsplat.check("fast")["adapts"] == []
+    assert load("photos", ["init.count=3"]).undecided == [key for key in found["adapts"] if key != "init.count"]
+    assert load("photos", ["adapt=null"]).undecided == []
+
+
+@pytest.mark.parametrize(
+    ("adapt", "complaint"),
+    [
+        ("{type: counted, key: model.sh_degre}", "adapt: counted: "),
+        ("{type: counted, key: optimise.steps}", "adapt: counted: optimise.steps: no 'optimise'"),
+        ("{type: counted, key: scene.downscale}", "scene.downscale is used before photographs are measured"),
+        ("{type: counted, key: optimize.steps}", r"optimize\.steps.* --set of one of its keys wins: optimize\.steps, "),
+        ("photo", "no adaptation named 'photo'; did you mean 'photos'"),
+        ("{type: photos, decisions: [{key: a, value: 1}]}", "'reason' is missing"),
+    ],
+)
+def test_what_cannot_be_decided_is_refused_in_a_sentence(adapt, complaint):
+    with pytest.raises(ConfigError, match=complaint):
+        decided("smoke", f"adapt={adapt}", count=2)
+
+
+@pytest.mark.parametrize(("count", "clear", "sky"), [(12, True, "100%"), (12, False, "0%"), (41, True, None)])
+def test_a_run_looks_for_a_sky_where_it_decides(tmp_path, rng, monkeypatch, count, clear, sky):
+    scene = Yard(rng, count, clear).write(tmp_path / "yard")
+    if sky is None:
+        monkeypatch.setattr("clsplat.runs.opening.share_with_sky", lambda run: pytest.fail("looked for a sky"))
+    text = describe(load("photos", [f"scene.path='{scene}'", "scene.holdout=0"]), tmp_path / "run", None, "new")
+    assert f"{count} training photographs; " in text
+    assert sky is None or f"{sky} of them show a sky" in text
+
+
+def test_transparent_photographs_say_nothing_of_a_sky(tiny_scene, tmp_path):
+    text = describe(load("photos", [f"scene.path='{tiny_scene}'"]), tmp_path / "run", None, "new")
+    assert "8 training photographs; the dataset does not say whether they show a sky" in text
+
+
+def test_decisions_are_named_by_their_keys_in_a_comparison():
+    assert flat(decided("smoke", ADAPT).resolved())["adapt.decisions.model.sh_degree"] == "9 photographs"
