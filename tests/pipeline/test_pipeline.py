@@ -10,7 +10,7 @@ from jsonschema import Draft202012Validator
 from ruamel.yaml import YAML
 
 from clsplat.core.errors import ConfigError
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline import files
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.pipeline.plugins import load_file
@@ -20,7 +20,7 @@ from clsplat.stages.optimize import Optimize
 from tests.support.pipelines import KINDS, flat
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-SHIPPED = list(shipped())
+SHIPPED = list(files.shipped())
 SMALL = """\
 name: small
 stages:
@@ -309,7 +309,7 @@ def test_a_short_pipeline_is_refused_with_its_place(tmp_path, short, words):
 
 
 def test_values_of_short_are_at_the_places_of_set():
-    full = {name: read_yaml(path).data.get("short") for name, path in shipped().items()}
+    full = {name: read_yaml(path).data.get("short") for name, path in files.shipped().items()}
     for name, values in full.items():
         given = [f"{place}={json.dumps(value)}" for place, value in (values or {}).items()]
         assert not values or load(name, [f"name={name}_7k", *given]).resolved() == load(f"{name}_7k").resolved()
