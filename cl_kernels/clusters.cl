@@ -1,22 +1,19 @@
-/* k-means: the nearest vector of each point (Lloyd 1982), and sums of the points of each vector.
+/* The vector of a palette that is most alike each point: that with the largest product.
  *
- * Points and vectors are whole numbers in floats, so small that every sum of products is below 2^24: float32 holds each
- * exactly, and no order of additions changes a bit.  The squared distance by 2 is |p|^2 / 2 + (|v|^2 / 2 - p . v).
- * No local memory.  Deterministic. */
+ * The products of a point are summed in the order of its components.  No local memory.  Deterministic. */
 #include "lanes.h"
 
-#define FARTHEST 3.0e38f  // beyond all distances
+#define FARTHEST 3.0e38f  // beyond all products
 #define TOGETHER 8        // vectors that an item compares with its points together, in registers
 
-/* Go on with some of the vectors: those from `first` on, few enough to stay in a cache.  Of vectors that are equally
- * near the first counts; 0 for a point that is not a number.  One item = LANES points. */
+/* Go on with some of the vectors: those from `first` on, few enough to stay in a cache.  Of vectors with equal products
+ * the first counts; 0 for a point that is not a number.  One item = LANES points. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void nearest_vectors(
-    __global const float *restrict points,   // [components,S] whole numbers
-    __global const float *restrict vectors,  // [entries,components] whole numbers; entries: a multiple of TOGETHER
-    __global const float *restrict norm,     // [entries] |v|^2 / 2; FARTHEST where there is no vector
+void most_alike(
+    __global const float *restrict points,   // [components,S]
+    __global const float *restrict vectors,  // [entries,components]; entries: a multiple of TOGETHER
     __global float *restrict label,          // [S] below 2^24
-    __global float *restrict apart,          // [S] |v|^2 / 2 - p . v of the nearest vector so far
+    __global float *restrict largest,        // [S] the largest product so far
     const uint components,
     const uint first,
     const uint end,
@@ -26,7 +23,7 @@ void nearest_vectors(
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
-    VF nearest = first == 0 ? (VF)(FARTHEST) : VLOAD(apart + i);
+    VF best = first == 0 ? (VF)(-FARTHEST) : VLOAD(largest + i);
     VF found = first == 0 ? (VF)(0.0f) : VLOAD(label + i);
     for (uint e = first; e < end; e += TOGETHER) {
         __global const float *v = vectors + (size_t)e * components;
@@ -39,31 +36,11 @@ void nearest_vectors(
                 product[j] += p * v[j * components + k];
         }
         for (uint j = 0; j < TOGETHER; j++) {
-            const VF difference = norm[e + j] - product[j];
-            const VI nearer = difference < nearest;
-            nearest = nearer ? difference : nearest;
-            found = nearer ? (VF)((float)(e + j)) : found;
+            const VI larger = product[j] > best;
+            best = larger ? product[j] : best;
+            found = larger ? (VF)((float)(e + j)) : found;
         }
     }
-    VSTORE(nearest, apart + i);
+    VSTORE(best, largest + i);
     VSTORE(found, label + i);
-}
-
-/* sums += points by their label.  Integer atomics: the sums do not depend on the order of the items.  One item = one
- * value; dimension 1 is the component.  What is not a number counts as 0. */
-__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void sum_members(
-    __global const float *restrict points,  // [components,S] whole numbers
-    __global const float *restrict label,   // [S] below entries
-    __global int *restrict sums,            // [entries,components]
-    const uint components,
-    const uint stride,
-    const uint count)
-{
-    const uint i = get_global_id(0), k = get_global_id(1);
-    if (i >= count)
-        return;
-    const float p = points[k * stride + i];
-    if (p == p)
-        atomic_add(sums + (uint)label[i] * components + k, (int)p);
 }

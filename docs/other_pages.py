@@ -18,6 +18,8 @@ from clsplat.cli.data import app as tools
 from clsplat.core import errors
 from clsplat.core.schedule import Curve
 from clsplat.core.settings import Settings
+from clsplat.pipeline.files import shipped
+from clsplat.pipeline.yaml_file import read_pipeline
 from clsplat.scene import Reader
 
 OTHER_CODES = {0: "Done.", 1: "Internal error, a defect of clsplat: `--debug` shows it; please report it."}
@@ -78,12 +80,12 @@ def summary(kind: type) -> str:
 def pipelines_page() -> str:
     """Return the shipped pipelines: what their headers say, and the files."""
     text = "# Shipped pipelines\n\n`clsplat run NAME --scene DIR` runs one. Copy a file to make your own variant.\n\n"
-    for file in sorted((ROOT / "pipelines").glob("*.yaml")):
-        lines = file.read_text("utf-8").splitlines()
+    for name, file in shipped().items():
+        lines = read_pipeline(file).splitlines()
         count = next(i for i, line in enumerate(lines) if not line.startswith("#"))
-        header = "\n".join(line.removeprefix("# ") for line in lines[:count]).replace(".\n", ".\n\n")
+        header = "\n".join(line.lstrip("# ") for line in lines[:count]).replace(".\n", ".\n\n")
         body = "\n".join(f"    {line}" for line in lines[count:])
-        text += f'## {file.stem}\n\n{header}\n\n??? note "{file.name}"\n\n    ```yaml\n{body}\n    ```\n\n'
+        text += f'## {name}\n\n{header}\n\n??? note "{file.name}"\n\n    ```yaml\n{body}\n    ```\n\n'
     return text
 
 

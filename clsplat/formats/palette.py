@@ -4,9 +4,6 @@ Sums that depend on an order run in one; products of matrices, whose order is th
 float32 holds exactly, so that no order changes them.
 """
 
-from collections.abc import Callable
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -97,59 +94,14 @@ def nearest(values: NDArray[np.floating], entries: NDArray[np.float64]) -> NDArr
     return np.searchsorted((entries[1:] + entries[:-1]) / 2, values).astype(np.uint8)
 
 
-class Clusters(Protocol):
-    """Points, [N, c], whole numbers from -LEVELS to LEVELS, at most 45 to a point: what k-means asks of them.
-
-    Every number is exact, so that whoever computes them, the host or a device, computes the same bits.
-    """
-
-    def nearest(self, vectors: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return the nearest of the vectors [E, c] for each point, the first of equally near ones, and half the squared
-        distance."""
-
-    def sums(self, labels: NDArray[np.int64], entries: int) -> NDArray[np.int64]:
-        """Return the sums of the points that have each label, [entries, c]."""
-
-
-Clustering = Callable[[NDArray[np.float32]], Clusters]
-
-
-class HostClusters:
-    """Clusters by products of matrices."""
-
-    def __init__(self, points: NDArray[np.float32]) -> None:
-        self.points = points
-
-    def nearest(self, vectors: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        points, half = self.points, np.square(vectors).sum(axis=1) / 2
-        labels, distance = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
-        space = np.empty((BLOCK, len(vectors)), np.float32)
-        for start in range(0, len(points), BLOCK):
-            block = points[start : start + BLOCK]
-            apart = np.matmul(block, vectors.T, out=space[: len(block)])
-            np.subtract(half, apart, out=apart)
-            best = apart.argmin(axis=1)
-            labels[start : start + BLOCK] = best
-            distance[start : start + BLOCK] = apart[np.arange(len(block)), best] + np.square(block).sum(axis=1) / 2
-        return labels, distance
-
-    def sums(self, labels: NDArray[np.int64], entries: int) -> NDArray[np.int64]:
-        columns = [np.bincount(labels, column, minlength=entries) for column in self.points.T]
-        return np.stack(columns, axis=1).astype(np.int64)
-
-
 def palette(
-    points: NDArray[np.float32],
-    entries: int,
-    clustering: Clustering = HostClusters,
-    weights: NDArray[np.float64] | None = None,
+    points: NDArray[np.float32], entries: int, weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return vectors [entries, c] that stand for points [N, c], and for each point the index of its vector.
+    """Return at most `entries` vectors, [E, c], that stand for points [N, c], and the vector of each point, [N].
 
     Lloyd's iteration on a share of the points, from evenly spaced ones; a vector without points gets one that is far
-    from its own.  At most 45 components.  `clustering` makes the clusters of points: the host's, or those of a device.
-    `weights`, [N], say how much errors count: a point is in that share as often as its weight says.  Points that are at
-    most `entries` different ones are kept; the last is then repeated.
+    from its own.  At most 45 components.  `weights`, [N], say how much errors count: a point is in that share as often
+    as its weight says.  Points that are at most `entries` different ones stay.
     """
     if (kept := different(points, entries)) is not None:
         return kept
@@ -158,48 +110,66 @@ def palette(
     sample, sample_whole = points[chosen].astype(np.float64), whole[chosen]
     starts = np.linspace(0, len(sample) - 1, entries).astype(np.int64)
     vectors, moved = sample[starts], sample_whole[starts]
-    clusters = clustering(sample_whole)
     for _ in range(PALETTE_ROUNDS):
-        labels, distance = clusters.nearest(moved)
+        labels, distance = _nearest_vectors(sample_whole, moved)
         held = np.bincount(labels, minlength=entries)
-        moved = np.rint(clusters.sums(labels, entries) / np.maximum(held, 1)[:, None]).astype(np.float32)
+        sums = [np.bincount(labels, column, minlength=entries) for column in sample_whole.T]
+        moved = np.rint(np.stack(sums, axis=1) / np.maximum(held, 1)[:, None]).astype(np.float32)
         empty = np.flatnonzero(held == 0)
         farthest = np.argsort(-distance, kind="stable")[: len(empty)]
         moved[empty] = sample_whole[farthest]
     for column in range(points.shape[1]):
         vectors[:, column] = np.bincount(labels, sample[:, column], minlength=entries) / np.maximum(held, 1)
     vectors[empty] = sample[farthest]
-    return vectors, clustering(whole).nearest(moved)[0]
+    return vectors, _nearest_vectors(whole, moved)[0]
 
 
-def _drawn(count: int, most: int, weights: NDArray[np.float64] | None) -> NDArray[np.int64]:
-    """The places, ascending, of points that train a palette: evenly spaced ones, by number or by weight."""
+def _nearest_vectors(
+    points: NDArray[np.float32], vectors: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The nearest of the vectors [E, c] for each point [N, c], the first of equal ones, and half the squared distance.
+
+    All are whole numbers from -LEVELS to LEVELS, so that every number is exact.
+    """
+    half = np.square(vectors).sum(axis=1) / 2
+    labels, distance = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+    space = np.empty((BLOCK, len(vectors)), np.float32)
+    for start in range(0, len(points), BLOCK):
+        block = points[start : start + BLOCK]
+        apart = np.matmul(block, vectors.T, out=space[: len(block)])
+        np.subtract(half, apart, out=apart)
+        best = apart.argmin(axis=1)
+        labels[start : start + BLOCK] = best
+        distance[start : start + BLOCK] = apart[np.arange(len(block)), best] + np.square(block).sum(axis=1) / 2
+    return labels, distance
+
+
+def _drawn(count: int, most: int, weights: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The places, ascending, of points that train a palette: evenly spaced ones by weight; by number without any."""
     most = min(count, most)
-    if weights is None or not weights.any():
+    if not weights.any():
         return np.linspace(0, count - 1, most).astype(np.int64)
     passed = np.cumsum(weights)
     return np.asarray(np.searchsorted(passed, (np.arange(most) + 0.5) / most * passed[-1]))
 
 
-def different(
-    points: NDArray[np.float32], most: int, padded: bool = True
-) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """Return the points themselves as a palette, and their labels; None where more than `most` of them differ.
+def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values as whole numbers from -LEVELS to LEVELS."""
+    largest = usual_largest(values) or np.float32(1)
+    return np.asarray(np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS)))
 
-    padded: in ascending order, the last repeated up to `most`; else in the order in which the points have them.
-    """
+
+def different(points: NDArray[np.float32], most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+    """Return the points that differ, in their order, and the label of each; None where more than `most` do."""
     if len(np.unique(points[:, 0])) > most:  # at once for most models
         return None
     found, first, labels = np.unique(points, axis=0, return_index=True, return_inverse=True)
     if len(found) > most:
         return None
-    labels = labels.reshape(-1)
-    if padded:
-        return np.concatenate([found, np.repeat(found[-1:], most - len(found), axis=0)]).astype(np.float64), labels
     order = np.argsort(first)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-    return found[order].astype(np.float64), place[labels]
+    return found[order].astype(np.float64), place[labels.reshape(-1)]
 
 
 def usual_largest(values: NDArray[np.float32]) -> np.float32:
@@ -207,9 +177,3 @@ def usual_largest(values: NDArray[np.float32]) -> np.float32:
     size = np.abs(values).ravel()
     place = min(int((1 - TAIL) * size.size), size.size - 1)
     return np.float32(np.partition(size, place)[place] if size.size else 0)
-
-
-def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Values as whole numbers from -LEVELS to LEVELS."""
-    largest = usual_largest(values) or np.float32(1)
-    return np.asarray(np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS)))

@@ -29,13 +29,12 @@ from clsplat.core.errors import DataError, quoted
 from clsplat.core.reading import read_file, read_json
 from clsplat.formats import packing
 from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, written
-from clsplat.formats.palette import Clustering, HostClusters, codebook, different, nearest, palette
+from clsplat.formats.palette import codebook, different, nearest, palette
 from clsplat.formats.ply import checked_numbers
 from clsplat.formats.sog_quantize import (
     base_for,
     log_weights,
     rounded,
-    rounded_opacities,
     rounded_quats,
     tree_palette,
     visible_form,
@@ -321,9 +320,13 @@ class _Sog:
 # Write SOG, version 2: the same model gives the same bytes.
 
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most, of a palette for all
-SHARES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # entries at most for a splat, of a palette for neighbours
+SHARES = {
+    "small": 0.16,
+    "balanced": 0.42,
+    "high": 0.45,
+}  # of a splat, of one that is not trained
 MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of its vectors, in 128ths
-TURN_STEP, ALPHA_STEP = 4, 2  # levels of 255
+TURN_STEP = 4  # levels of 255
 SIZE_SHARE = 0.25  # of a Gaussian's size, for its position: of one of median weight
 SCALE_STEP = 0.1  # of logarithms of standard deviations
 COLOUR_STEP = 0.05  # of the coefficients of band 0; 1 changes a colour by 0.28
@@ -426,23 +429,21 @@ class Harmonics:
     labels: NDArray[np.int64]
 
     @classmethod
-    def of(
+    def few(
         cls,
         rest: NDArray[np.float32],
         quality: Quality,
-        clustering: Clustering = HostClusters,
-        weights: NDArray[np.float64] | None = None,
-        better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]] | None = None,
+        weights: NDArray[np.float64],
+        better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
         step: float | None = None,
     ) -> "Harmonics":
-        """Quantise harmonics [N, c] by vectors for all; errors count by `weights` [N].  Those of `values` come out as
-        they are.
+        """Quantise harmonics [N, c] by few vectors, for training; those of `values` come out as they are.
 
-        better: makes of a palette [E, c] another one, and the label of each splat.  step: of numbers, where those are
-        few enough.
+        weights: how much errors count, [N].  better: makes of a palette [E, c] another one, and the label of each
+        splat.  step: of numbers, where those are few enough.
         """
-        vectors, labels = palette(rest, _few(len(rest), quality), clustering, weights)
-        if better and not np.array_equal(vectors[labels].astype(np.float32), rest):
+        vectors, labels = palette(rest, _few(len(rest), quality), weights)
+        if weights.any() and not np.array_equal(vectors[labels].astype(np.float32), rest):
             vectors, labels = better(vectors)
         return cls.by(vectors, labels, step)
 
@@ -470,13 +471,13 @@ def _quantised(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
     In `high` the tables have the precision of the format.
     """
     rest, base = p["sh_rest"], p["sh_base"]
-    most, few = min(MAX_PALETTE, int(SHARES[options.quality] * len(rest))), _few(len(rest), options.quality)
-    kept = (different(rest, few) or different(rest, most, padded=False)) if rest.shape[1] else None
+    most = min(MAX_PALETTE, max(_few(len(rest), options.quality), int(SHARES[options.quality] * len(rest))))
+    kept = different(rest, most) if rest.shape[1] else None
     harmonics = None if kept is None else Harmonics.by(*kept)
     if harmonics and rest.any():
         return p, harmonics
     if rest.any():
-        harmonics = Harmonics.by(*tree_palette(rest, weights, max(most, few), MEDIAN_STEPS[options.quality]))
+        harmonics = Harmonics.by(*tree_palette(rest, weights, most, MEDIAN_STEPS[options.quality]))
         base = base_for(base, rest - harmonics.values, visible_form(rest))
     if options.quality == "high":
         return {**p, "sh_base": base}, harmonics
@@ -485,7 +486,6 @@ def _quantised(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
         "means": weighed_means(p["means"], p["log_scales"], weights, SIZE_SHARE),
         "quats": quats,
         "log_scales": rounded(log_scales, SCALE_STEP),
-        "logit_opacity": rounded_opacities(p["logit_opacity"], ALPHA_STEP),
         "sh_base": rounded(base, COLOUR_STEP),
     }
     return {**p, **changed}, harmonics

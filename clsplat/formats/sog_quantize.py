@@ -14,10 +14,9 @@ from clsplat.core.quaternions import multiply
 from clsplat.formats.packing import from_smallest_three, smallest_three
 from clsplat.formats.palette import LEVELS as PALETTE_LEVELS
 from clsplat.formats.palette import usual_largest
-from clsplat.formats.splats import MAX_LOG, SH_C0, Parameters, logits, opacities, unit
+from clsplat.formats.splats import MAX_LOG, SH_C0, Parameters, unit
 
 Floats = NDArray[np.floating]
-SMALL = 25  # percentile of the sizes that steps of positions are compared with
 LEVELS = 65535  # of a position, from 0
 TINY = 2.0**-40  # levels, in the place of a size of 0
 MOST_BITS = 8  # last bits of a position that are alike
@@ -29,20 +28,6 @@ _TURNS = np.array([np.divide(turn, np.linalg.norm(turn)) for turn in _SIGNED if 
 def rounded(values: Floats, step: float) -> NDArray[np.float32]:
     """Return values as multiples of a step."""
     return np.asarray(np.rint(values.astype(np.float64) / step) * step, np.float32)
-
-
-def rounded_means(means: Floats, log_scales: Floats, share: float) -> NDArray[np.float32]:
-    """Return positions [N, 3] in steps of at most `share` of the size that a quarter of the Gaussians do not reach.
-
-    Steps are powers of two of the levels of a SOG, for each axis, so that low bits are alike.  The least position of an
-    axis stays, and so does the greatest: they are the range that levels divide.  For training that follows: what a
-    Gaussian weighs changes in it.
-    """
-    levels, low, level = _levels(means)
-    bits = np.floor(np.log2(np.maximum(share * np.percentile(_sizes(means, log_scales), SMALL, axis=0) / level, 1)))
-    step = np.exp2(np.minimum(bits, MOST_BITS))
-    coarse = np.where(levels > 0, np.floor(levels / step) * step + step - 1, 0)
-    return _positions(low + coarse * level)
 
 
 def weighed_means(
@@ -93,12 +78,6 @@ def rounded_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray
     levels = np.clip(np.rint(255 * (others * 0.5**0.5 + 0.5) / step) * step, 0, 255)
     turned = from_smallest_three(largest, (levels / 255 - 0.5) * 2**0.5)
     return turned, log_scales[rows[:, None], _axes(_TURNS)[taken]].astype(np.float32)
-
-
-def rounded_opacities(logit: Floats, step: int) -> NDArray[np.float32]:
-    """Return the logits of opacities on every `step`-th of 255 levels, 1 at least."""
-    levels = np.rint(255 * opacities(logit) / step) * step
-    return logits(np.clip(levels, 1, 255) / 255)
 
 
 def _axes(turns: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -175,51 +154,40 @@ def rounded_rows(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.floa
     return found
 
 
-# A palette of harmonics for neighbours: many vectors, each of few Gaussians that lie near each other.
+# A palette of many harmonics: parts of all Gaussians, divided again and again.
 
-RUN = 512  # Gaussians; a run of 256 takes fewer bytes and loses more
-REPEATED = 0.75  # share of different vectors, at most, of harmonics that come from a palette
 LLOYD_STEPS = 3  # of each division
 AT_ONCE = 0.5  # share of the parts, at most, that are divided before their errors are computed again
 TINY_WEIGHT = 1e-300  # in the place of the weight of an empty part
 SH_LEVELS = 128  # to a coefficient of 1
 LARGEST_STEP = 64.0  # levels
-Doubles = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
 
 def tree_palette(
-    rest: NDArray[np.float32], log_weights: Doubles, entries: int, median_step: float
-) -> tuple[Doubles, Labels]:
+    rest: NDArray[np.float32], log_weights: NDArray[np.float64], entries: int, median_step: float
+) -> tuple[NDArray[np.float64], Labels]:
     """Return vectors [E, 3 K], E at most `entries`, for harmonics [N, 3 K], and for each Gaussian its vector, [N].
 
     log_weights: as `log_weights` returns them; median_step: of vectors, in LEVELS, in the median, for harmonics of the
     usual size.
     """
-    run = len(rest) if _repeated(rest) else max(RUN, -(-len(rest) // entries))
-    runs = np.arange(len(rest)) // run
     form, weights = visible_form(rest), np.exp2(log_weights)
-    labels = _divided(_in_form(rest, form), weights, runs, entries)
+    labels = _divided(_in_form(rest, form), weights, entries)
     held = np.bincount(labels, weights)
     vectors = _sums(labels, weights, rest, len(held)) / held[:, None]
     log_held = np.log2(held)
     step = steps(log_held - np.median(log_held), usual_step(rest, median_step, median_step), LARGEST_STEP)
     first = np.zeros(len(held), np.int64)
     first[labels[::-1]] = np.arange(len(labels))[::-1]
-    order = np.lexsort((first, step, runs[first]))
+    order = np.lexsort((first, step))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     rounded = rounded_rows(SH_LEVELS * vectors, step, form).astype(np.float64) / SH_LEVELS
     return rounded[order], place[labels]
 
 
-def _repeated(rest: NDArray[np.float32]) -> bool:
-    """Whether many harmonics are repeated, by a palette for all that they had before: runs would repeat its vectors."""
-    most = int(REPEATED * len(rest))
-    return len(np.unique(rest[:, 0])) <= most and len(np.unique(rest, axis=0)) <= most
-
-
-def _in_form(rest: NDArray[np.float32], form: Doubles) -> NDArray[np.float32]:
+def _in_form(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
     """Harmonics so turned and stretched that the form is the square of a distance, [N, 3 K]."""
     count = len(form)
     root = np.linalg.cholesky(form).astype(np.float32)  # e^T G e = |root^T e|^2
@@ -230,9 +198,9 @@ def _in_form(rest: NDArray[np.float32], form: Doubles) -> NDArray[np.float32]:
     return found.reshape(rest.shape)
 
 
-def _divided(points: NDArray[np.float32], weights: Doubles, labels: Labels, entries: int) -> Labels:
-    """Parts of points [N, c], where they begin as `labels` and are divided until there are so many."""
-    labels, parts = labels.copy(), int(labels[-1]) + 1
+def _divided(points: NDArray[np.float32], weights: NDArray[np.float64], entries: int) -> Labels:
+    """Parts of points [N, c], which are divided until there are so many."""
+    labels, parts = np.zeros(len(points), np.int64), 1
     while parts < entries:
         held = np.maximum(np.bincount(labels, weights, minlength=parts), TINY_WEIGHT)  # a half may be empty
         mean = _sums(labels, weights, points, parts) / held[:, None]
@@ -255,7 +223,9 @@ def _divided(points: NDArray[np.float32], weights: Doubles, labels: Labels, entr
     return np.unique(labels, return_inverse=True)[1].reshape(-1)
 
 
-def _halves(points: NDArray[np.float32], weights: Doubles, own: Labels, beyond: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _halves(
+    points: NDArray[np.float32], weights: NDArray[np.float64], own: Labels, beyond: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Lloyd's iteration with two means for each part: which points are of the second, from a first guess."""
     parts = int(own.max()) + 1
     for _ in range(LLOYD_STEPS):
@@ -271,7 +241,9 @@ def _halves(points: NDArray[np.float32], weights: Doubles, own: Labels, beyond: 
     return beyond
 
 
-def _sums(labels: Labels, weights: Doubles, points: NDArray[np.floating], parts: int) -> Doubles:
+def _sums(
+    labels: Labels, weights: NDArray[np.float64], points: NDArray[np.floating], parts: int
+) -> NDArray[np.float64]:
     """Weighted sums of the points of each label, [parts, c], in the order of the points."""
     columns = [np.bincount(labels, weights * column, minlength=parts) for column in points.T]
     return np.stack(columns, axis=1)

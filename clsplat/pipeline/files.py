@@ -1,16 +1,32 @@
-"""The files of pipelines, found by path or by the name of a shipped one."""
+"""The files of pipelines, found by path or by the name of a shipped one.
+
+A file NAME.yaml with the key `short` stands for two pipelines, NAME and NAME_7k.  The path of the second is
+NAME_7k.yaml, which is no file on the disk; `read_pipeline` makes its text from the first.
+"""
 
 import difflib
+import re
 from pathlib import Path
 
 from clsplat.core.errors import ConfigError, in_shell, quoted
 from clsplat.core.files import PIPELINE
 from clsplat.core.resources import resource_dir
 
+SHORT = "_7k"  # how names of short pipelines end
+HAS_SHORT = re.compile(rb"^short\s*:", re.MULTILINE)
+
 
 def shipped() -> dict[str, Path]:
-    """Return the files of the shipped pipelines by name."""
-    return {file.stem: file for file in sorted(resource_dir("pipelines").glob("*.yaml"))}
+    """Return the paths of the shipped pipelines by name, in the order of their names."""
+    files = list(resource_dir("pipelines").glob("*.yaml"))
+    files += [file.with_stem(file.stem + SHORT) for file in files if HAS_SHORT.search(file.read_bytes())]
+    return {file.stem: file for file in sorted(files)}
+
+
+def origin(path: Path) -> Path:
+    """Return the file on the disk that holds a pipeline: NAME.yaml for NAME_7k.yaml where only the first is there."""
+    full = path.with_stem(path.stem.removesuffix(SHORT)) if path.stem != SHORT else path
+    return full if full != path and full.is_file() and not path.exists() else path
 
 
 def find(name: str) -> Path:
@@ -26,6 +42,8 @@ def find(name: str) -> Path:
     if is_file:
         return path
     if path.suffix in (".yaml", ".yml"):
+        if origin(path) != path:
+            return path
         raise ConfigError(f"{path}: no such pipeline file")
     files = shipped()
     if name in files:

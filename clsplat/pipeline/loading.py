@@ -228,8 +228,8 @@ def _is_of_photographs(override: str) -> bool:
 
 
 def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
-    """The file's data with each stage as {stage: name, …}, from which the models are chosen."""
-    data = dict(document.data)
+    """The file's data with each stage as {stage: name, …}, from which the models are chosen, and without `short`."""
+    data = {key: value for key, value in document.data.items() if key != "short"}
     for key in STAGE_LISTS:
         if isinstance(data.get(key), list):
             data[key] = [_tagged(item, (key, i), document, path) for i, item in enumerate(data[key])]

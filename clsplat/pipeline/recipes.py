@@ -12,7 +12,7 @@ from clsplat.core.settings import Settings, needs_settings, variants
 from clsplat.core.text_table import text_table
 from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.file import PipelineFile
-from clsplat.pipeline.files import find, shipped
+from clsplat.pipeline.files import find, origin, shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Matrix
 from clsplat.pipeline.overrides import Key, settable
@@ -35,7 +35,7 @@ def summary(path: Path) -> str:
 
 def summaries() -> list[dict[str, str]]:
     """Return name, summary and path of every shipped pipeline."""
-    return [{"name": name, "summary": summary(path), "path": str(path)} for name, path in shipped().items()]
+    return [{"name": name, "summary": summary(path), "path": str(origin(path))} for name, path in shipped().items()]
 
 
 def summaries_text(found: list[dict[str, str]]) -> str:
@@ -53,7 +53,7 @@ def manual(name: str) -> dict[str, Any]:
     return {
         "name": settings.name,
         "summary": summary(pipeline.path),
-        "path": str(pipeline.path),
+        "path": str(origin(pipeline.path)),
         "stages": pipeline.names,
         "keys": [asdict(key) for key in settable(settings)],
     }
@@ -97,6 +97,8 @@ def json_schema() -> dict[str, Any]:
         own = kind.model_json_schema()
         definitions |= {**own.pop("$defs", {}), kind.__name__: own}
         schema["properties"][key] = {"$ref": f"#/$defs/{kind.__name__}"}
+    short = "Other values of the pipeline NAME_7k, by places as --set has them; the comment above describes it."
+    schema["properties"]["short"] = {"type": "object", "title": "Short", "description": short}
     schema["required"].remove("stages")  # not required beside a matrix that names pipelines
     schema["anyOf"] = [
         {"required": ["stages"]},

@@ -5,6 +5,7 @@ Allowed are text, numbers, true, false, null, lists, and maps whose keys are tex
 """
 
 import io
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from ruamel.yaml.reader import ReaderError
 
 from clsplat.core.errors import ConfigError, quoted, shortened
 from clsplat.core.reading import read_text
+from clsplat.pipeline.files import origin
 
 SIZE_LIMIT = 1 << 20  # bytes
 NODE_LIMIT = 20_000  # values after aliases are expanded, so that aliases to aliases cannot fill the memory
@@ -77,8 +79,53 @@ def read_yaml(path: Path) -> Document:
 
 
 def read_pipeline(path: Path) -> str:
-    """Return the text of a pipeline file.  Raises ConfigError."""
-    return read_text(path, "a pipeline file", ConfigError, SIZE_LIMIT)
+    """Return the text of a pipeline, of NAME_7k as the key `short` of NAME.yaml describes it.  Raises ConfigError."""
+    file = origin(path)
+    text = read_text(file, "a pipeline file", ConfigError, SIZE_LIMIT)
+    return text if file == path else _short(text, path, file)
+
+
+# The text of NAME_7k.yaml: that of NAME.yaml with other values, below the comment above its key `short`.
+
+
+def _short(text: str, path: Path, file: Path) -> str:
+    document = _parse(text, str(file))
+    if not isinstance(document.data, dict) or not isinstance(document.data.get("short"), dict):
+        raise ConfigError(f"{file}: has no map 'short', which {path.name} needs; add one, or run {file.name}")
+    root = YAML(typ="safe", pure=True).compose(text)
+    key, short = next(pair for pair in root.value if pair[0].value == "short")
+    above = re.findall(r"(?:^#.*\n)*\Z", text[: key.start_mark.index], re.MULTILINE)[0]
+    values = {place.value: text[value.start_mark.index : value.end_mark.index] for place, value in short.value}
+    edits = [(key.start_mark.index - len(above), short.end_mark.index, "")]
+    for place, value in {"name": path.stem, **values}.items():
+        if not (node := _node(root, place)):
+            where = f"{file}:{document.line(('short', place))}: short"
+            raise ConfigError(f"{where}: the file has no {quoted(place)}; expected one of its keys, as in --set")
+        edits.append((node.start_mark.index, node.end_mark.index, value))
+    for first, last, new in sorted(edits, reverse=True):
+        text = text[:first] + new + text[last:]
+    return f"{above}#\n{text}"
+
+
+def _node(root: Node, place: str) -> Node | None:
+    """The value of a place, as --set writes it; None where there is none."""
+    first, *others = place.split(".")
+    level = [root]
+    while level and not (named := [_inside(node)[first] for node in level if first in _inside(node)]):
+        level = [inner for node in level for inner in _inside(node).values()]
+    found = named[0] if level and len(named) == 1 else None
+    for name in others:
+        around, found = found, _inside(found).get(name)
+        if isinstance(around, SequenceNode) and len(_inside(found)) == 1:  # a stage
+            (found,) = _inside(found).values()
+    return found
+
+
+def _inside(node: Node | None) -> dict[str, Node]:
+    """The values of a map by key, or the items of a list by number."""
+    if isinstance(node, MappingNode):
+        return {str(key.value): value for key, value in node.value}
+    return {str(i): item for i, item in enumerate(node.value)} if isinstance(node, SequenceNode) else {}
 
 
 def parse_value(text: str) -> Any:

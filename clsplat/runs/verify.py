@@ -27,7 +27,7 @@ from clsplat.gaussians.model import load as load_model
 from clsplat.gaussians.validate import examine, is_model
 from clsplat.nerf.files import is_field, load_field
 from clsplat.pipeline import plugins
-from clsplat.pipeline.files import shipped
+from clsplat.pipeline.files import origin, shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.prepare.cache import noted
@@ -240,7 +240,7 @@ def check(pipeline: str) -> dict[str, Any]:
     phase = RunState.read(Path(pipeline)).phase
     if not phase and pipeline not in shipped() and is_model(Path(pipeline)):
         return examine(Path(pipeline))
-    if len(Path(pipeline).parts) > 1 and not is_there(Path(pipeline)):
+    if len(Path(pipeline).parts) > 1 and not is_there(origin(Path(pipeline))):
         raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
     if Path(pipeline).is_dir() and (phase or pipeline not in shipped()):
         return verify(Path(pipeline))
@@ -248,4 +248,4 @@ def check(pipeline: str) -> dict[str, Any]:
         return {"path": str(found.path), "name": found.name, "cells": [cell.name for cell in found.cells]}
     checked = load(pipeline)
     stages = {"stages": checked.names, "adapts": checked.undecided}
-    return {"path": str(checked.path), "name": checked.settings.name, **stages}
+    return {"path": str(origin(checked.path)), "name": checked.settings.name, **stages}

@@ -5,19 +5,30 @@ from collections.abc import Collection, Mapping
 from functools import partial
 from typing import Annotated, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.errors import amount
 from clsplat.density.visible_error import VisibleError
 from clsplat.formats.sog import Harmonics
-from clsplat.formats.sog_quantize import rounded, rounded_means, rounded_opacities, rounded_quats
+from clsplat.formats.sog_quantize import (
+    log_weights,
+    rounded,
+    rounded_quats,
+    weighed_means,
+)
 from clsplat.formats.splats import Quality
-from clsplat.gaussians import clusters
-from clsplat.gaussians.clusters import DeviceClusters, most_alike
+from clsplat.gaussians.gaussians import ALIGNMENT, Gaussians
+from clsplat.opencl.device import Device, constants
 from clsplat.training.run import Run
 from clsplat.training.stage import ALL_HARMONICS, Scheduled, Stage
 
 LOG = logging.getLogger("clsplat")
+FILE = "clusters.cl"
+TOGETHER = int(constants(FILE)["TOGETHER"])
+BLOCK = 1 << 16  # points on the device at once: they have many components
+AT_ONCE = 1024  # vectors of a launch: they stay in a core's cache
 
 
 class PaletteSh(Scheduled):
@@ -48,13 +59,12 @@ class PaletteSh(Scheduled):
         gaussians = run.model.gaussians
         if not gaussians.sh_degree:
             return
-        rest, clustering = gaussians.get("sh_rest"), partial(DeviceClusters, run.device)
-        error = visible_error(run)
-        better = partial(error.palette, rest, nearest=partial(most_alike, run.device)) if error.weights.any() else None
-        found = Harmonics.of(rest, self.quality, clustering, error.weights, better, self.step)
+        rest, error = gaussians.get("sh_rest"), visible_error(run)
+        better = partial(error.palette, rest, nearest=partial(most_alike, run.device))
+        found = Harmonics.few(rest, self.quality, error.weights, better, self.step)
         gaussians.set("sh_rest", found.values)
         gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - found.values))
-        clusters.set_clusters(gaussians, found.labels, error.weights)
+        set_clusters(gaussians, found.labels, error.weights)
         if run.adam is not None:
             run.adam.forget("sh_rest")
         LOG.info("%s of %s", amount(len(found.palette), "harmonic"), amount(gaussians.count, "Gaussian"))
@@ -78,7 +88,7 @@ class SharePalette(Scheduled):
 
     def run(self, run: Run) -> None:
         if run.model.gaussians.sh_degree:
-            clusters.share(run.model.gaussians, "sh_rest")
+            share(run.model.gaussians, "sh_rest")
 
 
 def visible_error(run: Run) -> VisibleError:
@@ -88,6 +98,65 @@ def visible_error(run: Run) -> VisibleError:
     positions = (view.position for view in views)
     coefficients = gaussians.tables["sh_rest"].components // 3
     return VisibleError.of(zip(looks, positions, strict=False), gaussians.get("means"), coefficients)
+
+
+def most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the vector, of [E, c], with the largest product for each point, of [N, c], the first of equal ones."""
+    blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
+    return np.concatenate([_most_alike(device, block, vectors) for block in blocks])
+
+
+def _most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
+    count, components = points.shape
+    stride = -(-count // ALIGNMENT) * ALIGNMENT
+    planes = np.zeros((components, stride), np.float32)
+    planes[:, :count] = points.T
+    entries = -(-len(vectors) // TOGETHER) * TOGETHER
+    padded = np.concatenate([vectors, np.repeat(vectors[:1], entries - len(vectors), axis=0)])  # the first counts
+    label, largest = device.empty(stride), device.empty(stride)
+    uploaded, all_vectors = device.upload(planes), device.upload(np.ascontiguousarray(padded, np.float32))
+    for first in range(0, entries, AT_ONCE):
+        device.program(FILE).most_alike(
+            items=-(-count // int(device.tuning["LANES"])),
+            points=uploaded,
+            vectors=all_vectors,
+            label=label,
+            largest=largest,
+            components=components,
+            first=first,
+            end=min(first + AT_ONCE, entries),
+            stride=stride,
+            count=count,
+        )
+    return label.get()[:count].astype(np.int64)
+
+
+# Gaussians in clusters whose members share values; which cluster, and with which weight, is in tables next to them.
+
+LABEL, WEIGHT = "cluster/label", "cluster/weight"  # [1] a whole number below 2^24, [1] at least 0
+
+
+def set_clusters(gaussians: Gaussians, labels: NDArray[np.integer], weights: NDArray[np.floating]) -> None:
+    """Note the cluster of each Gaussian, [N], and how much it counts there, [N]."""
+    for name, column in ((LABEL, labels), (WEIGHT, weights)):
+        if name not in gaussians.tables:
+            gaussians.add(name, 1)
+        gaussians.set(name, column[:, None])
+
+
+def share(gaussians: Gaussians, name: str) -> None:
+    """Replace each row of a table by the weighted mean of its cluster's rows, summed in their order."""
+    labels = gaussians.get(LABEL)[:, 0].astype(np.int64)
+    order, first = np.argsort(labels, kind="stable"), np.concatenate([[0], np.cumsum(np.bincount(labels))])
+    gaussians.device.program("members.cl").share_mean(
+        items=(len(first) - 1, gaussians.tables[name].components),
+        values=gaussians[name],
+        weight=gaussians[WEIGHT],
+        member=gaussians.device.upload(order.astype(np.uint32)),
+        first=gaussians.device.upload(first.astype(np.uint32)),
+        stride=gaussians.capacity,
+        clusters=len(first) - 1,
+    )
 
 
 # Tables of a model in fewer different values, which a SOG holds in fewer bytes.
@@ -105,33 +174,30 @@ class RoundTables(Stage):
     stage: Literal["round_tables"] = "round_tables"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"means", "quats", "log_scales", "sh_base", "opacity"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"means", "quats", "log_scales", "sh_base"})
 
     means: Step | None = None
-    """Largest step of positions, as a share of the size (the geometric mean of three standard deviations) below which
-    a quarter of the Gaussians are."""
+    """Step of positions, as a share of the size of each Gaussian (the geometric mean of three standard deviations);
+    larger where it weighs little."""
     quats: Levels | None = None
     """Levels of 255 from one to the next; the axes of each Gaussian are named anew, so that it is turned least."""
     log_scales: Step | None = None
     """Step of the logarithms of standard deviations."""
     sh_base: Step | None = None
     """Step of the coefficients of band 0; 1 changes a colour by 0.28."""
-    opacity: Levels | None = None
-    """Levels of 255 from one to the next."""
 
     def run(self, run: Run) -> None:
         gaussians = run.model.gaussians
         tables = {name: gaussians.get(name) for name in self._changed()}
         if self.means:
-            tables["means"] = rounded_means(tables["means"], gaussians.get("log_scales"), self.means)
+            p = {name: gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
+            tables["means"] = weighed_means(p["means"], p["log_scales"], log_weights(p), self.means)
         if self.quats:
             tables["quats"], tables["log_scales"] = rounded_quats(tables["quats"], tables["log_scales"], self.quats)
         if self.log_scales:
             tables["log_scales"] = rounded(tables["log_scales"], self.log_scales)
         if self.sh_base:
             tables["sh_base"] = rounded(tables["sh_base"], self.sh_base)
-        if self.opacity:
-            tables["logit_opacity"] = rounded_opacities(tables["logit_opacity"], self.opacity)
         for name, table in tables.items():
             gaussians.set(name, table)
         run.refresh_filter()
@@ -142,6 +208,5 @@ class RoundTables(Stage):
             "quats": self.quats,
             "log_scales": self.log_scales or self.quats,
             "sh_base": self.sh_base,
-            "logit_opacity": self.opacity,
         }
         return [name for name, step in steps.items() if step]

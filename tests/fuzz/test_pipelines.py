@@ -43,7 +43,7 @@ LINES = b'{"step": 1, "kind": "train", "loss": 0.5}\n{"step": 2, "kind": "densif
 
 
 def test_a_damaged_pipeline_is_valid_or_refused(folder):
-    seeds = [shipped()[name].read_bytes() for name in ("smoke", "splat_7k", "photos", "micro_splatting")]
+    seeds = [shipped()[name].read_bytes() for name in ("smoke", "splat", "photos", "micro_splatting")]
     seeds += [load("smoke").text().encode(), load("mip_splatting").text().encode()]
 
     @fuzzed(data=damaged(seeds, YAML))

@@ -10,17 +10,17 @@ from jsonschema import Draft202012Validator
 from ruamel.yaml import YAML
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.resources import resource_dir
+from clsplat.pipeline import files
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.pipeline.plugins import load_file
-from clsplat.pipeline.recipes import json_schema
-from clsplat.pipeline.yaml_file import read_yaml
+from clsplat.pipeline.recipes import copy, json_schema
+from clsplat.pipeline.yaml_file import read_pipeline, read_yaml
 from clsplat.stages.optimize import Optimize
 from tests.support.pipelines import KINDS, flat
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-SHIPPED = sorted(path.stem for path in resource_dir("pipelines").glob("*.yaml"))
+SHIPPED = list(files.shipped())
 SMALL = """\
 name: small
 stages:
@@ -109,8 +109,6 @@ def changes(base: str, recipe: str) -> set[str]:
 SMOOTHING = {"model.world_filter", "model.world_filter.focal", "model.world_filter.variance"}
 MIP = {"model.screen_filter", "model.screen_filter.compensate", "model.screen_filter.variance"}
 REFRESH = {f"refresh_filter.{key}" for key in ("every", "start", "stop")}
-ENDS = {f"{stage}.stop" for stage in ("densify", "reset_opacity")}
-TWIN = {"steps", "rates.means.over", "evaluate.every", *ENDS}
 MATCHING = {
     f"densify.rules.{rule}~2{key}"
     for rule, size in (("clone", (".size_below",)), ("split", (".size_above", ".children", ".shrink")))
@@ -187,17 +185,13 @@ CROWDED = {
     *(f"densify.rules.clone_crowded{key}" for key in (".ratio_above", ".jitter", ".cells", ".extremes")),
 }
 DIFFERENCES = {
-    ("splat", "splat_7k"): TWIN,
     ("splat", "auto"): {
         f"densify.rules.{rule}.{key}" for rule in ("clone", "split") for key in ("gradient_above", "statistic")
     }
     | {f"densify~2.{key}" for key in STAGE}
     | {f"densify~2.rules.prune_spare{key}" for key in ("", ".start", ".error_rise", ".views")},
-    ("auto", "auto_7k"): TWIN | {f"densify~2.{key}" for key in ("every", "start", "stop")},
     ("splat", "steep"): SADDLE,
-    ("steep", "steep_7k"): TWIN,
     ("splat", "gdgs"): CROWDED,
-    ("gdgs", "gdgs_7k"): TWIN | {"densify.rules.clone_crowded.start"},
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
     ("mip_splatting", "box"): {"model.screen_filter", "model.screen_filter.variance"},
     ("splat", "mip_splatting_no_3d"): MIP,
@@ -209,28 +203,18 @@ DIFFERENCES = {
         *("densify.rules.split.statistic", "densify.rules.split.gradient_above"),
         *LIMITED,
     },
-    ("absgs", "absgs_7k"): TWIN | {"reset_opacity~2.stop"},
     ("splat", "fastgs"): FASTGS,
-    ("fastgs", "fastgs_7k"): TWIN | {"densify~2.every", "densify~2.start", "reset_opacity~2.stop"},
     ("splat", "taming"): {
         *rules("densify", grow_scored="start views", prune_faint="opacity_below start", prune_large="size_above start"),
         *rules("densify", prune_scored="opacity_below share size_above.between size_above.points start views"),
         *("densify.every", "densify.budget", "densify.budget.gaussians"),
     },
-    ("taming", "taming_7k"): TWIN | {"densify.every", "densify.budget.gaussians"},
     ("splat", "mini"): MINI,
-    ("mini", "mini_7k"): TWIN - ENDS
-    | {f"{stage}.{key}" for stage in ("densify~3", "hide_useless~2") for key in ("every", "stop")},
     ("splat", "speedy"): {
         f"{stage}.{key}" for stage in LEAST for key in ("every", "keep", "remove", "score", "start", "stop")
     },
-    ("speedy", "speedy_7k"): TWIN
-    | {f"{stage}.{key}" for stage in LEAST for key in ("every", "start")}
-    | {"prune_least.stop"},
     ("splat", "opti3dgs"): MEAN_FILTER,
-    ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
     ("splat", "dash"): DASH | {"reset_opacity.stop", "rates.logit_opacity"},
-    ("splat_7k", "dash_7k"): DASH,
     ("splat_7k", "fast"): {
         *rules("densify~2", prune_useless="of_all of_view start views views_below"),
         *(f"densify~2.{key}" for key in STAGE),
@@ -261,9 +245,7 @@ DIFFERENCES = {
         *("losses.l1.weight", "losses.l2", "losses.l2.weight"),
     },
     ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
-    ("mip_splatting_7k", "dash_mip_7k"): DASH | {"refresh_filter.start"},
     ("splat", "auto_opti3dgs"): HAAR,
-    ("splat_7k", "auto_opti3dgs_7k"): HAAR,
     ("splat", "micro_splatting"): {
         *(f"densify.rules.split_textured{key}" for key in ("", *SUBDIVIDE, ".texture", ".gradient_above")),
         *(f"densify.rules.split_textured.texture_above.{key}" for key in ("of", "quantile")),
@@ -277,18 +259,6 @@ DIFFERENCES = {
         ),
     },
     ("micro_splatting", "micro_splatting_v2"): THINNING,
-    ("micro_splatting_7k", "micro_splatting_v2_7k"): THINNING,
-    ("micro_splatting", "micro_splatting_7k"): TWIN | {"losses.l1.weight", "losses.l2.weight"},
-    **{
-        (name, f"{name}_7k"): TWIN | ({"refresh_filter.start", "refresh_filter.stop"} if refreshes else set())
-        for name, refreshes in (
-            ("mip_splatting", True),
-            ("box", True),
-            ("mip_splatting_no_3d", False),
-            ("mip_splatting_no_2d", True),
-            ("splat_ewa", False),
-        )
-    },
 }
 
 
@@ -302,12 +272,47 @@ def test_recipes_differ_only_where_their_headers_say():
     assert not faults, "\n".join(faults)
 
 
-@pytest.mark.parametrize(("full", "short"), [("splat", "splat_7k"), ("splat_ewa", "splat_ewa_7k")])
-def test_the_short_recipes_shorten_alike(full, short):
-    old, new = settings_of(full), settings_of(short)
-    place = "stages.optimize.rates.means.over"
-    assert 2 * new[place] == old[place]
-    assert new["stages.optimize.during.densify.stop"] == new["stages.optimize.during.reset_opacity.stop"] == 4000
+SHORT = """\
+# Small, in 5 steps.
+short:
+  optimize.steps: 5   # of 10
+  optimize.losses.1.weight: 0.1
+  optimize.during.0.every: 2
+  checkpoint.every: 3
+"""
+
+
+def test_a_short_pipeline_is_its_file_with_the_values_of_short(write, tmp_path):
+    (tmp_path / "small.yaml").write_text(f"# Small.\n{SMALL}{SHORT}")
+    short = str(tmp_path / "small_7k.yaml")
+    values = ("steps=5", "losses.1.weight=0.1", "during.0.every=2", "during.1.every=3")
+    expected = load(write(SMALL), ["name=small_7k", *(f"optimize.{value}" for value in values)])
+    assert load(short).resolved() == expected.resolved()
+    assert load(str(tmp_path / "small.yaml")).resolved() == load(write(SMALL)).resolved()
+    edited = copy(short, tmp_path / "mine.yaml").read_text()
+    assert edited.startswith("# Small, in 5 steps.\n#\n# Small.\nname: small_7k\n")
+    assert edited.endswith("- export\n")
+
+
+@pytest.mark.parametrize(
+    ("short", "words"),
+    [
+        ("short:\n  optimize.stepps: 5\n", r"small.yaml:18: short: the file has no 'optimize.stepps'"),
+        ("short:\n  optimize.during.2.every: 5\n", r"no 'optimize.during.2.every'"),
+        ("short: [1]\n", r"has no map 'short', which small_7k.yaml needs"),
+    ],
+)
+def test_a_short_pipeline_is_refused_with_its_place(tmp_path, short, words):
+    (tmp_path / "small.yaml").write_text(SMALL + short)
+    with pytest.raises(ConfigError, match=words):
+        load(str(tmp_path / "small_7k.yaml"))
+
+
+def test_values_of_short_are_at_the_places_of_set():
+    full = {name: read_yaml(path).data.get("short") for name, path in files.shipped().items()}
+    for name, values in full.items():
+        given = [f"{place}={json.dumps(value)}" for place, value in (values or {}).items()]
+        assert not values or load(name, [f"name={name}_7k", *given]).resolved() == load(f"{name}_7k").resolved()
 
 
 def replaced(old: str, new: str) -> str:
@@ -478,7 +483,7 @@ def read_yaml_text(text: str) -> object:
 
 
 def faults_of_schema(path: Path, schema: Draft202012Validator, is_resolved: bool) -> list[str]:
-    texts = {"the file": path.read_text()}
+    texts = {"the file": read_pipeline(path)}
     if is_resolved:
         matrix = load_experiment(str(path))
         texts["the resolved file"] = matrix.text if matrix else load(str(path)).text()

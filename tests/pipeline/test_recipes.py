@@ -8,13 +8,11 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.gaussians.model import load as load_model
-from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.training import checkpoint, records
 from clsplat.training.checkpoint import State
@@ -48,23 +46,6 @@ for name in sys.argv[3:]:
 
 def newest(out: Path) -> State:
     return checkpoint.load(checkpoint.saved(out)[-1])[0]
-
-
-def words(node: Any) -> list[str]:
-    """What a recipe is made of: all but its numbers, in an order of its own."""
-    if isinstance(node, dict):
-        return sorted(f"{key} {word}" for key, value in node.items() for word in words(value) if key != "name")
-    return (
-        sorted(word for part in node for word in words(part))
-        if isinstance(node, list)
-        else [node] * isinstance(node, str)
-    )
-
-
-def test_recipes_of_7000_steps_differ_from_twins_in_numbers():
-    twins = {name: f"{name}_7k" for name in shipped() if f"{name}_7k" in shipped()}
-    made_of = {name: words(load(name).settings.model_dump(mode="json")) for pair in twins.items() for name in pair}
-    assert not [name for name, twin in twins.items() if made_of[name] != made_of[twin]]
 
 
 @pytest.fixture(scope="module")

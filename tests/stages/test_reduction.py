@@ -241,7 +241,7 @@ ROUNDED = PALETTE.replace(
       losses: [l1]
       during: [add_to_average: {every: 1}]
   - take_average
-  - round_tables: {sh_base: 0.04, opacity: 2}
+  - round_tables: {sh_base: 0.04}
 """,
 ).replace("palette_sh: {quality: small}", "palette_sh: {quality: small, step: 0.01}")
 
@@ -255,8 +255,8 @@ def test_rounded_tables_are_frozen_and_written_as_they_are(many, tiny_scene, tmp
     steps = after["sh_rest"] / 0.01
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-3)
     order = morton_order(after["means"])
-    for name, table in after.items():
-        np.testing.assert_allclose(back[name], table[order], rtol=1e-4, atol=1e-5)
+    for name in after.keys() - {"logit_opacity"}:
+        np.testing.assert_allclose(back[name], after[name][order], rtol=1e-4, atol=1e-5)
 
 
 LEARNED = PALETTE.replace(

@@ -4,9 +4,9 @@
 
 prints a line `NAME SHA256` for each case, in the order of the names.  The hash is that of a PLY file's data, without
 its header, which holds the version, or of the tables of a field.  Cases are all recipes in `pipelines/`, in STEPS steps
-with growth, and trainings with settings that no recipe has.  Only the command line is used, so that this file serves
-before and after modules move.  Counts and skipped cases go to standard error.  Real scenes are read from $CLSPLAT_DATA,
-or from `shared/data` beside the checkout.
+with growth, and trainings with settings that no recipe has.  All runs are started from the command line, so that this
+file serves before and after modules move.  Counts and skipped cases go to standard error.  Real scenes are read from
+$CLSPLAT_DATA, or from `shared/data` beside the checkout.
 """
 
 import argparse
@@ -30,6 +30,9 @@ from typing import Any
 
 import numpy as np
 import yaml  # type: ignore[import-untyped]
+
+from clsplat.pipeline.files import shipped
+from clsplat.pipeline.yaml_file import read_pipeline
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
@@ -159,13 +162,13 @@ NAMED = {
 def cases() -> dict[str, Case]:
     """Return all cases by name."""
     recipes = {}
-    for file in sorted((ROOT / "pipelines").glob("*.yaml")):
-        stages = yaml.safe_load(file.read_text())["stages"]
+    for name, path in shipped().items():
+        stages = yaml.safe_load(read_pipeline(path))["stages"]
         text = json.dumps(stages)
         needs_model = '"source": "model"' in text
         is_moving = "motion" in text
         settings = ("init.file='{model}'",) if needs_model else ()
-        recipes[file.stem] = Case(file.stem, "moving" if is_moving else "still", settings)
+        recipes[name] = Case(name, "moving" if is_moving else "still", settings)
     return dict(sorted({**recipes, **NAMED}.items()))
 
 
@@ -288,9 +291,9 @@ class Place:
         for name, lens in {"lens": LENS, "fisheye": FISHEYE}.items():
             self._write_lens(name, lens)
         self.clsplat("data", "masks", "still", "--out", "masks")
-        for file in (ROOT / "pipelines").glob("*.yaml"):
-            short = shorten(yaml.safe_load(file.read_text()))
-            (self.folder / file.name).write_text(yaml.safe_dump(short, sort_keys=False))
+        for path in shipped().values():
+            short = shorten(yaml.safe_load(read_pipeline(path)))
+            (self.folder / path.name).write_text(yaml.safe_dump(short, sort_keys=False))
         if "model" in str(list(chosen.values())):
             self.clsplat("run", "splat_7k.yaml", "--scene", "still", "--out", "first")
             shutil.copy(self.folder / "first" / "point_cloud.ply", self.folder / "model.ply")

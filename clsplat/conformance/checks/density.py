@@ -17,9 +17,6 @@ from clsplat.density.importance import contributions, sensitivities
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.density.survey import SurveyView
 from clsplat.density.thresholds import SceneScale
-from clsplat.formats.palette import LEVELS
-from clsplat.gaussians import clusters as cluster_tables
-from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.methods.adc import Clone, PruneFaint, PruneLarge, SplitLarge
@@ -28,6 +25,7 @@ from clsplat.methods.mcmc import add_noise
 from clsplat.opencl.device import Device, constants
 from clsplat.photos.photographs import Mask, Photograph
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.stages.palette import most_alike, set_clusters, share
 from clsplat.training.adam import Adam
 
 CHECKS = Checks()
@@ -264,22 +262,14 @@ def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray
     return total
 
 
-@CHECKS.add("nearest_vectors", "sum_members")
-def clusters(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
-    """Whole numbers: every label, distance and sum is exact."""
+@CHECKS.add("most_alike")
+def alike(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """Whole numbers: every product is exact."""
     for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
-        points, vectors = (
-            rng.integers(-LEVELS, LEVELS + 1, (rows, components)).astype(np.float32) for rows in (count, entries)
-        )
-        vectors[-1], points[-1] = vectors[0], vectors[0]  # equally near: the first counts
-        held = DeviceClusters(device, points)
-        labels, distance = held.nearest(vectors)
-        what = f"{count} points and {entries} vectors"
-        expected, half = ref.nearest_vectors(points, vectors)
-        yield equal("nearest_vectors", f"labels of {what}", labels, expected)
-        yield equal("nearest_vectors", f"distances of {what}", distance, half.astype(np.float32))
-        sums = held.sums(expected, entries)
-        yield equal("sum_members", f"sums of {what}", sums, ref.member_sums(points, expected, entries))
+        points, vectors = (rng.integers(-511, 512, (rows, components)).astype(np.float32) for rows in (count, entries))
+        vectors[-1] = vectors[0]  # the first counts
+        found, expected = most_alike(device, points, vectors), (points @ vectors.T).argmax(axis=1)
+        yield equal("most_alike", f"labels of {count} points and {entries} vectors", found, expected)
 
 
 @CHECKS.add("share_mean")
@@ -288,9 +278,9 @@ def shared_means(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
         gaussians = random_case(rng, count).model(device).gaussians
         values, labels = gaussians.get("sh_rest"), rng.integers(0, clusters, count)
         weights = rng.random(count).astype(np.float32) * (labels != 0)  # of one cluster all are zero
-        cluster_tables.set_clusters(gaussians, labels, weights)
-        cluster_tables.share(gaussians, "sh_rest")
+        set_clusters(gaussians, labels, weights)
+        share(gaussians, "sh_rest")
         what, found = f"means of {clusters} clusters of {count} Gaussians", gaussians.get("sh_rest")
         yield by_element("share_mean", what, found, ref.shared_means(values, labels, weights), SUM, floor=0.1)
-        cluster_tables.share(gaussians, "sh_rest")
+        share(gaussians, "sh_rest")
         yield equal("share_mean", f"{what}, a second time", gaussians.get("sh_rest"), found)
