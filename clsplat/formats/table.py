@@ -151,7 +151,7 @@ CODECS = (
         "versions 1 and 2, bundled or as a folder with meta.json",
         "version 2, bundled, or as the files beside a meta.json, along a Morton curve",
         "position to 16 bits of a logarithm, or a quarter of a Gaussian's size, more where it weighs little, "
-        "quaternions to 6 bits, scales and colours to 256 values or to steps of 10 % and 0.014, opacity to 7 bits, "
+        "quaternions to 6 bits, scales and colours to 256 values or to steps of 10 % and 0.014, opacity to 8 bits, "
         "harmonics to a palette, names of axes, order",
         lambda start: looks_like_sog(start.data),
         lambda path, options: read_sog(path),

@@ -85,18 +85,21 @@ def write_inputs(run: Run) -> None:
         write_text(run.out / INPUTS, json.dumps(run.identity.data()) + "\n")
 
 
-def require_same_inputs(run: Run) -> None:
-    """Raise ConfigError, saying what changed, when the run was started with other photographs, cameras or points."""
-    before = _read(run.out / INPUTS)
-    digest = run.inputs_before or (before.digest if before else "")
+def require_same_inputs(scene: Path, identity: Identity | None, out: Path, digest: str = "") -> None:
+    """Raise ConfigError, saying what changed, when a run was started with other photographs, cameras or points.
+
+    digest: of those, where a checkpoint has it.
+    """
+    before = _read(out / INPUTS)
+    digest = digest or (before.digest if before else "")
     if not digest:
-        LOG.warning("%s: missing or damaged; photographs that have changed go unnoticed", run.out / INPUTS)
-    elif run.identity and run.identity.digest != digest:
-        changes = ", ".join(run.identity.changes(before)) if before else ""
+        LOG.warning("%s: missing or damaged; photographs that have changed go unnoticed", out / INPUTS)
+    elif identity and identity.digest != digest:
+        changes = ", ".join(identity.changes(before)) if before else ""
         changes = changes or f"{INPUTS} is missing or damaged, so what changed is not known"
         raise ConfigError(
-            f"{run.scene.path}: not what the run was started with: {shortened(changes, 500)}; put that back, or "
-            "begin anew: `clsplat run` with --restart or another --out"
+            f"{scene}: not what the run was started with: {shortened(changes, 500)}; put that back, or begin anew: "
+            "`clsplat run` with --restart or another --out"
         )
 
 
@@ -194,7 +197,7 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
     """
     taken, remarks = checkpoint.restore(run)
     if taken:
-        require_same_inputs(run)
+        require_same_inputs(run.scene.path, run.identity, run.out, run.inputs_before)
         stage = pipeline.stages[run.cursor] if run.cursor < len(pipeline.stages) else None
         if isinstance(stage, Training) and stage.steps < run.stage_step:
             raise ConfigError(

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -15,6 +15,7 @@ from clsplat.core.errors import ClsplatError, DataError
 from clsplat.core.files import PREPARED, write_text
 from clsplat.core.reading import read_json, sha256
 from clsplat.core.resources import __version__, list_sources
+from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.input_files import content_of, contents, in_place, placeless
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import plan
@@ -71,6 +72,14 @@ def _digest(parts: Iterable[str]) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:KEPT]
 
 
+def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple[Scene, Identity]:
+    """Read a scene, and hash its files with a function; photographs are not decoded.  Raises DataError."""
+    scene, _ = settings.applied(read_scene(settings.folder, settings.split))
+    paths = dict.fromkeys(path for view in scene.views for path in (view.image_path, view.mask_path))
+    files = {path: ImageFile(digest=digest_of(path)) for path in paths if path is not None and path != NO_FILE}
+    return scene, Identity.of(scene, files)
+
+
 class Scenes:
     """Fingerprints of scenes.  Hashes of photographs are kept by size and time of change, in a file a scene folder."""
 
@@ -98,15 +107,10 @@ class Scenes:
 
     def _read(self, pipeline: Pipeline) -> Known:
         settings = pipeline.settings.scene
-        original, _ = settings.applied(read_scene(settings.folder, settings.split))
-        paths = [path for view in original.views for path in (view.image_path, view.mask_path)]
-        files = {}
         with self._digests(settings.folder) as digest_of:
-            for path in paths:
-                if path is not None and path != NO_FILE and path not in files:
-                    files[path] = ImageFile(digest=digest_of(path))
+            original, identity = identify(settings, digest_of)
         pixels = sum(view.camera.width * view.camera.height for view in original.split("train")) / settings.downscale**2
-        return Known(Identity.of(original, files).digest, float(pixels), original)
+        return Known(identity.digest, float(pixels), original)
 
     @contextmanager
     def _digests(self, scene: Path) -> Iterator[Any]:

@@ -11,6 +11,7 @@ from typing import Any
 from clsplat.core import terminal
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, in_shell
 from clsplat.core.files import COMPARISON, LOG_FILE, OF_A_MATRIX, PIPELINE, STATUS, is_there, write_text
+from clsplat.core.reading import sha256
 from clsplat.core.signals import stop_at_once, stop_if_signalled, stopping_on_signals
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
@@ -22,9 +23,11 @@ from clsplat.runs.live.live import Live
 from clsplat.runs.model_file import overrides_of
 from clsplat.runs.opening import read_run_scene, settle
 from clsplat.runs.run_folder import Start, free_folder, start_of
+from clsplat.runs.runner import require_same_inputs
 from clsplat.runs.state import Phase, RunState
 from clsplat.runs.status import summary
 from clsplat.runs.time_budget import Show, execute_within
+from clsplat.sweeps.cell import identify
 from clsplat.sweeps.compare.page import write_comparison
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
@@ -164,7 +167,16 @@ class Job:
                     raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
                 run_pipeline(self.work, self.out, device, start, preview, minutes)
             else:
+                _require_same_photographs(self.work, self.out)
                 LOG.info("%s: up to date: its files are whole; change a setting or the folder to run again", self.out)
+
+
+def _require_same_photographs(pipeline: Pipeline, out: Path) -> None:
+    """Raise ConfigError where those of a run that is done have changed since; prepared ones are noted with it."""
+    scene = pipeline.settings.scene
+    if not pipeline.settings.prepare and scene.folder.exists():
+        _, identity = identify(scene, sha256)
+        require_same_inputs(scene.folder, identity, out)
 
 
 @contextmanager

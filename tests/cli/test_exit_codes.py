@@ -148,8 +148,9 @@ def test_too_little_memory_is_code_5(tiny_scene, tmp_path, monkeypatch, capsys):
     """A device with 2 MiB, for a scene that needs 10."""
     small = Device.__init__
 
-    def with_little_memory(device, info, *more):
-        small(device, dataclasses.replace(info, memory=2 << 20, allocation=2 << 20), *more)
+    def with_little_memory(device, *words, **named):
+        small(device, *words, **named)
+        device.info = dataclasses.replace(device.info, memory=2 << 20, allocation=2 << 20)
 
     monkeypatch.setattr(Device, "__init__", with_little_memory)
     out = tmp_path / "run"

@@ -37,6 +37,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/viewer/video/encoding.py:opened": "syncs what it has written",
     "clsplat/viewer/video/encoding.py:frames_of": "decodes what was written before",
     "clsplat/viewer/video/encoding.py:without_chance": "changes what was written before",
+    "clsplat/pipeline/files.py:shipped": "reads files of the package",
     "clsplat/viewer/page.py": "reads files of the package",
     "clsplat/runs/live/server.py": "reads files of the package",
     "clsplat/conformance/quick.py:_hash_of": "reads files of the package",

@@ -48,7 +48,7 @@ class Case:
         camera = replace(case.device_camera(device), view=1)
         self.photograph = Photograph(camera, device.upload(pixels), mask)
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
-        self.trainer = StepTrainer(*parts, device.upload(BACKGROUND), losses, Rates(), numbers=self.numbers)
+        self.trainer = StepTrainer(*parts, device.upload(BACKGROUND), losses, Rates())
         if colours:
             state, gains = ExposureState(Exposure(model=colours), ("a", "b")), np.array([0.3, 0.1, -0.2])
             state.rate, state.numbers = 0.01, self.numbers

@@ -12,7 +12,7 @@ from clsplat.pipeline import plugins
 from clsplat.pipeline.loading import adapted, load
 from clsplat.pipeline.stretching import in_steps
 from clsplat.runs.describe import describe
-from clsplat.runs.state import has_ended
+from clsplat.runs.state import RunState
 from clsplat.scene.quality import Measures
 from clsplat.stages.densify import Densify
 from clsplat.sweeps.compare.comparison import flat
@@ -120,10 +120,11 @@ def test_a_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
     assert digest(plain.out) == digest(out)
     again = clsplat.run(out / "pipeline.yaml", out=tmp_path / "again")
     assert digest(again) == digest(out)
-    assert has_ended(load("smoke", asked), out), "the same command finds it up to date"
+    state = RunState.read(out)
+    assert state.is_whole(load("smoke", asked)), "the same command finds it up to date"
     with pytest.raises(ConfigError, match=r"model\.sh_degree was 1, is 2"):
-        has_ended(load("smoke", [*asked, "model.sh_degree=2"]), out)
-    assert has_ended(load("smoke", [*asked, "model.sh_degree=1"]), out)
+        state.require_same(load("smoke", [*asked, "model.sh_degree=2"]))
+    assert state.is_whole(load("smoke", [*asked, "model.sh_degree=1"]))
 
 
 def test_before_preparation_it_says_what_is_undecided():
@@ -154,7 +155,7 @@ def test_what_cannot_be_decided_is_refused_in_a_sentence(adapt, complaint):
 def test_a_run_looks_for_a_sky_where_it_decides(tmp_path, rng, monkeypatch, count, clear, sky):
     scene = Yard(rng, count, clear).write(tmp_path / "yard")
     if sky is None:
-        monkeypatch.setattr("clsplat.runs.opening.share_with_sky", lambda run: pytest.fail("looked for a sky"))
+        monkeypatch.setattr("clsplat.runs.opening._share_with_sky", lambda run: pytest.fail("looked for a sky"))
     text = describe(load("photos", [f"scene.path='{scene}'", "scene.holdout=0"]), tmp_path / "run", None, "new")
     assert f"{count} training photographs; " in text
     assert sky is None or f"{sky} of them show a sky" in text

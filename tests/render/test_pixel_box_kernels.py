@@ -112,7 +112,7 @@ def test_gradients_of_the_reference_are_finite_differences(rng):
     case = random_case(rng, 3, 16, 12, **BOX)
     weights, black = rng.normal(size=(3, 12, 16)), np.zeros(3)
 
-    def rendered(gaussians: ref.RawGaussians) -> ref.blending.Frame:
+    def rendered(gaussians: ref.RawGaussians) -> ref.blending.RenderOutput:
         return ref.render(gaussians, case.camera(), black, 3, 0.2, 0.0, 0.0, ref.SMOOTH, 1.0)
 
     gaussians = case.gaussians()

@@ -19,7 +19,7 @@ from clsplat.training.stage import Stage, path_in_run
 
 READ = {  # text that is read, or compared, and never the name of something that is written
     "Auto.reason", "Appearance.reason", "BilateralGrid.reason", "Exposure.reason",
-    "CaptureChoice.given", "CaptureChoice.reason", "CaptureChoice.since", "CaptureChoice.keys",
+    "Adaptation.keep", "Photos.keep", "Decision.key", "Decision.reason",
     "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
     "SceneSettings.masks", "InverseDepth.folder",
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",
@@ -69,7 +69,7 @@ def test_every_text_in_a_pipeline_is_an_input_or_checked_output():
     checked = {
         f"{kind.__name__}.{n}" for kind, n in text_fields() if issubclass(kind, Stage) and n in kind.named_outputs()
     }
-    assert {"Export.file", "Render.folder", "Report.file"} <= checked
+    assert {"Export.file", "Render.folder", "HtmlReport.file"} <= checked
     assert found == READ | NAMES | checked, "a new text: check it with path_in_run, or list it as one that is read"
 
 

@@ -70,7 +70,7 @@ class Case:
         self.photograph = Photograph(replace(case.device_camera(device), view=1), device.upload(pixels), mask)
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         behind = device.upload(np.array([0.2, 0.5, 0.9], np.float32))
-        self.trainer = StepTrainer(*parts, behind, (L2(),), Rates(), numbers=self.numbers)
+        self.trainer = StepTrainer(*parts, behind, (L2(),), Rates())
         self.state = GridState(BilateralGrid(cells=list(nodes), weight=0.1), ("a", "b"), device)
         self.state.rate, self.trainer.modules = 0.01, [self.state]
         self.state.begin_with({"b": np.array([0.3, 0.1, -0.2])})
