@@ -64,16 +64,6 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
     return (*node.place, last)
 
 
-def value_at(data: dict[str, Any], place: str, root: type[BaseModel]) -> Any:
-    """Return the value at a place, in the notation of --set; None where the data have none.  Raises OverrideError."""
-    node, last = _found(data, f"{place}=", root)
-    if isinstance(node.data, list) and node.is_by_type(last):
-        return next((one for one in node.data if one["type"] == last), None)
-    if isinstance(node.data, list):
-        return node.data[node.number(last, place)]
-    return node.data.get(last) if isinstance(node.data, dict) else None
-
-
 def _found(data: dict[str, Any], text: str, root: type[BaseModel]) -> "tuple[_Node, str]":
     """What holds the key of 'place=value', and the key's name in it.  Raises OverrideError."""
     names, _ = split(text)

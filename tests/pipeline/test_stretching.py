@@ -27,7 +27,7 @@ def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
 
 
 def test_the_long_recipe_in_fewer_steps_is_the_short_one():
-    """But for the cadence and the end of growth, which splat_7k.yaml chooses."""
+    """But for the cadence and the end of growth, which splat_7k chooses."""
     new = stretched(load("splat").settings, 7000 / 30000).training
     assert (new.steps, new.rates.means.over) == (7000, 7000)
     raise_sh, densify, reset, white = new.during[:4]

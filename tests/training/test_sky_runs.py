@@ -61,10 +61,6 @@ def learned(yard, tmp_path_factory) -> Path:
     return out
 
 
-def sky_bytes(out: Path) -> bytes:
-    return (out / "point_cloud_sky.json").read_bytes()
-
-
 # ---- the oracle
 
 
