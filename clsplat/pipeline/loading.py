@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from clsplat.core.errors import ConfigError, OverrideError, one_line
+from clsplat.core.errors import ConfigError, OverrideError, one_line, quoted
 from clsplat.core.files import PREPARED
 from clsplat.core.schedule import is_act
 from clsplat.core.settings import nested, variants
@@ -191,8 +191,10 @@ def _keeping(settings: PipelineFile, places: Sequence[Place]) -> PipelineFile:
     """The settings, whose `adapt` keeps what overrides have set.  Raises ConfigError where its keys have no place."""
     if (adapt := settings.adapt) is None:
         return settings
-    keep, data = adapt.keep, settings.model_dump(mode="json")
-    for key in adapt.keys(settings.optimize):
+    keep, data, keys = adapt.keep, settings.model_dump(mode="json"), adapt.keys(settings.optimize)
+    if unknown := [key for key in (*keep, *(one.key for one in adapt.decisions or ())) if key not in keys]:
+        raise ConfigError(f"adapt: {adapt.type} does not decide {quoted(unknown[0])}; there are {', '.join(keys)}")
+    for key in keys:
         try:
             own = apply(copy.deepcopy(data), f"{key}=null", PipelineFile)
         except OverrideError as error:

@@ -94,6 +94,7 @@ def _short(text: str, path: Path, file: Path) -> str:
         raise ConfigError(f"{file}: has no map 'short', which {path.name} needs; add one, or run {file.name}")
     root = YAML(typ="safe", pure=True).compose(text)
     key, short = next(pair for pair in root.value if pair[0].value == "short")
+    root.value.remove((key, short))  # no place leads into it
     above = re.findall(r"(?:^#.*\n)*\Z", text[: key.start_mark.index], re.MULTILINE)[0]
     values = {place.value: text[value.start_mark.index : value.end_mark.index] for place, value in short.value}
     edits = [(key.start_mark.index - len(above), short.end_mark.index, "")]
@@ -110,6 +111,8 @@ def _short(text: str, path: Path, file: Path) -> str:
 def _node(root: Node, place: str) -> Node | None:
     """The value of a place, as --set writes it; None where there is none."""
     first, *others = place.split(".")
+    if not others:
+        return _inside(root).get(first)
     level = [root]
     while level and not (named := [_inside(node)[first] for node in level if first in _inside(node)]):
         level = [inner for node in level for inner in _inside(node).values()]

@@ -208,6 +208,8 @@ def _remedy(found: dict[str, Any], file: str) -> str:
     out = Path(found["run"])
     folders = [*(one for one in (out / file).parents if out in one.parents), out]
     state = next(one for one in map(RunState.read, folders) if one.phase or one.out == out)
+    if state.phase is Phase.DONE and "cells" not in state.status and not state.lost and PIPELINE in state.names:
+        return "go without them: all outputs are whole, and only training for longer needs these files"
     whole = {out / one["file"] for one in found["objects"] if one["whole"]}
     goes_on = "cells" in state.status or any(path in whole for path in state.checkpoints)
     goes_on |= state.phase < Phase.STATELESS and not (state.checkpoints or state.status.get("checkpoint"))

@@ -168,7 +168,7 @@ class Job:
                 run_pipeline(self.work, self.out, device, start, preview, minutes)
             else:
                 _require_same_photographs(self.work, self.out)
-                LOG.info("%s: up to date: its files are whole; change a setting or the folder to run again", self.out)
+                LOG.info("%s: up to date: its outputs are whole; change a setting or the folder to run again", self.out)
 
 
 def _require_same_photographs(pipeline: Pipeline, out: Path) -> None:

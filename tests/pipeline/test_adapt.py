@@ -97,6 +97,12 @@ def test_a_key_that_is_set_is_kept(override, kept, tmp_path):
     assert again.settings.model == found.settings.model
 
 
+@pytest.mark.parametrize("override", ["adapt.keep=[model.near]", "adapt.decisions=[{key: seed, value: 3, reason: x}]"])
+def test_a_key_that_is_not_decided_is_refused(override):
+    with pytest.raises(ConfigError, match=r"does not decide '(model.near|seed)'; there are"):
+        load("photos", [override])
+
+
 def test_other_photographs_are_decided_by_again(tmp_path):
     file = tmp_path / "run.yaml"
     file.write_text(decided("smoke", ADAPT, "model.background={type: auto, chosen: on, reason: blue}").text())

@@ -298,6 +298,7 @@ def test_a_short_pipeline_is_its_file_with_the_values_of_short(write, tmp_path):
     ("short", "words"),
     [
         ("short:\n  optimize.stepps: 5\n", r"small.yaml:18: short: the file has no 'optimize.stepps'"),
+        ("short:\n  steps: 5\n", r"no 'steps'"),
         ("short:\n  optimize.during.2.every: 5\n", r"no 'optimize.during.2.every'"),
         ("short: [1]\n", r"has no map 'short', which small_7k.yaml needs"),
     ],

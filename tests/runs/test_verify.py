@@ -250,6 +250,9 @@ def test_a_damaged_checkpoint_is_told_in_plain_words(copy):
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     assert damaged(copy)["checkpoints/step_000020.npz"].startswith("differs from its checksum (")
+    said = command("check", copy, expect=7).stderr
+    assert "all outputs are whole" in said
+    assert "resume" not in said, "it would leave the run as it is"
 
 
 def test_a_dry_resume_says_where_it_would_go_on(copy):
