@@ -96,23 +96,6 @@ def measure_speed(
     )
 
 
-def measure_growth(
-    chart: PathLike,
-    *,
-    pipeline: PathLike = "splat",
-    repeats: int = 20,
-    schedule: ScheduleName = "auto",
-    device: "str | Device | None" = None,
-) -> str:
-    """Time a step with 50 000 to a million Gaussians; write the chart, an SVG, and return a table."""
-    from clsplat.conformance.bench import measurement
-
-    load_plugins()
-    return measurement.measure_growth(
-        Path(chart), pipeline=str(pipeline), repeats=repeats, schedule=schedule, device=device
-    )
-
-
 def measure_packing(
     scene: str = "A",
     *,

@@ -123,23 +123,17 @@ def bench(
         Path | None, typer.Option(metavar="FILE", help="Compare with the JSON of an earlier run, which --json repeats.")
     ] = None,
     schedule: Annotated[Literal["auto", "wide", "simt"], typer.Option(help="wide for CPUs, simt for GPUs.")] = "auto",
-    growth: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Only time 50 000 to a million Gaussians; an SVG is written."),
-    ] = None,
     packing: Annotated[
         bool, typer.Option("--packing", help="Only time several processes at once, which share a CPU's cores.")
     ] = False,
     device: DeviceOption = None,
 ) -> None:
     """Time the stages of a training step on fixed scenes, beside the device's measured peaks."""
-    if growth and (against or as_json):
-        raise ConfigError("bench: --growth writes a chart; leave out --against and --json")
     if as_json:
         terminal.keep_stdout_for_json()
     if packing:
-        if model or growth or against:
-            raise ConfigError("bench: --packing times a fixed scene; leave --model, --growth and --against out")
+        if model or against:
+            raise ConfigError("bench: --packing times a fixed scene; leave --model and --against out")
         packings = tools.measure_packing(scenes, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device)
         if as_json:
             terminal.show_json(packings.data())
@@ -147,10 +141,6 @@ def bench(
             terminal.show(packings.text())
         return
     earlier = tools.read_measurement(against, pipeline) if against else {}
-    if growth is not None:
-        table = tools.measure_growth(growth, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device)
-        terminal.show(table)
-        return
     names = [name for name in scenes.split(",") if name]
     found = tools.measure_speed(
         names, model=model, scene=scene, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device

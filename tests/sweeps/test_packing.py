@@ -138,5 +138,5 @@ def test_the_command_prints_a_table(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "show", shown.append)
     bench(packing=True)
     assert "best: one run at a time" in shown[0]
-    with pytest.raises(ConfigError, match="leave --model, --growth and --against out"):
-        bench(packing=True, growth=Path("a.svg"))
+    with pytest.raises(ConfigError, match="leave --model and --against out"):
+        bench(packing=True, against=Path("a.json"))

@@ -3,7 +3,7 @@
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -250,14 +250,13 @@ def run_bench(cases: dict[str, BenchCase], peaks: Peaks, repeats: int) -> dict[s
 FOCAL = 400.0  # px, of the synthetic scenes
 SIZE = 2.2  # px, standard deviation of their splats
 SIZES = {"A": (400, 400, 50_000), "B": (800, 800, 300_000), "C": (1920, 1080, 1_000_000)}
-GROWTH_COUNTS = (50_000, 100_000, 200_000, 400_000, 700_000, 1_000_000)
 
 
-def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[Parameters, View]:
-    """Return flat Gaussians that face the camera, of about `size` px, with log-normal sizes and random opacities."""
+def synthetic(width: int, height: int, count: int) -> tuple[Parameters, View]:
+    """Return flat Gaussians that face the camera, of about SIZE px, with log-normal sizes and random opacities."""
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-8, width + 8, count), rng.uniform(-8, height + 8, count)
-    sizes = size * np.exp(rng.normal(0, 0.5, (count, 2)))
+    sizes = SIZE * np.exp(rng.normal(0, 0.5, (count, 2)))
     angle, depth = rng.uniform(0, np.pi, count), rng.uniform(1, 10, count)
     means = np.stack([(u - width / 2) / FOCAL * depth, (v - height / 2) / FOCAL * depth, depth], axis=1)
     scales = np.column_stack([sizes * depth[:, None] / FOCAL, np.full(count, 1e-4)])
@@ -275,9 +274,9 @@ def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[
     return parameters, View("bench", camera, np.eye(4)[:3], Path("bench"))
 
 
-def case(device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE) -> BenchCase:
+def case(device: Device, width: int, height: int, count: int, settings: PipelineFile) -> BenchCase:
     """Return a synthetic scene with a noise image as its photograph."""
-    parameters, view = synthetic(width, height, count, size)
+    parameters, view = synthetic(width, height, count)
     camera = upload_camera(device, view)
     shape = (3, height, width)
     pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
@@ -290,10 +289,3 @@ def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) 
     photographs = Photographs(device, background)
     parameters = load(model).tables() if detect(model) else from_points(read_points_ply(model), 0.1, 3)
     return BenchCase(device, parameters, photographs.get(opened.split("train")[0]), background, settings)
-
-
-def grown(device: Device, settings: PipelineFile) -> Iterator[BenchCase]:
-    """Yield scenes of 50 000 to a million Gaussians over one image; their total area is constant."""
-    width, height, largest = SIZES["C"]
-    for count in GROWTH_COUNTS:
-        yield case(device, width, height, count, settings, SIZE * (largest / count) ** 0.5)

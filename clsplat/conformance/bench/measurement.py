@@ -1,6 +1,5 @@
 """A benchmark: its cases, the device's peaks, the times, and their tables."""
 
-import statistics
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -9,16 +8,14 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from clsplat.conformance.bench.cases import SIZES, BenchResult, Peaks, case, grown, measure_peaks, real_case, run_bench
+from clsplat.conformance.bench.cases import SIZES, BenchResult, Peaks, case, measure_peaks, real_case, run_bench
 from clsplat.conformance.bench.packing import Packings, measure_packings, task_of
 from clsplat.core.errors import ConfigError, quoted
-from clsplat.core.files import write_text
 from clsplat.core.reading import read_json
 from clsplat.core.text_table import text_table
 from clsplat.opencl.device import Device, open_device
 from clsplat.opencl.discovery import Schedule, choose, resolve_schedule
 from clsplat.pipeline.loading import load
-from clsplat.viewer.charts import Line, curve
 
 # An earlier measurement: its file, and what it does not share with one of now.
 
@@ -85,10 +82,7 @@ def beside(now: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
     return lines
 
 
-# The figures as text, and the time over the number of Gaussians as a chart.
-
-SVG_ATTRIBUTES = 'xmlns="http://www.w3.org/2000/svg" width="460" height="220"'
-STYLE = "<style>text{font:11px sans-serif;fill:#4a5568}.grid{stroke:#e2e8f0}</style>"
+# The figures as text.
 
 
 def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str:
@@ -109,25 +103,6 @@ def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str
         cells.append([stage, f"{ms:.2f}", *ratio, *compared])
     memory = f"memory {result.memory / mib:,.0f} MiB at most; training plans {result.planned / mib:,.0f} MiB"
     return f"scene {name}: {counts}\n" + textwrap.indent(f"{text_table(cells, left=1)}\n{memory}", "  ")
-
-
-def growth_table(results: Sequence[BenchResult]) -> str:
-    """Return the milliseconds of steps as text, for growing numbers of Gaussians and pairs, and ns for each."""
-    rows = [("Gaussians", "pairs", "ms", "ns each")]
-    for result in results:
-        work = result.work
-        each = 1e6 * result.step / (work.gaussians + work.pairs)
-        rows.append((f"{work.gaussians:,}", f"{work.pairs:,}", f"{result.step:.1f}", f"{each:.1f}"))
-    return text_table(rows)
-
-
-def growth_chart(results: Sequence[BenchResult]) -> str:
-    """Return the milliseconds of a step over Gaussians + pairs, as SVG."""
-    points = [((r.work.gaussians + r.work.pairs) / 1e6, r.step) for r in results]
-    slope, x_max = statistics.median(y / x for x, y in points), max(x for x, _ in points)
-    lines = [Line(points, "measured"), Line([(0, 0), (x_max, slope * x_max)], "in proportion")]
-    drawing = curve("ms per step over millions of Gaussians + pairs", lines)
-    return drawing.replace("<svg", f"<svg {SVG_ATTRIBUTES}", 1).replace("</svg>", f"{STYLE}</svg>")
 
 
 @dataclass(frozen=True)
@@ -186,13 +161,3 @@ def measure_packing(
     info = device.info if isinstance(device, Device) else choose(device)
     resolve_schedule(info, schedule)
     return measure_packings(info, task_of(info, SIZES[scenes[0]], pipeline, repeats, schedule), scenes[0])
-
-
-def measure_growth(chart: Path, *, pipeline: str, repeats: int, schedule: Schedule, device: str | Device | None) -> str:
-    """Time 50 000 to a million Gaussians; write an SVG, return a table.  Raises ClsplatError."""
-    settings = load(pipeline).settings
-    opened = open_device(device, schedule)
-    peaks = measure_peaks(opened)
-    sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened, settings)]
-    write_text(chart, growth_chart(sizes))
-    return f"device: {opened.text}\n{growth_table(sizes)}"
