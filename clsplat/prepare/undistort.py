@@ -41,7 +41,7 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
             if counts is not None and not counts.all():
                 write_image(mask, np.repeat(np.where(counts, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
             write_image(image, load_image(pinhole_view))
-        views.append(replace(pinhole_view, name=name))
+        views.append(replace(pinhole_view, name=name, lens=None))
         count.reach(number)
     write_exposures(out / "images", dict(zip(names, camera_exposures(scene.views), strict=True)))
     if times := {name: view.time for view, name in zip(scene.views, names, strict=True) if view.time is not None}:

@@ -54,7 +54,7 @@ def test_a_picture_every_so_many_steps_and_a_video_of_them(run):
 
 def test_the_cameras_lie_beside_the_model(run):
     assert (run / "cameras" / "cameras.json").is_file()
-    assert (run / "cameras" / "sparse" / "0" / "images.txt").is_file()
+    assert (run / "cameras" / "sparse" / "0" / "images.bin").is_file()
 
 
 def test_a_run_with_videos_is_found_whole(run):
