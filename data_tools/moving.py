@@ -5,12 +5,8 @@ pixels of a test camera show nothing that moves is known too: there all its phot
 included.  For that, what moves keeps the light of the lamp above off other things, but not the faint light of the sky.
 """
 
-import json
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +33,7 @@ from .still_life import (
     planks,
     tin,
 )
-from .synthetic import CAMERA_DISTANCE, LOOK_AT, SyntheticOptions, surface_points, write_png
+from .synthetic import CAMERA_DISTANCE, LOOK_AT, SyntheticOptions, photographs, surface_points, write_transforms
 
 MOVING_VERSION = 1  # increase it when the images change
 HELD_OUT, FIRST_HELD_OUT = 5, 2  # of the moments: every fifth, from the third on
@@ -141,15 +137,13 @@ class Moving(SyntheticOptions):
     def fill(self, out: Path, workers: int) -> str:
         """Write images, static masks, cameras and points into `out`; return a line of text about them."""
         frames, poses = self.frames(), self.poses()
-        for folder in sorted({(out / name).parent for name in self.images()}):
-            folder.mkdir(parents=True)
         rng, seen = np.random.default_rng(self.seed), list[tuple[Array, Array, Array]]()
         share = -(-self.points // sum(split == "train" for split, _, _ in frames))
         least: dict[int, NDArray[np.uint8]] = {}
         most: dict[int, NDArray[np.uint8]] = {}
-        images = self._photographs(frames, min(workers, len(frames)))
+        images = photographs(partial(_photograph, self), frames, workers)
         for (split, i, moment), image in zip(frames, track(images, "rendering", total=len(frames)), strict=True):
-            write_png(out / f"{_name(split, i, moment)}.png", image)
+            write_image(out / f"{_name(split, i, moment)}.png", image)
             if split == "train":
                 world, pose = self.world_at(moment), poses[split][i]
                 found = surface_points(world, pose, image, share, self.noise, rng)
@@ -161,7 +155,7 @@ class Moving(SyntheticOptions):
             still = (least[i] == most[i]).all(axis=2) & (least[i][..., 3] == 255)
             write_image(out / _static(i), np.repeat(np.where(still, 255, 0).astype(np.uint8)[..., None], 3, axis=2))
         for split in poses:
-            (out / f"transforms_{split}.json").write_text(json.dumps(self._transforms(split), indent=1) + "\n", "utf-8")
+            write_transforms(out / f"transforms_{split}.json", self.world_at(0), self._transforms(split))
         positions, colours, times = (np.concatenate(parts).astype(np.float32) for parts in zip(*seen, strict=True))
         write_points_ply(out / "points3d.ply", PointCloud(positions, colours, times))
         count = sum(split == "train" for split, _, _ in frames)
@@ -170,18 +164,10 @@ class Moving(SyntheticOptions):
             f"{self.times} moments, {self.size} px, {len(positions):,} points"
         )
 
-    def _photographs(self, frames: list[tuple[str, int, int]], workers: int) -> Iterator[NDArray[np.uint8]]:
-        """Render in order, in processes."""
-        if workers == 1:
-            yield from map(partial(_photograph, self), frames)
-            return
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            yield from pool.map(partial(_photograph, self), frames, chunksize=4)
-
-    def _transforms(self, split: str) -> dict[str, object]:
+    def _transforms(self, split: str) -> list[dict[str, object]]:
         """Cameras and moments of a split, in the layout of D-NeRF, with the static masks of the test views."""
         poses = self.poses()[split]
-        frames = [
+        return [
             {
                 "file_path": f"./{_name(split, i, t)}",
                 "time": self.time(t),
@@ -190,7 +176,6 @@ class Moving(SyntheticOptions):
             }
             for _, i, t in (frame for frame in self.frames() if frame[0] == split)
         ]
-        return {"camera_angle_x": self.world_at(0).camera_angle_x, "frames": frames}
 
 
 def _photograph(options: Moving, frame: tuple[str, int, int]) -> NDArray[np.uint8]:

@@ -3,14 +3,14 @@
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
@@ -18,6 +18,7 @@ from rich.progress import track
 from clsplat.core.errors import DataError, OutputError
 from clsplat.core.files import is_there
 from clsplat.core.reading import read_file
+from clsplat.scene.images import write_image
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
 
@@ -25,6 +26,7 @@ from .casting import World, camera_pose
 from .shapes import Array, spiral
 from .still_life import SCENE, SCENE_RADIUS, SCENE_VERSION
 
+View = TypeVar("View")
 LOOK_AT = np.array([0.0, 0.0, 0.08])  # scene units: the point in the middle of every image
 CAMERA_DISTANCE = 3.75
 POINT_COUNT = 8000
@@ -109,36 +111,37 @@ def fill(out: Path, options: SyntheticOptions, workers: int) -> int:
     splits = options.poses()
     jobs = [(split, i, pose) for split, poses in splits.items() for i, pose in enumerate(poses)]
     world = options.world
-    images = photographs(world, [pose for _, _, pose in jobs], options.size, min(workers, len(jobs)))
+    images = photographs(partial(world.photograph, size=options.size), [pose for _, _, pose in jobs], workers)
     rng = np.random.default_rng(options.seed)
     points = []
-    for split in splits:
-        (out / split).mkdir()
     for (split, i, pose), image in zip(jobs, track(images, "rendering", total=len(jobs)), strict=True):
-        write_png(out / split / f"r_{i:03}.png", image)
+        write_image(out / split / f"r_{i:03}.png", image)
         if split == "train":
             points.append(surface_points(world, pose, image, -(-options.points // options.train), options.noise, rng))
     for split, poses in splits.items():
-        (out / f"transforms_{split}.json").write_text(
-            json.dumps(transforms(world, split, poses), indent=1) + "\n", "utf-8"
-        )
+        frames = [{"file_path": f"./{split}/r_{i:03}", "transform_matrix": p.tolist()} for i, p in enumerate(poses)]
+        write_transforms(out / f"transforms_{split}.json", world, frames)
     positions, colours = (np.concatenate(parts).astype(np.float32) for parts in zip(*points, strict=True))
     write_points_ply(out / "points3d.ply", PointCloud(positions, colours))
     return len(positions)
 
 
-def write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an image, [H, W, 4] RGBA."""
-    path.write_bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))[1].tobytes())
-
-
-def photographs(world: World, poses: list[Array], size: int, workers: int) -> Iterator[NDArray[np.uint8]]:
+def photographs(
+    render: Callable[[View], NDArray[np.uint8]], views: Sequence[View], workers: int
+) -> Iterator[NDArray[np.uint8]]:
     """Render views in order, in processes: threads would wait for the interpreter between NumPy calls this short."""
+    workers = min(workers, len(views))
     if workers == 1:
-        yield from (world.photograph(pose, size) for pose in poses)
+        yield from map(render, views)
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(partial(world.photograph, size=size), poses)
+        yield from pool.map(render, views)
+
+
+def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> None:
+    """Write the cameras of a split as the Blender data sets store them: camera-to-world, OpenGL axes."""
+    table = {"camera_angle_x": world.camera_angle_x, "frames": frames}
+    path.write_text(json.dumps(table, indent=1) + "\n", "utf-8")
 
 
 def surface_points(
@@ -154,9 +157,3 @@ def surface_points(
     positions = (origin + distance[hit] * directions[:, hit]).T
     colours = image[rows[chosen], columns[chosen], :3][hit] / 255
     return positions + noise * rng.standard_normal(positions.shape), colours
-
-
-def transforms(world: World, split: str, poses: list[Array]) -> dict[str, object]:
-    """Cameras of a split as the Blender data sets store them: camera-to-world, OpenGL axes."""
-    frames = [{"file_path": f"./{split}/r_{i:03}", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
-    return {"camera_angle_x": world.camera_angle_x, "frames": frames}

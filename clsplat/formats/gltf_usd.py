@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quoted
+from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file
 from clsplat.formats.packing import Output, written
 from clsplat.formats.ply import checked_numbers
@@ -155,11 +156,7 @@ class Gltf:
             )
         x, y, z, w = quaternion / length
         matrix = np.eye(4)
-        matrix[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+        matrix[:3, :3] = rotation_matrix(w, x, y, z)
         matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64)
         matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64)
         return matrix

@@ -166,11 +166,11 @@ def is_image(path: PurePath) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES
 
 
-def write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
-    """Write [H, W, 3] RGB as PNG, creating the folders above it.  Raises OutputError when that fails."""
-    assert rgb.dtype == np.uint8, rgb.dtype
-    assert rgb.shape[2:] == (3,), rgb.shape
-    _, encoded = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+def write_image(path: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write RGB or RGBA, [H, W, 3 or 4], as PNG, creating the folders above it.  Raises OutputError when that fails."""
+    assert pixels.dtype == np.uint8, pixels.dtype
+    assert pixels.shape[2:] in ((3,), (4,)), pixels.shape
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]))
     with atomic(path) as file:
         file.write(encoded.tobytes())
 

@@ -6,13 +6,11 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, amount
-from clsplat.core.files import atomic
-from clsplat.scene.images import read_image
+from clsplat.scene.images import read_image, write_image
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, load_image, load_mask
 
@@ -32,10 +30,7 @@ def load_photograph(
         return read_image(file).astype(np.uint8)
     except DataError:
         pixels = _loaded(view, background)
-    order = [2, 1, 0, 3][: pixels.shape[2]]
-    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, order]))
-    with atomic(file) as stream:
-        stream.write(encoded.tobytes())
+    write_image(file, pixels)
     return pixels
 
 

@@ -13,10 +13,11 @@ from scipy.spatial import cKDTree
 
 from clsplat.core.errors import DataError
 from clsplat.data_tools.casting import camera_pose
-from clsplat.data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, STILL_LIFE, write_png
+from clsplat.data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, STILL_LIFE
 from clsplat.gaussians.conversion import from_points
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
+from clsplat.scene.images import write_image
 from clsplat.scene.plane_sweep import MAX_DEPTH, MIN_DEPTH, PLANES, Surface, swept_points
 from clsplat.scene.quality import MAX_SPACING, laplacian_chance, opaque_pixels, spacing
 from clsplat.scene.scene import PointCloud
@@ -85,7 +86,7 @@ def table(tmp_path_factory):
         around, up = 0.12 * i, 0.35 + 0.06 * (i % 2)
         backward = np.array([cos(around) * cos(up), sin(around) * cos(up), sin(up)])
         pose = camera_pose(LOOK_AT + CAMERA_DISTANCE * backward, backward)
-        write_png(folder / f"{i}.png", world.photograph(pose, SIDE))
+        write_image(folder / f"{i}.png", world.photograph(pose, SIDE))
         flipped = np.linalg.inv(pose @ np.diag([1, -1, -1, 1]))[:3]
         views.append(View(str(i), camera, flipped, folder / f"{i}.png"))
         y, x = np.indices((SIDE, SIDE)).reshape(2, -1) + 0.5
@@ -138,7 +139,7 @@ def test_transparent_pixels_give_no_points(table, everywhere):
 def test_pixels_that_a_mask_leaves_out_give_no_points(table, tmp_path):
     left = np.zeros((SIDE, SIDE, 4), np.uint8)
     left[:, : SIDE // 2] = 255
-    write_png(tmp_path / "mask.png", left)
+    write_image(tmp_path / "mask.png", left)
     view = table[0][0]
     np.testing.assert_array_equal(
         opaque_pixels(replace(view, mask_path=tmp_path / "mask.png")), opaque_pixels(view) & (left[:, :, 0] > 0)
