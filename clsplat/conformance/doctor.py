@@ -246,23 +246,6 @@ def _hold(figures: int) -> str:
 # A report as one page that opens offline, to be attached to a bug report.
 
 
-@dataclass(frozen=True)
-class CheckRow:
-    """One check in a table."""
-
-    result: CheckResult
-    worst: Figure | None  # the figure nearest to its bound, or furthest beyond it
-
-    @property
-    def share(self) -> str:
-        """The worst figure by its bound."""
-        if self.worst is None:
-            return ""
-        if self.worst.counts:
-            return "exact" if self.worst.value == 0 else f"{self.worst.value:g} wrong"
-        return f"{100 * self.worst.value / self.worst.bound:.0f} %"
-
-
 def check_place(out: Path) -> None:
     """Raise ConfigError for a file of another kind or of a run, OutputError where a page cannot be written."""
     check_result(out, ".html")
@@ -293,7 +276,9 @@ def report_page(report: DeviceReport) -> str:
         advice=verdict.advice,
         failures=[(name or "once", text) for name, found in report.failures.items() for text in found],
         facts=_facts(report),
-        parts={name: (summary(results), [_row(result) for result in results]) for name, results in parts.items()},
+        parts={
+            name: (summary(results), [(result, worst(result)) for result in results]) for name, results in parts.items()
+        },
         speed=report.note("speed"),
         speed_text=report.speed(),
         logs=[(name, result) for name, results in parts.items() for result in results if result.log],
@@ -324,8 +309,14 @@ def _facts(report: DeviceReport) -> dict[str, str]:
     return facts
 
 
-def _row(result: CheckResult) -> CheckRow:
-    return CheckRow(result, max(result.figures, key=_excess, default=None))
+def worst(result: CheckResult) -> str:
+    """Return the figure nearest to its bound, or furthest beyond it, by its bound."""
+    found = max(result.figures, key=_excess, default=None)
+    if found is None:
+        return ""
+    if found.counts:
+        return "exact" if found.value == 0 else f"{found.value:g} wrong"
+    return f"{100 * found.value / found.bound:.0f} %"
 
 
 def _excess(figure: Figure) -> float:

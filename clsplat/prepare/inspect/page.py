@@ -1,6 +1,5 @@
 """An inspection as one page that opens offline: verdict, findings, figures, cameras and points."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,27 +23,11 @@ MAX_COORDINATE = 30 * RADIUS  # the page leaves out points beyond
 MAX_SLOPE = 5.0  # of a frustum's edges: half width by depth
 
 
-@dataclass(frozen=True)
-class Kind:
-    """Cameras of one colour."""
-
-    colour: str
-    name: str
+KINDS = (("#63b3ed", "training"), ("#f6ad55", "test"), ("#fc5c5c", "far away from all others"))  # of cameras
 
 
-KINDS = (Kind("#63b3ed", "training"), Kind("#f6ad55", "test"), Kind("#fc5c5c", "far away from all others"))
-
-
-@dataclass(frozen=True)
-class Space:
-    """What the canvas draws, and the kinds of cameras in it."""
-
-    kinds: list[Kind]
-    data: dict[str, Any]  # for space.js
-
-
-def space(inspection: Inspection) -> Space | None:
-    """Return cameras and points as space.js reads them; None when no camera could be read."""
+def space(inspection: Inspection) -> tuple[list[tuple[str, str]], dict[str, Any]] | None:
+    """Return the kinds of cameras, and these and points as space.js reads them; None when no camera could be read."""
     views = inspection.parts.views
     if not views:
         return None
@@ -61,11 +44,11 @@ def space(inspection: Inspection) -> Space | None:
         "points": _integers(points[drawn]),
         "colours": ["".join(f"{byte:02x}" for byte in rgb) for rgb in colours[drawn].astype(int).tolist()],
         "cameras": [[kinds[view.name], *_integers((_frustum(view, size) - origin) @ axes.T)] for view in views],
-        "shades": [kind.colour for kind in KINDS],
+        "shades": [colour for colour, _ in KINDS],
         "names": [view.name for view in views],
         "radius": RADIUS,
     }
-    return Space([KINDS[index] for index in sorted(set(kinds.values()))], data)
+    return [KINDS[index] for index in sorted(set(kinds.values()))], data
 
 
 def _kinds(inspection: Inspection, far: set[str]) -> dict[str, int]:
@@ -130,23 +113,6 @@ MAX_NAMES = 200  # of a list
 MAX_VIEWS = 8  # in the table of those that see the fewest points
 
 
-@dataclass(frozen=True)
-class PointVisibility:
-    """How many points the views see."""
-
-    charts: list[Markup]
-    fewest: list[tuple[str, int]]  # views and their points
-
-
-@dataclass(frozen=True)
-class NameList:
-    """The names behind a figure: MAX_NAMES of `count`."""
-
-    title: str
-    names: list[str]
-    count: int
-
-
 def write_page(inspection: Inspection, out: Path) -> None:
     """Write the page.  Raises OutputError when that fails."""
     write_text(out, inspection_page(inspection))
@@ -171,16 +137,17 @@ def inspection_page(inspection: Inspection) -> str:
     )
 
 
-def _seen(inspection: Inspection) -> PointVisibility | None:
+def _seen(inspection: Inspection) -> tuple[list[Markup], list[tuple[str, int]]] | None:
     """A histogram, and the views that see the fewest points; None where the dataset has no such counts."""
     seen = inspection.facts.seen
     if not seen:
         return None
     fewest = sorted(seen.items(), key=lambda item: item[1])[:MAX_VIEWS]
-    return PointVisibility(charts([histogram("views by their number of points", list(seen.values()))]), fewest)
+    return charts([histogram("views by their number of points", list(seen.values()))]), fewest
 
 
-def _lists(inspection: Inspection) -> list[NameList]:
+def _lists(inspection: Inspection) -> list[tuple[str, list[str], int]]:
+    """The names behind figures: a title, MAX_NAMES of them, and their number."""
     facts, photographs = inspection.facts, inspection.facts.photos
     lists = {
         "registered but missing on disk": facts.missing,
@@ -193,4 +160,4 @@ def _lists(inspection: Inspection) -> list[NameList]:
         "same pose": [" = ".join(names) for names in facts.same_pose],
         "few points": facts.few_seen,
     }
-    return [NameList(title, names[:MAX_NAMES], len(names)) for title, names in lists.items() if names]
+    return [(title, names[:MAX_NAMES], len(names)) for title, names in lists.items() if names]
