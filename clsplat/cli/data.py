@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat.core.errors import ConfigError
-from clsplat.data_tools.multiscale import write_multiscale
 from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.prepare.features import CameraModel
 from clsplat.prepare.mapping import Mapper
@@ -76,16 +75,6 @@ def city(
 
 
 @app.command()
-def multiscale(
-    source: Annotated[Path, typer.Argument(help="Folder of a single-scale Blender dataset.")],
-    out: Annotated[Path, typer.Argument(help="Folder to make.")],
-    levels: Annotated[int, typer.Option(min=1, max=8, help="Number of sizes: full, half, quarter, …")] = 4,
-) -> None:
-    """Make the multi-scale Blender dataset of mip-NeRF from a single-scale one."""
-    print(f"{write_multiscale(source, out, levels)} images written to {out}")
-
-
-@app.command()
 def photos(
     source: Annotated[Path, typer.Argument(help="Folder of photographs; it is not written to.")],
     out: Annotated[Path, typer.Argument(help="Folder for the scene; finished steps in it are not repeated.")],
@@ -142,17 +131,6 @@ def undistort(
     from clsplat.prepare.undistort import undistort_scene
 
     print(f"{undistort_scene(scene, out, long_side, blank)} images in {out}")
-
-
-@app.command()
-def resize(
-    scene: Annotated[Path, typer.Argument(help="Folder that holds `images`.")],
-    levels: Annotated[int, typer.Option(min=1, max=6, help="images_2, images_4, …")] = 3,
-) -> None:
-    """Make image pyramids beside a scene's images."""
-    from clsplat.data_tools.resize import write_pyramid
-
-    print(f"{write_pyramid(scene, levels)} images written beside {scene / 'images'}")
 
 
 @app.command()

@@ -11,10 +11,8 @@ from typer.testing import CliRunner
 
 from clsplat import cli
 from clsplat.core.errors import DataError
-from clsplat.data_tools import resize as resize_tool
 from clsplat.data_tools import video as video_tool
 from clsplat.data_tools.masks import write_masks
-from clsplat.data_tools.resize import write_pyramid
 from clsplat.data_tools.video import sharpest, write_frames
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import read_image
@@ -174,55 +172,6 @@ def test_sharpest(values, parts, chosen):
     assert sharpest(values, [0.0] * len(values), parts) == chosen
 
 
-# ---- pyramids
-
-
-def test_pyramids(tmp_path, rng):
-    pixels = rng.integers(0, 256, (21, 34, 3)).astype(np.uint8)
-    path = tmp_path / "images" / "a" / "b.png"
-    path.parent.mkdir(parents=True)
-    cv2.imwrite(str(path), pixels[:, :, ::-1])
-    assert write_pyramid(tmp_path, levels=2) == 2
-    half = read_image(tmp_path / "images_2" / "a" / "b.png")
-    assert half.shape == (10, 17, 3)
-    assert read_image(tmp_path / "images_4" / "a" / "b.png").shape == (5, 8, 3)
-    boxes = pixels[:20].reshape(10, 2, 17, 2, 3).mean(axis=(1, 3))
-    assert np.abs(half[0] - boxes[0]).mean() < 15
-    assert write_pyramid(tmp_path, levels=2) == 0
-    np.testing.assert_array_equal(read_image(path), pixels)
-    assert "holds no images" in refusal(write_pyramid, tmp_path / "images")
-
-
-def test_pyramids_go_on_and_keep_what_others_made(tmp_path, rng, monkeypatch):
-    folder, whole = tmp_path / "scene", tmp_path / "whole"
-    (folder / "images").mkdir(parents=True)
-    for i in range(4):
-        cv2.imwrite(str(folder / "images" / f"{i}.png"), rng.integers(0, 256, (16, 16, 3)).astype(np.uint8))
-    (folder / "images_2").mkdir()
-    (folder / "images_2" / "3.png").write_bytes(b"shipped")
-    shutil.copytree(folder, whole)
-    write_pyramid(whole, levels=2)
-    read: list[str] = []
-
-    def killed(path: Path) -> np.ndarray:
-        if len(read) == 2:
-            raise KeyboardInterrupt
-        read.append(path.name)
-        return read_image(path)
-
-    monkeypatch.setattr(resize_tool, "read_image", killed)
-    with pytest.raises(KeyboardInterrupt):
-        write_pyramid(folder, levels=2)
-    monkeypatch.setattr(resize_tool, "read_image", lambda path: (read.append(path.name), read_image(path))[1])
-    assert write_pyramid(folder, levels=2) == 3
-    assert read == ["0.png", "1.png", "2.png", "3.png"]
-    assert contents(folder) == contents(whole)
-    assert (folder / "images_2" / "3.png").read_bytes() == b"shipped"
-    cv2.imwrite(str(folder / "images" / "1.png"), np.full((16, 16, 3), 77, np.uint8))
-    assert write_pyramid(folder, levels=2) == 2
-    assert (read_image(folder / "images_4" / "1.png") == 77).all()
-
-
 # ---- masks
 
 
@@ -308,5 +257,5 @@ def test_data_tools_are_commands(tmp_path):
     result = CliRunner().invoke(cli.app, ["data", "masks", str(scene)])
     assert result.output.endswith("2 masks written\n")
     listing = CliRunner().invoke(cli.app, ["data", "--help"]).output
-    for name in ("photos", "video", "undistort", "resize", "masks", "multiscale", "synthetic", "fetch"):
+    for name in ("photos", "video", "undistort", "masks", "synthetic", "fetch"):
         assert name in listing

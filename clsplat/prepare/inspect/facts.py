@@ -7,7 +7,7 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -29,44 +29,7 @@ from clsplat.scene.scene import camera_extent, strayed
 from clsplat.scene.times import by_camera, moments_of
 from clsplat.scene.view import NO_FILE, View, camera_exposures, fits
 
-# Edges of photographs that repeat the pixels beside them: what an undistortion fills.
-
-EDGES = ("left", "top", "right", "bottom")  # as np.rot90 turns them to the left
-EXAMPLES = 3  # photographs: all of a dataset are filled alike
-WIDEST = 32  # px
-REPEATED, DIFFERENT = 0.5, 2.0  # mean grey levels between neighbouring lines: without loss, and of a sharp photograph
-VARIED = 8.0  # grey levels: the standard deviation along a line that is more than plain
-FULL = 1 << 30  # px: no photograph is longer
-
-
-def padding(files: Iterable[Path]) -> dict[str, int]:
-    """Return how many px of an edge repeat the line beside them in each of the first photographs, by edge.
-
-    It is WIDEST at most.  Lines of one colour say nothing, nor do photographs that are alike or enlarged everywhere.
-    JPEG hides it.
-    """
-    found: list[list[int]] = []
-    with suppress(DataError):  # what cannot be read is another finding
-        found = [filled(read_grey(file, FULL)[0]) for file in islice(files, EXAMPLES)]
-    least = np.min(found, axis=0).tolist() if found else []
-    return {edge: px for edge, px in zip(EDGES, least, strict=False) if px}
-
-
-def filled(grey: NDArray[np.uint8]) -> list[int]:
-    """Return how many px of each edge of a photograph [H, W] repeat the line beside them, in the order of EDGES."""
-    return [_repeats(np.rot90(grey, turns)[:, : WIDEST + 3].astype(np.float32)) for turns in range(len(EDGES))]
-
-
-def _repeats(lines: NDArray[np.float32]) -> int:
-    """How many columns at the left repeat the next one."""
-    changes = np.abs(np.diff(lines, axis=1)).mean(axis=0)
-    count = int(np.argmax(np.append(changes, np.inf) >= REPEATED))
-    beyond = changes[count : count + 2]  # where a photograph is enlarged, lines repeat here too
-    ends = len(beyond) == 2 and beyond[0] >= DIFFERENT and beyond[1] >= REPEATED
-    return count if ends and lines[:, 0].std() > VARIED else 0
-
-
-# What photographs look like beside each other: blurred ones, the same one twice, exposures that jump, filled edges.
+# What photographs look like beside each other: blurred ones, the same one twice, exposures that jump.
 
 THUMBNAIL = 32  # px, of each side
 SAME = 1.0  # grey levels between thumbnails: frames of a video are 9 apart, two codings of one photograph 0.3
@@ -92,7 +55,6 @@ class LookFacts:
     jumps: list[tuple[str, str, float]]  # one and the next, and the stops between their exposures as EXIF tells them
     steps: list[tuple[str, str, float]]  # one, the next, and its brightness by that of the first; where EXIF is silent
     unreadable: dict[str, str]  # the reason why they cannot be decoded
-    padded: dict[str, int]  # px of an edge that repeat the line beside them, in the first photographs
 
 
 def looks_of(parts: Parts, missing: Container[Path]) -> LookFacts:
@@ -127,7 +89,6 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
         unreadable={
             name: why_unreadable(files[name], error) for name, error in looked.items() if isinstance(error, DataError)
         },
-        padded=padding(files[name] for name in found),
     )
 
 

@@ -170,10 +170,6 @@ def _looks(facts: Facts) -> Iterator[Finding]:
         fault = f"{_are(len(steps), 'photograph')} more than twice as bright or dark as the one before ({named})"
         remedy = "EXIF does not tell both; if exposures changed, --set optimize.modules.exposure={} gives each its own"
         yield Finding("note", fault, remedy)
-    if (padded := facts.looks.padded) and not facts.photos.masks:
-        where = ", ".join(f"{px} px {edge}" for edge, px in padded.items())
-        fault = f"photographs repeat the pixels at an edge ({where}), as an undistortion fills it"
-        yield Finding("note", fault, "no model shows them; leave them out by scene.masks, or expect less PSNR")
 
 
 def _cameras(facts: Facts) -> Iterator[Finding]:

@@ -9,26 +9,19 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError
-from clsplat.core.files import atomic, write_text
-from clsplat.scene.images import read_image
+from clsplat.core.files import write_text
+from clsplat.scene.images import read_image, write_image
 from clsplat.scene.transforms_json import Transforms, view_name
 
 MIN_DEPTH, MAX_DEPTH = 2.0, 6.0  # scene units; mip-NeRF's values for these scenes
 
 
 def write_multiscale(source: Path, out: Path, levels: int = 4) -> int:
-    """Write images_train, images_test, … and metadata.json into `out`; return the number of images.
-
-    Raises DataError when `source` is not a Blender folder or its images cannot be halved so often.
-    """
+    """Write images_train, images_test, … and metadata.json into `out`; return the number of images."""
     splits = {path.stem.removeprefix("transforms_"): path for path in sorted(source.glob("transforms_*.json"))}
-    if "train" not in splits:
-        raise DataError(f"{source}: has no transforms_train.json; expected the folder of a Blender dataset")
     metadata = {name: _write_split(Transforms(path), name, out, levels) for name, path in splits.items()}
     write_text(out / "metadata.json", json.dumps(metadata) + "\n")
     points = source / "points3d.ply"
@@ -54,14 +47,9 @@ def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> d
     for i, (frame, view) in enumerate(zip(transforms.frames, transforms.views(), strict=True)):
         pixels = read_image(view.image_path)
         height, width = pixels.shape[:2]
-        if pixels.dtype != np.uint8 or height % 2 ** (levels - 1) or width % 2 ** (levels - 1):
-            raise DataError(
-                f"{view.image_path}: {width}x{height} pixels of {pixels.dtype}; expected 8 bits and a size that can be "
-                f"halved {levels - 1} times: use fewer levels"
-            )
         for j, image in enumerate(pyramid(pixels, levels)):
             file = view_name(f"images_{name}/{i:03d}_d{j}.png")
-            _write(out / file, image)
+            write_image(out / file, image)
             camera = {"width": width >> j, "height": height >> j, "focal": view.camera.fx / 2**j}
             sampling = {"label": j, "near": MIN_DEPTH, "far": MAX_DEPTH, "lossmult": 4.0**j}
             inverse = _pixel_to_camera(**camera)
@@ -73,10 +61,3 @@ def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> d
 def _pixel_to_camera(width: int, height: int, focal: float) -> list[list[float]]:
     """The inverse calibration matrix with OpenGL axes, as the format has it."""
     return [[1 / focal, 0.0, -0.5 * width / focal], [0.0, -1 / focal, 0.5 * height / focal], [0.0, 0.0, -1.0]]
-
-
-def _write(path: Path, pixels: NDArray[np.uint8]) -> None:
-    order = [2, 1, 0, 3][: pixels.shape[2]]
-    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, order]))
-    with atomic(path) as file:
-        file.write(encoded.tobytes())
