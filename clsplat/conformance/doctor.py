@@ -233,14 +233,10 @@ def _is_due(schedule: str, report: DeviceReport) -> bool:
 def progress(schedule: str, result: CheckResult) -> str:
     """Return a line for one check."""
     failures = result.failures
-    words = f"WRONG: {failures[0]}" if failures else _hold(len(result.figures))
+    count = len(result.figures)
+    holds = f"{amount(count, 'figure')} hold{'s' if count == 1 else ''}" if count else "measured"
+    words = f"WRONG: {failures[0]}" if failures else holds
     return f"  {f'{schedule:<5}{result.name}':<54}{result.seconds:5.1f} s  {words}"
-
-
-def _hold(figures: int) -> str:
-    if figures == 0:
-        return "measured"
-    return f"{amount(figures, 'figure')} hold{'s' if figures == 1 else ''}"
 
 
 # A report as one page that opens offline, to be attached to a bug report.

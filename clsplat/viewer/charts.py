@@ -51,16 +51,14 @@ def curve(
         up = (y - y_low) / (y_high - y_low)
         return LEFT + across * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - up * (HEIGHT - BOTTOM - top)
 
-    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">']
-    parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
+    parts = _begun(title)
     for i, row in enumerate(legend, 1):
         parts.append(f'<text x="{LEFT}" y="{15 + LEGEND_ROW * i}">{row}</text>')
     counts = not logarithmic and _are_whole(ys)
     rows = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high, counts)
     for tick, label in zip(rows, _numbers([10**row if logarithmic else row for row in rows], counts), strict=True):
         _, y = place(x_low, tick)
-        parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+        parts += _row(y, label)
     steps = _are_whole(xs)
     columns = _ticks(x_low, x_high, steps)
     for tick, label in (ticks or dict(zip(columns, _numbers(columns, steps), strict=True))).items():
@@ -86,13 +84,10 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
     for value in values:
         counts[min(bins - 1, int(bins * value / high))] += 1
     width, height = WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP
-    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">']
-    parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
+    parts = _begun(title)
     rows = _ticks(0, max(counts), whole=True)
     for tick, label in zip(rows, _numbers(rows, whole=True), strict=True):
-        y = HEIGHT - BOTTOM - tick / max(counts) * height
-        parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+        parts += _row(HEIGHT - BOTTOM - tick / max(counts) * height, label)
     for i, count in enumerate(counts):
         if count:
             tall = count / max(counts) * height
@@ -103,6 +98,18 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
         x = LEFT + tick / high * width
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{label}</text>')
     return "".join([*parts, "</svg>"])
+
+
+def _begun(title: str) -> list[str]:
+    """The start of a drawing with its title."""
+    start = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">'
+    return [start, f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>']
+
+
+def _row(y: float, label: str) -> list[str]:
+    """A line across the chart at a tick of the y axis, and its label."""
+    line = f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>'
+    return [line, f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>']
 
 
 def _drawn(line: Line, logarithmic: bool) -> Line:

@@ -2,10 +2,8 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import CONIC, SUM, Checks, Figure, Note, by_element, by_norm, equal, wrong
@@ -42,14 +40,11 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
     return replace(case, parameters=parameters, view=replace(case.view, time=TIME))
 
 
-def _wide(case: Case) -> dict[str, NDArray[Any]]:
-    return {name: table.astype(np.float64) for name, table in case.parameters.items()}
-
-
 def moment_figures(device: Device, rng: np.random.Generator, count: int, width: int) -> Iterator[Figure]:
     """The tables at a moment, and the gradients by them carried back."""
     case, (degree, turns) = moving_case(rng, count, width), WIDTHS[width]
-    model, camera, p, what = case.model(device), case.device_camera(device), _wide(case), f"{count} of {width} columns"
+    model, camera, what = case.model(device), case.device_camera(device), f"{count} of {width} columns"
+    p = {name: table.astype(np.float64) for name, table in case.parameters.items()}
     logit = p["logit_opacity"][:, 0]
     drawn = at_moment(Workspace(device), model, camera).gaussians
     means, quats, logits = ref.moved(p[MOTION], p["means"], p["quats"], logit, TIME, degree, turns)

@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance.check import GRADIENT, SUM, Checks, Figure, Note, by_element, by_norm, equal
 from clsplat.conformance.checks.images import planes_of
-from clsplat.conformance.reference import nerf as ref_cones
-from clsplat.conformance.reference import nerf as ref_field
-from clsplat.conformance.reference import nerf as ref_grid
+from clsplat.conformance.reference import nerf as ref
 from clsplat.conformance.scenes import random_case
 from clsplat.nerf.field import Draw, Field, Levels, Rays, RayTarget, SampleLevel
 from clsplat.nerf.network import PLACE_ROWS
@@ -42,7 +40,7 @@ EDGES = 2e-6  # of the distances, in shares of the farthest
 class GridLevel:
     """A level of a grid, and where its entries lie among the parameters."""
 
-    level: ref_grid.HashLevel
+    level: ref.HashLevel
     first: int
 
     def of(self, parameters: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -77,10 +75,10 @@ class FieldCase:
         camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)
         field = Field(shape, device.upload(parameters), device.upload(BACKGROUND))
         cast, levels = field.levels.drawn(camera, draw, rays), field.levels
-        pixels = ref_cones.drawn_pixels(WIDTH * HEIGHT, rays, draw.first, draw.seed, draw.step)
+        pixels = ref.drawn_pixels(WIDTH * HEIGHT, rays, draw.first, draw.seed, draw.step)
         filled = np.concatenate([pixels, np.repeat(pixels[-1:], cast.count - rays)])
         planes = planes_of(device, camera, photograph)
-        return cls(shape, levels, parameters, photograph, planes, cast, ref_cones.cones(scene.camera(), filled))
+        return cls(shape, levels, parameters, photograph, planes, cast, ref.cones(scene.camera(), filled))
 
     @property
     def on_device(self) -> Array:
@@ -89,7 +87,7 @@ class FieldCase:
     def units(self, samples: int, kind: int) -> NDArray[np.float64]:
         """Random numbers of the edges of each ray."""
         draw = self.rays.draw or Draw(0, 0, 0)
-        own = [ref_cones.units(draw.first + i, samples + 1, kind, draw.seed, draw.step) for i in range(self.rays.count)]
+        own = [ref.units(draw.first + i, samples + 1, kind, draw.seed, draw.step) for i in range(self.rays.count)]
         return np.stack(own)
 
     def wanted(self) -> NDArray[np.float64]:
@@ -99,9 +97,9 @@ class FieldCase:
 
     def encoded(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Encoded positions and directions of samples, [S, features]."""
-        means, variances = ref_cones.frustums(self.cones, edges.astype(np.float64))
-        sines = ref_cones.encoded_frustums(means, variances, self.shape.degrees)
-        direction = ref_cones.encoded_directions(self.cones, self.shape.direction_degrees)
+        means, variances = ref.frustums(self.cones, edges.astype(np.float64))
+        sines = ref.encoded_frustums(means, variances, self.shape.degrees)
+        direction = ref.encoded_directions(self.cones, self.shape.direction_degrees)
         of_grid = [own.level.forward(own.of(self.parameters), *self.places(edges)) for own in self.grid_levels()]
         position = np.concatenate([*of_grid, sines.reshape(sines.shape[0] * sines.shape[1], sines.shape[2])], axis=1)
         return position, np.repeat(direction, edges.shape[1] - 1, axis=0)
@@ -109,15 +107,14 @@ class FieldCase:
     def places(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Places of samples in the grid's cube, [S, 3], and their variances, [S]."""
         assert self.shape.grid is not None
-        means, variances = (one.reshape(-1, 3) for one in ref_cones.frustums(self.cones, edges.astype(np.float64)))
-        return ref_grid.places(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)
+        means, variances = (one.reshape(-1, 3) for one in ref.frustums(self.cones, edges.astype(np.float64)))
+        return ref.places(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)
 
     def grid_levels(self) -> list[GridLevel]:
         """The levels of the grid; none without one."""
         table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.of_network
         return [
-            GridLevel(ref_grid.HashLevel(cells, entries), first + FEATURES * before)
-            for cells, before, entries, _ in table
+            GridLevel(ref.HashLevel(cells, entries), first + FEATURES * before) for cells, before, entries, _ in table
         ]
 
 
@@ -131,7 +128,7 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure
     """Pixels, rays and where they are cut, drawn and even."""
     for count in RAYS:
         case = FieldCase.of(device, rng, count, Draw(7, 11, 5))
-        pixels = ref_cones.drawn_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
+        pixels = ref.drawn_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
         yield equal("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
         yield by_element("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
         for rays in (case.rays, replace(case.rays, draw=None)):
@@ -141,14 +138,14 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure
 def _edge_figures(case: FieldCase, what: str) -> Iterator[Figure]:
     coarse, fine = ((level.edges.get(), level.weights.get()) for level in case.levels.render(case.on_device, case.rays))
     shape, (edges, weights) = case.shape, coarse
-    drawn, again = case.units(shape.coarse_samples, ref_cones.COARSE), case.units(shape.fine_samples, ref_cones.FINE)
+    drawn, again = case.units(shape.coarse_samples, ref.COARSE), case.units(shape.fine_samples, ref.FINE)
     is_drawn = case.rays.draw is not None
     expected = [
-        ref_cones.coarse_edges(shape.near, shape.far, shape.coarse_samples, own if is_drawn else None) for own in drawn
+        ref.coarse_edges(shape.near, shape.far, shape.coarse_samples, own if is_drawn else None) for own in drawn
     ]
     yield by_element("spread_edges", what, edges, np.stack(expected), EDGES, floor=shape.far)
     pairs = zip(edges.astype(np.float64), weights.astype(np.float64), again, strict=True)
-    expected = [ref_cones.fine_edges(t, w, shape.fine_samples, own if is_drawn else None) for t, w, own in pairs]
+    expected = [ref.fine_edges(t, w, shape.fine_samples, own if is_drawn else None) for t, w, own in pairs]
     yield by_element("resample_edges", what, fine[0], np.stack(expected), 10 * EDGES, floor=shape.far)
 
 
@@ -269,7 +266,7 @@ def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for count, keys in FIELDS_CASES:
         case = FieldCase.of(device, rng, count, Draw(3, 4, 2), **keys)
         gradient = device.zeros(case.shape.parameters)
-        errors, expected = device.zeros(2 + count), list[ref_field.Weights]()
+        errors, expected = device.zeros(2 + count), list[ref.Weights]()
         by_entries = [np.zeros_like(own.of(case.parameters)) for own in case.grid_levels()]
         parameters = case.on_device
         for scale, level in zip((0.1, 1.0), case.levels.render(parameters, case.rays), strict=True):
@@ -291,7 +288,7 @@ def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
 
 
 def _gradient_figures(
-    shape: FieldShape, gradient: NDArray[Any], expected: list[ref_field.Weights], what: str
+    shape: FieldShape, gradient: NDArray[Any], expected: list[ref.Weights], what: str
 ) -> Iterator[Figure]:
     gradient = gradient[: shape.of_network]
     used = np.zeros(shape.of_network, bool)
@@ -313,23 +310,23 @@ class _Comparison:
 
     level: SampleLevel
     scale: float
-    network: ref_field.DenseNetwork
-    weights: ref_field.Weights
+    network: ref.DenseNetwork
+    weights: ref.Weights
     raw: tuple[NDArray[np.float64], NDArray[np.float64]]
-    inputs: ref_field.Inputs
-    composite: ref_field.Composite
+    inputs: ref.Inputs
+    composite: ref.Composite
     differences: NDArray[np.float64]
 
     @classmethod
     def of(cls, case: FieldCase, level: SampleLevel, scale: float) -> "_Comparison":
         network, weights = (
-            ref_field.DenseNetwork(case.shape.depth, case.shape.skip),
+            ref.DenseNetwork(case.shape.depth, case.shape.skip),
             case.shape.weights(case.parameters),
         )
         edges, samples = level.edges.get().astype(np.float64), level.samples
         colours, densities, inputs = network.forward(weights, *case.encoded(edges))
         lengths = np.diff(edges, axis=1) * case.cones[:, 7:8]
-        composite = ref_field.Composite(
+        composite = ref.Composite(
             colours.reshape(-1, samples, 3), densities.reshape(-1, samples), lengths, BACKGROUND.astype(np.float64)
         )
         differences = composite.colours()
@@ -347,7 +344,7 @@ class _Comparison:
             yield by_element("composite_forward", f"{name}, {what}", table.get(), wanted, 1e-4, 1.0)
         yield by_element("composite_forward", what, self.level.colours.get(), self.composite.colours(), 1e-4, 1.0)
 
-    def backward(self, counted: int) -> tuple[ref_field.Weights, NDArray[np.float64]]:
+    def backward(self, counted: int) -> tuple[ref.Weights, NDArray[np.float64]]:
         by_colours = 2 * self.scale * self.differences
         by_colours[counted:] = 0
         by_raw, by_densities = self.composite.backward(by_colours)
@@ -376,7 +373,7 @@ def updates_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Figu
         gradient = (rng.normal(size=count) * 10.0 ** rng.uniform(-10, 1, count)).astype(np.float32)
         learned.update(device.upload(gradient), AdamStep(0.01, epsilon), number)
         own = gradient.astype(np.float64)
-        values, moment1, moment2 = ref_field.update(values, moment1, moment2, own, 0.01, number, epsilon)
+        values, moment1, moment2 = ref.update(values, moment1, moment2, own, 0.01, number, epsilon)
     found = learned.tables()
     yield by_element("dense_update", "parameters", found["parameters"][:, 0], values, 1e-4, 0.01)
     yield by_element("dense_update", "first moments", found["moment1"][:, 0], moment1, 1e-4, 1e-12)

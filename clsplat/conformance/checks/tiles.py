@@ -203,13 +203,9 @@ def miscounted_figures(device: Device, case: Case) -> Iterator[Figure]:
         tile, splat = (array.get() for array in arrays)
         what = f"large Gaussians counted with {surplus:+d} tiles"
         owner = np.repeat(np.arange(number), count)
-        yield equal("emit_large", f"places of {what}", splat, _and_untouched(owner))
+        yield equal("emit_large", f"places of {what}", splat, np.append(owner, np.full(64, UNTOUCHED)))
         yield wrong("emit_large", f"tiles outside, {what}", tile[: len(owner)] >= camera.tiles)
         yield equal("emit_large", f"places behind {what}", tile[len(owner) :], UNTOUCHED)
         pairs = np.stack([owner, tile[: len(owner)]], axis=1)
         twice = len(pairs) - len(np.unique(pairs, axis=0)) - int(np.maximum(0, count - camera.tiles).sum())
         yield Figure("emit_large", f"tiles listed twice, {what}", max(0, twice), 0, counts=True)
-
-
-def _and_untouched(owner: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.concatenate([owner, np.full(64, UNTOUCHED)])

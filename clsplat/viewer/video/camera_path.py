@@ -108,7 +108,16 @@ def write(path: Path, views: Sequence[View], fps: float) -> None:
         "smoothness_value": 0.0,
         "default_fov": frames[0]["fov"],
         "default_transition_sec": len(views) / fps / max(1, len(keys) - 1),
-        "keyframes": [{"matrix": frames[i]["camera_to_world"], **_lens(frames[i])} for i in keys],
+        "keyframes": [
+            {
+                "matrix": frames[i]["camera_to_world"],
+                "fov": frames[i]["fov"],
+                "aspect": frames[i]["aspect"],
+                "override_transition_enabled": False,
+                "override_transition_sec": None,
+            }
+            for i in keys
+        ],
         "camera_path": frames,
     }
     write_text(path, json.dumps(table, indent=1) + "\n")
@@ -155,15 +164,6 @@ def _frame(view: View) -> dict[str, Any]:
     fov = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
     moment = {} if view.time is None else {"render_time": view.time}
     return {"camera_to_world": matrix.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height, **moment}
-
-
-def _lens(frame: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "fov": frame["fov"],
-        "aspect": frame["aspect"],
-        "override_transition_enabled": False,
-        "override_transition_sec": None,
-    }
 
 
 def _camera(size: Size, fov: float) -> Camera:
@@ -218,14 +218,10 @@ def _affine(file: Path) -> tuple[Floats, float]:
     """The rotation with its shift, [3, 4], and the scale of a file WORLD.  Raises DataError."""
     table = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
     frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
-    scale = frame.number("scale")
-    return _rigid(frame, "transform"), _positive(file, scale)
-
-
-def _positive(file: Path, scale: float | None) -> float:
+    matrix, scale = _rigid(frame, "transform"), frame.number("scale")
     if scale is None or not scale > 0:
         raise DataError(f"{file}: scale is {quoted(scale)}; expected a number above 0: export the file again")
-    return scale
+    return matrix, scale
 
 
 def _rigid(frame: JsonFrame, key: str) -> Floats:
