@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat.core.errors import ConfigError
+from clsplat.data_tools.multiscale import write_multiscale
 from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.prepare.features import CameraModel
 from clsplat.prepare.mapping import Mapper
@@ -72,6 +73,16 @@ def city(
     from clsplat.data_tools.city import City
 
     print(write_dataset(out, City(size=size, train=train, test=test, seed=seed, lots=lots)))
+
+
+@app.command()
+def multiscale(
+    source: Annotated[Path, typer.Argument(help="Folder of a single-scale Blender dataset.")],
+    out: Annotated[Path, typer.Argument(help="Folder to make.")],
+    levels: Annotated[int, typer.Option(min=1, max=8, help="Number of sizes: full, half, quarter, …")] = 4,
+) -> None:
+    """Make the multi-scale Blender dataset of mip-NeRF from a single-scale one."""
+    print(f"{write_multiscale(source, out, levels)} images written to {out}")
 
 
 @app.command()

@@ -257,5 +257,5 @@ def test_data_tools_are_commands(tmp_path):
     result = CliRunner().invoke(cli.app, ["data", "masks", str(scene)])
     assert result.output.endswith("2 masks written\n")
     listing = CliRunner().invoke(cli.app, ["data", "--help"]).output
-    for name in ("photos", "video", "undistort", "masks", "synthetic", "fetch"):
+    for name in ("photos", "video", "undistort", "masks", "multiscale", "synthetic", "fetch"):
         assert name in listing

@@ -10,12 +10,12 @@ import pytest
 
 from clsplat.core.errors import DataError
 from clsplat.core.settings import variants
+from clsplat.data_tools.multiscale import pyramid, write_multiscale
 from clsplat.photos.sampling import Order, ViewPool
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import make_scene
 from clsplat.scene.view import View, load_image
-from tests.support.multiscale import pyramid, write_multiscale
 from tests.support.refusals import refusal
 
 
@@ -98,6 +98,13 @@ def test_damaged_metadata_is_refused(folders, tmp_path):
         assert str(tmp_path) in message
         with pytest.raises(DataError, match=words):
             read_scene(tmp_path)
+
+
+def test_images_that_cannot_be_halved_are_refused(tiny_scene, tmp_path):
+    with pytest.raises(DataError, match="40x40 pixels of uint8; expected 8 bits and a size that can be halved 4 times"):
+        write_multiscale(tiny_scene, tmp_path, levels=5)
+    with pytest.raises(DataError, match=r"no transforms_train\.json"):
+        write_multiscale(tmp_path / "images_train", tmp_path, levels=2)
 
 
 def test_scales_are_those_of_the_photographs(tiny_scene):

@@ -33,7 +33,6 @@ import yaml  # type: ignore[import-untyped]
 
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.yaml_file import read_pipeline
-from tests.support.multiscale import write_multiscale
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
@@ -288,7 +287,7 @@ class Place:
             self.clsplat("data", "city", "city", "--size", "40", "--train", "8", "--test", "2", "--lots", "2")
             thin(self.folder / "city" / "points3d.ply")
         if "multiscale" in scenes:
-            write_multiscale(self.folder / "still", self.folder / "multiscale", 2)
+            self.clsplat("data", "multiscale", "still", "multiscale", "--levels", "2")
         for name, lens in {"lens": LENS, "fisheye": FISHEYE}.items():
             self._write_lens(name, lens)
         self.clsplat("data", "masks", "still", "--out", "masks")

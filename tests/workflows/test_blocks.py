@@ -13,11 +13,11 @@ import clsplat
 from clsplat.cli import app
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, NoneInsideError
 from clsplat.core.schedule import values_of
+from clsplat.data_tools.multiscale import write_multiscale
 from clsplat.density.control import Box
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
 from clsplat.workflows import finetune
-from tests.support.multiscale import write_multiscale
 
 pytestmark = pytest.mark.slow
 

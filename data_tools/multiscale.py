@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.errors import DataError
 from clsplat.core.files import write_text
 from clsplat.scene.images import read_image, write_image
 from clsplat.scene.transforms_json import Transforms, view_name
@@ -20,8 +21,13 @@ MIN_DEPTH, MAX_DEPTH = 2.0, 6.0  # scene units; mip-NeRF's values for these scen
 
 
 def write_multiscale(source: Path, out: Path, levels: int = 4) -> int:
-    """Write images_train, images_test, … and metadata.json into `out`; return the number of images."""
+    """Write images_train, images_test, … and metadata.json into `out`; return the number of images.
+
+    Raises DataError when `source` is not a Blender folder or its images cannot be halved so often.
+    """
     splits = {path.stem.removeprefix("transforms_"): path for path in sorted(source.glob("transforms_*.json"))}
+    if "train" not in splits:
+        raise DataError(f"{source}: has no transforms_train.json; expected the folder of a Blender dataset")
     metadata = {name: _write_split(Transforms(path), name, out, levels) for name, path in splits.items()}
     write_text(out / "metadata.json", json.dumps(metadata) + "\n")
     points = source / "points3d.ply"
@@ -47,6 +53,11 @@ def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> d
     for i, (frame, view) in enumerate(zip(transforms.frames, transforms.views(), strict=True)):
         pixels = read_image(view.image_path)
         height, width = pixels.shape[:2]
+        if pixels.dtype != np.uint8 or height % 2 ** (levels - 1) or width % 2 ** (levels - 1):
+            raise DataError(
+                f"{view.image_path}: {width}x{height} pixels of {pixels.dtype}; expected 8 bits and a size that can be "
+                f"halved {levels - 1} times: use fewer levels"
+            )
         for j, image in enumerate(pyramid(pixels, levels)):
             file = view_name(f"images_{name}/{i:03d}_d{j}.png")
             write_image(out / file, image)
