@@ -103,9 +103,7 @@ def inspect(
         raise DataError(inspection.verdict)
 
 
-@command(
-    "bench", "clsplat bench --json > before.json", "clsplat bench --against before.json", "clsplat bench --packing"
-)
+@command("bench", "clsplat bench --json > before.json", "clsplat bench --against before.json")
 def bench(
     scenes: Annotated[
         str, typer.Option(metavar="NAME,…", help="Fixed scenes, of A, B and C, separated by commas.")
@@ -127,9 +125,6 @@ def bench(
         Path | None,
         typer.Option(metavar="FILE", help="Only time 50 000 to a million Gaussians; an SVG is written."),
     ] = None,
-    packing: Annotated[
-        bool, typer.Option("--packing", help="Only time several processes at once, which share a CPU's cores.")
-    ] = False,
     device: DeviceOption = None,
 ) -> None:
     """Time the stages of a training step on fixed scenes, beside the device's measured peaks."""
@@ -137,15 +132,6 @@ def bench(
         raise ConfigError("bench: --growth writes a chart; leave out --against and --json")
     if as_json:
         terminal.keep_stdout_for_json()
-    if packing:
-        if model or growth or against:
-            raise ConfigError("bench: --packing times a fixed scene; leave --model, --growth and --against out")
-        packings = tools.measure_packing(scenes, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device)
-        if as_json:
-            terminal.show_json(packings.data())
-        else:
-            terminal.show(packings.text())
-        return
     earlier = tools.read_measurement(against, pipeline) if against else {}
     if growth is not None:
         table = tools.measure_growth(growth, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device)

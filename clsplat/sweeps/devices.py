@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from clsplat.conformance.bench.packing import known_packing, told
 from clsplat.core import machine
 from clsplat.core.errors import ConfigError, DataError, DeviceError, OutputError, amount
 from clsplat.core.files import write_text
@@ -29,21 +28,19 @@ from clsplat.sweeps.child import filled, run_command
 # How many runs share a CPU, and which cores each has.
 
 LOG = logging.getLogger("clsplat")
-Packing = int | Literal["auto"]
 Parts = list[tuple[int, ...]]  # the cores of each run; one without cores has all, and is not kept to any
 
 
-def shares_of(devices: Sequence[DeviceInfo], packing: Packing) -> list[Parts]:
-    """Return the cores of the runs of each device, and say what was chosen by a measurement.
+def shares_of(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
+    """Return the cores of the runs of each device; a device that is no CPU has one run.
 
-    A device that is no CPU has one run.  With "auto" so has each of several CPU devices, for they share the cores.
     Raises ConfigError for more runs than cores.
     """
     own = machine.usable()
-    if packing != "auto" and packing > len(own):
+    if packing > len(own):
         raise ConfigError(f"execution.packing: {packing} runs cannot share {amount(len(own), 'core')}; expected fewer")
-    is_only = sum(info.kind == "CPU" for info in devices) == 1
-    return [_parts(info, own, packing, is_only) if info.kind == "CPU" else [()] for info in devices]
+    parts: Parts = machine.shares(own, packing) if packing > 1 else [()]
+    return [parts if info.kind == "CPU" else [()] for info in devices]
 
 
 def memory_of_each(info: DeviceInfo, runs: int) -> int:
@@ -52,19 +49,6 @@ def memory_of_each(info: DeviceInfo, runs: int) -> int:
         return info.memory
     free = available_memory()
     return info.memory // runs if free is None else min(info.memory, free // runs)
-
-
-def _parts(info: DeviceInfo, own: tuple[int, ...], packing: Packing, is_only: bool) -> Parts:
-    if packing == "auto":
-        packing = _measured(info) if is_only and len(own) > 1 else 1
-    return machine.shares(own, packing) if packing > 1 else [()]
-
-
-def _measured(info: DeviceInfo) -> int:
-    known = known_packing(info)
-    how = "by `clsplat bench --packing`" if known else "`clsplat bench --packing` would tell whether several are faster"
-    LOG.info("%s: %s; %s", info.text, told(known or 1), how)
-    return known or 1
 
 
 TOLD = "clsplat"  # name of what a worker tells of its device, among the figures that Dask keeps of it
@@ -126,10 +110,10 @@ def place_of(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
         return None
 
 
-def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) -> list[DeviceSlot]:
+def places(worker: str, devices: list[str] | None = None, packing: int = 1) -> list[DeviceSlot]:
     """Return the devices of this machine that work, or those of a list of names, with their classes.
 
-    packing: the runs that share a CPU, each of which has a place; "auto": what was measured, else one.
+    packing: the runs that share a CPU, each of which has a place.
     Raises DeviceError where there is none, or one of the list does not work, ConfigError for more runs than cores.
     """
     infos = list_devices()
