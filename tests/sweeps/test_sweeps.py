@@ -394,19 +394,6 @@ def test_damaged_records_of_a_store_do_not_stop_who_looks(file, runs, tmp_path):
         assert store_status(store.root)["counts"] == before["counts"]
 
 
-def test_a_page_is_of_a_store_and_never_over_a_file_of_a_run(few_steps, store, tmp_path):
-    store.now()
-    (store.root / "cells").mkdir()
-    commands.status(store.root, tmp_path / "page.html")
-    assert "no cells" in (tmp_path / "page.html").read_text()
-    for folder, html, words in (
-        (few_steps, tmp_path / "page.html", "--html: .* is no store of cells"),
-        (store.root, tmp_path / "page.txt", "ends in .html"),
-    ):
-        with pytest.raises(ConfigError, match=words):
-            commands.status(folder, html)
-
-
 def test_a_single_pipeline_has_no_cell_by_number(runs, tmp_path):
     with pytest.raises(ConfigError, match="leave --index out"):
         single.run_one("smoke", tmp_path / "store", index=1)
