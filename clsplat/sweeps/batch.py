@@ -29,7 +29,6 @@ from clsplat.sweeps.child import plugin_files, run_command
 from clsplat.sweeps.devices import places
 from clsplat.sweeps.engines import Drive, Engine, InlineEngine, Wanted
 from clsplat.sweeps.experiment import matrix_opened
-from clsplat.sweeps.memory_need import Need
 from clsplat.sweeps.store import ERRORS, LEASE, MANIFEST, Store, copy_files, link_or_copy
 from clsplat.sweeps.task import Outcome, Terms, run_cell
 from clsplat.training import checkpoint
@@ -239,9 +238,8 @@ def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
     if planned := check_preparation(cell.pipeline, store.prepared.parent / cell.name):
         prepare(planned, cell.pipeline.settings.scene.folder, store.prepared)
     known = scenes.known(cell.pipeline)
-    need = Need.of(cell.pipeline, known.scene) if known.scene else None
     own = CellRun.of(cell.name, cell.pipeline, known.digest, bits="")
-    return Wanted(own, steps_of(cell.pipeline) * known.pixels, need)
+    return Wanted(own, steps_of(cell.pipeline) * known.pixels)
 
 
 def steps_of(pipeline: Pipeline) -> int:

@@ -37,7 +37,6 @@ class Known:
 
     digest: str
     pixels: float  # of all training photographs, for the order of cells
-    scene: Scene | None = None  # as its files have it; None where `prepare` makes it
 
 
 @cache
@@ -110,7 +109,7 @@ class Scenes:
         with self._digests(settings.folder) as digest_of:
             original, identity = identify(settings, digest_of)
         pixels = sum(view.camera.width * view.camera.height for view in original.split("train")) / settings.downscale**2
-        return Known(identity.digest, float(pixels), original)
+        return Known(identity.digest, float(pixels))
 
     @contextmanager
     def _digests(self, scene: Path) -> Iterator[Any]:

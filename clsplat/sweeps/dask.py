@@ -153,10 +153,6 @@ class Cluster:
             self._look(now)
         return self._places
 
-    def may_join(self, waited: float) -> bool:
-        """Whether workers may still join: those of a scheduler elsewhere, for a minute."""
-        return self._found is None and waited <= ALONE
-
     def _look(self, now: float) -> None:
         with self._needs_scheduler():
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
@@ -245,8 +241,7 @@ async def _serve(execution: Execution, found: Sequence[DeviceSlot], stop: thread
             "host": place.worker,
             "device": place.device,
             "bits": place.bits,
-            "limits": [place.memory, place.allocation],
-            "unified": place.unified,
+            "memory": place.memory,
             "code": code_digest(),
         }
         for place in found

@@ -19,7 +19,7 @@ from typing import Any
 from clsplat.core import machine
 from clsplat.core.errors import ConfigError, DataError, DeviceError, OutputError, amount
 from clsplat.core.files import write_text
-from clsplat.core.machine import Owner, available_memory, cache_folder
+from clsplat.core.machine import Owner, cache_folder
 from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
 from clsplat.sweeps.cell import code_digest
@@ -41,14 +41,6 @@ def shares_of(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
         raise ConfigError(f"execution.packing: {packing} runs cannot share {amount(len(own), 'core')}; expected fewer")
     parts: Parts = machine.shares(own, packing) if packing > 1 else [()]
     return [parts if info.kind == "CPU" else [()] for info in devices]
-
-
-def memory_of_each(info: DeviceInfo, runs: int) -> int:
-    """Return the bytes that each of the runs of a device may take: of a CPU they share what the host has free."""
-    if runs == 1:
-        return info.memory
-    free = available_memory()
-    return info.memory // runs if free is None else min(info.memory, free // runs)
 
 
 TOLD = "clsplat"  # name of what a worker tells of its device, among the figures that Dask keeps of it
@@ -93,8 +85,6 @@ class DeviceSlot:
     text: str = ""  # what it is
     cores: tuple[int, ...] = ()  # of a CPU that several runs share; none: all
     memory: int = sys.maxsize  # bytes that a run may take
-    allocation: int = sys.maxsize  # bytes, largest single buffer
-    unified: bool = False  # its memory is the host's
 
 
 def place_of(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
@@ -104,8 +94,7 @@ def place_of(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
         if values["code"] != code_digest():
             return None
         device, bits, text = (str(values[name]) for name in ("device", "bits", "host"))
-        memory, allocation = map(int, values["limits"])
-        return DeviceSlot(address, device, bits, text, (), memory, allocation, bool(values["unified"]))
+        return DeviceSlot(address, device, bits, text, memory=int(values["memory"]))
     except (ValueError, KeyError, TypeError):
         return None
 
@@ -122,15 +111,8 @@ def places(worker: str, devices: list[str] | None = None, packing: int = 1) -> l
         raise DeviceError("no OpenCL device works; `clsplat devices` tells why")
     found = []
     for info, parts in zip(chosen, shares_of(chosen, packing), strict=True):
-        own = DeviceSlot(
-            worker,
-            word_of(info, infos),
-            bits_class(info, infos),
-            info.text,
-            memory=memory_of_each(info, len(parts)),
-            allocation=info.allocation,
-            unified=info.unified,
-        )
+        bits, memory = bits_class(info, infos), info.memory // len(parts)
+        own = DeviceSlot(worker, word_of(info, infos), bits, info.text, memory=memory)
         found += [replace(own, cores=part) for part in parts]
     return found
 

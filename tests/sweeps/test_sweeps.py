@@ -292,7 +292,7 @@ class FakeClient:
 
     @staticmethod
     def told(code: str) -> str:
-        return json.dumps({"host": "h", "device": "d", "bits": "b", "limits": [8, 4], "unified": False, "code": code})
+        return json.dumps({"host": "h", "device": "d", "bits": "b", "memory": 8, "code": code})
 
     def scheduler_info(self, n_workers):
         return self.info
