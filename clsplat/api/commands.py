@@ -360,7 +360,7 @@ def work_for(
     devices: names, default every device that works; tls: files of the authority, the certificate and its key.
     """
     from clsplat.pipeline.execution import options
-    from clsplat.sweeps.worker import offer
+    from clsplat.sweeps.dask import offer  # where Dask is installed
 
     load_plugins()
     certificates = {key: file for key, file in zip(("ca", "cert", "key"), tls, strict=True) if file} or None

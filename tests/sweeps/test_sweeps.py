@@ -264,7 +264,7 @@ def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
 
 def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeypatch):
     pytest.importorskip("clsplat.sweeps.dask")
-    monkeypatch.setattr("clsplat.sweeps.worker.places", lambda *words: pytest.fail("a device is proved"))
+    monkeypatch.setattr("clsplat.sweeps.dask.places", lambda *words: pytest.fail("a device is proved"))
     with pytest.raises(ConfigError, match=r"tls.ca \(--tls-ca\): gone.pem"):
         sweeps.work_for("tls://127.0.0.1:1", tls=("gone.pem", authority.cert, authority.key))
 
