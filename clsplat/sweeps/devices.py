@@ -4,7 +4,6 @@ A name is not enough, and too much: other runtimes may give the same bits, and t
 processor.  Devices of one class may go on with each other's cells.
 """
 
-import hashlib
 import json
 import logging
 import subprocess
@@ -20,8 +19,10 @@ from clsplat.core import machine
 from clsplat.core.errors import ConfigError, DataError, DeviceError, OutputError, amount
 from clsplat.core.files import write_text
 from clsplat.core.machine import Owner, cache_folder
+from clsplat.core.manifest import hash_of
 from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
+from clsplat.pipeline.files import shipped
 from clsplat.sweeps.cell import code_digest
 from clsplat.sweeps.child import filled, run_command
 
@@ -47,32 +48,12 @@ TOLD = "clsplat"  # name of what a worker tells of its device, among the figures
 CLASS = 8  # hexadecimal digits of a bits class
 SECONDS = 600.0  # that the fixed run may take: a runtime may build its kernels for minutes
 SCENE_OPTIONS = ("--size", "48", "--train", "8", "--test", "2", "--seed", "0")
-PIPELINE = """\
-# What a training may use: spherical harmonics, growth, a reset, both filters.
-name: probe
-model:
-  sh_degree: 3
-  world_filter: {type: smoothing, variance: 0.2}
-  screen_filter: {type: mip, variance: 0.1}
-stages:
-  - init: {count: 500}
-  - optimize:
-      steps: 60
-      losses: [{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}]
-      during:
-        - raise_sh: {every: 10}
-        - densify:
-            every: 10
-            start: 5
-            stop: 45
-            rules:
-              - {type: clone, gradient_above: 2.0e-4, size_below: 0.01}
-              - {type: split, gradient_above: 2.0e-4, size_above: 0.01}
-              - {type: prune_faint, opacity_below: 0.005}
-        - reset_opacity: {every: 20, stop: 30, to: 0.1}
-        - refresh_filter: {every: 10}
-  - export: {file: point_cloud.ply}
-"""
+PIPELINE = "smoke"  # it grows, and resets opacity; with all bands, and both filters:
+SETTINGS = (
+    "model.sh_degree=3",
+    "model.world_filter={type: smoothing, variance: 0.2}",
+    "model.screen_filter={type: mip, variance: 0.1}",
+)
 
 
 @dataclass(frozen=True)
@@ -129,8 +110,7 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 
     Raises DeviceError where it fails.
     """
-    host = Owner.this().host
-    key = hashlib.sha256(json.dumps([host, info.text, info.driver, code_digest()]).encode()).hexdigest()
+    key = hash_of(Owner.this().host, info.text, info.driver, code_digest(), shipped()[PIPELINE])
     note = cache_folder() / "bits" / f"{key[:16]}.json"
     with suppress(DataError):
         found = read_json(note)
@@ -146,11 +126,10 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 def _run(device: str) -> str:
     with tempfile.TemporaryDirectory(prefix="clsplat-") as name:
         folder = Path(name)
-        write_text(folder / "probe.yaml", PIPELINE)
         scene = str(folder / "scene")
         _call(device, [sys.executable, "-P", "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder)
-        words = filled(run_command(device), folder / "probe.yaml", folder / "run")
-        _call(device, [*words, "--scene", scene], folder)
+        words = filled(run_command(device), shipped()[PIPELINE], folder / "run")
+        _call(device, [*words, "--scene", scene, *(word for one in SETTINGS for word in ("--set", one))], folder)
         return sha256(folder / "run" / "point_cloud.ply")[:CLASS]
 
 
