@@ -50,7 +50,6 @@ if TYPE_CHECKING:
     from clsplat.api.tools import doctor as doctor
     from clsplat.api.tools import inspect_scene as inspect_scene
     from clsplat.api.tools import load_plugin as load_plugin
-    from clsplat.api.tools import measure_packing as measure_packing
     from clsplat.api.tools import measure_speed as measure_speed
     from clsplat.api.tools import read_measurement as read_measurement
     from clsplat.api.trainer import Report as Report
@@ -95,7 +94,7 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     " train_in_blocks view work_for write_levels",
     "clsplat.api.pictures": "camera_path render_path render_views write_cameras write_video",
     "clsplat.api.renderer": "FieldRenderer Gradients Picture Renderer",
-    "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_packing measure_speed read_measurement",
+    "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",
     "clsplat.core.resources": "__version__",
     "clsplat.formats.splats": "Reading Writing",

@@ -86,17 +86,17 @@ def steps_key(folder: Path) -> str:
     return steps_key(folder)
 
 
-def status(folder: PathLike, html: PathLike | None = None) -> dict[str, Any]:
+def status(folder: PathLike) -> dict[str, Any]:
     """Return how far a run or a matrix is, from its files: what status.json holds, `last` report, `metrics` at the end.
 
     A matrix has `cells`, `done` and `failed` in the place of the step.  `silent` is the time in s since the last
     heartbeat of a run that has not ended, `ahead` that by which it lies in the future, from a minute on; the state is
     `killed` where its process is gone.  Of the store of a sweep return its `cells`, `counts` of their states, `events`,
-    of a scene in blocks its `state` and its `parts`.  html: a page to be written of a store.
+    of a scene in blocks its `state` and its `parts`.
     """
     from clsplat.workflows.folder import status_of
 
-    return status_of(Path(folder), path_of(html))
+    return status_of(Path(folder))
 
 
 def status_schema() -> dict[str, Any]:
@@ -360,7 +360,7 @@ def work_for(
     devices: names, default every device that works; tls: files of the authority, the certificate and its key.
     """
     from clsplat.pipeline.execution import options
-    from clsplat.sweeps.worker import offer
+    from clsplat.sweeps.dask import offer  # where Dask is installed
 
     load_plugins()
     certificates = {key: file for key, file in zip(("ca", "cert", "key"), tls, strict=True) if file} or None

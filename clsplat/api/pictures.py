@@ -135,8 +135,8 @@ def write_cameras(
     images: copy the photographs to out/images, too.  Returns the files of cameras.  Raises DataError for a lens that
     the format cannot hold, ConfigError where a file is there.
     """
-    from clsplat.runs import cameras
+    from clsplat.runs import model_file
     from clsplat.scene.scene import Scene
 
     load_plugins()
-    return cameras.write(scene if isinstance(scene, Scene) else Path(scene), Path(out), format, images)
+    return model_file.write_cameras(scene if isinstance(scene, Scene) else Path(scene), Path(out), format, images)

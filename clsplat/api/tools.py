@@ -9,7 +9,6 @@ from clsplat.opencl.runtimes import INSTALL as INSTALL
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.conformance.bench.measurement import Measurement
-    from clsplat.conformance.bench.packing import Packings
     from clsplat.conformance.doctor import DeviceReport
     from clsplat.opencl.device import Device
     from clsplat.prepare.inspect.findings import Inspection
@@ -93,26 +92,6 @@ def measure_speed(
         repeats=repeats,
         schedule=schedule,
         device=device,
-    )
-
-
-def measure_packing(
-    scene: str = "A",
-    *,
-    pipeline: PathLike = "splat",
-    repeats: int = 20,
-    schedule: ScheduleName = "auto",
-    device: "str | Device | None" = None,
-) -> "Packings":
-    """Time training steps of 1, 2, 4, … processes at once, each on its part of a CPU's cores, one at least.
-
-    Return steps per second and memory of each number, as `data()` and `text()`; sweeps on this machine take the `best`.
-    """
-    from clsplat.conformance.bench import measurement
-
-    load_plugins()
-    return measurement.measure_packing(
-        [scene], pipeline=str(pipeline), repeats=repeats, schedule=schedule, device=device
     )
 
 

@@ -14,6 +14,14 @@ from clsplat.core.errors import ConfigError, amount, quoted
 from clsplat.core.files import is_there
 
 
+def _numbers(option: str, text: str | None, expected: str) -> list[float] | None:
+    """The numbers of an option, separated by commas.  Raises ConfigError."""
+    try:
+        return None if text is None else [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"{option} {quoted(text)}: expected {expected}") from None
+
+
 @command(
     "evaluate",
     "clsplat evaluate runs/splat_7k",
@@ -45,11 +53,7 @@ def evaluate(
         terminal.keep_stdout_for_json()
     else:
         check_result(out, ".json")
-    try:
-        divisors = None if downscales is None else [float(text) for text in downscales.split(",")]
-    except ValueError:
-        expected = "expected numbers, separated by commas, such as 1,2,4"
-        raise ConfigError(f"--downscales {quoted(downscales)}: {expected}") from None
+    divisors = _numbers("--downscales", downscales, "numbers, separated by commas, such as 1,2,4")
     found = commands.evaluate(
         model,
         scene,
@@ -190,10 +194,7 @@ def compress(
     """Prune, train and quantise a model until it meets a target; every file is measured as it is read back."""
     from clsplat.workflows.compress import table
 
-    try:
-        shares = None if keep is None else [float(text) for text in keep.split(",")]
-    except ValueError:
-        raise ConfigError(f"--keep {quoted(keep)}: expected shares, separated by commas, such as 1,0.7,0.5") from None
+    shares = _numbers("--keep", keep, "shares, separated by commas, such as 1,0.7,0.5")
     found = commands.compress_model(model, scene, target, out, format=format_, keep=shares, steps=steps, device=device)
     terminal.show(table(found))
     chosen, source = found["chosen"], found["source"]

@@ -107,7 +107,6 @@ def _show_summary(folder: Path) -> None:
     "status",
     "clsplat status runs/splat_7k",
     "clsplat status runs/splat_7k --json",
-    "clsplat status runs/store --html store.html",
     "clsplat status --schema > status.schema.json",
 )
 def status(
@@ -117,7 +116,6 @@ def status(
             metavar="RUN|STORE", help="A folder of a run, a matrix or blocks, or a store of cells.", show_default=False
         ),
     ] = None,
-    html: Annotated[Path | None, typer.Option("--html", metavar="FILE", help="Write a page of a store.")] = None,
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of status.json.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -131,7 +129,7 @@ def status(
         return
     if folder is None:
         raise ConfigError("status: expected a run folder, or --schema")
-    found = commands.status(folder, html)
+    found = commands.status(folder)
     if as_json:
         terminal.show_json(found)
     else:

@@ -103,9 +103,7 @@ def inspect(
         raise DataError(inspection.verdict)
 
 
-@command(
-    "bench", "clsplat bench --json > before.json", "clsplat bench --against before.json", "clsplat bench --packing"
-)
+@command("bench", "clsplat bench --json > before.json", "clsplat bench --against before.json")
 def bench(
     scenes: Annotated[
         str, typer.Option(metavar="NAME,…", help="Fixed scenes, of A, B and C, separated by commas.")
@@ -123,23 +121,11 @@ def bench(
         Path | None, typer.Option(metavar="FILE", help="Compare with the JSON of an earlier run, which --json repeats.")
     ] = None,
     schedule: Annotated[Literal["auto", "wide", "simt"], typer.Option(help="wide for CPUs, simt for GPUs.")] = "auto",
-    packing: Annotated[
-        bool, typer.Option("--packing", help="Only time several processes at once, which share a CPU's cores.")
-    ] = False,
     device: DeviceOption = None,
 ) -> None:
     """Time the stages of a training step on fixed scenes, beside the device's measured peaks."""
     if as_json:
         terminal.keep_stdout_for_json()
-    if packing:
-        if model or against:
-            raise ConfigError("bench: --packing times a fixed scene; leave --model and --against out")
-        packings = tools.measure_packing(scenes, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device)
-        if as_json:
-            terminal.show_json(packings.data())
-        else:
-            terminal.show(packings.text())
-        return
     earlier = tools.read_measurement(against, pipeline) if against else {}
     names = [name for name in scenes.split(",") if name]
     found = tools.measure_speed(

@@ -245,12 +245,11 @@ CHECKPOINTS = "checkpoints"
 UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
-SEAMS = "seams"
 MODULE_FILES = "view_"  # what the side files of modules begin with
 RESERVED = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
-        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, SEAMS, "cameras.json"),
+        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json"),
     }
 )
 BEFORE_A_RUN = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml

@@ -116,11 +116,6 @@ def usable() -> tuple[int, ...]:
     return tuple(range(os.cpu_count() or 1))
 
 
-def packings(cores: int) -> list[int]:
-    """Return the numbers of processes that so many cores are shared by: 1, 2, 4, … and one a core."""
-    return sorted({1 << power for power in range(cores.bit_length()) if 1 << power <= cores} | {cores})
-
-
 def shares(cores: Cores, processes: int) -> list[tuple[int, ...]]:
     """Return the cores of each process: equal parts of neighbours, which share caches and memory.
 
@@ -206,15 +201,6 @@ def _boot() -> str | None:
     try:
         return read_text(BOOT_ID).strip() or None
     except DataError:
-        return None
-
-
-def peak_memory() -> int | None:
-    """Return the bytes that this process has held at most; None where the system does not say."""
-    try:
-        lines = read_text(Path("/proc/self/status")).splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))
-    except (DataError, StopIteration):
         return None
 
 

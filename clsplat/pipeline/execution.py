@@ -56,9 +56,8 @@ class Execution(Settings):
     """Devices of this machine, as `--device` takes them; auto: every device that works; inline: the first."""
     placement: Placement = Placement()
     """Which devices may run which cells."""
-    packing: Literal["auto"] | Annotated[int, Field(ge=1)] = "auto"
-    """Processes at once on each CPU of engine local, which share its cores; auto: what `clsplat bench --packing` found
-    best here, else one."""
+    packing: Annotated[int, Field(ge=1)] = 1
+    """Processes at once on each CPU of engine local, which share its cores."""
     retries: Annotated[int, Field(ge=1)] = 3
     """Failures of a cell without a newer checkpoint after which it is given up."""
     insecure: bool = False

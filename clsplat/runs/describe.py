@@ -9,9 +9,8 @@ from clsplat.core.errors import DataError, amount
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.estimate import expected
-from clsplat.runs.opening import ReadScene, check_start, open_run, read_run_scene, settle
+from clsplat.runs.opening import ReadScene, check_start, known, listed, open_run, read_run_scene, settle
 from clsplat.runs.outputs import check_places
-from clsplat.runs.preflight import known, listed
 from clsplat.runs.run_folder import Start, check_run_folder, start_of
 from clsplat.runs.runner import check_in, restore
 from clsplat.runs.state import RunState

@@ -36,9 +36,10 @@ from clsplat.render.painter import Painter, SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.results import read_metrics
 from clsplat.runs.state import has_pipeline
+from clsplat.scene import camera_files
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import is_image, write_image
-from clsplat.scene.scene import Background, Scene, scene_name
+from clsplat.scene.scene import HOLDOUT, Background, Scene, scene_name
 from clsplat.scene.view import Alpha, View
 from clsplat.stages.export import Export
 from clsplat.stages.render import image_paths
@@ -424,3 +425,19 @@ def evaluate(
         raise ConfigError(f"expected downscale factors from 1 on, got {wrong[0]:g}")
     perceptual = Perceptual.open(metric_names(list(metrics)), lpips, lpips_input)
     return ModelFile(model, scene, device).evaluate(downscales, perceptual)
+
+
+def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:
+    """Write cameras as files of other programs; return the files.
+
+    scene: a dataset, in a folder or as read, or a run folder, whose cameras are those that it has learned.
+    Raises ClsplatError.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out}: expected a folder to write into")
+    if isinstance(scene, Path) and has_pipeline(scene):
+        source = ModelSource.of(scene, None)
+        found = scene_beside(source.file, read_scene(source.folder, source.settings.split))
+    else:
+        found = scene if isinstance(scene, Scene) else read_scene(scene, HOLDOUT)
+    return camera_files.write_cameras(found, out, format_, images)

@@ -135,7 +135,6 @@ def _place(status: dict[str, Any]) -> str:
 
 # of what these stages write; others give their own names
 TITLES = {"export": "model", "export_field": "field", "render": "renders", "optimize": "pictures"}
-BEFORE_FILES = {"export": "point_cloud.ply", "render": "renders", "viewer": "viewer.html", "report": "report.html"}
 SHORTEST = 0.5  # seconds of a stage that is told
 
 
@@ -161,9 +160,8 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
             ("refit", "steps on all of its photographs") if kept["refit"] else ("kept", "steps, the best model")
         )
         yield f"  {name:<8} {kept['step']:,} {what}, by a validation PSNR of {kept['validation']:.2f} dB"
-    if scene := metrics.get("scene"):
-        yield f"  scene    {scene}" + (f"; {placed}" if placed else "")
-    files = {stage: folder / name for stage, name in metrics.get("files", BEFORE_FILES).items()}
+    yield f"  scene    {metrics['scene']}" + (f"; {placed}" if placed else "")
+    files = {stage: folder / name for stage, name in metrics["files"].items()}
     of_modules = {file: what for kind in variants(TrainingModule).values() for file, what in kind.files.items()}
     told = {
         of_modules.get(file.name) or TITLES.get(stage, stage): file for stage, file in files.items() if file.exists()
@@ -171,7 +169,7 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     for name, file in told.items():
         yield f"  {name:<{max(8, *map(len, told))}} {file}"
     steps = {name: found.get("seconds", 0) for name, found in metrics.get("preparation", {}).items()}
-    spent = {**steps, **metrics.get("seconds", {})}
+    spent = {**steps, **metrics["seconds"]}
     if long := [f"{name} {seconds:.0f} s" for name, seconds in spent.items() if seconds >= SHORTEST]:
         yield f"  time     {', '.join(long)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +21,7 @@ from clsplat.pipeline.matrix import Cell as MatrixCell
 from clsplat.pipeline.matrix import Experiment, load_experiment
 from clsplat.prepare.cache import prepare
 from clsplat.runs.failures import Failures
-from clsplat.runs.preflight import check_preparation
+from clsplat.runs.opening import check_preparation
 from clsplat.runs.run_folder import Start
 from clsplat.runs.state import Phase, RunState, read_sums, sum_of
 from clsplat.sweeps.cell import CellRun, Scenes
@@ -29,7 +29,6 @@ from clsplat.sweeps.child import plugin_files, run_command
 from clsplat.sweeps.devices import places
 from clsplat.sweeps.engines import Drive, Engine, InlineEngine, Wanted
 from clsplat.sweeps.experiment import matrix_opened
-from clsplat.sweeps.memory_need import Need
 from clsplat.sweeps.store import ERRORS, LEASE, MANIFEST, Store, copy_files, link_or_copy
 from clsplat.sweeps.task import Outcome, Terms, run_cell
 from clsplat.training import checkpoint
@@ -74,32 +73,6 @@ EVERY = 2.0  # seconds between two looks at the files
 SHOWN = 4  # cells that are named
 
 
-class Watched:
-    """Counts the steps of all cells, from the files of those that run."""
-
-    def __init__(self, steps: Mapping[str, int]) -> None:
-        """steps: of each cell, by its name."""
-        self._steps, self._looked = steps, time.monotonic()
-        self._count = Count("steps", sum(steps.values()))
-
-    def __call__(self, store: Store, running: Mapping[str, CellRun], ended: Mapping[str, object]) -> None:
-        """Look, where it is time to."""
-        if time.monotonic() - self._looked < EVERY:
-            return
-        self._looked = time.monotonic()
-        done = sum(self._steps.get(name, 0) for name in ended)
-        told = []
-        for name, cell in running.items():
-            newest = max(store.folder(cell.key).attempts(), key=lambda attempt: attempt.beaten, default=None)
-            step = read_status(newest.path).get("step") if newest else 0
-            if isinstance(step, int):
-                done += step
-                told.append(f"{name} {step}/{self._steps.get(name, 0)}")
-        named = ", ".join([*told[:SHOWN], *(["…"] if len(told) > SHOWN else [])])
-        self._count.what = f"steps ({named})" if told else "steps"
-        self._count.reach(min(done, self._count.total))
-
-
 LOG = logging.getLogger("clsplat")
 
 
@@ -120,7 +93,8 @@ class Batch:
     _stop: threading.Event = field(default_factory=threading.Event)
 
     def __post_init__(self) -> None:
-        self._watched = Watched({cell.name: steps_of(cell.pipeline) for cell in self.cells})
+        self._steps = {cell.name: steps_of(cell.pipeline) for cell in self.cells}
+        self._count, self._looked = Count("steps", sum(self._steps.values())), time.monotonic()
 
     def ready(self) -> None:
         """Called once, before the first cell begins."""
@@ -146,8 +120,20 @@ class Batch:
                 self._go(drive, wanted)
 
     def _look(self) -> None:
-        """Show how far the cells are."""
-        self._watched(self.store, self.running, self.outcomes)
+        """Show how far the cells are, from the files of those that run, where it is time to."""
+        if time.monotonic() - self._looked < EVERY:
+            return
+        self._looked = time.monotonic()
+        done, told = sum(self._steps[name] for name in self.outcomes), []
+        for name, cell in self.running.items():
+            newest = max(self.store.folder(cell.key).attempts(), key=lambda attempt: attempt.beaten, default=None)
+            step = read_status(newest.path).get("step") if newest else 0
+            if isinstance(step, int):
+                done += step
+                told.append(f"{name} {step}/{self._steps[name]}")
+        named = ", ".join([*told[:SHOWN], *(["…"] if len(told) > SHOWN else [])])
+        self._count.what = f"steps ({named})" if told else "steps"
+        self._count.reach(min(done, self._count.total))
 
     def _is_stopped(self) -> bool:
         """Whether a signal came; an engine in this process asks again and again."""
@@ -156,7 +142,7 @@ class Batch:
 
     def _wanted(self) -> list[Wanted]:
         """The cells whose scenes can be read; the others have failed."""
-        scenes, found = Scenes(self.store.scenes), []
+        scenes, found = Scenes(self.store.prepared), []
         for cell in self.cells:
             with self.failures.kept(cell.name):
                 found.append(wanted_cell(cell, scenes, self.store))
@@ -239,9 +225,8 @@ def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
     if planned := check_preparation(cell.pipeline, store.prepared.parent / cell.name):
         prepare(planned, cell.pipeline.settings.scene.folder, store.prepared)
     known = scenes.known(cell.pipeline)
-    need = Need.of(cell.pipeline, known.scene) if known.scene else None
     own = CellRun.of(cell.name, cell.pipeline, known.digest, bits="")
-    return Wanted(own, steps_of(cell.pipeline) * known.pixels, need)
+    return Wanted(own, steps_of(cell.pipeline) * known.pixels)
 
 
 def steps_of(pipeline: Pipeline) -> int:
@@ -278,7 +263,7 @@ def run_one(
     store, stop, driving = Store(root), threading.Event(), threading.Event()
     with stopping_on_signals(lambda: ask_to_stop(stop, driving)):
         terms = Terms(store.now(), retries, "cell")
-        wanted = wanted_cell(chosen, Scenes(store.scenes), store)
+        wanted = wanted_cell(chosen, Scenes(store.prepared), store)
         (place,) = places("cell", [device or ""])
         cell = wanted.on(place.bits)
         store.note_sweep(f"{experiment.name}-{cell.name}", {cell.name: cell.key}, cell.key)

@@ -4,16 +4,15 @@ import hashlib
 import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import ClsplatError, DataError
-from clsplat.core.files import PREPARED, write_text
-from clsplat.core.reading import read_json, sha256
+from clsplat.core.errors import DataError
+from clsplat.core.reading import sha256
 from clsplat.core.resources import __version__, list_sources
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.input_files import content_of, contents, in_place, placeless
@@ -37,7 +36,6 @@ class Known:
 
     digest: str
     pixels: float  # of all training photographs, for the order of cells
-    scene: Scene | None = None  # as its files have it; None where `prepare` makes it
 
 
 @cache
@@ -81,12 +79,13 @@ def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple
 
 
 class Scenes:
-    """Fingerprints of scenes.  Hashes of photographs are kept by size and time of change, in a file a scene folder."""
+    """Fingerprints of scenes, each of whose files is hashed once."""
 
-    def __init__(self, folder: Path) -> None:
-        """folder: of those files, which may be lost."""
-        self._folder = folder
+    def __init__(self, prepared: Path) -> None:
+        """prepared: the folder of what `prepare` makes."""
+        self._prepared = prepared
         self._known: dict[str, Known] = {}
+        self._digest_of = cache(_digest_of)
 
     def known(self, pipeline: Pipeline) -> Known:
         """Return what is known of a pipeline's scene.
@@ -98,47 +97,22 @@ class Scenes:
         steps = [step.model_dump(mode="json") for step in settings.prepare]
         key = json.dumps([settings.scene.model_dump(mode="json"), steps])
         if key not in self._known:
-            self._known[key] = self._prepared(pipeline) if settings.prepare else self._read(pipeline)
+            self._known[key] = self._read(pipeline)
         return self._known[key]
-
-    def _prepared(self, pipeline: Pipeline) -> Known:
-        folder = pipeline.settings.scene.folder
-        return Known(plan(pipeline.settings.prepare, folder, self._folder / PREPARED)[-1].key, 0.0)
 
     def _read(self, pipeline: Pipeline) -> Known:
         settings = pipeline.settings.scene
-        with self._digests(settings.folder) as digest_of:
-            original, identity = identify(settings, digest_of)
+        if steps := pipeline.settings.prepare:
+            return Known(plan(steps, settings.folder, self._prepared)[-1].key, 0.0)
+        original, identity = identify(settings, self._digest_of)
         pixels = sum(view.camera.width * view.camera.height for view in original.split("train")) / settings.downscale**2
-        return Known(identity.digest, float(pixels), original)
+        return Known(identity.digest, float(pixels))
 
-    @contextmanager
-    def _digests(self, scene: Path) -> Iterator[Any]:
-        """Yield a function that hashes a file below a scene, or knows its hash from before."""
-        place = hashlib.sha256(str(scene.resolve()).encode()).hexdigest()[:KEPT]
-        note = self._folder / f"{place}.json"
-        before: dict[str, Any] = {}
-        with suppress(DataError):
-            found = read_json(note)
-            before = found if isinstance(found, dict) else {}
-        after = dict(before)
 
-        def digest_of(path: Path) -> str:
-            try:
-                state = path.stat()
-                stamp = [state.st_size, state.st_mtime_ns]
-                match before.get(str(path)):
-                    case [size, time, str(digest)] if [size, time] == stamp:
-                        return digest
-                after[str(path)] = [*stamp, sha256(path)]
-            except (DataError, OSError):  # the run will say what is wrong with it
-                return ""
-            return str(after[str(path)][2])
-
-        yield digest_of
-        if after != before:
-            with suppress(ClsplatError):
-                write_text(note, json.dumps(after) + "\n")
+def _digest_of(path: Path) -> str:
+    with suppress(DataError):  # the run will say what is wrong with it
+        return sha256(path)
+    return ""
 
 
 KEY = 20  # hexadecimal digits of the hash that names a cell

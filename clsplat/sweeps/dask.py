@@ -7,6 +7,7 @@ effect, stopping.  At most one cell a device is in flight, for a worker that die
 import asyncio
 import json
 import logging
+import ssl
 import threading
 import time
 import uuid
@@ -17,12 +18,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import ConfigError, DeviceError, InternalError, Interrupted
+from clsplat.core.errors import ConfigError, DataError, DeviceError, InternalError, Interrupted, one_line
+from clsplat.core.machine import Owner
+from clsplat.core.reading import read_file
 from clsplat.core.signals import stopping_on_signals
 from clsplat.pipeline.execution import Execution, Tls
 from clsplat.sweeps.cell import CellRun, code_digest
 from clsplat.sweeps.child import PATIENCE, plugin_files, run_command
-from clsplat.sweeps.connection import require_certificates, unanswered, warn_of_open_port
 from clsplat.sweeps.devices import TOLD, DeviceSlot, place_of, places
 from clsplat.sweeps.engines import ALONE, CellLost, Ticket
 from clsplat.sweeps.store import Store
@@ -51,6 +53,28 @@ SETTINGS = {
 }
 
 
+def require_certificates(tls: Tls) -> None:
+    """Raise ConfigError where one cannot be read, or they do not belong together.  Dask would name no file."""
+    for key in ("ca", "cert", "key"):
+        try:
+            read_file(Path(getattr(tls, key)))
+        except DataError as error:
+            raise ConfigError(f"tls.{key} (--tls-{key}): {error}") from error
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        context.load_verify_locations(tls.ca)
+    except ssl.SSLError as error:
+        raise ConfigError(f"tls.ca (--tls-ca): {tls.ca}: expected a certificate in PEM ({error.reason})") from error
+    try:
+        context.load_cert_chain(tls.cert, tls.key, password=lambda: "")  # else it would ask in the terminal
+    except (ssl.SSLError, ValueError) as error:
+        reason = getattr(error, "reason", None) or error
+        raise ConfigError(
+            f"tls.cert, tls.key (--tls-cert, --tls-key): {tls.cert}, {tls.key}: expected a certificate in PEM and its "
+            f"private key, without a password ({reason})"
+        ) from error
+
+
 def security(tls: Tls | None) -> Any:
     """Return the certificates as distributed takes them; None without.  Raises ConfigError."""
     if tls is None:
@@ -58,6 +82,21 @@ def security(tls: Tls | None) -> Any:
     require_certificates(tls)
     sides = {f"tls_{side}_{part}": getattr(tls, part) for side in SIDES for part in ("cert", "key")}
     return distributed.Security(tls_ca_file=tls.ca, require_encryption=True, **sides)
+
+
+def warn_of_open_port(execution: Execution) -> None:
+    """Say so where a scheduler elsewhere is reached without TLS."""
+    if execution.insecure:
+        LOG.warning("%s: is not encrypted; whoever reaches the scheduler's port can run code", execution.engine)
+
+
+def unanswered(execution: Execution, error: BaseException) -> DeviceError:
+    """Return the error of a scheduler that cannot be reached."""
+    reason = one_line(error.__cause__ or error) or "no answer"
+    remedy = "start it with `dask scheduler`"
+    if execution.tls:
+        remedy += " and certificates of the authority that tls.ca (--tls-ca) names"
+    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); {remedy}")
 
 
 LOG = logging.getLogger("clsplat")
@@ -153,10 +192,6 @@ class Cluster:
             self._look(now)
         return self._places
 
-    def may_join(self, waited: float) -> bool:
-        """Whether workers may still join: those of a scheduler elsewhere, for a minute."""
-        return self._found is None and waited <= ALONE
-
     def _look(self, now: float) -> None:
         with self._needs_scheduler():
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
@@ -224,8 +259,17 @@ class Cluster:
 # Worker processes of this machine, one a device, for a scheduler elsewhere.
 
 
-def serve(execution: Execution, found: Sequence[DeviceSlot]) -> None:
-    """Let a process a device work for a scheduler, until that ends or a signal comes.  Raises DeviceError."""
+def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
+    """Prove each device by a short run, and work for a scheduler until it ends or a signal comes: `clsplat worker`.
+
+    execution: its engine is the scheduler; devices: names, default every device that works.  Raises DeviceError where
+    there is none or no scheduler answers.
+    """
+    if execution.tls:
+        require_certificates(execution.tls)  # before a device is proved, which takes a while
+    found = places(Owner.this().host, list(devices) if devices is not None else None)
+    for place in found:
+        LOG.info("offers %s, bits:%s", place.text, place.bits)
     warn_of_open_port(execution)
     stop = threading.Event()
     with dask.config.set(SETTINGS), stopping_on_signals(stop.set):
@@ -245,8 +289,7 @@ async def _serve(execution: Execution, found: Sequence[DeviceSlot], stop: thread
             "host": place.worker,
             "device": place.device,
             "bits": place.bits,
-            "limits": [place.memory, place.allocation],
-            "unified": place.unified,
+            "memory": place.memory,
             "code": code_digest(),
         }
         for place in found

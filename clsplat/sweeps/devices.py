@@ -4,7 +4,6 @@ A name is not enough, and too much: other runtimes may give the same bits, and t
 processor.  Devices of one class may go on with each other's cells.
 """
 
-import hashlib
 import json
 import logging
 import subprocess
@@ -14,89 +13,47 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from clsplat.conformance.bench.packing import known_packing, told
 from clsplat.core import machine
 from clsplat.core.errors import ConfigError, DataError, DeviceError, OutputError, amount
 from clsplat.core.files import write_text
-from clsplat.core.machine import Owner, available_memory, cache_folder
+from clsplat.core.machine import Owner, cache_folder
+from clsplat.core.manifest import hash_of
 from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
+from clsplat.pipeline.files import shipped
 from clsplat.sweeps.cell import code_digest
 from clsplat.sweeps.child import filled, run_command
 
 # How many runs share a CPU, and which cores each has.
 
 LOG = logging.getLogger("clsplat")
-Packing = int | Literal["auto"]
 Parts = list[tuple[int, ...]]  # the cores of each run; one without cores has all, and is not kept to any
 
 
-def shares_of(devices: Sequence[DeviceInfo], packing: Packing) -> list[Parts]:
-    """Return the cores of the runs of each device, and say what was chosen by a measurement.
+def shares_of(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
+    """Return the cores of the runs of each device; a device that is no CPU has one run.
 
-    A device that is no CPU has one run.  With "auto" so has each of several CPU devices, for they share the cores.
     Raises ConfigError for more runs than cores.
     """
     own = machine.usable()
-    if packing != "auto" and packing > len(own):
+    if packing > len(own):
         raise ConfigError(f"execution.packing: {packing} runs cannot share {amount(len(own), 'core')}; expected fewer")
-    is_only = sum(info.kind == "CPU" for info in devices) == 1
-    return [_parts(info, own, packing, is_only) if info.kind == "CPU" else [()] for info in devices]
-
-
-def memory_of_each(info: DeviceInfo, runs: int) -> int:
-    """Return the bytes that each of the runs of a device may take: of a CPU they share what the host has free."""
-    if runs == 1:
-        return info.memory
-    free = available_memory()
-    return info.memory // runs if free is None else min(info.memory, free // runs)
-
-
-def _parts(info: DeviceInfo, own: tuple[int, ...], packing: Packing, is_only: bool) -> Parts:
-    if packing == "auto":
-        packing = _measured(info) if is_only and len(own) > 1 else 1
-    return machine.shares(own, packing) if packing > 1 else [()]
-
-
-def _measured(info: DeviceInfo) -> int:
-    known = known_packing(info)
-    how = "by `clsplat bench --packing`" if known else "`clsplat bench --packing` would tell whether several are faster"
-    LOG.info("%s: %s; %s", info.text, told(known or 1), how)
-    return known or 1
+    parts: Parts = machine.shares(own, packing) if packing > 1 else [()]
+    return [parts if info.kind == "CPU" else [()] for info in devices]
 
 
 TOLD = "clsplat"  # name of what a worker tells of its device, among the figures that Dask keeps of it
 CLASS = 8  # hexadecimal digits of a bits class
 SECONDS = 600.0  # that the fixed run may take: a runtime may build its kernels for minutes
 SCENE_OPTIONS = ("--size", "48", "--train", "8", "--test", "2", "--seed", "0")
-PIPELINE = """\
-# What a training may use: spherical harmonics, growth, a reset, both filters.
-name: probe
-model:
-  sh_degree: 3
-  world_filter: {type: smoothing, variance: 0.2}
-  screen_filter: {type: mip, variance: 0.1}
-stages:
-  - init: {count: 500}
-  - optimize:
-      steps: 60
-      losses: [{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}]
-      during:
-        - raise_sh: {every: 10}
-        - densify:
-            every: 10
-            start: 5
-            stop: 45
-            rules:
-              - {type: clone, gradient_above: 2.0e-4, size_below: 0.01}
-              - {type: split, gradient_above: 2.0e-4, size_above: 0.01}
-              - {type: prune_faint, opacity_below: 0.005}
-        - reset_opacity: {every: 20, stop: 30, to: 0.1}
-        - refresh_filter: {every: 10}
-  - export: {file: point_cloud.ply}
-"""
+PIPELINE = "smoke"  # it grows, and resets opacity; with all bands, and both filters:
+SETTINGS = (
+    "model.sh_degree=3",
+    "model.world_filter={type: smoothing, variance: 0.2}",
+    "model.screen_filter={type: mip, variance: 0.1}",
+)
 
 
 @dataclass(frozen=True)
@@ -109,8 +66,6 @@ class DeviceSlot:
     text: str = ""  # what it is
     cores: tuple[int, ...] = ()  # of a CPU that several runs share; none: all
     memory: int = sys.maxsize  # bytes that a run may take
-    allocation: int = sys.maxsize  # bytes, largest single buffer
-    unified: bool = False  # its memory is the host's
 
 
 def place_of(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
@@ -120,16 +75,15 @@ def place_of(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
         if values["code"] != code_digest():
             return None
         device, bits, text = (str(values[name]) for name in ("device", "bits", "host"))
-        memory, allocation = map(int, values["limits"])
-        return DeviceSlot(address, device, bits, text, (), memory, allocation, bool(values["unified"]))
+        return DeviceSlot(address, device, bits, text, memory=int(values["memory"]))
     except (ValueError, KeyError, TypeError):
         return None
 
 
-def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) -> list[DeviceSlot]:
+def places(worker: str, devices: list[str] | None = None, packing: int = 1) -> list[DeviceSlot]:
     """Return the devices of this machine that work, or those of a list of names, with their classes.
 
-    packing: the runs that share a CPU, each of which has a place; "auto": what was measured, else one.
+    packing: the runs that share a CPU, each of which has a place.
     Raises DeviceError where there is none, or one of the list does not work, ConfigError for more runs than cores.
     """
     infos = list_devices()
@@ -138,15 +92,8 @@ def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) 
         raise DeviceError("no OpenCL device works; `clsplat devices` tells why")
     found = []
     for info, parts in zip(chosen, shares_of(chosen, packing), strict=True):
-        own = DeviceSlot(
-            worker,
-            word_of(info, infos),
-            bits_class(info, infos),
-            info.text,
-            memory=memory_of_each(info, len(parts)),
-            allocation=info.allocation,
-            unified=info.unified,
-        )
+        bits, memory = bits_class(info, infos), info.memory // len(parts)
+        own = DeviceSlot(worker, word_of(info, infos), bits, info.text, memory=memory)
         found += [replace(own, cores=part) for part in parts]
     return found
 
@@ -163,8 +110,7 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 
     Raises DeviceError where it fails.
     """
-    host = Owner.this().host
-    key = hashlib.sha256(json.dumps([host, info.text, info.driver, code_digest()]).encode()).hexdigest()
+    key = hash_of(Owner.this().host, info.text, info.driver, code_digest(), shipped()[PIPELINE])
     note = cache_folder() / "bits" / f"{key[:16]}.json"
     with suppress(DataError):
         found = read_json(note)
@@ -180,11 +126,10 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 def _run(device: str) -> str:
     with tempfile.TemporaryDirectory(prefix="clsplat-") as name:
         folder = Path(name)
-        write_text(folder / "probe.yaml", PIPELINE)
         scene = str(folder / "scene")
         _call(device, [sys.executable, "-P", "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder)
-        words = filled(run_command(device), folder / "probe.yaml", folder / "run")
-        _call(device, [*words, "--scene", scene], folder)
+        words = filled(run_command(device), shipped()[PIPELINE], folder / "run")
+        _call(device, [*words, "--scene", scene, *(word for one in SETTINGS for word in ("--set", one))], folder)
         return sha256(folder / "run" / "point_cloud.ply")[:CLASS]
 
 

@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-from clsplat.core.errors import DeviceError, Interrupted, MemoryLimitError, amount, first_few
+from clsplat.core.errors import DeviceError, Interrupted, MemoryLimitError
 from clsplat.sweeps.cell import CellRun
 from clsplat.sweeps.child import plugin_files, run_command
 from clsplat.sweeps.devices import DeviceSlot
-from clsplat.sweeps.memory_need import Need
 from clsplat.sweeps.store import Different, Store
 from clsplat.sweeps.task import Outcome, Terms, run_cell
 
@@ -34,9 +33,6 @@ class Engine(Protocol):
 
     def places(self) -> list[DeviceSlot]:
         """Return the devices that are there now.  Raises ClsplatError where there will be none."""
-
-    def may_join(self, waited: float) -> bool:
-        """Whether other devices may still join a sweep that has waited for them, for so many seconds."""
 
     def start(self, cell: CellRun, place: DeviceSlot, terms: Terms) -> Ticket:
         """Begin to run a cell on a device that is free."""
@@ -62,9 +58,6 @@ class InlineEngine:
     def places(self) -> list[DeviceSlot]:
         return [self._place]
 
-    def may_join(self, waited: float) -> bool:
-        return False
-
     def start(self, cell: CellRun, place: DeviceSlot, terms: Terms) -> Ticket:
         command = run_command(place.device, plugin_files())
         return _Ended(run_cell(cell, self._store, command, terms, self._is_stopped))
@@ -84,7 +77,7 @@ class Wanted:
 
     cell: CellRun  # of no class
     cost: float  # steps times pixels, to compare
-    need: Need | None = None  # of memory; None: not known, it may run anywhere
+    above: int = 0  # bytes of the largest device that did not hold it
 
     def on(self, bits: str) -> CellRun:
         """Return the cell in a bits class."""
@@ -105,7 +98,6 @@ class Drive:
     look: Callable[[], None] = lambda: None  # called again and again
     bits: str | None = None  # the class of all cells, once it is chosen
     _seen: float = field(default_factory=time.monotonic)  # when a device of that class was there last
-    _unheld: float | None = None  # since when nothing runs, for no device holds what waits
     _unsuited: tuple[list[DeviceSlot], set[DeviceSlot]] = field(default_factory=lambda: ([], set()))
     """All devices, and those that suit no cell that waits."""
     _running: dict[DeviceSlot, tuple[Wanted, CellRun, Ticket]] = field(default_factory=dict)
@@ -121,10 +113,6 @@ class Drive:
             if self.is_stopped():
                 raise Interrupted("stopped; the same command with --resume goes on")
             self._hand_out(waiting)
-            if self._running:
-                self._unheld = None
-            elif waiting:
-                self._refuse(waiting)
             before = len(self._running)
             for place in list(self._running):
                 self._take_in(place, waiting)
@@ -133,7 +121,7 @@ class Drive:
                 time.sleep(LOOK)
 
     def _hand_out(self, waiting: list[Wanted]) -> None:
-        places = self.engine.places()
+        places = sorted(self.engine.places(), key=lambda place: -place.memory)  # for the longest cell the largest
         classes = [place.bits for place in places]
         if self.is_same and self.bits is None and classes:
             self.bits = self._chosen(classes, waiting)
@@ -171,71 +159,42 @@ class Drive:
             )
 
     def _suits(self, one: Wanted, place: DeviceSlot, places: Sequence[DeviceSlot]) -> bool:
-        """Whether a cell may run on a device: of its class, and such that holds it, as it ends where one does."""
+        """Whether a cell may run on a device: of its class, and larger than those that did not hold it, if one is."""
         allowed = self._allowed(one, places)
-        need = self._need(one, allowed)
-        if need is None or place not in allowed:
-            return place in allowed
-        return need.ends_on(place) or (need.begins_on(place) and not any(map(need.ends_on, allowed)))
+        return place in ([other for other in allowed if other.memory > one.above] or allowed)
 
     def _allowed(self, one: Wanted, places: Sequence[DeviceSlot]) -> list[DeviceSlot]:
         """The devices in whose class a cell may run: one that has begun stays in its own, where that is there now."""
         if self.is_same:
             return [place for place in places if place.bits == self.bits]
-        begun = [own for own in {place.bits for place in places} if self.store.folder(one.on(own).key).path.is_dir()]
+        own = {place.bits for place in places if not one.above}
+        begun = [bits for bits in own if self.store.folder(one.on(bits).key).path.is_dir()]
         return [place for place in places if not begun or place.bits in begun]
-
-    def _need(self, one: Wanted, allowed: Sequence[DeviceSlot]) -> Need | None:
-        """The memory that a cell needs; none where it is published."""
-        classes = {place.bits for place in allowed} if one.need else ()
-        return None if any(self.store.folder(one.on(own).key).result.is_dir() for own in classes) else one.need
-
-    def _refuse(self, waiting: list[Wanted]) -> None:
-        """End the cells that no device holds, where none that does may join; it is called when nothing runs, so that
-        the others are done."""
-        places, found = self.engine.places(), list[tuple[Wanted, Need, list[DeviceSlot]]]()
-        for one in waiting:
-            allowed = self._allowed(one, places)
-            need = self._need(one, allowed)
-            if need is not None and allowed and not any(map(need.begins_on, allowed)):
-                found.append((one, need, allowed))
-        if found and not self._may_join(found):
-            for each in found:
-                self._give_up(*each)
-                waiting.remove(each[0])
-
-    def _may_join(self, found: Sequence[tuple[Wanted, Need, list[DeviceSlot]]]) -> bool:
-        """Whether a device may still join that holds some of these cells; say so once."""
-        now = time.monotonic()
-        waited = 0.0 if self._unheld is None else now - self._unheld
-        if not self.engine.may_join(waited):
-            return False
-        if self._unheld is None:
-            names = first_few([one.cell.name for one, *_ in found])
-            LOG.warning("no device holds %s: %s; waiting for a larger one", amount(len(found), "cell"), names)
-        if self._unheld is None or waited > ALONE:
-            self._unheld = now
-        return True
-
-    def _give_up(self, one: Wanted, need: Need, allowed: Sequence[DeviceSlot]) -> None:
-        largest = max(allowed, key=need.limit_on)
-        cell, code, message = one.on(largest.bits), MemoryLimitError.exit_code, need.refusal(largest)
-        self.store.add(cell).give_up(code, message)
-        self.store.tell("failed", cell=cell.key, exit_code=code)
-        self.ended(cell, Outcome("failed", "", code, message))
 
     def _take_in(self, place: DeviceSlot, waiting: list[Wanted]) -> None:
         one, cell, ticket = self._running[place]
         try:
             outcome = ticket.outcome()
         except CellLost:
-            del self._running[place]
             self.store.tell("lost", cell=cell.key, worker=place.worker)
-            waiting.insert(0, one)
-            self._unsuited[1].clear()
+            self._again(one, place, waiting)
             return
-        if outcome is not None and outcome.state == "different":
+        if outcome is None:
+            return
+        if outcome.state == "different":
             raise Different(outcome.message)
-        if outcome is not None:
-            del self._running[place]
-            self.ended(cell, outcome)
+        larger = replace(one, above=place.memory)
+        if outcome.exit_code == MemoryLimitError.exit_code and any(
+            other.memory > place.memory for other in self._allowed(larger, self.engine.places())
+        ):
+            LOG.warning("cell %s: %s; it goes to a larger device", cell.name, outcome.message)
+            self._again(larger, place, waiting)
+            return
+        del self._running[place]
+        self.ended(cell, outcome)
+
+    def _again(self, one: Wanted, place: DeviceSlot, waiting: list[Wanted]) -> None:
+        """Let a cell wait, and others take its device."""
+        del self._running[place]
+        waiting.insert(0, one)
+        self._unsuited[1].clear()

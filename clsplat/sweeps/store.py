@@ -4,7 +4,7 @@
                 attempts/<uuid>/    an ordinary run folder, written by one process ever, with its lease.json
                 result/             the attempt that came first, renamed, with its manifest.json
                 failed.json         why it was given up
-    prepared/  scenes/              what `prepare` makes; hashes of photographs
+    prepared/                       what `prepare` makes
     undistorted/<scene>-<code>/     photographs without the distortion of their lenses, made once a host
     sweeps/<name>-<hash>.json       the cells of a matrix by their names
     cancel/all  cancel/<key>        that what began before is to stop
@@ -396,7 +396,7 @@ class CellFolder:
                 shutil.rmtree(attempt.path, ignore_errors=True)
 
 
-CELLS, EVENTS, SWEEPS, CANCEL, SCENES = "cells", "events", "sweeps", "cancel", "scenes"
+CELLS, EVENTS, SWEEPS, CANCEL = "cells", "events", "sweeps", "cancel"
 ALL = "all"
 
 
@@ -414,11 +414,6 @@ class Store:
         if not (root / CELLS).is_dir():
             raise DataError(f"{root}: has no folder `{CELLS}`; expected the store of a sweep")
         return cls(root)
-
-    @property
-    def scenes(self) -> Path:
-        """The folder of hashes of photographs."""
-        return self.root / SCENES
 
     @property
     def prepared(self) -> Path:

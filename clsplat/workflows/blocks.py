@@ -10,7 +10,6 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +24,7 @@ from clsplat.core.errors import (
     one_line,
     quoted,
 )
-from clsplat.core.files import METRICS, SEAMS, atomic
+from clsplat.core.files import METRICS
 from clsplat.core.progress import only
 from clsplat.core.reading import read_json, sha256
 from clsplat.core.text_table import text_table
@@ -40,25 +39,19 @@ from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.input_files import placeless
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell as MatrixCell
-from clsplat.render.camera import upload_camera
-from clsplat.render.painter import layers
-from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.estimate import DENSEST, minutes_text, most_of, step_seconds
 from clsplat.runs.failures import Failures
 from clsplat.runs.model_file import as_setting, photographs_of, require_model
 from clsplat.runs.opening import read_run_scene
 from clsplat.runs.status import status_text
-from clsplat.scene.scene import Scene
-from clsplat.scene.view import View
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
-from clsplat.stages.render import image_path
 from clsplat.sweeps.batch import Batch
 from clsplat.sweeps.store import Store
 from clsplat.workflows.block_pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
 from clsplat.workflows.finetune import claimed, is_trained, trained
 from clsplat.workflows.folder import COARSE, MERGED, RECORD
-from clsplat.workflows.partition import SIGHT, Block, Partition, PartitionCell, Partitioner
+from clsplat.workflows.partition import SIGHT, Block, Partition, Partitioner
 
 # How long the training of each block takes, roughly.
 
@@ -87,53 +80,6 @@ def _counts(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[in
 
 def _trainings(pipeline: Pipeline) -> list[Optimize]:
     return [stage for stage in pipeline.stages if isinstance(stage, Optimize)]
-
-
-# Where the borders of blocks lie in the test views: a mask for each view, which the compare page reads.
-
-NEAR_FACE = 0.05  # of a cell's size: what lies so near a face is at a border
-COVERED = 0.5  # of a pixel, from which on its depth counts
-Floats = NDArray[np.floating]
-
-
-def write_seams(cells: list[PartitionCell], model: Model, scene: Scene, device: Device, run: Path) -> None:
-    """Write, for each test view, which pixels show what lies near a face between blocks: 255 there, else 0.
-
-    run: the folder of the merged model; masks go into its folder `seams`.  Raises OutputError.
-    """
-    rasterizer, uploaded = Rasterizer(device), model.upload(device)
-    black = device.upload(np.zeros(3, np.float32))
-    for view in scene.split("test"):
-        found = layers(rasterizer, uploaded, upload_camera(device, view), black, depth=True)
-        assert found.depth is not None
-        near = is_near(places(view, found.depth).reshape(-1, 3), cells).reshape(found.depth.shape)
-        mask = np.where(near & (found.alpha >= COVERED), np.uint8(255), np.uint8(0))
-        _, encoded = cv2.imencode(".png", mask)
-        with atomic(image_path(run / SEAMS, view.name)) as file:
-            file.write(encoded.tobytes())
-
-
-def places(view: View, depth: Floats) -> Floats:
-    """Return where the pixels of a view lie at these depths, [height, width, 3] scene units."""
-    camera, pose = view.camera, np.asarray(view.world_to_camera, np.float64)
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
-    return np.asarray((rays * depth[:, :, None] - pose[:, 3]) @ pose[:, :3])
-
-
-def is_near(points: Floats, cells: list[PartitionCell]) -> NDArray[np.bool_]:
-    """Return which points, [N, 3], lie near a face of the cell that holds them, [N].
-
-    Near is `NEAR_FACE` of the cell's size along the axis: half as far as growth goes beyond a face.
-    """
-    near = np.zeros(len(points), bool)
-    for cell in cells:
-        held, box = cell.box.holds(points), cell.box
-        for axis in range(3):
-            for bound in (box.low[axis], box.high[axis]):
-                if bound is not None:
-                    near |= held & (np.abs(points[:, axis] - bound) < NEAR_FACE * cell.size[axis])
-    return near
 
 
 LOG = logging.getLogger("clsplat")
@@ -279,11 +225,10 @@ class Blocks:
         LOG.info("%s of %s merged", amount(count, "Gaussian"), amount(len(parts), "block"))
         return file
 
-    def finish(self, file: Path, partition: Partition) -> Path:
-        """Run what follows a training on the merged model, and write where borders lie in it; return its folder."""
+    def finish(self, file: Path) -> Path:
+        """Run what follows a training on the merged model; return its folder."""
         run = self.out / MERGED
         trained(of_merged(self.pipeline, file), run, self.device)
-        write_seams([block.cell for block in partition.blocks], load_model(file), self.scene.scene, self.device, run)
         return run
 
 
@@ -306,7 +251,7 @@ def train_in_blocks(
         partition = work.partition()
         if only_plan:
             return {**work.plan_of(partition), "run": None}
-        run = work.finish(work.merge(work.train(partition)), partition)
+        run = work.finish(work.merge(work.train(partition)))
     return {**partition.data(), "run": str(run), "metrics": read_json(run / METRICS)}
 
 

@@ -5,8 +5,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import ConfigError, DataError, in_shell, one_line
-from clsplat.core.files import END_STATES, check_result
+from clsplat.core.errors import DataError, in_shell, one_line
+from clsplat.core.files import END_STATES
 from clsplat.core.reading import read_json
 from clsplat.runs import verify
 from clsplat.runs.state import RunState
@@ -26,24 +26,11 @@ def is_in_blocks(folder: Path) -> bool:
     return (folder / RECORD).is_file()
 
 
-def status_of(folder: Path, html: Path | None = None) -> dict[str, Any]:
-    """Return the state of what a folder holds: a scene in blocks, a store of cells, or a run.
-
-    html: a page to be written of a store.  Raises DataError; ConfigError where the page is of something else.
-    """
-    if html is not None and not is_store(folder):
-        raise ConfigError(f"--html: {folder} is no store of cells; a run and a matrix have pages in their folders")
+def status_of(folder: Path) -> dict[str, Any]:
+    """Return the state of what a folder holds: a scene in blocks, a store of cells, or a run.  Raises DataError."""
     if is_in_blocks(folder):
         return blocks_status(folder)
-    if not is_store(folder):
-        return run_status(folder)
-    found = store_status(folder)
-    if html is not None:
-        from clsplat.sweeps.status import write_page  # and what fills templates, which a look does not need
-
-        check_result(html, ".html")
-        write_page(found, html)
-    return found
+    return store_status(folder) if is_store(folder) else run_status(folder)
 
 
 def check(pipeline: str) -> dict[str, Any]:

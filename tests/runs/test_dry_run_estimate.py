@@ -13,7 +13,7 @@ from clsplat.pipeline.matrix import Cell
 from clsplat.prepare.matching import MAX_EXHAUSTIVE, most_pairs
 from clsplat.runs import estimate as module
 from clsplat.runs.describe import describe
-from clsplat.runs.preflight import check_preparation, known, listed
+from clsplat.runs.opening import check_preparation, known, listed
 from clsplat.stages.optimize import Optimize
 from clsplat.sweeps.batch import wanted_cell
 from clsplat.sweeps.cell import Scenes

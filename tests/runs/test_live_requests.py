@@ -5,84 +5,51 @@ import json
 import pytest
 
 from clsplat.runs.live.preview import Desk
-from clsplat.runs.live.server import Answer, Answers, Refused, Request, camera, host_name, moment, read
+from clsplat.runs.live.server import Answers, Refused, Request, camera, host_name, moment, read
 
 TOKEN = "secret-token"
 
 
-def head(target: str = f"/{TOKEN}/state.json?after=3", host: str = "127.0.0.1:8710", method: str = "GET") -> bytes:
-    return f"{method} {target} HTTP/1.1\r\nHost: {host}\r\nAccept: */*\r\n".encode()
-
-
-def refusal(data: bytes) -> int:
+def refusal(target: str, host: str = "localhost") -> int:
     with pytest.raises(Refused) as caught:
-        read(data, TOKEN)
+        read(target, host, TOKEN)
     return caught.value.answer.status
 
 
 def test_a_request_is_its_path_behind_the_secret_and_its_fields():
-    request = read(head(), TOKEN)
+    request = read(f"/{TOKEN}/state.json?after=3", "localhost", TOKEN)
     assert (request.path, request.query) == ("state.json", {"after": "3"})
     assert request.number("after", 0, 9) == 3
-    assert read(head(f"/{TOKEN}/"), TOKEN).path == ""
+    assert read(f"/{TOKEN}/", "localhost", TOKEN).path == ""
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1:9000", "[::1]:80", "LocalHost:1"])
 def test_names_of_this_machine_are_answered_at_every_port(host):
     """A tunnel may end at another port."""
-    assert read(head(host=host), TOKEN).path == "state.json"
+    assert read(f"/{TOKEN}/state.json", host, TOKEN).path == "state.json"
 
 
 @pytest.mark.parametrize("host", ["evil.example:8710", "127.0.0.1.evil.example", "localhost.evil", ""])
 def test_a_name_that_was_bound_to_this_machine_is_refused(host):
-    assert refusal(head(host=host)) == 403
+    assert refusal(f"/{TOKEN}/", host) == 403
 
 
-@pytest.mark.parametrize("method", ["POST", "HEAD", "get"])
-def test_only_get_is_answered(method):
-    assert refusal(head(method=method)) == 405
-
-
-@pytest.mark.parametrize("target", ["/state.json", "/secret-toke/", "/secret-token2/x", "/%FF/", "//x/"])
+@pytest.mark.parametrize("target", ["/state.json", "/secret-toke/", "/secret-token2/x", "/%FF/", "//x/", "", "/é/"])
 def test_without_the_secret_nothing_is_there(target):
-    assert refusal(head(target)) == 404
+    assert refusal(target) == 404
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"GET\r\n",
-        b"GET /secret-token/ HTTP/1.1\r\n",
-        b"GET /secret-token/ HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n",
-        b"GET /secret-token/ SPDY/3\r\nHost: localhost\r\n",
-        b"GET http://localhost/secret-token/ HTTP/1.1\r\nHost: localhost\r\n",
-        b"GET /secret-token/?" + b"a=1&" * 50 + b" HTTP/1.1\r\nHost: localhost\r\n",
-        b"\xff\xfe /secret-token/ HTTP/1.1\r\nHost: localhost\r\n",
-        b"GET //[ HTTP/1.1\r\nHost: localhost\r\n",
-    ],
-)
-def test_what_is_no_request_is_refused(data):
-    assert refusal(data) == 400
+@pytest.mark.parametrize("target", ["/secret-token/?" + "a=1&" * 50, "//["])
+def test_what_is_no_address_is_refused(target):
+    assert refusal(target) == 400
 
 
 @pytest.mark.parametrize("text", ["", "-1", "10", "1.0", "१", "9" * 4000])
 def test_a_number_is_checked(text):
-    request = read(head(f"/{TOKEN}/?view=5"), TOKEN)
+    request = read(f"/{TOKEN}/?view=5", "localhost", TOKEN)
     request.query["view"] = text
     with pytest.raises(Refused, match="view: expected a whole number from 0 to 9"):
         request.number("view", 0, 9)
-
-
-def test_an_answer_forbids_frames_caches_and_referrers():
-    lines = Answer.json({"a": 1}).bytes().decode().split("\r\n")
-    assert lines[0] == "HTTP/1.1 200 OK"
-    assert lines[-1] == '{"a":1}'
-    kept = Answer(200, headers={"Cache-Control": "private"}).bytes()
-    assert kept.count(b"Cache-Control: ") == kept.count(b"Cache-Control: private") == 1
-    for line in ("Cache-Control: no-store", "Referrer-Policy: no-referrer", "X-Frame-Options: DENY"):
-        assert line in lines
-    assert "X-Content-Type-Options: nosniff" in lines
 
 
 def test_a_name_without_its_port():

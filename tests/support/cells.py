@@ -43,9 +43,6 @@ class Fake:
     def places(self):
         return list(self._places)
 
-    def may_join(self, waited):
-        return False
-
     def start(self, cell, place, terms):
         self.started.append((cell.name, place.device, cell.spec["bits"]))
         end = self.ends.pop(0)

@@ -39,7 +39,7 @@ def test_killed_run_resumes_and_its_cell_has_undisturbed_bits(
 ):
     """CLSPLAT_KILLS=20 kills workers, runs, drivers and schedulers, over six cells."""
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
-    cell = wanted_cell(Cell("few", checked), Scenes(store.scenes), store).on("b")
+    cell = wanted_cell(Cell("few", checked), Scenes(store.prepared), store).on("b")
     outcome = run_cell(cell, store, [PYTHON, "-c", RUN, FILE, OUT], terms)
     assert outcome.state == "published", outcome.message
     ends = [event["exit_code"] for event in store.events() if event["event"] == "end"]

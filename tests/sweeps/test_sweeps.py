@@ -264,7 +264,7 @@ def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
 
 def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeypatch):
     pytest.importorskip("clsplat.sweeps.dask")
-    monkeypatch.setattr("clsplat.sweeps.worker.places", lambda *words: pytest.fail("a device is proved"))
+    monkeypatch.setattr("clsplat.sweeps.dask.places", lambda *words: pytest.fail("a device is proved"))
     with pytest.raises(ConfigError, match=r"tls.ca \(--tls-ca\): gone.pem"):
         sweeps.work_for("tls://127.0.0.1:1", tls=("gone.pem", authority.cert, authority.key))
 
@@ -292,7 +292,7 @@ class FakeClient:
 
     @staticmethod
     def told(code: str) -> str:
-        return json.dumps({"host": "h", "device": "d", "bits": "b", "limits": [8, 4], "unified": False, "code": code})
+        return json.dumps({"host": "h", "device": "d", "bits": "b", "memory": 8, "code": code})
 
     def scheduler_info(self, n_workers):
         return self.info
@@ -392,19 +392,6 @@ def test_damaged_records_of_a_store_do_not_stop_who_looks(file, runs, tmp_path):
         for folder in store.folders():
             (folder.path / "spec.json").write_text(damage)
         assert store_status(store.root)["counts"] == before["counts"]
-
-
-def test_a_page_is_of_a_store_and_never_over_a_file_of_a_run(few_steps, store, tmp_path):
-    store.now()
-    (store.root / "cells").mkdir()
-    commands.status(store.root, tmp_path / "page.html")
-    assert "no cells" in (tmp_path / "page.html").read_text()
-    for folder, html, words in (
-        (few_steps, tmp_path / "page.html", "--html: .* is no store of cells"),
-        (store.root, tmp_path / "page.txt", "ends in .html"),
-    ):
-        with pytest.raises(ConfigError, match=words):
-            commands.status(folder, html)
 
 
 def test_a_single_pipeline_has_no_cell_by_number(runs, tmp_path):

@@ -11,8 +11,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.schedule import at_step
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import camera_values, moved_camera, upload_camera
-from clsplat.runs import cameras
-from clsplat.runs.model_file import evaluate
+from clsplat.runs.model_file import evaluate, write_cameras
 from clsplat.scene.camera import Camera, Lens
 from clsplat.scene.camera_files import posed
 from clsplat.scene.detect import read_scene
@@ -143,7 +142,7 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
     scene = read_scene(tiny_scene, 5)
     assert lengths[0] != scene.views[0].camera.fx
     assert CameraOptimizer.beside(with_focals / "point_cloud.ply", scene).views[0].camera.fx == lengths[0]
-    cameras.write(with_focals, tmp_path / "cameras", "nerfstudio", "copy")
+    write_cameras(with_focals, tmp_path / "cameras", "nerfstudio", "copy")
     for view in read_scene(tmp_path / "cameras", 5).views:
         assert (view.camera.fx, view.camera.fy) == pytest.approx(lengths)
     for row in ({"focal_lengths": [1]}, {"focal_lengths": [1, -1]}, {"focal_lengths": [1e300, 60]}, []):

@@ -11,8 +11,7 @@ from clsplat.conformance import reference as ref
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.schedule import at_step
 from clsplat.pipeline.loading import load
-from clsplat.runs import cameras
-from clsplat.runs.model_file import evaluate
+from clsplat.runs.model_file import evaluate, write_cameras
 from clsplat.scene.detect import read_scene
 from clsplat.training import checkpoint
 from clsplat.training.modules.base import attached
@@ -153,7 +152,7 @@ def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tin
     scene = read_scene(tiny_scene, 5)
     moved_views = CameraOptimizer.beside(with_poses / "point_cloud.ply", scene).views
     assert any((a.world_to_camera != b.world_to_camera).any() for a, b in zip(scene.views, moved_views, strict=True))
-    cameras.write(with_poses, tmp_path / "cameras", "nerfstudio", "copy")
+    write_cameras(with_poses, tmp_path / "cameras", "nerfstudio", "copy")
     written = [view.world_to_camera for view in read_scene(tmp_path / "cameras", 5).views]
     for view in moved_views:
         assert min(np.abs(pose - view.world_to_camera).max() for pose in written) < 1e-9

@@ -9,12 +9,11 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from clsplat.conformance.bench.cases import SIZES, BenchResult, Peaks, case, measure_peaks, real_case, run_bench
-from clsplat.conformance.bench.packing import Packings, measure_packings, task_of
 from clsplat.core.errors import ConfigError, quoted
 from clsplat.core.reading import read_json
 from clsplat.core.text_table import text_table
 from clsplat.opencl.device import Device, open_device
-from clsplat.opencl.discovery import Schedule, choose, resolve_schedule
+from clsplat.opencl.discovery import Schedule
 from clsplat.pipeline.loading import load
 
 # An earlier measurement: its file, and what it does not share with one of now.
@@ -149,15 +148,3 @@ def measure(
     if model is not None and scene is not None:
         cases[model.stem] = real_case(opened, model, scene, settings)
     return Measurement(opened.text, settings.name, peaks, run_bench(cases, peaks, repeats))
-
-
-def measure_packing(
-    scenes: Sequence[str], *, pipeline: str, repeats: int, schedule: Schedule, device: str | Device | None
-) -> Packings:
-    """Time the packings of a CPU with a training step of one fixed scene.  Raises ClsplatError."""
-    if len(scenes) != 1 or scenes[0] not in SIZES:
-        raise ConfigError(f"--packing: expected one scene, of {', '.join(SIZES)}, got {quoted(','.join(scenes))}")
-    load(pipeline)
-    info = device.info if isinstance(device, Device) else choose(device)
-    resolve_schedule(info, schedule)
-    return measure_packings(info, task_of(info, SIZES[scenes[0]], pipeline, repeats, schedule), scenes[0])

@@ -4,7 +4,7 @@ import logging
 import os
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.core.errors import MemoryLimitError
 from clsplat.core.page import shrunk
@@ -134,9 +135,9 @@ class Preview:
         view = fitted(order.view, side)
         camera = upload_camera(self.run.device, view)
         image = render_view(self.run.painter(rasterizer), camera)
-        _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        jpeg = encoded(image, QUALITY)
         self._costs[side] = time.perf_counter() - started
-        return EncodedPicture(data.tobytes(), self.run.step)
+        return EncodedPicture(jpeg, self.run.step)
 
     def release(self) -> None:
         """Give the memory back."""
@@ -208,12 +209,11 @@ class Credit:
         return self._credit
 
 
-# The photographs of a run as small files, read when a page asks for them, and kept as long as there is room.
+# The photographs of a run as small files, read when a page asks for them; its browser keeps them.
 
 Kind = Literal["thumbnail", "photograph"]
 JPEG_SIDES: dict[Kind, int] = {"thumbnail": THUMBNAIL, "photograph": LARGEST}
 JPEG_QUALITY = 88
-CACHE_BYTES = 48 << 20  # of photographs that are kept
 PATIENCE = 20.0  # s that a page waits for its share of the time
 
 
@@ -224,7 +224,6 @@ class Pictures:
         self, views: Sequence[View], background: tuple[float, float, float], undistorted: Path | None, budget: Credit
     ) -> None:
         self.views, self._background, self._undistorted, self._budget = views, background, undistorted, budget
-        self._kept: OrderedDict[tuple[Kind, int], bytes] = OrderedDict()  # least recently used first
         self._lock = threading.Lock()
 
     def get(self, kind: Kind, index: int) -> bytes | None:
@@ -232,12 +231,7 @@ class Pictures:
         if not self._lock.acquire(timeout=PATIENCE):
             return None
         try:
-            if (kind, index) not in self._kept:
-                if not self._in_time():
-                    return None
-                self._read(index)
-            self._kept.move_to_end((kind, index))
-            return self._kept[kind, index]
+            return self._read(kind, index) if self._in_time() else None
         finally:
             self._lock.release()
 
@@ -249,17 +243,18 @@ class Pictures:
             time.sleep(0.05)
         return True
 
-    def _read(self, index: int) -> None:
-        """Read a photograph, and keep all of its sizes."""
+    def _read(self, kind: Kind, index: int) -> bytes:
         started = time.thread_time()
         pixels = load_photograph(self.views[index], self._background, self._undistorted)[:, :, :3]
-        for kind, side in JPEG_SIDES.items():
-            bgr = np.ascontiguousarray(shrunk(pixels, side)[..., ::-1])
-            _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-            self._kept[kind, index] = data.tobytes()
-        while len(self._kept) > len(JPEG_SIDES) and sum(map(len, self._kept.values())) > CACHE_BYTES:
-            self._kept.popitem(last=False)
+        data = encoded(shrunk(pixels, JPEG_SIDES[kind]), JPEG_QUALITY)
         self._budget.spend((time.thread_time() - started) / (os.cpu_count() or 1))
+        return data
+
+
+def encoded(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Return an RGB image, [height, width, 3], as a JPEG."""
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return data.tobytes()
 
 
 # What the reports of a run say, as points of curves.

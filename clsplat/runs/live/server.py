@@ -1,18 +1,17 @@
-"""The server: threads that read bounded requests on the loopback address, and write answers."""
+"""The server: threads that read requests on the loopback address, and write answers."""
 
 import hmac
 import json
 import logging
 import math
 import os
-import socket
 import socketserver
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from time import monotonic, sleep
+from time import sleep
 from typing import Any, cast, get_args
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -30,11 +29,8 @@ from clsplat.viewer.page import camera_data, joined, stand_data, style
 
 # What a browser asks, and who may ask: GET alone, by a name of this machine, below a secret path.
 
-LONGEST = 8192  # bytes of a request: its line and its headers
 FIELDS = 8  # of a query
 NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})  # another one is a page elsewhere whose name leads here
-PHRASES = {200: "OK", 204: "No Content", 400: "Bad Request", 403: "Forbidden", 404: "Not Found"}
-PHRASES |= {405: "Method Not Allowed", 431: "Request Header Fields Too Large", 503: "Service Unavailable"}
 HEADERS = {  # where an answer has no others
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",  # the address holds the secret
@@ -58,26 +54,13 @@ class Answer:
     def json(cls, value: Any) -> "Answer":
         return cls(200, json.dumps(value, separators=(",", ":")).encode(), "application/json")
 
-    @classmethod
-    def refusal(cls, status: int, why: str) -> "Answer":
-        return cls(status, f"{why}\n".encode())
-
-    def bytes(self) -> bytes:
-        """Return the answer as it is sent."""
-        headers = {"Content-Type": self.kind, "Content-Length": len(self.body), **HEADERS, **self.headers}
-        lines = [f"HTTP/1.1 {self.status} {PHRASES[self.status]}"]
-        lines += [f"{name}: {value}" for name, value in headers.items()]
-        if self.status in (400, 405, 431):
-            lines.append("Connection: close")
-        return "\r\n".join([*lines, "", ""]).encode("latin-1") + self.body
-
 
 class Refused(Exception):
     """A request that is not answered but for the reason; carries the answer."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(why)
-        self.answer = Answer.refusal(status, why)
+        self.answer = Answer(status, f"{why}\n".encode())
 
 
 @dataclass(frozen=True)
@@ -95,23 +78,15 @@ class Request:
         return int(text)
 
 
-def read(head: bytes, token: str) -> Request:
-    """Return what the lines of a request ask for.  Raises Refused: 400, 403, 404, 405."""
+def read(target: str, host: str, token: str) -> Request:
+    """Return what a request asks for.  Raises Refused: 400, 403, 404."""
+    if host_name(host.strip().lower()) not in NAMES:
+        raise Refused(403, "this page answers to 127.0.0.1 and localhost alone")
     try:
-        first, *rest = head.decode("ascii").split("\r\n")
-        method, target, version = first.split(" ")
-        named = [line.partition(":") for line in rest if line]
-        hosts = [value.strip().lower() for name, _, value in named if name.lower() == "host"]
         parts = urlsplit(target)
         query = parse_qsl(parts.query, keep_blank_values=True, max_num_fields=FIELDS)
     except ValueError:
-        raise Refused(400, "expected a request of HTTP/1.1") from None
-    if not version.startswith("HTTP/1.") or len(hosts) != 1 or not target.startswith("/"):
-        raise Refused(400, "expected a request of HTTP/1.1 with one Host")
-    if method != "GET":
-        raise Refused(405, "expected GET")
-    if host_name(hosts[0]) not in NAMES:
-        raise Refused(403, "this page answers to 127.0.0.1 and localhost alone")
+        raise Refused(400, "expected the address of this page") from None
     secret, _, path = unquote(parts.path)[1:].partition("/")
     if not hmac.compare_digest(secret.encode("utf-8", "replace"), token.encode()):
         raise Refused(404, "not found")
@@ -127,9 +102,7 @@ def host_name(host: str) -> str:
 LOG = logging.getLogger("clsplat")
 LOOPBACK = "127.0.0.1"
 PORT, TRIED = 8710, 20  # the first port that is tried where none is given, and how many
-CONNECTIONS = 32  # at a time; browsers keep six
 IDLE = 15.0  # seconds until a connection that asks for nothing more is closed
-HEAD = 2.0  # seconds that the head of a request may take
 RATE, BURST = 30.0, 120.0  # answers a second, and at once after a rest: a page opens with many small pictures
 POLL = 0.1  # seconds until the server sees that it is to stop
 
@@ -139,120 +112,76 @@ class Server(socketserver.ThreadingTCPServer):
 
     daemon_threads = True
     block_on_close = False
-    request_queue_size = CONNECTIONS
+    request_queue_size = 32
     allow_reuse_address = os.name == "posix"  # elsewhere it lets two programs share a port
 
     def __init__(self, port: int, token: str, answer: Callable[[Request], Answer]) -> None:
         """port: 0 takes the first one from PORT on that is free.  Raises ConfigError where it is in use."""
-        self.token, self.answer = token, answer
-        self._slots, self._rate = threading.Semaphore(CONNECTIONS), Credit(RATE, BURST)
+        self.token, self.answer, self.ended, self._rate = token, answer, False, Credit(RATE, BURST)
         self._rate.spend(-BURST)
-        self.ended, self._open, self._lock = False, set[Any](), threading.Lock()
-        super().__init__((LOOPBACK, 0), _Connection, bind_and_activate=False)
-        self.port = self._bind(port)
-        self._thread = threading.Thread(target=self.serve_forever, args=(POLL,), name="live", daemon=True)
-        self._thread.start()
+        for self.port in [port] if port else range(PORT, PORT + TRIED):
+            try:
+                super().__init__((LOOPBACK, self.port), _Connection)
+                break
+            except OSError as error:
+                reason = error.strerror
+        else:
+            which = f"port {port}" if port else f"ports {PORT} to {PORT + TRIED - 1}"
+            raise ConfigError(
+                f"--live: {which} of {LOOPBACK} cannot be used ({reason}); give another one"
+                + ("" if not port else ", or none: the next that is free is taken")
+            )
+        threading.Thread(target=self.serve_forever, args=(POLL,), name="live", daemon=True).start()
 
     def stop(self) -> None:
         """Answer no more; a connection that is open ends after the answer that it is being given."""
         self.ended = True
         self.shutdown()
         self.server_close()
-        with self._lock:
-            for one in self._open:
-                with suppress(OSError):  # the other side has closed it
-                    one.shutdown(socket.SHUT_RD)
 
-    def _bind(self, port: int) -> int:
-        """Listen; return the port."""
-        ports = [port] if port else range(PORT, PORT + TRIED)
-        for one in ports:
-            try:
-                self.server_address = LOOPBACK, one
-                self.server_bind()
-                self.server_activate()
-                return one
-            except OSError as error:
-                fault: OSError = error
-                self.socket.close()
-                self.socket = socket.socket(self.address_family, self.socket_type)
-        self.socket.close()
-        which = f"port {port}" if port else f"ports {PORT} to {PORT + TRIED - 1}"
-        raise ConfigError(
-            f"--live: {which} of {LOOPBACK} cannot be used ({fault.strerror}); give another one"
-            + ("" if not port else ", or none: the next that is free is taken")
-        )
-
-    def paced(self) -> None:
+    def pace(self) -> None:
         """Wait until another answer may be given."""
         while self._rate.credit < 1:
             sleep(1 / RATE)
         self._rate.spend(1)
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        if self._slots.acquire(timeout=POLL):
-            with self._lock:
-                self._open.add(request)
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._slots.release()
-
-    def shutdown_request(self, request: Any) -> None:
-        with self._lock:
-            self._open.discard(request)
-            super().shutdown_request(request)
-
     def handle_error(self, request: Any, client_address: Any) -> None:
         LOG.debug("live: a request failed", exc_info=True)
 
 
-class _Connection(socketserver.StreamRequestHandler):
+class _Connection(BaseHTTPRequestHandler):
     """One connection: requests one after the other."""
 
     server: Server
+    protocol_version = "HTTP/1.1"
     timeout = IDLE
+    wbufsize = -1  # an answer is one packet
     disable_nagle_algorithm = True
 
-    def handle(self) -> None:
-        try:
-            while (head := self._head()) is not None and not self.server.ended:
-                self.connection.settimeout(IDLE)
-                self.server.paced()
-                answer = self._answer(head)
-                self.wfile.write(answer.bytes())
-                if answer.status in (400, 405, 431):  # what follows may be a body
-                    return
-        except OSError:  # it was closed, or says nothing
-            return
+    def do_GET(self) -> None:
+        if not self.server.ended:
+            self.server.pace()
+            try:
+                answer = self.server.answer(read(self.path, self.headers.get("Host", ""), self.server.token))
+            except Refused as refused:
+                answer = refused.answer
+            self._send(answer)
+        self.close_connection |= self.server.ended
 
-    def _answer(self, head: bytes) -> Answer:
-        if len(head) > LONGEST:
-            return Answer.refusal(431, f"expected at most {LONGEST} bytes")
-        try:
-            return self.server.answer(read(head, self.server.token))
-        except Refused as refused:
-            return refused.answer
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        self.close_connection = True  # what follows may be a body
+        self._send(Answer(code, f"{message}\n".encode()))
 
-    def _head(self) -> bytes | None:
-        """The lines up to the empty one, or more than LONGEST bytes; None at the end."""
-        self.rfile.peek(1)  # type: ignore[attr-defined]
-        head, line, end = b"", b"", monotonic() + HEAD
-        while len(head + line) <= LONGEST:
-            self.connection.settimeout(max(end - monotonic(), 1e-3))  # one end for all: bytes may come one by one
-            if not (byte := self.rfile.read1(1)):
-                return None
-            line += byte
-            if line in (b"\r\n", b"\n"):
-                return head
-            if byte == b"\n":
-                head, line = head + line, b""
-        return head + line
+    def _send(self, answer: Answer) -> None:
+        self.send_response_only(answer.status)
+        headers = {"Content-Type": answer.kind, "Content-Length": len(answer.body), **HEADERS, **answer.headers}
+        for name, value in headers.items():
+            self.send_header(name, str(value))
+        self.end_headers()
+        self.wfile.write(answer.body)
+
+    def log_message(self, format: str, *values: Any) -> None:
+        LOG.debug("live: " + format, *values)
 
 
 # The page of a live preview, with the style and the controls of the viewer.

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean, stdev
+from typing import Any
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -16,7 +17,7 @@ from clsplat.core.page import charts, duration, embedded, render
 from clsplat.pipeline.file import SceneSettings
 from clsplat.runs.results import Points, RunFolder, RunMetrics
 from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing
-from clsplat.sweeps.compare.crops import ImageCrop, Seams, find_crops, find_seams
+from clsplat.sweeps.compare.crops import ImageCrop, find_crops
 from clsplat.training.records import VIEWS, over_views
 from clsplat.viewer.charts import COLOURS, Line, curve
 
@@ -272,44 +273,6 @@ LOG = logging.getLogger("clsplat")
 MAX_NAMES = 4  # of pipelines, in the title
 
 
-@dataclass(frozen=True)
-class CropFigure:
-    """A crop with its images as data URLs."""
-
-    view: str
-    overview: str
-    frame: dict[str, float]  # percent of the overview
-    photograph: str
-    renders: list[str]  # by variant
-    psnrs: list[float]  # dB, by variant
-
-
-@dataclass(frozen=True)
-class SeamFigure:
-    """The bands along the borders of blocks, as text and a data URL."""
-
-    text: str
-    rows: list[tuple[Variant, str, str]]  # PSNR of the band, and of the rest
-    picture: str
-
-
-@dataclass(frozen=True)
-class SceneSection:
-    """The section of the page about one scene."""
-
-    name: str
-    variants: list[Variant]
-    several_seeds: bool
-    explanations: list[str]  # of the tables
-    remarks: list[str]
-    main: MetricTable
-    other: MetricTable | None
-    curves: list[Markup]
-    crops: list[CropFigure]
-    no_crops: str  # the reason
-    seams: SeamFigure | None = None
-
-
 def write_comparison(
     paths: Sequence[Path],
     out: Path,
@@ -364,11 +327,12 @@ def _links(run: RunFolder, folder: Path) -> dict[str, str]:
     }
 
 
-def _section(name: str, rows: Sequence[VariantRow]) -> SceneSection:
-    crops, no_crops, seams = _pictures(rows)
+def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
+    """The section of the page about one scene."""
+    crops, no_crops = _pictures(rows)
     several_seeds = any(len(row.runs) > 1 for row in rows)
     explanations = ["mean ± standard deviation over seeds"] if several_seeds else []
-    return SceneSection(
+    return dict(
         name=name,
         variants=[row.variant for row in rows],
         several_seeds=several_seeds,
@@ -379,7 +343,6 @@ def _section(name: str, rows: Sequence[VariantRow]) -> SceneSection:
         curves=curves(rows),
         crops=[_figure(crop) for crop in crops],
         no_crops=no_crops,
-        seams=_seam_figure(seams, rows) if seams else None,
     )
 
 
@@ -391,8 +354,8 @@ def _sizes(scene: SceneSettings) -> list[str]:
     return [f"sizes are shares of the photographs' own; trained at {', '.join([first, *more])}"]
 
 
-def _pictures(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str, Seams | None]:
-    """Crops of each row's first run, or why there are none, such as missing photographs; and seams of blocks."""
+def _pictures(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
+    """Crops of each row's first run, or why there are none, such as missing photographs."""
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene
     try:
@@ -400,25 +363,14 @@ def _pictures(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str, Seams |
         scene = photographs.downscaled(settings.downscale)
     except (DataError, ConfigError) as error:
         LOG.warning("no crops: %s", error)
-        return [], str(error), None
+        return [], str(error)
     crops = find_crops(runs, scene, background)
-    reason = "" if crops else "there is no view that all runs rendered; add `- render` to the stages"
-    return crops, reason, find_seams(runs, scene, background)
+    return crops, "" if crops else "there is no view that all runs rendered; add `- render` to the stages"
 
 
-def _seam_figure(seams: Seams, rows: Sequence[VariantRow]) -> SeamFigure:
-    text = (
-        f"{100 * seams.share:.1f} % of the pixels of {amount(seams.views, 'view')} show what lies near a border of "
-        f"blocks; red in {seams.view}"
-    )
-    figures = zip(rows, seams.band, seams.rest, strict=True)
-    found = [(row.variant, f"{band:.2f}", f"{rest:.2f}") for row, band, rest in figures]
-    return SeamFigure(text, found, embedded(seams.picture))
-
-
-def _figure(crop: ImageCrop) -> CropFigure:
-    """The crop for the page; PNG keeps every bit of its squares."""
-    return CropFigure(
+def _figure(crop: ImageCrop) -> dict[str, Any]:
+    """The crop for the page, with images as data URLs; PNG keeps every bit of its squares."""
+    return dict(
         view=crop.view,
         overview=embedded(crop.overview),
         frame=crop.frame,
