@@ -20,7 +20,7 @@ from tests.support.refusals import refusal
 SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
 PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "store", "viewer", "live")
 FOLDER = Path(package.__file__).parent / "core" / "templates"
-DRAWINGS = {"clsplat/viewer/charts.py", "clsplat/conformance/bench/measurement.py"}  # SVG, escaped there
+DRAWINGS = {"clsplat/viewer/charts.py"}  # SVG, escaped there
 STATES = ("good", "warn", "bad", "note")  # colours of text with papers of their own
 WITHOUT_TEXT = {  # a background, or text on one that another rule or the page's data fix
     *("td.bar i", "button.grown", ".slider::after", ".space canvas", ".space button:hover", ".space output", ".chip"),
@@ -105,7 +105,7 @@ def test_every_template_file_is_part_of_a_page():
 def test_values_are_escaped_and_charts_are_not():
     values = {"state": "ready", "verdict": HOSTILE, "findings": [], "figures": {HOSTILE: HOSTILE}, "space": None}
     chart = curve(HOSTILE, [Line([(0.0, 0.0), (1.0, 1.0)])])
-    seen = {"charts": charts([chart, ""]), "fewest": [(HOSTILE, 3)]}
+    seen = charts([chart, ""]), [(HOSTILE, 3)]
     page = Page(render("inspect.html.j2", title=HOSTILE, subtitle=HOSTILE, seen=seen, lists=[], **values))
     assert page.elements["script"] == 1
     assert page.elements["svg"] == 1
