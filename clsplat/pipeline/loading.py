@@ -183,8 +183,8 @@ def with_decisions(pipeline: Pipeline, decisions: Iterable[Decision]) -> Pipelin
         data["adapt"]["decisions"] = [one.model_dump() for one in made]
         return replace(pipeline, settings=_validated(data, pipeline.path, Document(data)))
     except ConfigError as error:
-        told = f"{one_line(error)}; --set of one of its keys wins: {', '.join(one.key for one in made)}"
-        raise ConfigError(f"adapt: {adapt.type}: {told}") from error
+        keys = ", ".join(one.key for one in made)
+        raise ConfigError(f"adapt: {adapt.type}: {one_line(error)}; --set of one of its keys wins: {keys}") from error
 
 
 def _keeping(settings: PipelineFile, places: Sequence[Place]) -> PipelineFile:
