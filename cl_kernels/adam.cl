@@ -71,7 +71,7 @@ static inline void update_plane(__global float *values, __global float *moment1,
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void update_gaussians(
     __global float *restrict means,                  // [3,S] scene units
-    __global float *restrict quats,                  // [4,S] unnormalised
+    __global float *restrict quats,                  // [4,S] unnormalized
     __global float *restrict log_scales,             // [3,S] log of scene units
     __global float *restrict logit_opacity,          // [S]
     __global float *restrict sh_base,                // [3,S]
@@ -126,7 +126,7 @@ void update_gaussians(
     VF weights[VECTORS][16];
     for (uint v = 0; v < VECTORS && i + v * LANES < count; v++) {
         const uint at = i + v * LANES;
-        colour_backward(splats, pixel_sums, stride, count, at, g + kept);
+        color_backward(splats, pixel_sums, stride, count, at, g + kept);
         first[kept] = at;
         updated[kept] = g[kept].touched | (VI)((int)every);
         if (ANY(updated[kept])) {
@@ -169,9 +169,9 @@ void update_gaussians(
         UPDATE(log_scales, k, log_scales[k]);
     UPDATE(logit_opacity, 0, logit_opacity);
     for (uint channel = 0; channel < 3; channel++)
-        UPDATE(sh_base, channel, basis[0] * g[v].colour[channel]);
+        UPDATE(sh_base, channel, basis[0] * g[v].color[channel]);
     for (uint k = 1; k < (sh_rest_degree + 1) * (sh_rest_degree + 1); k++)
         for (uint channel = 0; channel < 3; channel++)
             UPDATE_BUT(unseen & ~undrawn, rest, SH_STRIDE(stride), sh_rest, (k - 1) * 3 + channel,
-                       basis[k] * g[v].colour[channel]);
+                       basis[k] * g[v].color[channel]);
 }

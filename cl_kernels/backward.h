@@ -1,4 +1,4 @@
-/* Gradients of a Gaussian's parameters from its sums over pixels: the reverse of projection and colour.
+/* Gradients of a Gaussian's parameters from its sums over pixels: the reverse of projection and color.
  * It computes the values of the forward pass again.  Both kernels that update parameters use it, so they give the same
  * bits. */
 #ifndef CLSPLAT_BACKWARD_H
@@ -96,17 +96,17 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
     *grad_focal = jx * (s->x * gu + j00) + jy * (s->y * gv + j11) + s->ray_x * ray_x + s->ray_y * ray_y;
 }
 
-/* Gradients of everything but the coefficients of harmonics: those are basis[k] * colour[channel]. */
+/* Gradients of everything but the coefficients of harmonics: those are basis[k] * color[channel]. */
 typedef struct {
     VI touched;      // the Gaussian was drawn; where not, all gradients are zero and these values invalid
     VF mean2d[2];    // px^-1
     VF means[3], quats[4], log_scales[3], logit_opacity;
     VF focal;        // of the logarithm of both focal lengths
-    VF basis[16], colour[3];
+    VF basis[16], color[3];
 } gradient_t;
 
-/* Which Gaussians were drawn, and the gradients of their colours. */
-static inline void colour_backward(
+/* Which Gaussians were drawn, and the gradients of their colors. */
+static inline void color_backward(
     __global const float *splats,      // [N,RECORD] see splat.h
     __global const float *pixel_sums,  // [PIXEL_SUMS,S] see splat.h
     const uint stride, const uint count, const uint i, gradient_t *g)
@@ -117,7 +117,7 @@ static inline void colour_backward(
             table[k][lane] = i + lane < count ? splats[(size_t)(i + lane) * RECORD + SPLAT_OPACITY + k] : 0.0f;
     g->touched = VLOAD_PRIVATE(table[0]) > 0.0f;  // culled records are all zero
     for (uint channel = 0; channel < 3; channel++)  // max(0, .) passes no gradient where it clamped
-        g->colour[channel] = VLOAD_PRIVATE(table[1 + channel]) > 0.0f
+        g->color[channel] = VLOAD_PRIVATE(table[1 + channel]) > 0.0f
                                  ? VLOAD(pixel_sums + (SUM_RED + channel) * stride + i) : (VF)(0.0f);
 }
 
@@ -136,7 +136,7 @@ static inline void weigh_harmonics(
             for (uint v = 0; v < vectors; v++)
                 if (!((unseen >> v) & 1))
                     weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * SH_STRIDE(stride) + first[v]) *
-                                     g[v].colour[channel];
+                                     g[v].color[channel];
     }
 }
 
@@ -155,10 +155,10 @@ static inline void no_gradient(gradient_t *g)
     g->logit_opacity = g->focal = zero;
 }
 
-/* The other gradients, from those of the colours and from the weights of the harmonics. */
+/* The other gradients, from those of the colors and from the weights of the harmonics. */
 static inline void gradient_of(
     __global const float *means,            // [3,S] scene units
-    __global const float *quats,            // [4,S] unnormalised
+    __global const float *quats,            // [4,S] unnormalized
     __global const float *log_scales,       // [3,S] log of scene units
     __global const float *logit_opacity,    // [S]
     __global const float *filter_variance,  // [S] scene units^2

@@ -36,9 +36,9 @@ void blend_forward(
     float lines[SEGMENT][LINE_FIELDS][TILE];
     uchar lists[TILE / 2][SEGMENT];
     uint listed[TILE / 2];
-    VF centres[COLUMNS];
+    VF centers[COLUMNS];
     for (uint column = 0; column < COLUMNS; column++)
-        centres[column] = pixel_centres(tile_x, column);
+        centers[column] = pixel_centers(tile_x, column);
     pixels_t pixels[TILE * COLUMNS];
     for (uint v = 0; v < TILE * COLUMNS; v++) {
         const pixels_t clear = {(VF)(1.0f), (VF)(0.0f), (VF)(0.0f), (VF)(0.0f)};
@@ -65,8 +65,8 @@ void blend_forward(
                 const uint stop = some + 16 < count ? some + 16 : count;
                 for (uint k = some; k < stop; k++) {
                     const float *splat = (const float *)(segment + list[k]);
-                    blend(&one, SPLAT_AT(splat, lines[list[k]], y, 0), centres[0], splat + SPLAT_RED);
-                    blend(&other, SPLAT_AT(splat, lines[list[k]], below, right), centres[right], splat + SPLAT_RED);
+                    blend(&one, SPLAT_AT(splat, lines[list[k]], y, 0), centers[0], splat + SPLAT_RED);
+                    blend(&other, SPLAT_AT(splat, lines[list[k]], below, right), centers[right], splat + SPLAT_RED);
                 }
                 open = ANY((one.t > 0.0f) | (other.t > 0.0f));
                 const uint reached = begin + list[stop - 1] + 1;
@@ -83,7 +83,7 @@ void blend_forward(
         for (uint column = 0; column < COLUMNS; column++) {
             const uint row = tile_y * TILE + y;
             const uint at = row * width + tile_x * TILE + column * LANES;
-            const VF inside = inside_image(camera, centres[column], row);
+            const VF inside = inside_image(camera, centers[column], row);
             const pixels_t p = pixels[y * COLUMNS + column];
             const VF t = magnitude(p.t);
             VSTORE((p.red + t * background[0]) * inside, image + at);
@@ -128,11 +128,11 @@ static inline void store_record(const pixel_sums_t m, __global float *record)
 #if PIXEL_BOX
 /* Add a row of pixels. */
 static inline void add_row(const float *splat, const float (*lines)[TILE], const float (*slopes)[TILE],
-                           const bool turned, const float row, const uint y, const VF *centres,
+                           const bool turned, const float row, const uint y, const VF *centers,
                            grad_pixels_t *pixels, pixel_sums_t *sums)
 {
     for (uint column = 0; column < COLUMNS; column++) {
-        const VF pixel = centres[column];
+        const VF pixel = centers[column];
         row_splat_t s = splat_on_lines(splat, lines, turned, row, y, column, pixel);
         for (uint k = 0; k < SLOPE_FIELDS; k++)
             ((VF *)&s.slopes)[k] = field_at(slopes[k], turned, y, column);
@@ -142,7 +142,7 @@ static inline void add_row(const float *splat, const float (*lines)[TILE], const
 #endif
 
 /* Sum one splat over the rows of its tile that it reaches. */
-static inline void pixel_sums_of(const float *splat, const uint tile_x, const uint tile_y, const VF *centres,
+static inline void pixel_sums_of(const float *splat, const uint tile_x, const uint tile_y, const VF *centers,
                                  grad_pixels_t *pixels, pixel_sums_t *sums)
 {
     const VF zero = (VF)(0.0f);
@@ -157,15 +157,15 @@ static inline void pixel_sums_of(const float *splat, const uint tile_x, const ui
 #if PIXEL_BOX
     if (splat[BOX_TURNED] > 0.0f)  // apart, so that both loops know where their fields lie
         for (uint y = y_first; y < y_end; y++)
-            add_row(splat, lines, slopes, true, top + y, y, centres, pixels + y * COLUMNS, &pixel_sums);
+            add_row(splat, lines, slopes, true, top + y, y, centers, pixels + y * COLUMNS, &pixel_sums);
     else
         for (uint y = y_first; y < y_end; y++)
-            add_row(splat, lines, slopes, false, top + y, y, centres, pixels + y * COLUMNS, &pixel_sums);
+            add_row(splat, lines, slopes, false, top + y, y, centers, pixels + y * COLUMNS, &pixel_sums);
 #else
     /* One vector after the other, as one loop: two together are too much code for the registers that there are. */
     for (uint v = y_first * COLUMNS; v < y_end * COLUMNS; v++) {
         const row_splat_t at_row = splat_on_lines(splat, lines, slopes, v / COLUMNS);
-        blend_backward_step(pixels + v, at_row, centres[v % COLUMNS], splat + SPLAT_RED, &pixel_sums);
+        blend_backward_step(pixels + v, at_row, centers[v % COLUMNS], splat + SPLAT_RED, &pixel_sums);
     }
 #endif
     *sums = pixel_sums;
@@ -193,9 +193,9 @@ void blend_backward(
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     __global const float16 *records = (__global const float16 *)splats;
-    VF centres[COLUMNS];
+    VF centers[COLUMNS];
     for (uint column = 0; column < COLUMNS; column++)
-        centres[column] = pixel_centres(tile_x, column);
+        centers[column] = pixel_centers(tile_x, column);
     grad_pixels_t pixels[TILE * COLUMNS];
     for (uint y = 0; y < TILE; y++)
         for (uint column = 0; column < COLUMNS; column++) {
@@ -234,7 +234,7 @@ void blend_backward(
         }
         for (uint j = 0; j < length; j++) {
             pixel_sums_t pixel_sums;
-            pixel_sums_of((const float *)(segment + j), tile_x, tile_y, centres, pixels, &pixel_sums);
+            pixel_sums_of((const float *)(segment + j), tile_x, tile_y, centers, pixels, &pixel_sums);
             store_record(pixel_sums, pair_sums + (size_t)pairs[j] * RECORD);
         }
     }

@@ -44,7 +44,7 @@ void blur_rows(
         sums[channel * plane + y * stride + x] = total[channel];
 }
 
-/* The same along columns, and the division; pixels without a neighbour that counts stay unchanged. */
+/* The same along columns, and the division; pixels without a neighbor that counts stay unchanged. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void blur_columns(
     __global const float *restrict sums,  // [4,H',stride]

@@ -46,7 +46,7 @@
 #define INVERSE_DEPTH 0  // 1: the fourth plane of the image is the blended inverse depth (splat.h)
 #endif
 #ifndef GRAD_BEHIND
-#define GRAD_BEHIND 0  // 1: the loss depends on what the splats leave of a pixel, beside its colour (splat.h)
+#define GRAD_BEHIND 0  // 1: the loss depends on what the splats leave of a pixel, beside its color (splat.h)
 #endif
 
 /* ---- constants of the method (Kerbl et al. 2023); tests change the first three to make blending smooth ---- */
@@ -72,7 +72,7 @@ typedef struct {
     float world_to_camera[12];  // row-major [3,4]
     float position[3];          // scene units
     float fx, fy, cx, cy;       // px
-    float ray_x_min, ray_x_max, ray_y_min, ray_y_max;  // limits of x/z and y/z in the linearised projection
+    float ray_x_min, ray_x_max, ray_y_min, ray_y_max;  // limits of x/z and y/z in the linearized projection
     uint width, height;         // px
     uint tiles_x, tiles_y;
 } camera_t;

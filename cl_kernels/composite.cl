@@ -1,8 +1,8 @@
-/* From the outputs of a network to the colour of a ray, and back (Max 1995, as in Barron et al. 2021).
+/* From the outputs of a network to the color of a ray, and back (Max 1995, as in Barron et al. 2021).
  *
- *   density of a sample s = softplus(raw - 1), colour c = (1 + 2 p) sigmoid(raw) - p with p = 0.001
+ *   density of a sample s = softplus(raw - 1), color c = (1 + 2 p) sigmoid(raw) - p with p = 0.001
  *   weight w_k = T_k (1 - exp(-s_k e_k)), T_k+1 = T_k exp(-s_k e_k), e_k its length
- *   colour of a ray = sum of w_k c_k + (1 - sum of w_k) background
+ *   color of a ray = sum of w_k c_k + (1 - sum of w_k) background
  *
  * The loss of a ray is the squared difference from its pixel times a scale that its photograph has.  Back: with g_k =
  * dL/dw_k, dL/d(s_k e_k) = T_k+1 g_k - (sum over j > k of w_j g_j), from the last sample to the first.
@@ -11,9 +11,9 @@
 #include "layers.h"
 
 #define DENSITY_BIAS (-1.0f)   // released code, which begins with nearly empty space
-#define COLOUR_PADDING 0.001f  // lets colours reach 0 and 1
+#define COLOR_PADDING 0.001f  // lets colors reach 0 and 1
 #define DUST 1.0e-30f
-#define COLOUR_ROWS 4          // rows of the network's colours, and of its densities: one block (layers.h)
+#define COLOR_ROWS 4          // rows of the network's colors, and of its densities: one block (layers.h)
 #define RAY_LENGTH 7           // of a ray's values: |d| (rays.cl)
 #define RAY_STEP 8
 
@@ -28,22 +28,22 @@ static inline float density_of(const float raw)
 
 static inline float logistic(const float x) { return 1.0f / (1.0f + exp(-x)); }
 
-static inline float colour_of(const float raw)
+static inline float color_of(const float raw)
 {
-    return (1.0f + 2.0f * COLOUR_PADDING) * logistic(raw) - COLOUR_PADDING;
+    return (1.0f + 2.0f * COLOR_PADDING) * logistic(raw) - COLOR_PADDING;
 }
 
-/* Colours and weights of rays. */
+/* Colors and weights of rays. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void composite_forward(
-    __global const float *restrict raw_colours,    // [T,COLOUR_ROWS,SAMPLES]
-    __global const float *restrict raw_densities,  // [T,COLOUR_ROWS,SAMPLES] the first row
+    __global const float *restrict raw_colors,    // [T,COLOR_ROWS,SAMPLES]
+    __global const float *restrict raw_densities,  // [T,COLOR_ROWS,SAMPLES] the first row
     __global const float *restrict cones,          // [rays,RAY_STEP]
     __global const float *restrict edges,          // [rays,samples + 1]
     __global const float *restrict background,     // [3]
     __global float *restrict weights,              // [rays,samples]
     __global float *restrict left,                 // [rays,samples] T_k+1
-    __global float *restrict colours,              // [rays,3]
+    __global float *restrict colors,              // [rays,3]
     const uint samples,
     const uint rays)
 {
@@ -54,35 +54,35 @@ void composite_forward(
     const float length = cones[ray * RAY_STEP + RAY_LENGTH];
     float through = 1.0f, sums[3] = {0.0f, 0.0f, 0.0f}, covered = 0.0f;
     for (uint k = 0; k < samples; k++) {
-        const uint at = feature_at(ray * samples + k, 0, COLOUR_ROWS);
+        const uint at = feature_at(ray * samples + k, 0, COLOR_ROWS);
         const float passed = exp(-density_of(raw_densities[at]) * (t[k + 1] - t[k]) * length);
         const float weight = through * (1.0f - passed);
         through *= passed;
         for (uint channel = 0; channel < 3; channel++)
-            sums[channel] += weight * colour_of(raw_colours[at + channel * SAMPLES]);
+            sums[channel] += weight * color_of(raw_colors[at + channel * SAMPLES]);
         covered += weight;
         weights[ray * samples + k] = weight;
         left[ray * samples + k] = through;
     }
     for (uint channel = 0; channel < 3; channel++)
-        colours[ray * 3 + channel] = sums[channel] + (1.0f - covered) * background[channel];
+        colors[ray * 3 + channel] = sums[channel] + (1.0f - covered) * background[channel];
 }
 
 /* Squared errors of rays, and derivatives of the loss by what the network gives. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void composite_backward(
-    __global const float *restrict raw_colours,    // [T,COLOUR_ROWS,SAMPLES]
-    __global const float *restrict raw_densities,  // [T,COLOUR_ROWS,SAMPLES]
+    __global const float *restrict raw_colors,    // [T,COLOR_ROWS,SAMPLES]
+    __global const float *restrict raw_densities,  // [T,COLOR_ROWS,SAMPLES]
     __global const float *restrict cones,          // [rays,RAY_STEP]
     __global const float *restrict edges,          // [rays,samples + 1]
     __global const float *restrict background,     // [3]
     __global const float *restrict weights,        // [rays,samples]
     __global const float *restrict left,           // [rays,samples] T_k+1
-    __global const float *restrict colours,        // [rays,3]
+    __global const float *restrict colors,        // [rays,3]
     __global const float *restrict photograph,     // [3,rows,stride]
     __global const uint *restrict pixels,          // [counted] row * width + column
-    __global float *restrict by_colours,           // [T,COLOUR_ROWS,SAMPLES]
-    __global float *restrict by_densities,         // [T,COLOUR_ROWS,SAMPLES]
+    __global float *restrict by_colors,           // [T,COLOR_ROWS,SAMPLES]
+    __global float *restrict by_densities,         // [T,COLOR_ROWS,SAMPLES]
     __global float *restrict errors,               // [step's rays] from first_ray on
     const float scale,                             // of a ray's squared difference in the loss
     const uint first_ray,
@@ -99,27 +99,27 @@ void composite_backward(
     const float own = ray < counted ? 1.0f : 0.0f, length = cones[ray * RAY_STEP + RAY_LENGTH];
     const uint pixel = pixels[ray < counted ? ray : counted - 1];
     __global const float *shown = photograph + pixel / width * stride + pixel % width, *t = edges + ray * (samples + 1);
-    float by_colour[3], error = 0.0f;
+    float by_color[3], error = 0.0f;
     for (uint channel = 0; channel < 3; channel++) {
-        const float difference = colours[ray * 3 + channel] - shown[channel * plane];
-        by_colour[channel] = 2.0f * own * scale * difference;
+        const float difference = colors[ray * 3 + channel] - shown[channel * plane];
+        by_color[channel] = 2.0f * own * scale * difference;
         error += difference * difference;
     }
     if (ray < counted)
         errors[first_ray + ray] = error;
     float behind = 0.0f;  // sum of w_j g_j over the samples behind
     for (uint k = samples; k-- > 0;) {
-        const uint at = feature_at(ray * samples + k, 0, COLOUR_ROWS);
+        const uint at = feature_at(ray * samples + k, 0, COLOR_ROWS);
         const float weight = weights[ray * samples + k];
         float by_weight = 0.0f;
         for (uint channel = 0; channel < 3; channel++) {
-            const float raw = raw_colours[at + channel * SAMPLES], y = logistic(raw);
-            by_weight += by_colour[channel] * (colour_of(raw) - background[channel]);
-            by_colours[at + channel * SAMPLES] =
-                without_dust(by_colour[channel] * weight * (1.0f + 2.0f * COLOUR_PADDING) * y * (1.0f - y));
+            const float raw = raw_colors[at + channel * SAMPLES], y = logistic(raw);
+            by_weight += by_color[channel] * (color_of(raw) - background[channel]);
+            by_colors[at + channel * SAMPLES] =
+                without_dust(by_color[channel] * weight * (1.0f + 2.0f * COLOR_PADDING) * y * (1.0f - y));
             by_densities[at + (1 + channel) * SAMPLES] = 0.0f;
         }
-        by_colours[at + 3 * SAMPLES] = 0.0f;
+        by_colors[at + 3 * SAMPLES] = 0.0f;
         const float by_depth = left[ray * samples + k] * by_weight - behind;
         by_densities[at] =
             without_dust(by_depth * (t[k + 1] - t[k]) * length * logistic(raw_densities[at] + DENSITY_BIAS));
@@ -127,10 +127,10 @@ void composite_backward(
     }
 }
 
-/* Put the colours of rays into a picture. */
+/* Put the colors of rays into a picture. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void place_colours(
-    __global const float *restrict colours,  // [rays,3]
+void place_colors(
+    __global const float *restrict colors,  // [rays,3]
     __global const uint *restrict pixels,    // [rays] row * width + column
     __global float *restrict image,          // [3,rows,stride]
     const uint width,
@@ -143,5 +143,5 @@ void place_colours(
         return;
     const uint at = pixels[ray] / width * stride + pixels[ray] % width;
     for (uint channel = 0; channel < 3; channel++)
-        image[channel * plane + at] = colours[ray * 3 + channel];
+        image[channel * plane + at] = colors[ray * 3 + channel];
 }

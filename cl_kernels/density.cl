@@ -20,7 +20,7 @@ void count_seen(
         seen[i] += 1.0f;
 }
 
-/* Add the Euclidean norm of this view's screen gradient, in the units of the reference: loss by normalised device
+/* Add the Euclidean norm of this view's screen gradient, in the units of the reference: loss by normalized device
  * coordinates.  The gradient lies in planes `first` and `first` + 1. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void accumulate_norm(
@@ -218,7 +218,7 @@ void spawn_children(
     __global const uint *restrict source,   // [M] row before the edit
     __global const uint *restrict kept,     // [N] before the edit; 0 = split
     __global const float *restrict shrink,  // [N] before the edit
-    __global const float *restrict quats,   // [4,S] unnormalised
+    __global const float *restrict quats,   // [4,S] unnormalized
     __global float *restrict means,         // [3,S] scene units
     __global float *restrict log_scales,    // [3,S] log of scene units
     const uint seed,

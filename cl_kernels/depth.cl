@@ -1,4 +1,4 @@
-/* Depth instead of colour: blending then sums weight times depth, and weight, over splats.
+/* Depth instead of color: blending then sums weight times depth, and weight, over splats.
  *
  * One item = one Gaussian.  No local memory.  Deterministic. */
 #include "splat.h"

@@ -21,7 +21,7 @@ static inline void rotation_of(const VF *q, VF *r)
     r[8] = 1.0f - 2.0f * (x * x + y * y);
 }
 
-/* Gradient of the unnormalised quaternion from that of the rotation matrix: chain through rotation_of and q/|q|. */
+/* Gradient of the unnormalized quaternion from that of the rotation matrix: chain through rotation_of and q/|q|. */
 static inline void rotation_backward(const VF *q, const VF inverse_norm, const VF *h, VF *grad)
 {
     const VF w = q[0], x = q[1], y = q[2], z = q[3];
@@ -59,7 +59,7 @@ typedef struct {
 /* The result is written to an address: Oclgrind 21.10 does not support inlined functions that return a structure. */
 static inline void shape_of(
     __global const float *means,            // [3,S] scene units
-    __global const float *quats,            // [4,S] unnormalised
+    __global const float *quats,            // [4,S] unnormalized
     __global const float *log_scales,       // [3,S] log of scene units
     __global const float *filter_variance,  // [S] scene units^2
     __constant camera_t *camera,

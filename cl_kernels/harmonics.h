@@ -1,6 +1,6 @@
 /* Real spherical harmonics up to degree 3 in the sign convention of 3DGS: value and gradient.
  *
- * colour = max(0, 1/2 + sum_k basis_k(d) sh_k), d the unit direction from the camera to the Gaussian. */
+ * color = max(0, 1/2 + sum_k basis_k(d) sh_k), d the unit direction from the camera to the Gaussian. */
 #ifndef CLSPLAT_HARMONICS_H
 #define CLSPLAT_HARMONICS_H
 #include "lanes.h"

@@ -151,7 +151,7 @@ static inline VF exp_clamped(VF x)
 /* ln x for finite x > 0 (normal numbers): exponent bits plus 2 atanh((m-1)/(m+1)) for m in [0.7, 1.4]. */
 static inline VF log_positive(VF x)
 {
-    const VI bits = as_VI(x) - 0x3f3504f3;  // 0x3f3504f3 is sqrt(1/2): centres the mantissa on 1
+    const VI bits = as_VI(x) - 0x3f3504f3;  // 0x3f3504f3 is sqrt(1/2): centers the mantissa on 1
     const VI exponent = bits >> 23;
     const VF m = as_VF((bits & 0x007fffff) + 0x3f3504f3);
     const VF e = as_VF(exponent + 0x4b400000) - ROUND_MAGIC;  // int to float without a conversion call

@@ -1,13 +1,13 @@
-/* A layer of splats of its own before an image: the colours of both, and the derivatives by the image behind.
+/* A layer of splats of its own before an image: the colors of both, and the derivatives by the image behind.
  *
- * A pixel has the colour C + T b, with C the layer's colour before black, T what the layer leaves and b the image's
- * colour.  A loss of what the layer covers, scale times the sum of 1 - T, keeps it open.  By the image behind, dL/db =
- * T dL/d(colour); by the layer, the backward pass of blending starts from the colours of both.  Planes are
- * [channels,H',W'] with H', W' whole tiles, zero outside the image.  A fourth plane of the image, which is no colour,
+ * A pixel has the color C + T b, with C the layer's color before black, T what the layer leaves and b the image's
+ * color.  A loss of what the layer covers, scale times the sum of 1 - T, keeps it open.  By the image behind, dL/db =
+ * T dL/d(color); by the layer, the backward pass of blending starts from the colors of both.  Planes are
+ * [channels,H',W'] with H', W' whole tiles, zero outside the image.  A fourth plane of the image, which is no color,
  * is that of both. */
 #include "planes.h"
 
-/* Colours of both, T dL/dT of the cover's loss, which blend_backward reads, and the sum of 1 - T of each row.
+/* Colors of both, T dL/dT of the cover's loss, which blend_backward reads, and the sum of 1 - T of each row.
  * One group = one row.  Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void lay_over(

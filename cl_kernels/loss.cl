@@ -21,7 +21,7 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void unpack_pixels(
     __global const uchar *restrict pixels,  // [channels,height,width]
     __global float *restrict planes,        // [channels,H',stride]
-    const float factor,                     // 1/255 for colours, 1 for a mask
+    const float factor,                     // 1/255 for colors, 1 for a mask
     const uint width,
     const uint height,
     const uint stride)
@@ -50,11 +50,11 @@ void apply_mask(
         planes[channel * pixels + pixel] = 0.0f;
 }
 
-/* Put another colour behind transparent pixels: colours += transparency (behind - background).
+/* Put another color behind transparent pixels: colors += transparency (behind - background).
  * One item = one pixel of one channel; dimensions pixel, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void change_background(
-    __global float *restrict colours,             // [3,H',stride] over `background`
+    __global float *restrict colors,             // [3,H',stride] over `background`
     __global const float *restrict transparency,  // [H',stride] 0 to 1, 0 outside the image
     __global const float *restrict background,    // [3]
     __global const float *restrict behind,        // [3]
@@ -62,7 +62,7 @@ void change_background(
 {
     const uint pixel = get_global_id(0), channel = get_global_id(1);
     if (pixel < pixels)
-        colours[channel * pixels + pixel] += transparency[pixel] * (behind[channel] - background[channel]);
+        colors[channel * pixels + pixel] += transparency[pixel] * (behind[channel] - background[channel]);
 }
 
 /* gradient (+)= l1 sign(x - y) + l2 2 (x - y).  Local memory: TEAM * 8 bytes. */

@@ -2,7 +2,7 @@
  *
  * A row of the table `motion` is (planes of [W,S])
  *
- *   0-2 velocity v = b_1 · 3 centre tau · 4 log of the duration s · from 5 on b_2, then b_3 · last the turn c, 4 planes
+ *   0-2 velocity v = b_1 · 3 center tau · 4 log of the duration s · from 5 on b_2, then b_3 · last the turn c, 4 planes
  *
  * With dt = t - tau, times in [0, 1] over the scene (FreeTimeGS, Wang et al. 2025; Spacetime Gaussians, Li et al.
  * 2024):
@@ -36,7 +36,7 @@ static inline void moment_of(__global const float *motion, const float time, con
                              moment_t *moment)
 {
     moment_t m;
-    m.dt = time - VLOAD(motion + MOTION_CENTRE * stride + i);
+    m.dt = time - VLOAD(motion + MOTION_CENTER * stride + i);
     m.inverse_duration = exp_clamped(-VLOAD(motion + MOTION_DURATION * stride + i));
     const VF distance = m.dt * m.inverse_duration;
     m.log_presence = larger(-0.5f * distance * distance, (VF)(POWER_MIN));
@@ -49,8 +49,8 @@ static inline void moment_of(__global const float *motion, const float time, con
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void move_forward(
     __global const float *restrict motion,         // [W,S] see above
-    __global const float *restrict means,          // [3,S] scene units, at the centres
-    __global const float *restrict logit_opacity,  // [S] at the centres
+    __global const float *restrict means,          // [3,S] scene units, at the centers
+    __global const float *restrict logit_opacity,  // [S] at the centers
     __global float *restrict moved_means,          // [3,S] scene units; infinite where nothing is there
     __global float *restrict moved_logit,          // [S]
     const float time,                              // of the scene, in [0, 1]
@@ -80,7 +80,7 @@ void move_forward(
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void turn_forward(
     __global const float *restrict motion,  // [W,S] see above
-    __global const float *restrict quats,   // [4,S] unnormalised, at the centres
+    __global const float *restrict quats,   // [4,S] unnormalized, at the centers
     __global float *restrict moved_quats,   // [4,S]
     const float time,                       // of the scene, in [0, 1]
     const uint first,                       // plane of the turn
@@ -90,19 +90,19 @@ void turn_forward(
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
-    const VF dt = time - VLOAD(motion + MOTION_CENTRE * stride + i);
+    const VF dt = time - VLOAD(motion + MOTION_CENTER * stride + i);
     for (uint k = 0; k < 4; k++)
         VSTORE(VLOAD(quats + k * stride + i) + VLOAD(motion + (first + k) * stride + i) * dt,
                moved_quats + k * stride + i);
 }
 
-/* Gradients by the motion and by the opacity at the centre; those by means and quaternions are those at the moment. */
+/* Gradients by the motion and by the opacity at the center; those by means and quaternions are those at the moment. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void move_backward(
     __global const float *restrict motion,         // [W,S] see above
-    __global const float *restrict logit_opacity,  // [S] at the centres
+    __global const float *restrict logit_opacity,  // [S] at the centers
     __global const float *restrict grad_means,     // [3,S] at the moment
-    __global float *restrict grad_logit_opacity,   // [S] at the moment; becomes that at the centre
+    __global float *restrict grad_logit_opacity,   // [S] at the moment; becomes that at the center
     __global float *restrict grad_motion,          // [W,S]; its turn is left alone
     const float time,                              // of the scene, in [0, 1]
     const uint degree,                             // of the polynomial, 1 to 3
@@ -120,25 +120,25 @@ void move_backward(
     const VF by_logit = VLOAD(grad_logit_opacity + i);
     VSTORE((m.present ? by_logit / divisor : zero), grad_logit_opacity + i);
 
-    VF by_centre = zero;
+    VF by_center = zero;
     for (uint k = 0; k < 3; k++) {
         const VF by_mean = VLOAD(grad_means + k * stride + i);
         VF power = (VF)(1.0f);
         for (uint order = 1; order <= degree; order++) {
             const uint at = (plane_of(order) + k) * stride + i;
-            by_centre = by_centre - by_mean * VLOAD(motion + at) * (power * (float)order);
+            by_center = by_center - by_mean * VLOAD(motion + at) * (power * (float)order);
             power = power * m.dt;
             VSTORE((m.present ? by_mean * power : zero), grad_motion + at);
         }
     }
     const VF by_presence = by_logit * ((1.0f + odds) / divisor);  // by log g
     const VF distance = m.dt * m.inverse_duration;
-    by_centre = by_centre + by_presence * (distance * m.inverse_duration);
-    VSTORE((m.present ? by_centre : zero), grad_motion + MOTION_CENTRE * stride + i);
+    by_center = by_center + by_presence * (distance * m.inverse_duration);
+    VSTORE((m.present ? by_center : zero), grad_motion + MOTION_CENTER * stride + i);
     VSTORE((m.present ? by_presence * (distance * distance) : zero), grad_motion + MOTION_DURATION * stride + i);
 }
 
-/* Gradients by the turn, added to those by the centre; those by the quaternions at the centre are those at the moment.
+/* Gradients by the turn, added to those by the center; those by the quaternions at the center are those at the moment.
  * After move_backward. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void turn_backward(
@@ -153,15 +153,15 @@ void turn_backward(
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
-    const VF dt = time - VLOAD(motion + MOTION_CENTRE * stride + i);
-    VF by_centre = VLOAD(grad_motion + MOTION_CENTRE * stride + i);
+    const VF dt = time - VLOAD(motion + MOTION_CENTER * stride + i);
+    VF by_center = VLOAD(grad_motion + MOTION_CENTER * stride + i);
     for (uint k = 0; k < 4; k++) {
         const uint at = (first + k) * stride + i;
         const VF by_quat = VLOAD(grad_quats + k * stride + i);
         VSTORE(by_quat * dt, grad_motion + at);
-        by_centre = by_centre - by_quat * VLOAD(motion + at);
+        by_center = by_center - by_quat * VLOAD(motion + at);
     }
-    VSTORE(by_centre, grad_motion + MOTION_CENTRE * stride + i);
+    VSTORE(by_center, grad_motion + MOTION_CENTER * stride + i);
 }
 
 /* One update of some planes of the motion, whose values stay within bounds.  Dimension 1 is the plane. */

@@ -4,7 +4,7 @@
 #define CLSPLAT_MOTION_H
 #include "lanes.h"
 
-#define MOTION_CENTRE 3u    // time of the mean
+#define MOTION_CENTER 3u    // time of the mean
 #define MOTION_DURATION 4u  // log of the duration
 
 #endif

@@ -52,7 +52,7 @@ void brevity(
         return;
     const uint at = MOTION_DURATION * stride + i;
     const VF shorter = log_below - VLOAD(motion + at);
-    const VI penalised = ((LANE_INDEX + (int)i) < (int)count) & (shorter > 0.0f);
-    VSTORE(VLOAD(grad_motion + at) - (penalised ? (VF)(weight) : (VF)(0.0f)), grad_motion + at);
-    sums[get_global_id(0)] = sum_lanes(penalised ? shorter : (VF)(0.0f));
+    const VI penalized = ((LANE_INDEX + (int)i) < (int)count) & (shorter > 0.0f);
+    VSTORE(VLOAD(grad_motion + at) - (penalized ? (VF)(weight) : (VF)(0.0f)), grad_motion + at);
+    sums[get_global_id(0)] = sum_lanes(penalized ? shorter : (VF)(0.0f));
 }

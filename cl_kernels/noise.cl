@@ -13,7 +13,7 @@ __constant float REACH = 0.1f;        // where 5e-5 of the noise is left: nothin
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void add_noise(
     __global float *restrict means,                // [3,S] scene units
-    __global const float *restrict quats,          // [4,S] unnormalised
+    __global const float *restrict quats,          // [4,S] unnormalized
     __global const float *restrict log_scales,     // [3,S] log of scene units
     __global const float *restrict logit_opacity,  // [S]
     const float rate,                              // scene units^-1

@@ -29,11 +29,11 @@ void covariance_trace(
         trace += scale2[k];
     }
     const VF excess = trace - (above + pixels2 * VLOAD(nearest2 + i));
-    const VI penalised = ((LANE_INDEX + (int)i) < (int)count) & (excess > 0.0f);
-    const VF factor = penalised ? (VF)(2.0f * weight) : (VF)(0.0f);
+    const VI penalized = ((LANE_INDEX + (int)i) < (int)count) & (excess > 0.0f);
+    const VF factor = penalized ? (VF)(2.0f * weight) : (VF)(0.0f);
     for (uint k = 0; k < 3; k++)
         VSTORE(VLOAD(grad_log_scales + k * stride + i) + factor * scale2[k], grad_log_scales + k * stride + i);
-    sums[get_global_id(0)] = sum_lanes(penalised ? excess : (VF)(0.0f));
+    sums[get_global_id(0)] = sum_lanes(penalized ? excess : (VF)(0.0f));
 }
 
 /* grad_log_scales += weight dA/d(log s): the ratio itself, up for the longest axis and down for the shortest. */
@@ -56,13 +56,13 @@ void anisotropy(
     const VF longest = larger(larger(scales[0], scales[1]), scales[2]);
     const VF shortest = smaller(smaller(scales[0], scales[1]), scales[2]);
     const VF ratio = exp_clamped(longest - shortest);
-    const VI penalised = ((LANE_INDEX + (int)i) < (int)count) & (ratio > above);
-    const VF slope = penalised ? weight * ratio : (VF)(0.0f), zero = (VF)(0.0f);
+    const VI penalized = ((LANE_INDEX + (int)i) < (int)count) & (ratio > above);
+    const VF slope = penalized ? weight * ratio : (VF)(0.0f), zero = (VF)(0.0f);
     for (uint k = 0; k < 3; k++) {
         const VF up = scales[k] == longest ? slope : zero, down = scales[k] == shortest ? slope : zero;
         VSTORE(VLOAD(grad_log_scales + k * stride + i) + (up - down), grad_log_scales + k * stride + i);
     }
-    sums[get_global_id(0)] = sum_lanes(penalised ? ratio - above : zero);
+    sums[get_global_id(0)] = sum_lanes(penalized ? ratio - above : zero);
 }
 
 /* grad_log_scales += weight s. */

@@ -1,7 +1,7 @@
-/* The mean of a splat over the box of a pixel, instead of its value at the centre, where PIXEL_BOX is 1.
+/* The mean of a splat over the box of a pixel, instead of its value at the center, where PIXEL_BOX is 1.
  *
  * With V the covariance of the splat on the screen without any blur, y the pixel axis of its larger variance (x where
- * the splat is `turned`), s^2 = V_yy, k = V_xy / V_yy and t^2 = V_xx - k^2 V_yy, d = mean - pixel centre:
+ * the splat is `turned`), s^2 = V_yy, k = V_xy / V_yy and t^2 = V_xx - k^2 V_yy, d = mean - pixel center:
  *
  *   Z(dy) = F((dy + 1/2) / s) - F((dy - 1/2) / s)        the marginal of y, over the pixel's height
  *   m, v  = mean and variance of y within the pixel      a truncated normal distribution
@@ -74,7 +74,7 @@ static inline rise_t rise_of(const VF place, const VF h)
     return f;
 }
 
-/* A splat on lines of pixels: alpha = scale (F(z + spread) - F(z - spread)), z = (shift - pixel centre) inverse. */
+/* A splat on lines of pixels: alpha = scale (F(z + spread) - F(z - spread)), z = (shift - pixel center) inverse. */
 typedef struct {
     VF scale, shift;    // shift: px, across the lines
     VF inverse, spread; // 1 / e, px^-1; w / (2 e)
@@ -146,12 +146,12 @@ static inline within_t sharp_within(const VF dy, const float s, const rise_t f)
     return w;
 }
 
-/* The lines at `centre`, px along the larger variance, and the derivatives there. */
-static inline void line_of(const float *splat, const VF centre, line_t *line, slopes_t *slopes)
+/* The lines at `center`, px along the larger variance, and the derivatives there. */
+static inline void line_of(const float *splat, const VF center, line_t *line, slopes_t *slopes)
 {
     const bool turned = splat[BOX_TURNED] > 0.0f;
     const float k = splat[BOX_SLOPE], s = splat[BOX_LONG], t = splat[BOX_SHORT], inverse_s = 1.0f / s;
-    const VF dy = splat[turned ? SPLAT_X : SPLAT_Y] - centre;
+    const VF dy = splat[turned ? SPLAT_X : SPLAT_Y] - center;
     const rise_t f = rise_of(dy * inverse_s, (VF)(0.5f * inverse_s));
     within_t y;
     if (0.5f * inverse_s < BOX_UNIFORM)

@@ -1,6 +1,6 @@
 /* The derivatives of the losses by the place and the focal length of a camera, as sums over Gaussians.
  *
- * To move a camera is to move all Gaussians the other way: turning it by -w about its centre c turns means, quaternions
+ * To move a camera is to move all Gaussians the other way: turning it by -w about its center c turns means, quaternions
  * and directions of view by w.  What a Gaussian shows in a direction does not turn with them: the derivative by the
  * direction d from c, which is part of dL/dp, is taken out.  With a mean p and a quaternion (a, v), whose derivatives
  * are (g_a, g_v), in world axes
@@ -45,7 +45,7 @@ static inline void pose_terms(
 __kernel __attribute__((reqd_work_group_size(POSE_GROUP, 1, 1)))
 void pose_gradient(
     __global const float *restrict means,            // [3,S] scene units
-    __global const float *restrict quats,            // [4,S] unnormalised
+    __global const float *restrict quats,            // [4,S] unnormalized
     __global const float *restrict log_scales,       // [3,S] log of scene units
     __global const float *restrict logit_opacity,    // [S]
     __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major, or slots (slots.h)
@@ -71,7 +71,7 @@ void pose_gradient(
         gradient_t g;
         VF weights[1][16], terms[POSE_SUMS];
         const uint rest = sh_first(sh_slot, sh_block, i);
-        colour_backward(splats, pixel_sums, stride, count, i, &g);
+        color_backward(splats, pixel_sums, stride, count, i, &g);
         weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &rest, weights);
         gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0],
                     near_plane, screen_variance, compensate, degree, stride, i, &g);

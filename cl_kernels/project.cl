@@ -1,6 +1,6 @@
-/* Projection of Gaussians to screen ellipses with view-dependent colour, and its gradient (backward.h).
+/* Projection of Gaussians to screen ellipses with view-dependent color, and its gradient (backward.h).
  *
- * Kerbl et al. 2023, section 4, with the linearised perspective of Zwicker et al. 2001.  Both filters are numbers:
+ * Kerbl et al. 2023, section 4, with the linearized perspective of Zwicker et al. 2001.  Both filters are numbers:
  * `filter_variance`, scene units^2, is added to the squared scales, `screen_variance`, px^2, to the screen covariance.
  * The opacity is multiplied by the energy factor of the first, and with `compensate` = 1 also by that of the second
  * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11), and by a constant, which changes no derivative by a logit: that is the
@@ -11,11 +11,11 @@
 #include "tiles.h"
 
 static inline void add_band(const uint first, const uint last, const VF *basis, __global const float *sh_rest,
-                            const uint stride, const uint first_value, VF *colour)
+                            const uint stride, const uint first_value, VF *color)
 {
     for (uint k = first; k < last; k++)
         for (uint channel = 0; channel < 3; channel++)
-            colour[channel] += basis[k] * VLOAD(sh_rest + ((k - 1) * 3 + channel) * SH_STRIDE(stride) + first_value);
+            color[channel] += basis[k] * VLOAD(sh_rest + ((k - 1) * 3 + channel) * SH_STRIDE(stride) + first_value);
 }
 
 /* Write the records of LANES splats: zero where not visible. */
@@ -43,7 +43,7 @@ __attribute__((vec_type_hint(VF)))  // in vectors already: a compiler that joins
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void project_forward(
     __global const float *restrict means,            // [3,S] scene units
-    __global const float *restrict quats,            // [4,S] unnormalised
+    __global const float *restrict quats,            // [4,S] unnormalized
     __global const float *restrict log_scales,       // [3,S] log of scene units
     __global const float *restrict logit_opacity,    // [S]
     __global const float *restrict sh_base,          // [3,S]
@@ -106,20 +106,20 @@ void project_forward(
     const VI visible = inside & s.valid & opaque & (u + half_x >= 0.0f) & (u - half_x <= (float)camera->width) &
                        (v + half_y >= 0.0f) & (v - half_y <= (float)camera->height);
 
-    VF colour[3] = {(VF)(0.5f), (VF)(0.5f), (VF)(0.5f)};
+    VF color[3] = {(VF)(0.5f), (VF)(0.5f), (VF)(0.5f)};
     if (ANY(visible)) {
         VF d[3], basis[16];
         view_direction(means, camera, stride, i, d);
         harmonics_basis(degree, d[0], d[1], d[2], basis);
         for (uint channel = 0; channel < 3; channel++)
-            colour[channel] += basis[0] * VLOAD(sh_base + channel * stride + i);
+            color[channel] += basis[0] * VLOAD(sh_base + channel * stride + i);
         const uint rest = sh_first(sh_slot, sh_block, i);
         if (degree > 0)
-            add_band(1, 4, basis, sh_rest, stride, rest, colour);
+            add_band(1, 4, basis, sh_rest, stride, rest, color);
         if (degree > 1)
-            add_band(4, 9, basis, sh_rest, stride, rest, colour);
+            add_band(4, 9, basis, sh_rest, stride, rest, color);
         if (degree > 2)
-            add_band(9, 16, basis, sh_rest, stride, rest, colour);
+            add_band(9, 16, basis, sh_rest, stride, rest, color);
     }
 
     const VF zero = (VF)(0.0f);
@@ -128,12 +128,12 @@ void project_forward(
     const VF longer = turned ? s.xx : s.yy;
     const VF fields[RECORD] = {
         u, v, s.xy / longer, sqrt(longer), sqrt(s.determinant / longer), opacity,
-        larger(colour[0], zero), larger(colour[1], zero), larger(colour[2], zero),
+        larger(color[0], zero), larger(color[1], zero), larger(color[2], zero),
         v - half_y, v + half_y, u - half_x, u + half_x, turned ? (VF)(1.0f) : zero, s.inverse_z, zero};
 #else
     const VF fields[RECORD] = {
         u, v, s.conic_xx, s.conic_xy, s.conic_yy, opacity,
-        larger(colour[0], zero), larger(colour[1], zero), larger(colour[2], zero),
+        larger(color[0], zero), larger(color[1], zero), larger(color[2], zero),
         v - half_y, v + half_y, u - half_x, u + half_x, power_min, s.inverse_z, zero};
 #endif
     const footprint_t footprint = footprint_of(fields, visible, camera->tiles_x, row_begin, row_end);
@@ -156,7 +156,7 @@ static inline void store_planes(__global float *planes, const VF *values, const 
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void project_backward(
     __global const float *restrict means,            // [3,S] scene units
-    __global const float *restrict quats,            // [4,S] unnormalised
+    __global const float *restrict quats,            // [4,S] unnormalized
     __global const float *restrict log_scales,       // [3,S] log of scene units
     __global const float *restrict logit_opacity,    // [S]
     __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major, or slots (slots.h)
@@ -186,7 +186,7 @@ void project_backward(
     gradient_t g;
     VF weights[1][16];
     const uint rest = sh_first(sh_slot, sh_block, i);
-    colour_backward(splats, pixel_sums, stride, count, i, &g);
+    color_backward(splats, pixel_sums, stride, count, i, &g);
     weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &rest, weights);
     gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0], near_plane,
                 screen_variance, compensate, degree, stride, i, &g);
@@ -196,7 +196,7 @@ void project_backward(
     store_planes(grad_logit_opacity, &g.logit_opacity, g.touched, 1, stride, i);
     store_planes(grad_mean2d, g.mean2d, g.touched, 2, stride, i);
     for (uint k = 0; k < (degree + 1) * (degree + 1); k++) {
-        const VF coefficients[3] = {g.basis[k] * g.colour[0], g.basis[k] * g.colour[1], g.basis[k] * g.colour[2]};
+        const VF coefficients[3] = {g.basis[k] * g.color[0], g.basis[k] * g.color[1], g.basis[k] * g.color[2]};
         if (k == 0)
             store_planes(grad_sh_base, coefficients, g.touched, 3, stride, i);
         else if (sh_held(sh_slot, i))

@@ -1,6 +1,6 @@
 /* Rays of pixels, each the axis of a cone, and where a ray is cut into samples (Barron et al. 2021, "Mip-NeRF").
  *
- *   ray     o the camera's position, d towards the pixel's centre with depth 1 in the camera; at a distance t of 1 the
+ *   ray     o the camera's position, d toward the pixel's center with depth 1 in the camera; at a distance t of 1 the
  *           cone has the radius 2 / sqrt(12) of a pixel's width (section 3.1)
  *   coarse  edges evenly from near to far; in training each is drawn up to 1/2 interval before or after
  *   fine    edges at even values of the distribution of the blurred coarse weights (equation 18, alpha 0.01),

@@ -8,7 +8,7 @@
 #define COLUMNS (TILE / LANES)  // vectors per tile row
 #define SEGMENT 64              // splats of a tile loaded together: one wait for memory, then rows read the cache
 
-static inline VF pixel_centres(const uint tile_x, const uint column)
+static inline VF pixel_centers(const uint tile_x, const uint column)
 {
     return to_VF(LANE_INDEX + (int)(tile_x * TILE + column * LANES)) + 0.5f;
 }
@@ -17,7 +17,7 @@ static inline VF pixel_centres(const uint tile_x, const uint column)
 #define LINE_FIELDS (sizeof(line_t) / sizeof(VF))
 #define SLOPE_FIELDS (sizeof(slopes_t) / sizeof(VF))
 #define SPLAT_AT(splat, lines, y, column) \
-    splat_on_lines(splat, lines, splat[BOX_TURNED] > 0.0f, tile_y * TILE + (y) + 0.5f, y, column, centres[column])
+    splat_on_lines(splat, lines, splat[BOX_TURNED] > 0.0f, tile_y * TILE + (y) + 0.5f, y, column, centers[column])
 
 /* The lines of a splat through a tile, rows or columns, each field of all lines together. */
 static inline void lines_of(const float *splat, const uint tile_x, const uint tile_y, float (*lines)[TILE],
@@ -26,7 +26,7 @@ static inline void lines_of(const float *splat, const uint tile_x, const uint ti
     for (uint column = 0; column < COLUMNS; column++) {
         line_t line;
         slopes_t slope;
-        line_of(splat, pixel_centres(splat[BOX_TURNED] > 0.0f ? tile_x : tile_y, column), &line, &slope);
+        line_of(splat, pixel_centers(splat[BOX_TURNED] > 0.0f ? tile_x : tile_y, column), &line, &slope);
         for (uint k = 0; k < LINE_FIELDS; k++)
             VSTORE_PRIVATE(((const VF *)&line)[k], lines[k] + column * LANES);
         for (uint k = 0; slopes && k < SLOPE_FIELDS; k++)
@@ -58,7 +58,7 @@ static inline void lines_of(const float *splat, const uint tile_x, const uint ti
                             float (*slopes)[TILE])
 {
     for (uint y = 0; y < TILE; y += LANES) {
-        const VF row = pixel_centres(tile_y, y / LANES), dy = splat[SPLAT_Y] - row;
+        const VF row = pixel_centers(tile_y, y / LANES), dy = splat[SPLAT_Y] - row;
         const VI inside = (row >= splat[SPLAT_Y_MIN]) & (row <= splat[SPLAT_Y_MAX]);
         VSTORE_PRIVATE(splat[SPLAT_XY] * dy, lines[0] + y);
         VSTORE_PRIVATE(0.5f * splat[SPLAT_YY] * dy * dy, lines[1] + y);

@@ -1,6 +1,6 @@
 /* The splitting matrix of each Gaussian (SteepGS, Wang et al. 2025): what its loss gains when it becomes two.
  *
- * On the screen, with p = dL/dpower, the conic K and d = mean - pixel centre:
+ * On the screen, with p = dL/dpower, the conic K and d = mean - pixel center:
  *
  *   S2 = sum_pixels dL/dalpha Hessian of alpha by the mean = sum_pixels p (K d d^T K - K)
  *

@@ -3,8 +3,8 @@
  * The picture is an octahedral map (Meyer et al. 2010, "On floating-point normal vectors", section 2.2): with s = |x| +
  * |y| + |z|, a direction (x, y, z) lies at (u, v) = (x, y) / s where z >= 0, and at (x - sign(x) z, y - sign(y) z) / s
  * else.  So (u, v) fills the square [-1, 1]^2 without a gap, and the square's edges meet on the sphere.  side *
- * side texels have their centres at -1 + (2 i + 1) / side; between four of them colours are bilinear.  A pixel has the
- * colour C + T b, with b the map's colour in the direction of its ray and T what the splats leave.
+ * side texels have their centers at -1 + (2 i + 1) / side; between four of them colors are bilinear.  A pixel has the
+ * color C + T b, with b the map's color in the direction of its ray and T what the splats leave.
  *
  * The host lists, for each camera, the runs of pixels of a row between the same four texels in one octant: what is read
  * and summed for a run is the same for all its pixels, and only its rays differ.  Each sum has one place and is written
@@ -98,16 +98,16 @@ void sky_forward(
             const VF seen = inside * magnitude(VLOAD(transmittance + at));
             for (uint channel = 0; channel < 3; channel++) {
                 __global const float *values = texels + channel * map_plane;
-                VF colour = (VF)(0.0f);
+                VF color = (VF)(0.0f);
                 for (uint k = 0; k < CORNERS; k++)
-                    colour += weights[k] * values[corners[k]];
-                VSTORE(VLOAD(image + channel * plane + at) + seen * colour, image + channel * plane + at);
+                    color += weights[k] * values[corners[k]];
+                VSTORE(VLOAD(image + channel * plane + at) + seen * color, image + channel * plane + at);
             }
         }
     }
 }
 
-/* Whether the photograph shows the map's colour, 1 or 0: the mean difference of the channels is small, and all four
+/* Whether the photograph shows the map's color, 1 or 0: the mean difference of the channels is small, and all four
  * texels are learned.  As sky_forward. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sky_matches(
@@ -139,10 +139,10 @@ void sky_matches(
             VF apart = (VF)(0.0f);
             for (uint channel = 0; channel < 3; channel++) {
                 __global const float *values = texels + channel * map_plane;
-                VF colour = (VF)(0.0f);
+                VF color = (VF)(0.0f);
                 for (uint k = 0; k < CORNERS; k++)
-                    colour += weights[k] * values[corners[k]];
-                apart += magnitude(colour - VLOAD(photograph + channel * plane + at));
+                    color += weights[k] * values[corners[k]];
+                apart += magnitude(color - VLOAD(photograph + channel * plane + at));
             }
             float learned = 1.0f;
             for (uint k = 0; k < CORNERS; k++)

@@ -1,7 +1,7 @@
 /* One splat at LANES pixels: alpha, blending and its gradient.  Both schedules use these functions, so their images are
  * equal bit for bit.
  *
- *   power = -1/2 (xx dx^2 + yy dy^2) - xy dx dy,  alpha = min(0.99, opacity e^power),  d = mean - pixel centre
+ *   power = -1/2 (xx dx^2 + yy dy^2) - xy dx dy,  alpha = min(0.99, opacity e^power),  d = mean - pixel center
  *
  * A splat contributes to a pixel when the pixel's row lies in its extent, power_min <= power <= 0 (power_min is where
  * alpha falls to 1/255) and blending it leaves transmittance >= 1e-4; the first splat that would leave less finishes
@@ -38,7 +38,7 @@
 #define SUM_XX 3       // p dx dx
 #define SUM_XY 4       // p dx dy
 #define SUM_YY 5       // p dy dy
-#define SUM_RED 6      // w dL/dcolour; then green, blue
+#define SUM_RED 6      // w dL/dcolor; then green, blue
 #define SUM_ABS_X 9    // |dL/dx| of the mean, px^-1; this and the next sums exist where PIXEL_SUMS is larger
 #define SUM_ABS_Y 10
 #define SUM_WEIGHT 11  // w, where the texture is known: not below 0
@@ -158,7 +158,7 @@ static inline contribution_t contribution_of(const row_splat_t s, const VF pixel
     return k;
 }
 
-/* State of LANES pixels going front to back: transmittance and colour. */
+/* State of LANES pixels going front to back: transmittance and color. */
 typedef struct {
     VF t, red, green, blue;
 #if WEIGHT_ENTROPY
@@ -173,22 +173,22 @@ typedef struct {
 /* ln w; finite for the weight 0 of what is not blended. */
 static inline VF log_weight(const VF w) { return log_positive(larger(w, (VF)(1.0e-30f))); }
 
-static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const float *colour)
+static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const float *color)
 {
     const contribution_t k = contribution_of(s, pixel, p->t);
-    p->red += k.weight * colour[0];
-    p->green += k.weight * colour[1];
-    p->blue += k.weight * colour[2];
+    p->red += k.weight * color[0];
+    p->green += k.weight * color[1];
+    p->blue += k.weight * color[2];
 #if WEIGHT_ENTROPY
     p->entropy -= k.weight * log_weight(k.weight);
 #elif INVERSE_DEPTH
-    p->inverse_depth += k.weight * colour[SPLAT_INVERSE_DEPTH - SPLAT_RED];
+    p->inverse_depth += k.weight * color[SPLAT_INVERSE_DEPTH - SPLAT_RED];
 #endif
     p->t = k.next;
 }
 
-/* State of LANES pixels for gradients: g = dL/dcolour of the pixel; rest = g . (colour that is blended after this
- * splat, background included), which starts as g . final colour.  Then dL/dalpha = t (c . g) - rest_after / (1 -
+/* State of LANES pixels for gradients: g = dL/dcolor of the pixel; rest = g . (color that is blended after this
+ * splat, background included), which starts as g . final color.  Then dL/dalpha = t (c . g) - rest_after / (1 -
  * alpha): front to back, without dividing the transmittance.
  *
  * The entropy adds -(ln w + 1) dL/dH to what a splat of weight w shows of g, c . g: the sum over all splats and the
@@ -208,16 +208,16 @@ typedef struct {
 #endif
 } grad_pixels_t;
 
-static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, const VF pixel, const float *colour,
+static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, const VF pixel, const float *color,
                                        pixel_sums_t *m)
 {
     const VF zero = (VF)(0.0f);
     const contribution_t k = contribution_of(s, pixel, p->t);
-    VF shade = colour[0] * p->red + colour[1] * p->green + colour[2] * p->blue;
+    VF shade = color[0] * p->red + color[1] * p->green + color[2] * p->blue;
 #if WEIGHT_ENTROPY
     shade = shade - p->entropy * (log_weight(k.weight) + 1.0f);
 #elif INVERSE_DEPTH
-    shade = shade + colour[SPLAT_INVERSE_DEPTH - SPLAT_RED] * p->inverse_depth;
+    shade = shade + color[SPLAT_INVERSE_DEPTH - SPLAT_RED] * p->inverse_depth;
 #endif
     p->rest = p->rest - k.weight * shade;
     const VF grad_alpha = p->t * shade - p->rest / k.remain;

@@ -13,7 +13,7 @@ static inline float luminance_of(__global const float *image, const uint plane, 
     return 0.299f * image[at] + 0.587f * image[plane + at] + 0.114f * image[2 * plane + at];
 }
 
-/* Luminance of LANES pixels of a row with a neighbour on either side, [LANES + 2]; `x` lies in the image. */
+/* Luminance of LANES pixels of a row with a neighbor on either side, [LANES + 2]; `x` lies in the image. */
 static inline void load_line(__global const float *image, const uint plane, const uint row, const uint x,
                              const uint width, float *line)
 {
@@ -56,7 +56,7 @@ void image_gradient(
     VSTORE(inside * 0.125f * sqrt(across * across + down * down), magnitude + y * stride + x);
 }
 
-/* Set the magnitude of masked pixels and of their neighbours to -1: it is not known there.  One item = one pixel. */
+/* Set the magnitude of masked pixels and of their neighbors to -1: it is not known there.  One item = one pixel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void hide_masked(
     __global const float *restrict mask,  // [H',stride] 0 or 1

@@ -30,7 +30,7 @@ typedef struct {
 
 static inline VF clamp_to(const VF x, const VF low, const VF high) { return smaller(larger(x, low), high); }
 
-/* First and one past the last tile of `begin` to `end` along one axis whose pixel centres reach into [low, high] px. */
+/* First and one past the last tile of `begin` to `end` along one axis whose pixel centers reach into [low, high] px. */
 static inline VF first_tile(const VF low, const uint begin, const uint end)
 {
     return ceil(clamp_to((low - (TILE - 0.5f)) * (1.0f / TILE), (VF)(begin), (VF)(end)));
@@ -77,8 +77,8 @@ static inline footprint_t footprint_of(const VF *splat, const VI visible, const 
     return f;
 }
 
-/* Whether the ellipse reaches a pixel centre of the tile in `column` and `row` of the rectangle: the smallest -power
- * over the centres' rectangle lies at the mean or on the edges next to it, where it is a parabola (the test of
+/* Whether the ellipse reaches a pixel center of the tile in `column` and `row` of the rectangle: the smallest -power
+ * over the centers' rectangle lies at the mean or on the edges next to it, where it is a parabola (the test of
  * StopThePop, Radl et al. 2024). */
 static inline VI touches_tile(const footprint_t *f, const VF column, const VF row)
 {

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from clsplat.api.renderer import Colour, Renderer
+from clsplat.api.renderer import Color, Renderer
 from clsplat.formats.splats import PARAMETERS
 from clsplat.scene.view import View
 
@@ -22,7 +22,7 @@ class _Render(torch.autograd.Function):
     """Forward: a picture; backward: Picture.backward."""
 
     @staticmethod
-    def forward(ctx: Any, renderer: Renderer, view: View, background: Colour | None, *tensors: torch.Tensor) -> Any:
+    def forward(ctx: Any, renderer: Renderer, view: View, background: Color | None, *tensors: torch.Tensor) -> Any:
         tables: dict[str, Any] = {n: t.detach().cpu().numpy() for n, t in zip(PARAMETERS, tensors, strict=True)}
         model, count = renderer.model, len(tables["means"])
         if model.motion is not None:
@@ -51,7 +51,7 @@ class _Render(torch.autograd.Function):
 
 
 def render(
-    renderer: Renderer, view: View, parameters: Mapping[str, torch.Tensor], background: Colour | None = None
+    renderer: Renderer, view: View, parameters: Mapping[str, torch.Tensor], background: Color | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return image [height, width, 3] and alpha [height, width] of a view, differentiable once.
 

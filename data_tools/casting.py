@@ -2,7 +2,7 @@
 
     primary ray -> closest shape -> paint x (key light x shadow + sky x openness) -> mean of the pixel's samples
 
-The z axis points up.  Colours are linear light until `photograph` encodes them.  Points and directions are [3, R], as
+The z axis points up.  Colors are linear light until `photograph` encodes them.  Points and directions are [3, R], as
 in shapes.py.
 """
 
@@ -55,7 +55,7 @@ class World:
     def shade(self, points: Array, index: NDArray[np.intp], sample: int) -> Array:
         """Light that surface points send out, seen by the `sample`-th shadow ray and sky ray of all, [3, R]."""
         count = self.grid * self.grid
-        lamp, sky = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T  # far apart in neighbouring samples
+        lamp, sky = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T  # far apart in neighboring samples
         normal = self.by_shape(Shape.normal, index, points)
         start = points + SKIN * normal
         to_key = unit(align(KEY_DIRECTION, KEY_WIDTH * lamp[0], KEY_WIDTH * lamp[1], 1.0))
@@ -79,7 +79,7 @@ class World:
         return pose[:3, 3:], unit(rotate(pose[:3, :3], through))
 
     def photograph(self, pose: Array, size: int) -> NDArray[np.uint8]:
-        """Render one view, [size, size, 4] RGBA: colours with gamma 2 (close to sRGB), alpha = covered share."""
+        """Render one view, [size, size, 4] RGBA: colors with gamma 2 (close to sRGB), alpha = covered share."""
         rows = max(1, BLOCK // size)
         parts = [self.expose(pose, size, range(r, min(r + rows, size))) for r in range(0, size, rows)]
         return np.concatenate(parts)
@@ -87,7 +87,7 @@ class World:
     def expose(self, pose: Array, size: int, rows: range) -> NDArray[np.uint8]:
         """Render some rows of a view, [rows, size, 4] RGBA."""
         y, x = (v.ravel() for v in np.meshgrid(np.array(rows, float), np.arange(float(size)), indexing="ij"))
-        colour, cover = np.zeros((3, len(x))), np.zeros(len(x))
+        color, cover = np.zeros((3, len(x))), np.zeros(len(x))
         for sample in range(self.grid * self.grid):
             down, right = divmod(sample, self.grid)
             origin, directions = self.camera_rays(
@@ -96,9 +96,9 @@ class World:
             distance, index = self.trace(origin, directions)
             hit = np.flatnonzero(np.isfinite(distance))
             light = self.shade(origin + distance[hit] * directions[:, hit], index[hit], sample)
-            colour[:, hit] += np.sqrt(np.minimum(light, 1))  # encoded first: readers average encoded values
+            color[:, hit] += np.sqrt(np.minimum(light, 1))  # encoded first: readers average encoded values
             cover[hit] += 1
-        rgba = np.vstack([colour / np.maximum(cover, 1), cover / self.grid**2])
+        rgba = np.vstack([color / np.maximum(cover, 1), cover / self.grid**2])
         return np.rint(255 * rgba).astype(np.uint8).T.reshape(len(rows), size, 4)
 
 

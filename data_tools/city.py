@@ -65,10 +65,10 @@ def chance(x: int, y: int, purpose: int) -> float:
     return float(scramble((key & np.uint64(0xFFFFFFFF)).astype(np.uint32))[0])
 
 
-def lot(x: int, y: int, centre: tuple[float, float]) -> list[Shape]:
+def lot(x: int, y: int, center: tuple[float, float]) -> list[Shape]:
     """What stands on a lot: a park, or a house with or without a tower."""
     if chance(x, y, 0) < PARKS:
-        return [Cuboid(centre=(*centre, 0.01), half=(LOT / 2, LOT / 2, 0.01), paint=park)]
+        return [Cuboid(center=(*center, 0.01), half=(LOT / 2, LOT / 2, 0.01), paint=park)]
     height = HEIGHTS[0] + (HEIGHTS[1] - HEIGHTS[0]) * chance(x, y, 1) ** 2
     sides = [LOT / 2 * (0.72 + 0.28 * chance(x, y, purpose)) for purpose in (2, 3)]
     shapes = [(1.0, height, 4)] + ([(0.55, 0.5 * height, 6)] if chance(x, y, 8) < 0.4 else [])
@@ -77,7 +77,7 @@ def lot(x: int, y: int, centre: tuple[float, float]) -> list[Shape]:
     for share, tall, purpose in shapes:
         half = (share * sides[0], share * sides[1], tall / 2)
         wall, roof = (kinds[int(4 * chance(x, y, purpose + i))] for i, kinds in enumerate((WALLS, ROOFS)))
-        found.append(Cuboid(centre=(*centre, floor + tall / 2), half=half, paint=partial(house, half, wall, roof)))
+        found.append(Cuboid(center=(*center, floor + tall / 2), half=half, paint=partial(house, half, wall, roof)))
         floor += tall
     return found
 
@@ -105,7 +105,7 @@ class City(SyntheticOptions):
         """The ground, and what stands on the lots."""
         half, places = self.half, range(self.lots)
         reach = half + 6 * FLIGHT
-        base = Cuboid(centre=(0, 0, -0.1), half=(reach, reach, 0.1), paint=partial(ground, half))
+        base = Cuboid(center=(0, 0, -0.1), half=(reach, reach, 0.1), paint=partial(ground, half))
         at = [(i + 0.5) * PITCH - half for i in places]
         return World((base, *(shape for x in places for y in places for shape in lot(x, y, (at[x], at[y])))), 0.9, 2)
 

@@ -29,14 +29,14 @@ class WebArchive:
     """An archive on the web.  Without a checksum, `fetch` reports that of the file, so that the user can compare it."""
 
     url: str
-    licence: str
+    license: str
     sha256: str | None = None
 
 
 SOURCES = {
     "mipnerf360": WebArchive(
         "http://storage.googleapis.com/gresearch/refraw360/360_v2.zip",
-        "Mip-NeRF 360 (Barron et al. 2022); no licence is stated: for research",
+        "Mip-NeRF 360 (Barron et al. 2022); no license is stated: for research",
     ),
     "tandt_db": WebArchive(
         "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip",
@@ -70,7 +70,7 @@ def fetch(source: WebArchive, out: Path, report: Report = print) -> Path:
         archive.unlink()
     except OSError as error:
         raise unwritable(out, error) from error
-    report(f"{source.licence}\n{out} is complete")
+    report(f"{source.license}\n{out} is complete")
     return out
 
 

@@ -59,13 +59,13 @@ def flight(time: float) -> Vector:
 
 
 STANDING: tuple[Shape, ...] = (
-    Cylinder(centre=(0, 0, -0.05), radius=SCENE_RADIUS, half=0.05, paint=planks, yaw=25),
-    Cuboid(centre=(0.02, 0.0, 0.03), half=(0.52, 0.52, 0.03), paint=chessboard, yaw=-22),
-    Sphere(centre=(-0.12, 0.14, 0.39), radius=0.33, paint=globe, tilt=23, yaw=40),
-    Cylinder(centre=(0.40, 0.16, 0.28), radius=0.17, half=0.22, paint=tin, yaw=10),
-    Cuboid(centre=(0.20, -0.30, 0.145), half=(0.085, 0.085, 0.085), paint=die, yaw=33),
-    Sphere(centre=(-0.42, 0.85, 0.16), radius=0.16, paint=marble),
-    Cylinder(centre=(0.30, 0.86, 0.26), radius=0.075, half=0.26, paint=candy),
+    Cylinder(center=(0, 0, -0.05), radius=SCENE_RADIUS, half=0.05, paint=planks, yaw=25),
+    Cuboid(center=(0.02, 0.0, 0.03), half=(0.52, 0.52, 0.03), paint=chessboard, yaw=-22),
+    Sphere(center=(-0.12, 0.14, 0.39), radius=0.33, paint=globe, tilt=23, yaw=40),
+    Cylinder(center=(0.40, 0.16, 0.28), radius=0.17, half=0.22, paint=tin, yaw=10),
+    Cuboid(center=(0.20, -0.30, 0.145), half=(0.085, 0.085, 0.085), paint=die, yaw=33),
+    Sphere(center=(-0.42, 0.85, 0.16), radius=0.16, paint=marble),
+    Cylinder(center=(0.30, 0.86, 0.26), radius=0.075, half=0.26, paint=candy),
 )
 
 
@@ -74,14 +74,14 @@ def shapes_at(time: float) -> tuple[Shape, ...]:
     brightness = 0.55 + 0.45 * np.cos(2 * np.pi * PULSES * time)
     return (
         *STANDING,
-        Sphere(centre=flight(time), radius=BALL, paint=dotted, yaw=30, tilt=20),
+        Sphere(center=flight(time), radius=BALL, paint=dotted, yaw=30, tilt=20),
         Cuboid(
-            centre=(0.80, 0.42, BOOK[2]),
+            center=(0.80, 0.42, BOOK[2]),
             half=BOOK,
             yaw=TURN[0] + (TURN[1] - TURN[0]) * time,
             paint=partial(bound, (0.42, 0.03, 0.04), BOOK),
         ),
-        Sphere(centre=(-0.74, 0.42, 0.15), radius=0.15, paint=partial(lamp, brightness)),
+        Sphere(center=(-0.74, 0.42, 0.15), radius=0.15, paint=partial(lamp, brightness)),
     )
 
 
@@ -156,8 +156,8 @@ class Moving(SyntheticOptions):
             write_image(out / _static(i), np.repeat(np.where(still, 255, 0).astype(np.uint8)[..., None], 3, axis=2))
         for split in poses:
             write_transforms(out / f"transforms_{split}.json", self.world_at(0), self._transforms(split))
-        positions, colours, times = (np.concatenate(parts).astype(np.float32) for parts in zip(*seen, strict=True))
-        write_points_ply(out / "points3d.ply", PointCloud(positions, colours, times))
+        positions, colors, times = (np.concatenate(parts).astype(np.float32) for parts in zip(*seen, strict=True))
+        write_points_ply(out / "points3d.ply", PointCloud(positions, colors, times))
         count = sum(split == "train" for split, _, _ in frames)
         return (
             f"{count} training views of {self.train} cameras and {len(frames) - count} test views of {self.test}, "

@@ -84,7 +84,7 @@ def common(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
 class Shape:
     """A painted convex body with its own axes: turned by `tilt` about x, then by `yaw` about z (degrees)."""
 
-    centre: Vector
+    center: Vector
     paint: Paint
     yaw: float = 0.0
     tilt: float = 0.0
@@ -111,11 +111,11 @@ class Shape:
 
     def local(self, points: Array) -> Array:
         """Bring world points into the shape's own axes."""
-        return rotate(self.axes, points - np.array(self.centre)[:, None])
+        return rotate(self.axes, points - np.array(self.center)[:, None])
 
     def intersect(self, origins: Array, directions: Array) -> Array:
         """Distance along each ray to the surface ahead, [R]; inf = miss."""
-        offset = origins - np.array(self.centre)[:, None]
+        offset = origins - np.array(self.center)[:, None]
         along, square = dot(offset, directions), dot(offset, offset) - self.reach**2
         near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # rays through the ball
         distance = np.full(along.shape, np.inf)

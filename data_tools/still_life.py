@@ -37,7 +37,7 @@ def scramble(key: NDArray[np.uint32]) -> Array:
 
 
 def mix(a: Vector | Array, b: Vector | Array, t: Array | NDArray[np.bool_]) -> Array:
-    """Blend colours [3] or [3, R]: `a` where t is 0, `b` where it is 1."""
+    """Blend colors [3] or [3, R]: `a` where t is 0, `b` where it is 1."""
     a, b = (np.reshape(c, (3, -1)) for c in (a, b))
     return np.asarray(a + (b - a) * t)
 
@@ -88,9 +88,9 @@ def globe(p: Array) -> Array:
 def beach_ball(p: Array) -> Array:
     """Six gores around z and a white cap."""
     white = (0.8, 0.77, 0.7)
-    colours = np.array([(0.75, 0.04, 0.04), white, (0.02, 0.2, 0.6), (0.8, 0.52, 0.02), white, (0.02, 0.4, 0.15)])
+    colors = np.array([(0.75, 0.04, 0.04), white, (0.02, 0.2, 0.6), (0.8, 0.52, 0.02), white, (0.02, 0.4, 0.15)])
     gore = np.floor(np.arctan2(p[1], p[0]) * 3 / np.pi).astype(int) % 6
-    return mix(colours.T[:, gore], white, np.hypot(p[0], p[1]) < 0.045)
+    return mix(colors.T[:, gore], white, np.hypot(p[0], p[1]) < 0.045)
 
 
 def dotted(p: Array) -> Array:
@@ -171,24 +171,24 @@ def pencil(p: Array) -> Array:
     return mix(mix(body, metal, p[2] > 0.22), (0.8, 0.28, 0.27), p[2] > 0.285)
 
 
-def book(centre: Vector, half: Vector, yaw: float, cover: Vector) -> Cuboid:
+def book(center: Vector, half: Vector, yaw: float, cover: Vector) -> Cuboid:
     """A bound box: its paint needs its size."""
-    return Cuboid(centre=centre, half=half, yaw=yaw, paint=partial(bound, cover, half))
+    return Cuboid(center=center, half=half, yaw=yaw, paint=partial(bound, cover, half))
 
 
 SCENE: tuple[Shape, ...] = (
-    Cylinder(centre=(0, 0, -0.05), radius=SCENE_RADIUS, half=0.05, paint=planks, yaw=25),
-    Cuboid(centre=(0.02, 0.0, 0.03), half=(0.52, 0.52, 0.03), paint=chessboard, yaw=-22),
-    Sphere(centre=(-0.12, 0.14, 0.39), radius=0.33, paint=globe, tilt=23, yaw=40),
-    Cylinder(centre=(0.40, 0.20, 0.28), radius=0.17, half=0.22, paint=tin, yaw=10),
-    Sphere(centre=(0.22, -0.22, 0.21), radius=0.15, paint=dotted, yaw=30, tilt=20),
-    Cuboid(centre=(-0.20, -0.30, 0.145), half=(0.085, 0.085, 0.085), paint=die, yaw=33),
+    Cylinder(center=(0, 0, -0.05), radius=SCENE_RADIUS, half=0.05, paint=planks, yaw=25),
+    Cuboid(center=(0.02, 0.0, 0.03), half=(0.52, 0.52, 0.03), paint=chessboard, yaw=-22),
+    Sphere(center=(-0.12, 0.14, 0.39), radius=0.33, paint=globe, tilt=23, yaw=40),
+    Cylinder(center=(0.40, 0.20, 0.28), radius=0.17, half=0.22, paint=tin, yaw=10),
+    Sphere(center=(0.22, -0.22, 0.21), radius=0.15, paint=dotted, yaw=30, tilt=20),
+    Cuboid(center=(-0.20, -0.30, 0.145), half=(0.085, 0.085, 0.085), paint=die, yaw=33),
     book((-0.78, -0.12, 0.06), (0.22, 0.30, 0.06), 8, (0.05, 0.13, 0.33)),
     book((-0.77, -0.13, 0.165), (0.19, 0.26, 0.045), 31, (0.42, 0.03, 0.04)),
-    Sphere(centre=(-0.78, -0.1, 0.34), radius=0.13, paint=orange, tilt=-15),
-    Sphere(centre=(0.80, -0.25, 0.24), radius=0.24, paint=beach_ball, tilt=50, yaw=30),
-    Sphere(centre=(-0.42, 0.85, 0.16), radius=0.16, paint=marble),
-    Cylinder(centre=(0.42, 0.86, 0.26), radius=0.075, half=0.26, paint=candy),
-    Cylinder(centre=(0.10, -0.86, 0.032), radius=0.032, half=0.34, paint=pencil, tilt=90, yaw=62),
-    Cuboid(centre=(0.50, -0.75, 0.085), half=(0.085, 0.085, 0.085), paint=die, yaw=-15, tilt=90),
+    Sphere(center=(-0.78, -0.1, 0.34), radius=0.13, paint=orange, tilt=-15),
+    Sphere(center=(0.80, -0.25, 0.24), radius=0.24, paint=beach_ball, tilt=50, yaw=30),
+    Sphere(center=(-0.42, 0.85, 0.16), radius=0.16, paint=marble),
+    Cylinder(center=(0.42, 0.86, 0.26), radius=0.075, half=0.26, paint=candy),
+    Cylinder(center=(0.10, -0.86, 0.032), radius=0.032, half=0.34, paint=pencil, tilt=90, yaw=62),
+    Cuboid(center=(0.50, -0.75, 0.085), half=(0.085, 0.085, 0.085), paint=die, yaw=-15, tilt=90),
 )

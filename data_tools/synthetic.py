@@ -121,8 +121,8 @@ def fill(out: Path, options: SyntheticOptions, workers: int) -> int:
     for split, poses in splits.items():
         frames = [{"file_path": f"./{split}/r_{i:03}", "transform_matrix": p.tolist()} for i, p in enumerate(poses)]
         write_transforms(out / f"transforms_{split}.json", world, frames)
-    positions, colours = (np.concatenate(parts).astype(np.float32) for parts in zip(*points, strict=True))
-    write_points_ply(out / "points3d.ply", PointCloud(positions, colours))
+    positions, colors = (np.concatenate(parts).astype(np.float32) for parts in zip(*points, strict=True))
+    write_points_ply(out / "points3d.ply", PointCloud(positions, colors))
     return len(positions)
 
 
@@ -147,7 +147,7 @@ def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> 
 def surface_points(
     world: World, pose: Array, image: NDArray[np.uint8], count: int, noise: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return noisy surface points of a view, as from structure from motion: positions and colours, [M, 3]."""
+    """Return noisy surface points of a view, as from structure from motion: positions and colors, [M, 3]."""
     rows, columns = np.nonzero(image[..., 3] == 255)
     chosen = rng.integers(len(rows), size=count) if len(rows) else np.zeros(0, int)
     x, y = np.stack([columns[chosen], rows[chosen]]) + rng.random((2, len(chosen)))
@@ -155,5 +155,5 @@ def surface_points(
     distance, _ = world.trace(origin, directions)
     hit = np.isfinite(distance)
     positions = (origin + distance[hit] * directions[:, hit]).T
-    colours = image[rows[chosen], columns[chosen], :3][hit] / 255
-    return positions + noise * rng.standard_normal(positions.shape), colours
+    colors = image[rows[chosen], columns[chosen], :3][hit] / 255
+    return positions + noise * rng.standard_normal(positions.shape), colors

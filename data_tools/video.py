@@ -30,7 +30,7 @@ STILL = 0.1  # px from one frame to the next: what noise and coding leave of it
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None, times: bool = False) -> int:
     """Write the sharpest frame of each of `frames` parts of a video with the same motion as PNG; return their number.
 
-    The format is PNG because a second lossy coding changes features and colours.  An interrupted call goes on: frames
+    The format is PNG because a second lossy coding changes features and colors.  An interrupted call goes on: frames
     of the same video and settings stay unchanged.  times: also write times.json, of a scene that moves: the number of
     each frame in the video.
     Raises DataError when the video cannot be decoded, or has one frame, as a picture has, and when `out` holds other
@@ -126,9 +126,9 @@ def _measured(video: Path) -> tuple[list[float], list[float]]:
     empty = np.empty(0, np.float32)
     flow, before = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST), None
     for image in decoded(video):
-        grey = np.asarray(cv2.cvtColor(limited(image, SIDE), cv2.COLOR_BGR2GRAY), np.uint8)
-        sharp.append(sharpness(grey))
-        small = limited(grey, FLOW_SIDE)
+        gray = np.asarray(cv2.cvtColor(limited(image, SIDE), cv2.COLOR_BGR2GRAY), np.uint8)
+        sharp.append(sharpness(gray))
+        small = limited(gray, FLOW_SIDE)
         way = np.zeros((*small.shape, 2), np.float32) if before is None else flow.calc(before, small, empty)
         way = cv2.resize(way, CELLS, interpolation=cv2.INTER_AREA)
         moved.append(float(np.median(np.linalg.norm(way, axis=2))))

@@ -48,7 +48,7 @@ FAMILIES = {  # by the name of the base; any other family gets a page of its own
     "PhotographTransform": Family("views", "transform", "transforms"),
     "TrainingModule": Family("modules", "training module", "modules"),
     "Appearance": Family("modules", "module for the colors of photographs", "modules"),
-    "ColourModel": Family("modules", "model of colors", "model", listed=False),
+    "ColorModel": Family("modules", "model of colors", "model", listed=False),
     "WorldFilter": Family("filters", "world filter", "world_filter", listed=False),
     "ScreenFilter": Family("filters", "screen filter", "screen_filter", listed=False),
     "Backdrop": Family("filters", "background", "background", listed=False),

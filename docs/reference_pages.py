@@ -23,7 +23,7 @@ HEADINGS = {
 }
 INTRODUCTIONS = {
     "stages": "A pipeline is a list of stages. Those that can stand in `during` run every so many steps of training.",
-    "losses": "`optimize.losses` is a list; training minimises the weighted sum.",
+    "losses": "`optimize.losses` is a list; training minimizes the weighted sum.",
     "rules": "`densify.rules` is a list. All rules act as one rearrangement of the Gaussians.",
     "statistics": "A [growing rule](rules.md#grow) acts where the mean of its `statistic` is large. Only the "
     "statistics that a rule names are summed and cost time.",
@@ -88,7 +88,7 @@ def settings_page() -> str:
 
 def readers_page() -> str:
     """Return the dataset formats, in the order in which they are looked for."""
-    text = "# Dataset readers\n\nThe first reader that recognises a folder reads it: [datasets](../datasets.md).\n\n"
+    text = "# Dataset readers\n\nThe first reader that recognizes a folder reads it: [datasets](../datasets.md).\n\n"
     for reader in readers():
         text += f"## {reader.name}\n\n{manual(type(reader))}It looks for {reader.expects}.\n\n"
     return text

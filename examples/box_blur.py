@@ -18,13 +18,13 @@ class BoxBlur(PhotographTransform):
         camera, reach = planes.camera, round(at_step(self.reach, step))
         if reach == 0:
             return planes
-        blurred = planes.workspace.array("box_blur", planes.colours.shape)
+        blurred = planes.workspace.array("box_blur", planes.colors.shape)
         program = planes.workspace.device.program(Path(__file__).with_suffix(".cl"))
         program.box_blur(
             items=(camera.stride, camera.rows, 3),
-            image=planes.colours,
+            image=planes.colors,
             blurred=blurred,
             reach=reach,
             **camera.plane_arguments(),
         )
-        return replace(planes, colours=blurred)
+        return replace(planes, colors=blurred)

@@ -181,7 +181,7 @@ def smooth(device: Device) -> Device:
 
 
 def forgets_released_buffers(info: DeviceInfo) -> bool:
-    """Oclgrind 21.10 takes a buffer at the address of a released one for that one, with its size and uninitialised
+    """Oclgrind 21.10 takes a buffer at the address of a released one for that one, with its size and uninitialized
     values: its check does not see releases.
     https://github.com/jrprice/Oclgrind/blob/v21.10/src/plugins/Uninitialized.h
     """

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The small kernel tests under Oclgrind: data races, out-of-bounds accesses, uninitialised reads.  That takes hours;
+# The small kernel tests under Oclgrind: data races, out-of-bounds accesses, uninitialized reads.  That takes hours;
 # arguments go to pytest: `tests/oclgrind.sh tests/render --one-each` takes minutes.  Oclgrind exits 0 whatever it finds, so
 # its log is what counts.
 set -euo pipefail
@@ -26,6 +26,6 @@ check() {  # names of tests, as pytest's -k has them; options of Oclgrind
 
 check "simt and not schedules" --data-races --uninitialized
 # Oclgrind 21.10 reads vectors at index -1, so that it crashes or computes other values, where the optimiser left lanes of a
-# shuffle open (https://github.com/jrprice/Oclgrind/issues/193): what may run the wide schedule is checked unoptimised.
+# shuffle open (https://github.com/jrprice/Oclgrind/issues/193): what may run the wide schedule is checked unoptimized.
 check "not simt or schedules" --data-races --uninitialized --build-options -O0
 echo "oclgrind: clean"

@@ -54,4 +54,4 @@ def path_of(value: PathLike | None) -> Path | None:
 
 def layer_names(depth: bool, alpha: bool) -> tuple[str, ...]:
     """Return the layers that are rendered."""
-    return ("colour", *(name for name, wanted in (("depth", depth), ("alpha", alpha)) if wanted))
+    return ("color", *(name for name, wanted in (("depth", depth), ("alpha", alpha)) if wanted))

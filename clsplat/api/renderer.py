@@ -22,12 +22,12 @@ from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.painter import Layers, layers
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.render.tiles import Sort
-from clsplat.scene.view import View, colour_of
+from clsplat.scene.view import View, color_of
 
 Floats = NDArray[np.float32]
-Colour = float | Sequence[float]
+Color = float | Sequence[float]
 _OPENING = threading.Lock()
-GEOMETRY = 6  # of the sums over pixels, the ones that do not belong to the colour (cl_kernels/splat.h)
+GEOMETRY = 6  # of the sums over pixels, the ones that do not belong to the color (cl_kernels/splat.h)
 
 
 def proved(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
@@ -120,20 +120,20 @@ class Renderer:
         """Take another model, or the same after its arrays were changed in place."""
         self.model, self._model = model, model.upload(self.device)
 
-    def render(self, view: View, background: Colour | None = None, depth: bool = False) -> Picture:
+    def render(self, view: View, background: Color | None = None, depth: bool = False) -> Picture:
         """Render a view; of a moving model, the moment of the view's time.
 
-        background: a colour in [0, 1], one number or three; by default the model's sky or colour, else black;
+        background: a color in [0, 1], one number or three; by default the model's sky or color, else black;
         depth: compute it, which takes another pass.  Raises ValueError for a camera that cannot be and for other
         backgrounds, NumericError where a value of the picture is not finite.
         """
         view.camera.check()
-        camera, colour = upload_camera(self.device, view), self._colour(background)
+        camera, color = upload_camera(self.device, view), self._color(background)
         model = self._model if background is None else replace(self._model, sky=None)
-        found = layers(self.rasterizer, model, camera, self.device.upload(colour), depth)
+        found = layers(self.rasterizer, model, camera, self.device.upload(color), depth)
         for values in found.arrays:
             require_finite(values, view)
-        return Picture(found.image, found.alpha, found.depth, view, colour, model, self)
+        return Picture(found.image, found.alpha, found.depth, view, color, model, self)
 
     def backward(self, picture: Picture, image: Floats | None, alpha: Floats | None) -> Gradients:
         """Return the gradients of a loss, as Picture.backward does."""
@@ -159,7 +159,7 @@ class Renderer:
         return Gradients(**{name: np.ascontiguousarray(a.get()[:, :count].T) for name, a in arrays.items()})
 
     def _forward(
-        self, model: DeviceModel, camera: DeviceCamera, background: Floats, content: Content = "colour"
+        self, model: DeviceModel, camera: DeviceCamera, background: Floats, content: Content = "color"
     ) -> Frame:
         return self.rasterizer.forward(model, camera, self.device.upload(background), content)
 
@@ -169,10 +169,10 @@ class Renderer:
         planes[:, : camera.height, : camera.width] = derivative.transpose(2, 0, 1)
         return self.rasterizer.pixel_sums(model, frame, self.device.upload(planes))
 
-    def _colour(self, background: Colour | None) -> Floats:
+    def _color(self, background: Color | None) -> Floats:
         if background is None:
             background = BACKGROUNDS[self.model.rendering.background or "black"]
-        return np.ascontiguousarray(colour_of(background), np.float32)
+        return np.ascontiguousarray(color_of(background), np.float32)
 
 
 def _checked(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:

@@ -188,7 +188,7 @@ class Trainer:
         return host_model(self._run)
 
     def add_loss(self, function: HostFunction, weight: Schedule = 1.0) -> None:
-        """Minimise also `function(image, photograph) -> (value, derivative by the image)`, in NumPy, from now on.
+        """Minimize also `function(image, photograph) -> (value, derivative by the image)`, in NumPy, from now on.
 
         Arrays are [height, width, 3] float32 in [0, 1]; weight: factor, by step.  Each step copies both images to the
         host and the derivative back; a plug-in with a kernel does not.

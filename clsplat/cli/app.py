@@ -28,7 +28,7 @@ SYNONYMS = {
     **dict.fromkeys(("benchmark", "time", "profile"), "bench"),
     **dict.fromkeys(("prove", "diagnose", "selftest"), "doctor"),
     **dict.fromkeys(("export", "transform", "merge"), "convert"),
-    **dict.fromkeys(("shrink", "prune", "quantise", "quantize"), "compress"),
+    **dict.fromkeys(("shrink", "prune", "quantize", "quantize"), "compress"),
     **dict.fromkeys(("decimate", "simplify", "levels", "stream"), "lod"),
     **dict.fromkeys(("split", "tiles", "city"), "blocks"),
     "diff": "compare",

@@ -132,7 +132,7 @@ def convert(
     ] = None,
     transform: Annotated[
         str | None,
-        typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; colours turn too."),
+        typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; colors turn too."),
     ] = None,
     drop_below: Annotated[
         float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians that are fainter.")
@@ -191,7 +191,7 @@ def compress(
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Prune, train and quantise a model until it meets a target; every file is measured as it is read back."""
+    """Prune, train and quantize a model until it meets a target; every file is measured as it is read back."""
     from clsplat.workflows.compress import table
 
     shares = _numbers("--keep", keep, "shares, separated by commas, such as 1,0.7,0.5")
@@ -225,7 +225,7 @@ def lod(
         model, folder, scene, levels=levels, keep=keep, steps=steps, downscale=downscale, device=device
     )
     terminal.show(table(found))
-    measured = f"; PSNR of {found['split']} views, not yet quantised" if found["split"] else ""
+    measured = f"; PSNR of {found['split']} views, not yet quantized" if found["split"] else ""
     terminal.remark(f"{found['folder']}/lod-meta.json: {found['bytes'] / 1e6:.3g} MB{measured}")
 
 

@@ -76,7 +76,7 @@ def wrong(kernel: str, what: str, mask: NDArray[Any], allowed: float = 0) -> Fig
 def image_figures(kernel: str, what: str, value: NDArray[Any], expected: NDArray[Any]) -> Iterator[Figure]:
     """Compare images [C, H, W], with a pixel here and there that falls on the other side of a threshold.
 
-    One splat more or less changes a pixel by up to 1/255 of its colour, and colours reach 3.
+    One splat more or less changes a pixel by up to 1/255 of its color, and colors reach 3.
     """
     difference = np.abs(value - expected).max(axis=0)
     yield Figure(kernel, f"{what}: largest difference", float(difference.max()), 1.5e-2)

@@ -316,7 +316,7 @@ def worst(result: CheckResult) -> str:
 
 
 def _excess(figure: Figure) -> float:
-    """How far a figure is towards its bound; NaN and wrong counts are beyond all."""
+    """How far a figure is toward its bound; NaN and wrong counts are beyond all."""
     if not figure.holds:
         return float("inf")
     return figure.value / figure.bound if figure.bound else 0.0

@@ -40,7 +40,7 @@ def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rotated_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the coefficients [N, (K-1)*3], coefficient-major, of the same colours after a rotation [3, 3].
+    """Return the coefficients [N, (K-1)*3], coefficient-major, of the same colors after a rotation [3, 3].
 
     A rotation maps each band onto itself, so each band's matrix follows from values at a few directions.
     """

@@ -117,7 +117,7 @@ def usable() -> tuple[int, ...]:
 
 
 def shares(cores: Cores, processes: int) -> list[tuple[int, ...]]:
-    """Return the cores of each process: equal parts of neighbours, which share caches and memory.
+    """Return the cores of each process: equal parts of neighbors, which share caches and memory.
 
     Cores that are left over belong to nobody, so that all processes have as many.
     """

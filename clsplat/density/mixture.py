@@ -1,4 +1,4 @@
-"""Two Gaussians as one: the mean and covariance of their mixture, the mean of their colours, and their mass."""
+"""Two Gaussians as one: the mean and covariance of their mixture, the mean of their colors, and their mass."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -70,15 +70,13 @@ def merged(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = vo
     log_scales = log_scales_of(variances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
     opacity = mixtures.opacity(log_scales, size)
-    colours = {
-        name: (1 - share) * tables[name][first] + share * tables[name][second] for name in ("sh_base", "sh_rest")
-    }
+    colors = {name: (1 - share) * tables[name][first] + share * tables[name][second] for name in ("sh_base", "sh_rest")}
     return {
         "means": mixtures.means,
         "quats": unit_quaternions(axes),
         "log_scales": log_scales,
         "logit_opacity": np.log(opacity / (1 - opacity))[:, None],
-        **colours,
+        **colors,
     }
 
 

@@ -45,7 +45,7 @@ class Statistic(Settings):
 
 
 class ScreenGrad(Statistic):
-    """Length of the gradient by the projected mean, in normalised device coordinates (Kerbl et al. 2023).
+    """Length of the gradient by the projected mean, in normalized device coordinates (Kerbl et al. 2023).
 
     Published thresholds have the same unit.
     """

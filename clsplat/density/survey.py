@@ -62,8 +62,8 @@ class SurveyView:
         workspace, camera, planes = self._workspace, self.photograph.camera, self.photograph.planes(self._workspace)
         if planes.mask is not None:
             apply_mask(workspace, camera, self.frame.image, planes.mask)
-            apply_mask(workspace, camera, planes.colours, planes.mask)
-        comparison = Comparison(workspace, camera, self.frame.image, planes.colours, self._gradient(), planes.mask)
+            apply_mask(workspace, camera, planes.colors, planes.mask)
+        comparison = Comparison(workspace, camera, self.frame.image, planes.colors, self._gradient(), planes.mask)
         return sum(loss.add(comparison).value() for loss in losses)
 
     def radius(self) -> Floats:

@@ -1,7 +1,7 @@
 """How much errors of spherical harmonics show in the training views, and a palette of harmonics that shows few.
 
 A Gaussian is seen from some directions only.  With Y(d) the harmonics of the bands above 0 in a direction, an error e
-of its coefficients changes its colour there by Y(d) . e, of which the band 0 takes up the mean m . e.  Over the views,
+of its coefficients changes its color there by Y(d) . e, of which the band 0 takes up the mean m . e.  Over the views,
 by the Gaussian's weight w in each, the square of what is left is e^T A e, with A = sum w (Y - m) (Y - m)^T.
 """
 
@@ -34,7 +34,7 @@ class VisibleError:
     def of(
         cls, looks: Iterable[tuple[SurveyView, NDArray[np.floating]]], means: NDArray[np.floating], coefficients: int
     ) -> "VisibleError":
-        """Sum over views, each with the centre of its camera, [3].  means: [N,3] scene units."""
+        """Sum over views, each with the center of its camera, [3].  means: [N,3] scene units."""
         i, j = np.triu_indices(coefficients)
         weights, first = np.zeros(len(means)), np.zeros((coefficients, len(means)))
         second = np.zeros((len(i), len(means)))

@@ -1,6 +1,6 @@
 """PlayCanvas' compressed PLY: 16 bytes a splat, and 3(K-1) for its harmonics, in chunks of 256 with their own ranges.
 
-chunk   min and max of x y z, scale_x y z and r g b, float32; old files have no colours, whose range is then [0, 1]
+chunk   min and max of x y z, scale_x y z and r g b, float32; old files have no colors, whose range is then [0, 1]
 vertex  packed_position   x << 21 | y << 11 | z    11, 10 and 11 bits of the chunk's range
         packed_rotation   index of the largest of w x y z << 30, the others 10 bits each of c / sqrt 2 + 1/2
         packed_scale      logarithms, as the position;    packed_color   r << 24 | g << 16 | b << 8 | opacity
@@ -44,8 +44,8 @@ BITS = (11, 10, 11)  # of x, y and z
 MAX_LOG_SCALE = 20.0
 SH_RANGE = 8.0  # from -4 to 4
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-AXES, SCALES, COLOURS = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
-_ENDS = [f"{end}_{name}" for group in (AXES, SCALES, COLOURS) for end in ("min", "max") for name in group]
+AXES, SCALES, COLORS = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
+_ENDS = [f"{end}_{name}" for group in (AXES, SCALES, COLORS) for end in ("min", "max") for name in group]
 
 
 def is_compressed(header: PlyHeader) -> bool:
@@ -68,14 +68,14 @@ def read_compressed_ply(path: Path) -> SplatFile:
             tables[name] = np.ndarray(section.count, section.dtype, file.read(length))
     chunks, vertices = _checked(path, header, tables)
     per_splat = np.repeat(np.arange(len(chunks)), CHUNK)[: len(vertices)]
-    colour, alpha = _colours(vertices, chunks, per_splat)
+    color, alpha = _colors(vertices, chunks, per_splat)
     rest = _harmonics(path, tables.get("sh"), len(vertices))
     parameters = {
         "means": _ranged(vertices["packed_position"], chunks, AXES, per_splat),
         "quats": _quaternions(vertices["packed_rotation"]),
         "log_scales": _ranged(vertices["packed_scale"], chunks, SCALES, per_splat),
         "logit_opacity": logits(alpha[:, None]),
-        "sh_base": ((colour - 0.5) / SH_C0).astype(np.float32),
+        "sh_base": ((color - 0.5) / SH_C0).astype(np.float32),
         "sh_rest": rest,
     }
     return SplatFile(parameters, comment_of(path, header), mode_of(header))
@@ -85,13 +85,13 @@ def write_compressed_ply(path: Path, splats: SplatFile, options: Writing) -> str
     """Write splats along a Morton curve.  Raises OutputError."""
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     count = len(p["means"])
-    colour = p["sh_base"].astype(np.float64) * SH_C0 + 0.5
+    color = p["sh_base"].astype(np.float64) * SH_C0 + 0.5
     scales = np.clip(p["log_scales"], -MAX_LOG_SCALE, MAX_LOG_SCALE)
-    chunks = np.concatenate([_ends(table) for table in (p["means"], scales, colour)], axis=1)
+    chunks = np.concatenate([_ends(table) for table in (p["means"], scales, color)], axis=1)
     position, scale = (_packed(_shares(table), BITS) for table in (p["means"], scales))
     alpha = opacities(p["logit_opacity"])
-    colours = _packed(np.concatenate([_shares(colour), alpha], axis=1), (8, 8, 8, 8))
-    vertices = np.stack([position, _packed_rotation(p["quats"]), scale, colours], axis=1)
+    colors = _packed(np.concatenate([_shares(color), alpha], axis=1), (8, 8, 8, 8))
+    vertices = np.stack([position, _packed_rotation(p["quats"]), scale, colors], axis=1)
     rest = swapped(p["sh_rest"], p["sh_rest"].shape[1] // 3, 3).astype(np.float64)
     sh = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype(np.uint8)
     elements = {
@@ -175,13 +175,13 @@ def _spread(
     return values
 
 
-def _colours(
+def _colors(
     vertices: NDArray[Any], chunks: NDArray[Any], per_splat: NDArray[np.integer]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Colours, [N, 3], and opacities, [N]."""
+    """Colors, [N, 3], and opacities, [N]."""
     shares = _fields(vertices["packed_color"], (8, 8, 8, 8))
     if set(_ENDS[12:]) <= set(chunks.dtype.names or ()):
-        return _spread(shares[:, :3], chunks, COLOURS, per_splat), shares[:, 3]
+        return _spread(shares[:, :3], chunks, COLORS, per_splat), shares[:, 3]
     return shares[:, :3], shares[:, 3]
 
 

@@ -81,7 +81,7 @@ class Gltf:
             self.placement = FLIP @ placements[0] @ FLIP
 
     def accessor(self, number: Any, width: int) -> NDArray[np.float32]:
-        """Return the rows of an accessor, [count, width]; normalised whole numbers as those in [-1, 1]."""
+        """Return the rows of an accessor, [count, width]; normalized whole numbers as those in [-1, 1]."""
         one = self.tree["accessors"][_index(number)]
         kind, count, start = COMPONENTS[one["componentType"]], _index(one["count"]), _index(one.get("byteOffset", 0))
         view = self.tree["bufferViews"][_index(one["bufferView"])]
@@ -119,7 +119,7 @@ class Gltf:
         if kernel != "ellipse":
             raise DataError(f"{self.path}: its kernel is {quoted(kernel)}; expected 'ellipse': export it again")
         if space != "srgb_rec709_display":
-            LOG.warning("%s: its colours are %s; they are taken as they are", self.path, quoted(space))
+            LOG.warning("%s: its colors are %s; they are taken as they are", self.path, quoted(space))
 
     def _meshes(self) -> list[tuple[int, NDArray[np.float64]]]:
         """The meshes of the scene, each with the matrix of its node."""
@@ -272,8 +272,8 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
 def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
     """What is written, by name: tables [N, c] of float32 or uint8."""
     alpha = opacities(p["logit_opacity"])
-    colour = np.clip(SH_C0 * p["sh_base"].astype(np.float64) + 0.5, 0, 1)
-    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)  # sRGB, IEC 61966-2-1
+    color = np.clip(SH_C0 * p["sh_base"].astype(np.float64) + 0.5, 0, 1)
+    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)  # sRGB, IEC 61966-2-1
     with np.errstate(over="ignore"):
         scale = np.minimum(np.exp(p["log_scales"].astype(np.float64)), np.finfo(np.float32).max)
     tables: dict[str, NDArray[Any]] = {

@@ -42,7 +42,7 @@ def from_smallest_three(largest: NDArray[np.integer], others: NDArray[np.floatin
 
 
 def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Return the rows [N] along a Morton curve through the box of the means: neighbours get similar numbers."""
+    """Return the rows [N] along a Morton curve through the box of the means: neighbors get similar numbers."""
     if not len(means):
         return np.zeros(0, np.intp)
     low = means.min(axis=0).astype(np.float64)
@@ -82,7 +82,7 @@ BGRA = [2, 1, 0, 3]
 def encode(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
     """Return an image of pixels [n, 4], row by row, filled up with zeros; alpha must be 1 at least.
 
-    It is decoded again, for the colour under an alpha of 0 would be lost.  Raises OutputError where that differs.
+    It is decoded again, for the color under an alpha of 0 would be lost.  Raises OutputError where that differs.
     """
     height = -(-len(pixels) // width)
     image = np.zeros((height * width, 4), np.uint8)

@@ -41,14 +41,14 @@ class _Cells:
     """Sorted values in consecutive cells, which are divided by the places `cuts`, [ENTRIES + 1]."""
 
     def __init__(self, ordered: NDArray[np.float64]) -> None:
-        self.ordered, self.centre = ordered, ordered[len(ordered) // 2]
-        around = ordered - self.centre
+        self.ordered, self.center = ordered, ordered[len(ordered) // 2]
+        around = ordered - self.center
         self.sums, self.squares = _sums(around), _sums(np.square(around))
 
     def means(self, cuts: NDArray[np.int64]) -> NDArray[np.float64]:
         """The mean of each cell; of an empty one the value before it."""
         first, last = cuts[:-1], cuts[1:]
-        mean: NDArray[np.float64] = (self.sums[last] - self.sums[first]) / np.maximum(last - first, 1) + self.centre
+        mean: NDArray[np.float64] = (self.sums[last] - self.sums[first]) / np.maximum(last - first, 1) + self.center
         return np.where(last > first, mean, self.ordered[np.maximum(first, 1) - 1])
 
     def errors(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -322,7 +322,7 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     moving = columns_among(names)
     if moving is None:
         raise DataError(
-            f"{path}: has some properties of a motion and lacks others; expected velocity_0..2, time_centre and "
+            f"{path}: has some properties of a motion and lacks others; expected velocity_0..2, time_center and "
             "log_duration, and none or all of acceleration_0..2, jerk_0..2 and turn_0..3: export it again"
         )
     return {**parameters, MOTION: _columns(vertices, moving)} if moving else parameters

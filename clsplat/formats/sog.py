@@ -329,7 +329,7 @@ MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of its vectors, i
 TURN_STEP = 4  # levels of 255
 SIZE_SHARE = 0.25  # of a Gaussian's size, for its position: of one of median weight
 SCALE_STEP = 0.1  # of logarithms of standard deviations
-COLOUR_STEP = 0.05  # of the coefficients of band 0; 1 changes a colour by 0.28
+COLOR_STEP = 0.05  # of the coefficients of band 0; 1 changes a color by 0.28
 SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
 DIGITS = 16  # of the SHA-256 of an image in a folder, in its name
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of files in the ZIP: the same model gives the same bytes
@@ -352,7 +352,7 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
     weights: their binary logarithms, [N], of `log_weights`: of the model that the splats may be a part of.
     """
     in_folder = path.name == META
-    p, harmonics = _quantised(splats.parameters, weights, options)
+    p, harmonics = _quantized(splats.parameters, weights, options)
     width = -(-int(np.ceil(np.sqrt(len(splats)))) // 4) * 4
     images: dict[str, bytes] = {}
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "asset": {"generator": "clsplat"}}
@@ -416,7 +416,7 @@ def _means(p: Parameters, image: Any) -> dict[str, Any]:
 
 
 def _alpha(p: Parameters) -> NDArray[np.float64]:
-    """Opacities in 255 steps, 1 at least: lossless WebP forgets the colour under 0."""
+    """Opacities in 255 steps, 1 at least: lossless WebP forgets the color under 0."""
     return np.maximum(np.rint(255 * opacities(p["logit_opacity"][:, 0])), 1)
 
 
@@ -437,7 +437,7 @@ class Harmonics:
         better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
         step: float | None = None,
     ) -> "Harmonics":
-        """Quantise harmonics [N, c] by few vectors, for training; those of `values` come out as they are.
+        """Quantize harmonics [N, c] by few vectors, for training; those of `values` come out as they are.
 
         weights: how much errors count, [N].  better: makes of a palette [E, c] another one, and the label of each
         splat.  step: of numbers, where those are few enough.
@@ -464,7 +464,7 @@ def _few(count: int, quality: Quality) -> int:
     return min(PALETTES[quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(count / SMALLEST)))))
 
 
-def _quantised(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
+def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
     """The tables, rounded, and a palette of the harmonics.
 
     Harmonics that are a palette already stay as they are, and so do the tables then: whoever made it rounded them.
@@ -486,7 +486,7 @@ def _quantised(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
         "means": weighed_means(p["means"], p["log_scales"], weights, SIZE_SHARE),
         "quats": quats,
         "log_scales": rounded(log_scales, SCALE_STEP),
-        "sh_base": rounded(base, COLOUR_STEP),
+        "sh_base": rounded(base, COLOR_STEP),
     }
     return {**p, **changed}, harmonics
 

@@ -34,7 +34,7 @@ from clsplat.formats.splats import (
 )
 
 LOG = logging.getLogger("clsplat")
-ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
+ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 LARGEST_SCALE = 1e6  # scene units: text, read as numbers, has larger ones
 EXPECTED = "a .splat file, 32 bytes a splat"
 
@@ -59,13 +59,13 @@ def read_splat(path: Path) -> SplatFile:
     rows = np.frombuffer(data, ROW)
     if (rows["scale"] < 0).any():
         raise DataError(f"{path}: holds scales below 0; expected {EXPECTED}: it may be a file of another format")
-    colour = rows["colour"] / 255.0
+    color = rows["color"] / 255.0
     parameters: Parameters = {
         "means": rows["position"].astype(np.float32),
         "quats": unit(rows["rotation"] / 128.0 - 1).astype(np.float32),
         "log_scales": logs(rows["scale"]),
-        "logit_opacity": logits(colour[:, 3:]),
-        "sh_base": ((colour[:, :3] - 0.5) / SH_C0).astype(np.float32),
+        "logit_opacity": logits(color[:, 3:]),
+        "sh_base": ((color[:, :3] - 0.5) / SH_C0).astype(np.float32),
         "sh_rest": np.zeros((len(rows), 0), np.float32),
     }
     return SplatFile(parameters)
@@ -83,13 +83,13 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     rows["position"] = p["means"]
     with np.errstate(over="ignore"):
         rows["scale"] = np.minimum(np.exp(p["log_scales"].astype(np.float64)), LARGEST_SCALE / 2)
-    colour = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
-    tell_cut(path, "splat", "colours from 0 to 1", beyond_bytes(255 * colour))
+    color = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
+    tell_cut(path, "splat", "colors from 0 to 1", beyond_bytes(255 * color))
     if p["sh_rest"].shape[1]:
         LOG.warning(
-            "%s: splat holds no harmonics: the colours are the same from everywhere; other formats hold them", path
+            "%s: splat holds no harmonics: the colors are the same from everywhere; other formats hold them", path
         )
-    rows["colour"] = np.clip(np.rint(255 * colour), 0, 255)
+    rows["color"] = np.clip(np.rint(255 * color), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
     with written(path) as file:
         file.write(rows[order].tobytes())
@@ -138,7 +138,7 @@ class SplatSection:
         """The layout of one splat."""
         position, scale, sh = KINDS[level]
         fields: list[Any] = [("position", position, 3), ("scale", scale, 3), ("rotation", scale, 4)]
-        fields += [("colour", "u1", 4), ("sh", sh, 3 * (sh_coefficients(self.degree) - 1))]
+        fields += [("color", "u1", 4), ("sh", sh, 3 * (sh_coefficients(self.degree) - 1))]
         return np.dtype(fields)
 
     def sizes(self, level: int) -> tuple[int, int, int]:
@@ -201,24 +201,24 @@ def _tables(
     position = rows["position"].astype(np.float64)
     if level and section.count:
         position = (position - section.range) * (section.block / 2 / section.range)
-        position += _centres(path, data, start, section)
+        position += _centers(path, data, start, section)
     sh = rows["sh"].astype(np.float64)
     if level == 2:
         sh = ends[0] + sh / 255 * (ends[1] - ends[0])
-    colour = rows["colour"] / 255.0
+    color = rows["color"] / 255.0
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
         return {
             "means": position.astype(np.float32),
             "quats": rows["rotation"].astype(np.float32),
             "log_scales": logs(rows["scale"]),
-            "logit_opacity": logits(colour[:, 3:]),
-            "sh_base": ((colour[:, :3] - 0.5) / SH_C0).astype(np.float32),
+            "logit_opacity": logits(color[:, 3:]),
+            "sh_base": ((color[:, :3] - 0.5) / SH_C0).astype(np.float32),
             "sh_rest": _interleaved(sh).astype(np.float32),
         }
 
 
-def _centres(path: Path, data: bytes, start: int, section: SplatSection) -> NDArray[np.float64]:
-    """The centre of each splat's bucket, [count, 3]: full buckets come first, then partial ones."""
+def _centers(path: Path, data: bytes, start: int, section: SplatSection) -> NDArray[np.float64]:
+    """The center of each splat's bucket, [count, 3]: full buckets come first, then partial ones."""
     partial = np.frombuffer(data, "<u4", section.partial, start).astype(np.int64)
     filled = section.full * section.bucket_size
     if filled + int(partial.sum()) < section.count or filled > section.rows:
@@ -227,8 +227,8 @@ def _centres(path: Path, data: bytes, start: int, section: SplatSection) -> NDAr
     ends = np.minimum(np.cumsum(held), section.count)
     bucket = np.repeat(np.arange(len(held)), np.diff(ends, prepend=0))
     table = np.frombuffer(data, "u1", section.bucket_bytes * section.buckets, start + 4 * section.partial)
-    centres = table.reshape(section.buckets, section.bucket_bytes)[:, :12].copy().view("<f4")
-    return centres[bucket].astype(np.float64)
+    centers = table.reshape(section.buckets, section.bucket_bytes)[:, :12].copy().view("<f4")
+    return centers[bucket].astype(np.float64)
 
 
 def _interleaved(sh: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 """What a model file holds, and what the formats share: names and widths of tables, activations, axes.
 
-    means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
+    means [3] scene units · quats [4] (w, x, y, z), unnormalized · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
     filter_variance [1] scene units², the world filter; only in our own PLY, as is
     motion [5 or more], where Gaussians move
@@ -23,7 +23,7 @@ from clsplat.core.errors import DataError
 # The table `motion` of Gaussians that move: its columns, and their names in a PLY.
 
 MOTION = "motion"
-FIELDS = {"velocity": 3, "time_centre": 1, "log_duration": 1, "acceleration": 3, "jerk": 3, "turn": 4}
+FIELDS = {"velocity": 3, "time_center": 1, "log_duration": 1, "acceleration": 3, "jerk": 3, "turn": 4}
 TURN = 4  # columns of the turn
 MAX_DEGREE = 3
 EXPECTED = "expected a number from 0, the first moment of the scene, to 1, its last"
@@ -51,7 +51,7 @@ def motion_degree_of(width: int) -> int:
 def fields_of(width: int) -> dict[str, slice]:
     """Return the columns of each field in a table with so many columns, by name, in their order."""
     degree, turns = WIDTHS[width]
-    present = ["velocity", "time_centre", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * turns]
+    present = ["velocity", "time_center", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * turns]
     ends: dict[str, slice] = {}
     start = 0
     for name in present:

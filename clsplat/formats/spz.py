@@ -2,7 +2,7 @@
 
     header     u32 magic, version, splats · u8 SH degree, fractional bits, flags, 0; of version 4 in place of the 0: u8
                streams, u32 offset of their table (u64 packed, u64 unpacked size each), 12 bytes of 0
-    positions  int24 of x 2^bits (version 1: float16) · alphas  255 opacity · colours  255 (0.15 f_dc + 1/2)
+    positions  int24 of x 2^bits (version 1: float16) · alphas  255 opacity · colors  255 (0.15 f_dc + 1/2)
     scales     16 (log s + 10) · rotations  index of the largest of x y z w << 30, the others as sign and 9 bits of
                511 |c| sqrt 2 (versions 1, 2: x y z as 127.5 c + 127.5, where w >= 0)
     harmonics  128 f + 128, coefficient-major, to 1/2^(bits - 1)
@@ -53,7 +53,7 @@ MAGIC = b"NGSP"
 MIP, EXTENSIONS = 1, 2  # flags
 HEADER = 16  # bytes
 STORED_DEGREE = 4  # which the format knows; bands beyond MAX_DEGREE are dropped
-COLOUR = 0.15
+COLOR = 0.15
 MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # bits of positions; the second for quality high
 ROWS = 1 << 13  # that are decoded at once: what that takes beside the result is little
@@ -63,7 +63,7 @@ MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
 LARGEST_STEP = {"small": 128.0, "balanced": 64.0, "high": 1.0}
 # step of positions: a share of the smallest deviation, for a Gaussian of median weight
 SMALLEST_SHARE = {"small": 0.5, "balanced": 0.5, "high": 0.0}
-# steps of colours, in levels of 255: of the Gaussian of median weight, and at most
+# steps of colors, in levels of 255: of the Gaussian of median weight, and at most
 BASE_STEP = {"small": (2**0.5, 16.0), "balanced": (2**0.5, 16.0), "high": (1.0, 1.0)}
 MAX_ZEROS = 16  # last bits of a position, at most
 TURN_STEP = {"small": 4, "balanced": 4, "high": 1}  # levels of quaternions, of 511
@@ -104,7 +104,7 @@ def unpacked(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Par
     byte = np.arange(256, dtype=np.float32)
     levels = {
         "logit_opacity": logits(np.arange(256) / 255.0),
-        "sh_base": ((np.arange(256) / 255.0 - 0.5) / COLOUR).astype(np.float32),
+        "sh_base": ((np.arange(256) / 255.0 - 0.5) / COLOR).astype(np.float32),
         "log_scales": byte / np.float32(16) - np.float32(10),
         "sh_rest": (byte - np.float32(128)) / np.float32(128),
     }
@@ -180,18 +180,18 @@ def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: in
     harmonics, base = _rounded_sh(p, sh_steps[order], options.sh_bits)
     cut = {
         "alphas": 255 * opacities(p["logit_opacity"]),
-        "colours": 255 * (COLOUR * base.astype(np.float64) + 0.5),
+        "colors": 255 * (COLOR * base.astype(np.float64) + 0.5),
         "scales": 16 * (p["log_scales"].astype(np.float64) + 10),
     }
     tell_cut(path, "SPZ", "harmonics from -1 to 1", np.abs(p["sh_rest"]) > 1)
-    tell_cut(path, "SPZ", "colours from -0.44 to 1.44", beyond_bytes(cut["colours"]))
+    tell_cut(path, "SPZ", "colors from -0.44 to 1.44", beyond_bytes(cut["colors"]))
     tell_cut(path, "SPZ", "scales from 4.5e-05 to 379", beyond_bytes(cut["scales"]))
     step = steps(weights, *BASE_STEP[options.quality])[:, None]
-    cut["colours"] = np.rint(cut["colours"] / step) * step
-    alphas, colours, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in cut.values())
+    cut["colors"] = np.rint(cut["colors"] / step) * step
+    alphas, colors, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in cut.values())
     positions = _fixed(p, weights, fraction, SMALLEST_SHARE[options.quality])
     rotations = _rotations(p["quats"], TURN_STEP[options.quality])
-    return [positions, alphas, colours, scales, rotations, harmonics.tobytes()]
+    return [positions, alphas, colors, scales, rotations, harmonics.tobytes()]
 
 
 def _fixed(p: Parameters, weights: NDArray[np.float64], fraction: int, share: float) -> bytes:

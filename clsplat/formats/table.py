@@ -120,9 +120,9 @@ CODECS = (
     Codec(
         "compressed PLY",
         (".compressed.ply",),
-        "with and without ranges of colours",
+        "with and without ranges of colors",
         "chunks of 256 along a Morton curve",
-        "position and scale to 1/2047 of a chunk's range, quaternions to 10 bits, colours and opacity to 8, "
+        "position and scale to 1/2047 of a chunk's range, quaternions to 10 bits, colors and opacity to 8, "
         "harmonics to 1/32, order",
         lambda start: (header := start.ply()) is not None and is_compressed(header),
         lambda path, options: read_compressed_ply(path),
@@ -135,9 +135,9 @@ CODECS = (
         "versions 1 to 4",
         "version 3, or 4 with the extra `spz`, in groups of like precision, each along a Morton curve",
         "rounds: position to 2^-12 or half of the smallest deviation, more where the Gaussian weighs little, "
-        "log scale to 1/16, quaternions to 7 bits, opacity to 8, colours and harmonics to 8 or fewer by the weight of "
+        "log scale to 1/16, quaternions to 7 bits, opacity to 8, colors and harmonics to 8 or fewer by the weight of "
         "the Gaussian; "
-        "cuts: harmonics beyond 1, colours beyond -0.44 and 1.44, scales beyond 4.5e-5 and 379; order",
+        "cuts: harmonics beyond 1, colors beyond -0.44 and 1.44, scales beyond 4.5e-5 and 379; order",
         lambda start: start.data.startswith((b"NGSP", b"\x1f\x8b")),
         read_spz,
         write_spz,
@@ -151,7 +151,7 @@ CODECS = (
         "versions 1 and 2, bundled or as a folder with meta.json",
         "version 2, bundled, or as the files beside a meta.json, along a Morton curve",
         "position to 16 bits of a logarithm, or a quarter of a Gaussian's size, more where it weighs little, "
-        "quaternions to 6 bits, scales and colours to 256 values or to steps of 10 % and 0.014, opacity to 8 bits, "
+        "quaternions to 6 bits, scales and colors to 256 values or to steps of 10 % and 0.014, opacity to 8 bits, "
         "harmonics to a palette, names of axes, order",
         lambda start: looks_like_sog(start.data),
         lambda path, options: read_sog(path),
@@ -173,7 +173,7 @@ CODECS = (
         "GLB",
         (".glb",),
         "KHR_gaussian_splatting, numbers of every kind, nodes that are moved, turned or scaled",
-        "KHR_gaussian_splatting, 32-bit floats, and colours for other viewers",
+        "KHR_gaussian_splatting, 32-bit floats, and colors for other viewers",
         "digits of large logits: opacities and scales are stored, not their logits and logarithms",
         lambda start: start.data.startswith(b"glTF"),
         lambda path, options: read_glb(path),
@@ -205,7 +205,7 @@ CODECS = (
         (".splat",),
         "all",
         "the largest and most opaque first",
-        "harmonics, colours outside [0, 1], order; colours and opacity are in 8 bits, quaternions in 8",
+        "harmonics, colors outside [0, 1], order; colors and opacity are in 8 bits, quaternions in 8",
         lambda start: looks_like_splat(start.data, start.size),
         lambda path, options: read_splat(path),
         write_splat,

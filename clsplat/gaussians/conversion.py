@@ -393,7 +393,7 @@ def _name_of(out: Path) -> tuple[Path, str, str]:
 COUNT = 10_000  # Gaussians, 2 degrees from each other
 RADIUS = 10.0  # of the sphere, by the distance that holds SHARE of the model (WildGaussians, Kulhanek et al. 2024)
 SHARE = 0.97
-WIDTH = 0.65  # standard deviation, by the distance of neighbours: gaps let 2 % through (ours)
+WIDTH = 0.65  # standard deviation, by the distance of neighbors: gaps let 2 % through (ours)
 FLAT = 0.1  # standard deviation along the ray, by that across
 LOGIT = 6.0  # of the opacity
 
@@ -404,12 +404,12 @@ def with_sky_splats(model: Model, count: int = COUNT) -> Model:
         return model
     model = model.baked()
     means = model.means.astype(np.float64)
-    centre = np.median(means, axis=0)
-    radius = RADIUS * float(np.quantile(np.linalg.norm(means - centre, axis=1), SHARE))
+    center = np.median(means, axis=0)
+    radius = RADIUS * float(np.quantile(np.linalg.norm(means - center, axis=1), SHARE))
     directions = fibonacci(count)
     across = np.log(radius * np.sqrt(4 * np.pi / count) * WIDTH)
     added: dict[str, NDArray[Any]] = {
-        "means": centre + radius * directions,
+        "means": center + radius * directions,
         "quats": _turns(directions),
         "log_scales": np.tile([across, across, across + np.log(FLAT)], (count, 1)),
         "logit_opacity": np.full((count, 1), LOGIT),
@@ -444,9 +444,9 @@ MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
 
 
 def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0) -> Parameters:
-    """Return one Gaussian for each point, `scale` times as large as the point, or as the distance to its neighbours."""
+    """Return one Gaussian for each point, `scale` times as large as the point, or as the distance to its neighbors."""
     count = len(points)
-    log_scales = 0.5 * np.log(neighbour_distance2(points.positions))
+    log_scales = 0.5 * np.log(neighbor_distance2(points.positions))
     if points.sizes is not None:
         log_scales = np.where(np.isnan(points.sizes), log_scales, np.log(points.sizes))
     log_scales = log_scales + math.log(scale)
@@ -457,16 +457,16 @@ def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 
         "quats": quats.astype(np.float32),
         "log_scales": np.repeat(log_scales[:, None], 3, axis=1).astype(np.float32),
         "logit_opacity": np.full((count, 1), math.log(opacity / (1 - opacity)), np.float32),
-        "sh_base": ((points.colours - 0.5) / SH_C0).astype(np.float32),
+        "sh_base": ((points.colors - 0.5) / SH_C0).astype(np.float32),
         "sh_rest": np.zeros((count, 3 * (sh_coefficients(degree) - 1)), np.float32),
     }
 
 
-def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the mean squared distance to the three nearest neighbours, exact, [N] scene units²."""
-    neighbours = min(4, len(positions))
-    if neighbours < 2:
+def neighbor_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the mean squared distance to the three nearest neighbors, exact, [N] scene units²."""
+    neighbors = min(4, len(positions))
+    if neighbors < 2:
         return np.full(len(positions), 1.0)
-    distance = scipy.spatial.cKDTree(positions).query(positions, k=neighbours, workers=-1)[0]
+    distance = scipy.spatial.cKDTree(positions).query(positions, k=neighbors, workers=-1)[0]
     squared: NDArray[np.float64] = np.square(distance[:, 1:]).mean(axis=1)
     return np.maximum(squared, MIN_DISTANCE2)

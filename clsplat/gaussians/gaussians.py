@@ -3,9 +3,9 @@
 Every table is a set of planes [components, capacity] on the device, and [N, components] on the host.  Parameters,
 Adam's moments and statistics are all tables, so that their rows always move together.
 
-    means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
+    means [3] scene units · quats [4] (w, x, y, z), unnormalized · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
-    filter_variance [1] scene units², the world filter; zero when there is none, never optimised
+    filter_variance [1] scene units², the world filter; zero when there is none, never optimized
     motion [W] of Gaussians that move (clsplat/formats/splats.py); absent where none does
 """
 
@@ -265,7 +265,7 @@ class DeviceModel:
     compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
     pixel_box: float = 0.0  # 1: splats are integrated over the box of each pixel instead
     dropout: DropoutMask | None = None  # of a step
-    sky: DeviceSky | None = None  # behind them, in place of a background of one colour
+    sky: DeviceSky | None = None  # behind them, in place of a background of one color
 
     @property
     def defines(self) -> dict[str, int]:

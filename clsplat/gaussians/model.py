@@ -128,7 +128,7 @@ class Model:
     """
 
     means: Floats  # [N, 3] scene units
-    quats: Floats  # [N, 4] (w, x, y, z), unnormalised
+    quats: Floats  # [N, 4] (w, x, y, z), unnormalized
     log_scales: Floats  # [N, 3] log of scene units
     logit_opacity: Floats  # [N, 1]
     sh_base: Floats  # [N, 3] band 0
@@ -137,7 +137,7 @@ class Model:
         None  # [N, 1] scene units², the world filter where it is not yet part of the scales
     )
     rendering: Rendering = NUMBERS
-    sky: Sky | None = None  # behind the Gaussians, in place of a background of one colour
+    sky: Sky | None = None  # behind the Gaussians, in place of a background of one color
     motion: Floats | None = None  # [N, 5 or more] of Gaussians that move, see clsplat/formats/splats.py
 
     def __post_init__(self) -> None:
@@ -198,8 +198,8 @@ class Model:
         return opacities(self.logit_opacity[:, 0]).astype(np.float32)
 
     @property
-    def colours(self) -> Floats:
-        """Colours of band 0, [N, 3]; in [0, 1] where they can be shown."""
+    def colors(self) -> Floats:
+        """Colors of band 0, [N, 3]; in [0, 1] where they can be shown."""
         return np.asarray(self.sh_base * SH_C0 + 0.5, np.float32)
 
     def __getitem__(self, chosen: Any) -> "Model":
@@ -210,7 +210,7 @@ class Model:
     def transformed(
         self, scale: float = 1.0, rotation: NDArray[np.floating] | None = None, translation: Any = (0, 0, 0)
     ) -> "Model":
-        """Return the model after x -> scale · rotation x + translation; colours turn with it.
+        """Return the model after x -> scale · rotation x + translation; colors turn with it.
 
         rotation: [3, 3]; translation: [3] scene units.  Raises ValueError for a matrix that is not a rotation, and
         where the result is more than a model file holds.

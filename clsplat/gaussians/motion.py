@@ -20,14 +20,14 @@ def still(count: int, width: int) -> NDArray[np.float32]:
     """Return the motion of Gaussians that are there always and never move, [count, width]."""
     table = np.zeros((count, width), np.float32)
     fields = fields_of(width)
-    table[:, fields["time_centre"]], table[:, fields["log_duration"]] = 0.5, STILL
+    table[:, fields["time_center"]], table[:, fields["log_duration"]] = 0.5, STILL
     return table
 
 
 def presence(motion: NDArray[np.floating], time: float | NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the factor of each opacity at a time, or at a time of its own, [N]; it is [N] in (0, 1]."""
     fields, table = fields_of(motion.shape[1]), motion.astype(np.float64)
-    dt = np.reshape(time, (-1, 1)) - table[:, fields["time_centre"]]
+    dt = np.reshape(time, (-1, 1)) - table[:, fields["time_center"]]
     with np.errstate(over="ignore"):
         return np.exp(-0.5 * np.square(dt * np.exp(np.minimum(-table[:, fields["log_duration"]], LOGIT))))[:, 0]
 
@@ -39,7 +39,7 @@ def at_time(parameters: Parameters, time: float) -> Parameters:
     there = factor >= FAINTEST
     tables = {name: table[there] for name, table in parameters.items() if name != MOTION}
     motion, factor = motion[there], factor[there, None]
-    dt = time - motion[:, fields["time_centre"]]
+    dt = time - motion[:, fields["time_center"]]
     moved = tables["means"].astype(np.float64)
     for order, name in enumerate(("velocity", "acceleration", "jerk"), 1):
         if name in fields:
@@ -81,7 +81,7 @@ def alike(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters
 
 
 def moved_to(tables: Mapping[str, NDArray[np.float64]], by: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """Return means, quaternions and motion of the same paths, told from centres that are `by`, [N], later in time."""
+    """Return means, quaternions and motion of the same paths, told from centers that are `by`, [N], later in time."""
     motion, way = tables[MOTION].copy(), by[:, None]
     fields, still_there = fields_of(motion.shape[1]), np.zeros((len(by), 3))
     first, second, third = (
@@ -89,7 +89,7 @@ def moved_to(tables: Mapping[str, NDArray[np.float64]], by: NDArray[np.float64])
         for name in ("velocity", "acceleration", "jerk")
     )
     means = tables["means"] + first * way + second * way**2 + third * way**3
-    motion[:, fields["time_centre"]] += way
+    motion[:, fields["time_center"]] += way
     motion[:, fields["velocity"]] = first + 2 * second * way + 3 * third * way**2
     if "acceleration" in fields:
         motion[:, fields["acceleration"]] = second + 3 * third * way

@@ -1,4 +1,4 @@
-"""The colours behind the Gaussians by direction: a map on the host, on the device, and in a file beside a model's."""
+"""The colors behind the Gaussians by direction: a map on the host, on the device, and in a file beside a model's."""
 
 import json
 import logging
@@ -26,7 +26,7 @@ def signs(directions: NDArray[np.floating]) -> Floats:
 
 
 def places(directions: NDArray[np.floating], side: int) -> Floats:
-    """Return where directions, [..., 3] of any length, lie between the centres of texels, [..., 2] from -0.5 on."""
+    """Return where directions, [..., 3] of any length, lie between the centers of texels, [..., 2] from -0.5 on."""
     directions = np.asarray(directions, np.float64)
     sign = signs(directions)
     below = np.minimum(directions[..., 2:], 0)
@@ -36,9 +36,9 @@ def places(directions: NDArray[np.floating], side: int) -> Floats:
 
 
 def texel_directions(side: int) -> Floats:
-    """Return the directions of the centres of all texels, unit vectors, [side * side, 3], row by row."""
-    centres = (2 * np.arange(side) + 1) / side - 1
-    v, u = (axis.ravel() for axis in np.meshgrid(centres, centres, indexing="ij"))
+    """Return the directions of the centers of all texels, unit vectors, [side * side, 3], row by row."""
+    centers = (2 * np.arange(side) + 1) / side - 1
+    v, u = (axis.ravel() for axis in np.meshgrid(centers, centers, indexing="ij"))
     z = 1 - np.abs(u) - np.abs(v)
     fold = np.maximum(-z, 0)
     found = np.stack([u - np.where(u < 0, -fold, fold), v - np.where(v < 0, -fold, fold), z], axis=1)
@@ -55,7 +55,7 @@ def texel_at(i: Integers, j: Integers, side: int) -> Integers:
     return j * side + i
 
 
-def neighbours(side: int) -> Integers:
+def neighbors(side: int) -> Integers:
     """Return the texels about each texel and itself, [side * side, 9]."""
     j, i = (axis.ravel() for axis in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
     return np.stack([texel_at(i + right, j + down, side) for down in (-1, 0, 1) for right in (-1, 0, 1)], axis=1)
@@ -85,7 +85,7 @@ LOG = logging.getLogger("clsplat")
 
 SIDES = 8, 512  # texels: smallest and largest
 MEANING = (
-    "colours behind the model by direction, an octahedral map: with s = |x| + |y| + |z| the direction (x, y, z) of the "
+    "colors behind the model by direction, an octahedral map: with s = |x| + |y| + |z| the direction (x, y, z) of the "
     "scene lies at (u, v) = (x, y) / s, where z < 0 at (x - sign(x) z, y - sign(y) z) / s; texels, red, green and "
     "blue, lie row by row at u, v = -1 + (2 i + 1) / side"
 )
@@ -105,7 +105,7 @@ class DeviceSky:
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """A map of the colours behind a model."""
+    """A map of the colors behind a model."""
 
     texels: NDArray[np.float32]  # [side * side, 3], row by row
 
@@ -119,7 +119,7 @@ class Sky:
         return DeviceSky(device.upload(np.ascontiguousarray(self.texels.T)), self.side)
 
     def turned(self, rotation: NDArray[np.floating]) -> "Sky":
-        """Return the map of a scene that is turned by x -> rotation x, [3, 3]; colours between texels are bilinear."""
+        """Return the map of a scene that is turned by x -> rotation x, [3, 3]; colors between texels are bilinear."""
         return Sky(sampled(self.texels, texel_directions(self.side) @ rotation).astype(np.float32))
 
     def write(self, path: Path, models: Mapping[str, str]) -> None:

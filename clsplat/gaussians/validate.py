@@ -110,7 +110,7 @@ def _activated(model: Model) -> list[str]:
         found.append("its opacities look like opacities, not logits of them")
     base = model.sh_base
     if ((base >= 0) & (base <= 1)).mean() > NEARLY_ALL and np.ptp(base) > 0:
-        found.append("its base colours look like colours, not coefficients around grey")
+        found.append("its base colors look like colors, not coefficients around gray")
     return found
 
 
@@ -121,7 +121,7 @@ def _ranges(model: Model) -> dict[str, list[float]]:
     quantities: dict[str, NDArray[Any]] = {
         "scales": scales,
         "opacities": model.opacities,
-        "colours": model.colours,
+        "colors": model.colors,
         "harmonics": model.sh_rest,
         "quaternions": np.linalg.norm(model.quats.astype(np.float64), axis=1),
     }

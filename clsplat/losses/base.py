@@ -87,7 +87,7 @@ class ViewGradients(ViewLosses):
 
 
 class Loss(Settings):
-    """A summand of the objective, which training minimises."""
+    """A summand of the objective, which training minimizes."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
 
@@ -104,8 +104,8 @@ class ImageLoss(Loss):
     """Whether it compares; one that does not needs no symmetry, and is no loss to train on alone."""
 
     def reads(self, step: int) -> Content:
-        """Return what it reads of the image at a global step: colours, or a fourth plane, which then exists."""
-        return "colour"
+        """Return what it reads of the image at a global step: colors, or a fourth plane, which then exists."""
+        return "color"
 
     @abstractmethod
     def add(self, comparison: Comparison) -> LossValue:
@@ -163,9 +163,9 @@ def content_of(losses: Sequence[Loss], step: int) -> Content:
     for loss in losses:
         if not isinstance(loss, ImageLoss | Penalty):
             raise ConfigError(f"the loss {type(loss).__name__}: expected a subclass of ImageLoss or of Penalty")
-    planes = {loss.reads(step) for loss in losses if isinstance(loss, ImageLoss)} - {"colour"}
+    planes = {loss.reads(step) for loss in losses if isinstance(loss, ImageLoss)} - {"color"}
     if len(planes) > 1:
         raise ConfigError(
             f"losses read {' and '.join(sorted(planes))} of an image; expected one of them: leave one out"
         )
-    return planes.pop() if planes else "colour"
+    return planes.pop() if planes else "color"

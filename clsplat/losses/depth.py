@@ -28,7 +28,7 @@ class InverseDepth(ImageLoss):
     reads_photograph: ClassVar[bool] = False
 
     def reads(self, step: int) -> Content:
-        return "inverse_depth" if at_step(self.weight, step) > 0 else "colour"
+        return "inverse_depth" if at_step(self.weight, step) > 0 else "color"
 
     def add(self, comparison: Comparison) -> LossValue:
         weight, known, camera = at_step(self.weight, comparison.step), comparison.depths, comparison.camera

@@ -16,7 +16,7 @@ from clsplat.gaussians.motion import moved_to, presence
 from clsplat.losses.base import LossValue, Penalty, PenaltyInputs
 from clsplat.methods.adc import Grow
 
-APART = 0.6  # of each child from the centre, in durations
+APART = 0.6  # of each child from the center, in durations
 SHORTER = 0.8  # its duration by that of the Gaussian: the variance of both together, 0.6² + 0.8², is that of the one
 LONGEST = 0.5  # duration that is divided: of those that are there always, half the scene
 MOST = 1 - 1e-6  # opacity
@@ -26,7 +26,7 @@ class SplitInTime(Grow):
     """Divide Gaussians whose statistic is large in time, where they travel farther than their size (ours).
 
     What follows a curve, or changes on its way, is two then: each with its own velocity, one before the other.  Where
-    the time at the centre is the same for both, they are together as opaque as it was.
+    the time at the center is the same for both, they are together as opaque as it was.
     """
 
     type: Literal["split_in_time"] = "split_in_time"
@@ -79,8 +79,8 @@ class PruneAbsent(Rule):
         require_motion(self.type, gaussians)
         moments = np.unique([view.time or 0.0 for view in edit.survey.views])
         motion = gaussians.get(MOTION)
-        centres = motion[:, fields_of(motion.shape[1])["time_centre"]][:, 0]
-        after = np.searchsorted(moments, centres).clip(1, max(len(moments) - 1, 1))
+        centers = motion[:, fields_of(motion.shape[1])["time_center"]][:, 0]
+        after = np.searchsorted(moments, centers).clip(1, max(len(moments) - 1, 1))
         near = [presence(motion, moments[np.minimum(place, len(moments) - 1)]) for place in (after - 1, after)]
         most = opacities(gaussians.get("logit_opacity")[:, 0]) * np.maximum(*near)
         edit.choose(most < edit.at(self.opacity_below), copies=0, kept=0)

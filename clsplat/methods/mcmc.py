@@ -75,7 +75,7 @@ def divided(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the opacity of each of so many equal Gaussians in one place, and the factor of their scales (eqs. 8, 9).
 
-    Together they have the opacity of one at its centre, and its integral along a line.
+    Together they have the opacity of one at its center, and its integral along a line.
     """
     new = np.clip(1 - (1 - opacity) ** (1 / rows), lowest, 1 - 1e-6)
     series = sum(scipy.special.comb(rows, j) * (-1.0) ** (j - 1) * new**j / np.sqrt(j) for j in range(1, MOST + 1))

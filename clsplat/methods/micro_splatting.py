@@ -158,24 +158,24 @@ class PruneUnimportant(Rule):
         edit.choose(chosen, copies=0, kept=0)
 
 
-class MergeNeighbours(Rule):
-    """Replace two mutual nearest neighbours, close and of like colour, by one Gaussian.
+class MergeNeighbors(Rule):
+    """Replace two mutual nearest neighbors, close and of like color, by one Gaussian.
 
-    It has the mean and covariance of their mixture and the mean of their colours, weighted by opacity times volume, and
+    It has the mean and covariance of their mixture and the mean of their colors, weighted by opacity times volume, and
     the opacity that keeps the sum of these weights.  The row of the heavier one stays, with its statistics and Adam's
     moments, except those of scales and rotation.
     """
 
-    type: Literal["merge_neighbours"] = "merge_neighbours"
+    type: Literal["merge_neighbors"] = "merge_neighbors"
     grows: ClassVar[bool] = False
     rewrites: ClassVar[bool] = True
     conflicts = AT_REST
-    training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "colour_below"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "color_below"})
 
     distance_below: Positive = 0.5
     """Largest distance, a share of the sum of their mean scales; by step."""
-    colour_below: Positive = 0.05
-    """Largest difference of a channel of the base colours, in [0, 1]; by step."""
+    color_below: Positive = 0.05
+    """Largest difference of a channel of the base colors, in [0, 1]; by step."""
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
@@ -195,7 +195,7 @@ class MergeNeighbours(Rule):
         edit.choose(absorbed, copies=0, kept=0)
 
     def _pairs(self, edit: Edit, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of mutual nearest neighbours that may merge, the heavier one first."""
+        """Rows of mutual nearest neighbors that may merge, the heavier one first."""
         means, mass = tables["means"], mass_of(tables)
         if len(means) < 2 or not np.isfinite(means).all():  # the next report ends the training
             return np.empty(0, np.int64), np.empty(0, np.int64)
@@ -206,8 +206,8 @@ class MergeNeighbours(Rule):
         mutual = (nearest[nearest] == rows) & (rows < nearest)
         size = np.exp(tables["log_scales"].mean(axis=1))
         close = distance < edit.at(self.distance_below) * (size + size[nearest])
-        colour = SH_C0 * np.abs(tables["sh_base"] - tables["sh_base"][nearest]).max(axis=1)
-        one = rows[mutual & close & (colour < edit.at(self.colour_below))]
+        color = SH_C0 * np.abs(tables["sh_base"] - tables["sh_base"][nearest]).max(axis=1)
+        one = rows[mutual & close & (color < edit.at(self.color_below))]
         two = nearest[one]
         heavier = mass[one] >= mass[two]
         return np.where(heavier, one, two), np.where(heavier, two, one)

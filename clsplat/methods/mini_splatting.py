@@ -102,7 +102,7 @@ class Drawn(NamedTuple):
     """What was drawn of one photograph."""
 
     positions: Floats  # [n, 3] scene units
-    colours: Floats  # [n, 3] in [0, 1]
+    colors: Floats  # [n, 3] in [0, 1]
     pixel: Floats  # [n] side of a pixel at its depth, scene units
     apart: Floats  # [n] distance to the next that was drawn, about, scene units
 
@@ -116,11 +116,12 @@ class ReinitFromDepth(Stage):
     that holds the transmittance, 1 − alpha, as in the code of 3DGS.  Pixels that a mask leaves out are not drawn.
 
     A Gaussian lies at the mean depth of what covers its pixel, weighted by alpha T, which at an edge falls between
-    two surfaces; published is the middle of the ray's way through the Gaussian of the largest weight.  It has the
-    photograph's colour; where photographs have learnt colours of their own, that of the model's picture, which has none
-    of them.  A learnt camera counts where it was learnt to be.  The Gaussian's standard deviation is the mean distance
-    to the three nearest neighbours, as `init` has it, but at least a pixel and at most the distance to the next drawn
-    pixel.  Adam's moments, statistics and averages begin anew; the active degree of the harmonics stays, with zeros.
+    two surfaces; published is the middle of the ray's way through the Gaussian of the largest weight. It has the
+    photograph's color; where photographs have learned colors of their own, that of the model's picture, which has
+    none of them. A learned camera counts where it was learned to be. The Gaussian's standard deviation is the mean
+    distance to the three nearest neighbors, as `init` has it, but at least a pixel and at most the distance to the
+    next drawn pixel. Adam's moments, statistics and averages begin anew; the active degree of the harmonics stays,
+    with zeros.
     """
 
     stage: Literal["reinit_from_depth"] = "reinit_from_depth"
@@ -143,12 +144,12 @@ class ReinitFromDepth(Stage):
         count = self.count or before
         run.memory_plan(first_tables(width), last_place(run.harmonics, run.device.info)).check(count, more_room(run))
         drawn = self._drawn(run, count)
-        positions, colours, pixel, apart = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        positions, colors, pixel, apart = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
         if not len(positions):
             raise NumericError(
                 "reinit_from_depth: the model covers no pixel of the training photographs; train longer before it"
             )
-        points = PointCloud(positions.astype(np.float32), colours.astype(np.float32))
+        points = PointCloud(positions.astype(np.float32), colors.astype(np.float32))
         parameters = from_points(points, self.opacity, width)
         size = np.clip(np.exp(parameters["log_scales"][:, 0].astype(np.float64)), pixel, apart)
         parameters["log_scales"][:] = np.log(self.scale * size)[:, None]
@@ -165,7 +166,7 @@ class ReinitFromDepth(Stage):
     def _drawn(run: Run, count: int) -> list[Drawn]:
         """What is drawn of each training photograph; random numbers are of the seed, the step and its place."""
         views = learned_scene(run).downscaled(run.downscale).split("train")
-        painter, found, own_colours = run.painter(), list[Drawn](), measured_as(run) is not None
+        painter, found, own_colors = run.painter(), list[Drawn](), measured_as(run) is not None
         for number, view in enumerate(run.status.counted(views, "photographs", len(views))):
             photograph = run.photographs.get(view)
             layers = painter.layers(photograph.camera, depth=True)
@@ -173,7 +174,7 @@ class ReinitFromDepth(Stage):
             mask, own = photograph.counted(), count // len(views) + (number < count % len(views))
             alpha = np.where(layers.depth > 0, layers.alpha, 0) * (1 if mask is None else mask)
             random = np.random.default_rng([run.seed, run.step, number])
-            image = to_8_bits(layers.image) if own_colours else photograph.image()
+            image = to_8_bits(layers.image) if own_colors else photograph.image()
             found.append(drawn_of(view, alpha, layers.depth, image, own, random))
         return found
 

@@ -103,28 +103,28 @@ class HaarState(ModuleState):
 
 
 def apply_filter(planes: Planes, numbers: ByNumber) -> Planes:
-    """Return a photograph after the transform; the colours of `planes` stay as they are."""
+    """Return a photograph after the transform; the colors of `planes` stay as they are."""
     camera, workspace = planes.camera, planes.workspace
-    found = workspace.array("haar", planes.colours.shape)
+    found = workspace.array("haar", planes.colors.shape)
     workspace.device.program("haar.cl").haar_forward(
         items=(camera.stride // 2, camera.rows // 2),
-        image=planes.colours,
+        image=planes.colors,
         found=found,
         **_arguments(planes, numbers, found),
     )
-    return replace(planes, colours=found)
+    return replace(planes, colors=found)
 
 
 def filter_gradients(planes: Planes, numbers: ByNumber, gradient: Array) -> Callable[[], ByNumber]:
     """Begin the derivatives by scale and leak of what `apply_filter` returned of `planes`; the result waits for them.
 
-    gradient: by those colours, [3, rows, stride], zero outside the image and where the mask is.
+    gradient: by those colors, [3, rows, stride], zero outside the image and where the mask is.
     """
     columns, strips = planes.camera.stride // 2, -(-planes.camera.rows // (2 * STRIP))
     sums = planes.workspace.array("haar sums", (2, strips, columns))
     planes.workspace.device.program("haar.cl").haar_backward(
         items=(columns, strips),
-        image=planes.colours,
+        image=planes.colors,
         gradient=gradient,
         sums=sums,
         **_arguments(planes, numbers, sums),

@@ -39,8 +39,8 @@ class Lpips:
             raise DataError(
                 f"{path}: not an ONNX file that OpenCV {cv2.__version__} reads ({_short(error)})"
             ) from error
-        grey = np.full((64, 64, 3), 128, np.uint8)
-        if (distance := self.distance(grey, grey)) != 0:
+        gray = np.full((64, 64, 3), 128, np.uint8)
+        if (distance := self.distance(gray, gray)) != 0:
             raise ConfigError(f"{path}: the distance of equal images is {distance:g}, expected 0: this is not LPIPS")
 
     def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:

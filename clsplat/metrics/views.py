@@ -126,9 +126,9 @@ def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
     return {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
 
 
-# PSNR of a rendered image in the colours of its photograph, which no training has seen.
+# PSNR of a rendered image in the colors of its photograph, which no training has seen.
 
-GUESSED = 1.0  # dB by which figures in the photographs' colours are better, from which on the log says why
+GUESSED = 1.0  # dB by which figures in the photographs' colors are better, from which on the log says why
 
 LEAST = 1e-3  # slope of a regression, below which there is nothing to divide by
 # Usable pixels for each number that is fitted to a channel: p numbers of n independent errors add p / n of their
@@ -137,7 +137,7 @@ PIXELS = 64
 
 
 class Fitted(Protocol):
-    """Colours of photographs that can be fitted to one."""
+    """Colors of photographs that can be fitted to one."""
 
     fitted_to_a_channel: ClassVar[int]  # numbers that `fitted` finds for each of red, green and blue
 
@@ -158,41 +158,41 @@ class Gains:
         return np.column_stack([np.diag(gains), np.zeros(3)])
 
 
-def colour_figures(
+def color_figures(
     image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: Fitted
 ) -> dict[str, float]:
-    """Return `psnr_colour` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
+    """Return `psnr_color` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
 
-    mask: pixels that count, [height, width].  Without `psnr_colour` where a half has too few pixels to fit colours to.
+    mask: pixels that count, [height, width].  Without `psnr_color` where a half has too few pixels to fit colors to.
     Of the image NaN counts as black, and what is infinite as white or black.
     """
     truth, finite = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
     counted = np.ones(truth.shape[:2], bool) if mask is None else mask
-    changed = in_colours_of(finite, photograph, counted, model)
+    changed = in_colors_of(finite, photograph, counted, model)
     corrected = corrected_by_regression(finite, truth, counted)
-    own = {} if changed is None else {"psnr_colour": psnr(changed, photograph, counted)}
+    own = {} if changed is None else {"psnr_color": psnr(changed, photograph, counted)}
     return {**own, "psnr_affine": psnr(corrected, photograph, counted)}
 
 
 def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
-    """Return the averages over views of what colour_figures returned, with the keys of metrics.json.
+    """Return the averages over views of what color_figures returned, with the keys of metrics.json.
 
-    Where views have no `psnr_colour`, `psnr_colour_views` is the number of those that have, and `psnr_colour_reason`
+    Where views have no `psnr_color`, `psnr_color_views` is the number of those that have, and `psnr_color_reason`
     says why; where none has, it is None.
     """
-    found, has = means(rows), [row for row in rows if "psnr_colour" in row]
+    found, has = means(rows), [row for row in rows if "psnr_color" in row]
     if not found or len(has) == len(rows):
         return found
-    reason = f"{len(rows) - len(has)} of {len(rows)} views have a half with too few pixels to fit colours to"
-    return {"psnr_colour": None, **found, "psnr_colour_views": len(has), "psnr_colour_reason": reason}
+    reason = f"{len(rows) - len(has)} of {len(rows)} views have a half with too few pixels to fit colors to"
+    return {"psnr_color": None, **found, "psnr_color_views": len(has), "psnr_color_reason": reason}
 
 
-def in_colours_of(
+def in_colors_of(
     image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: Fitted
 ) -> NDArray[np.float64] | None:
-    """Return the image with each half, left and right, in the colours that the other half of the photograph asks for.
+    """Return the image with each half, left and right, in the colors that the other half of the photograph asks for.
 
-    Pixels that are black or white in the photograph say nothing of its colours.  None where a half has fewer than
+    Pixels that are black or white in the photograph say nothing of its colors.  None where a half has fewer than
     PIXELS others for each number that is fitted to a channel: that depends on the photograph and the mask alone, so
     that models are compared on the same views.  Those beyond white in the image are left out of the fit where enough
     others are left; else all count.
@@ -228,22 +228,22 @@ def corrected_by_regression(
     return np.clip(corrected, 0, 1)
 
 
-def tell_of_colours(averages: dict[str, Any]) -> None:
-    """Log the figures of a split in the photographs' colours, where there are any."""
-    if "psnr_colour" not in averages:
+def tell_of_colors(averages: dict[str, Any]) -> None:
+    """Log the figures of a split in the photographs' colors, where there are any."""
+    if "psnr_color" not in averages:
         return
-    figure, reason = averages["psnr_colour"], averages.get("psnr_colour_reason")
+    figure, reason = averages["psnr_color"], averages.get("psnr_color_reason")
     if figure is None:
-        LOG.warning("no PSNR in the photographs' colours: %s", reason)
+        LOG.warning("no PSNR in the photographs' colors: %s", reason)
     elif reason:
         LOG.warning(
-            "in the photographs' colours: PSNR %.2f dB, the mean of %s: %s",
-            *(figure, amount(averages["psnr_colour_views"], "view"), reason),
+            "in the photographs' colors: PSNR %.2f dB, the mean of %s: %s",
+            *(figure, amount(averages["psnr_color_views"], "view"), reason),
         )
     else:
         differ = figure - averages["psnr"] > GUESSED
         why = "; exposures of these photographs differ, which PSNR counts as errors" if differ else ""
-        LOG.info("in the photographs' colours: PSNR %.2f dB%s", figure, why)
+        LOG.info("in the photographs' colors: PSNR %.2f dB%s", figure, why)
 
 
 # PSNR of a scene that moves, apart for moments that training has seen and for those that it has not.
@@ -275,7 +275,7 @@ class ViewMetrics:
     psnr: float  # dB
     ssim: float
     perceptual: dict[str, float | None] = field(default_factory=dict)
-    colours: dict[str, float] = field(default_factory=dict)  # dB, by name, where photographs have colours of their own
+    colors: dict[str, float] = field(default_factory=dict)  # dB, by name, where photographs have colors of their own
     still: dict[str, float] = field(default_factory=dict)  # of static pixels, where the scene moves
     moments: dict[str, float] = field(default_factory=dict)  # dB, by whether the moment is held out
 
@@ -285,7 +285,7 @@ class ViewMetrics:
             "view": self.view,
             "psnr": self.psnr,
             "ssim": self.ssim,
-            **self.colours,
+            **self.colors,
             **self.moments,
             **self.still,
             **self.perceptual,
@@ -319,7 +319,7 @@ def device_ssim(workspace: Workspace, photograph: Photograph, image: Image) -> f
     pixels = workspace.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
     rendered = unpack(workspace, camera, pixels, 1 / 255, "rendered")
     planes = photograph.planes(workspace)
-    _, sums = ssim_maps(Comparison(workspace, camera, rendered, planes.colours, gradient=rendered))
+    _, sums = ssim_maps(Comparison(workspace, camera, rendered, planes.colors, gradient=rendered))
     return float(sums.get().sum(dtype=np.float64)) / (3 * camera.width * camera.height)
 
 
@@ -329,14 +329,14 @@ def measure(
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
     finite: bool = False,
-    colours: Fitted | None = None,
+    colors: Fitted | None = None,
     counted: Iterable[View] | None = None,
     trained: Sequence[View] = (),
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
     Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.
-    colours: the photographs' in training, for figures in their colours beside PSNR; counted: the views, of somebody who
+    colors: the photographs' in training, for figures in their colors beside PSNR; counted: the views, of somebody who
     counts them; trained: the views that were trained on, for the figures of moments of a scene that moves.
     With `finite`, NumericError is raised for a picture that is not finite, which counts as black otherwise.
     """
@@ -351,7 +351,7 @@ def measure(
             require_finite(floats, view)
         rendered = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted()
-        own = colour_figures(floats, image, mask, colours) if colours else {}
+        own = color_figures(floats, image, mask, colors) if colors else {}
         still = stillness.add(view, rendered, image, mask)
         if mask is None:
             similarity = device_ssim(painter.workspace, photograph, rendered)
@@ -374,7 +374,7 @@ def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM)
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),
-        **mean_figures([r.colours for r in results]),
+        **mean_figures([r.colors for r in results]),
         **means([r.moments for r in results]),
         **means([r.still for r in results]),
         **perceptual.mean([r.perceptual for r in results]),

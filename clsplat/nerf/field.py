@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.nerf.network import Encoding, Network, Samples
-from clsplat.nerf.shape import BLOCK, COLOUR_ROWS, LANES_MAX, SAMPLES, FieldShape
+from clsplat.nerf.shape import BLOCK, COLOR_ROWS, LANES_MAX, SAMPLES, FieldShape
 from clsplat.opencl.device import Array, constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.painter import Layers
@@ -52,16 +52,16 @@ class SampleLevel:
     rays: Rays
     samples: int
     edges: Array  # [count, samples + 1]
-    raw_colours: Array  # [tiles, COLOUR_ROWS, SAMPLES]
-    raw_densities: Array  # [tiles, COLOUR_ROWS, SAMPLES]
+    raw_colors: Array  # [tiles, COLOR_ROWS, SAMPLES]
+    raw_densities: Array  # [tiles, COLOR_ROWS, SAMPLES]
     weights: Array  # [count, samples]
     left: Array  # [count, samples]
-    colours: Array  # [count, 3]
+    colors: Array  # [count, 3]
 
 
 @dataclass(frozen=True)
 class RayTarget:
-    """What the colours of rays are compared with."""
+    """What the colors of rays are compared with."""
 
     photograph: Array  # [3, rows, stride]
     scale: float  # of a ray's squared difference in the loss
@@ -117,24 +117,24 @@ class Levels:
     def differentiate(self, parameters: Array, level: SampleLevel, target: RayTarget, gradient: Array) -> None:
         """Add the derivatives of the loss of a level, the last one that was rendered, to `gradient`, [P]; write the
         squared differences of its rays."""
-        rays, tiles = level.rays, level.raw_colours.shape[0]
-        by_colours, by_densities = (
-            self.workspace.array(f"field by {name}", (tiles, COLOUR_ROWS, SAMPLES)) for name in ("colours", "densities")
+        rays, tiles = level.rays, level.raw_colors.shape[0]
+        by_colors, by_densities = (
+            self.workspace.array(f"field by {name}", (tiles, COLOR_ROWS, SAMPLES)) for name in ("colors", "densities")
         )
         camera = rays.camera
         self._composite.composite_backward(
             items=rays.count,
-            raw_colours=level.raw_colours,
+            raw_colors=level.raw_colors,
             raw_densities=level.raw_densities,
             cones=rays.cones,
             edges=level.edges,
             background=self.background,
             weights=level.weights,
             left=level.left,
-            colours=level.colours,
+            colors=level.colors,
             photograph=target.photograph,
             pixels=rays.pixels,
-            by_colours=by_colours,
+            by_colors=by_colors,
             by_densities=by_densities,
             errors=target.errors,
             scale=target.scale,
@@ -146,15 +146,15 @@ class Levels:
             counted=rays.counted,
             rays=rays.count,
         )
-        by_grid = self.network.backward(parameters, by_colours, by_densities, gradient)
+        by_grid = self.network.backward(parameters, by_colors, by_densities, gradient)
         self.encoding.backward(by_grid, gradient)
 
     def place(self, level: SampleLevel, image: Array) -> None:
-        """Put the colours of a level's rays into a picture, [3, rows, stride]."""
+        """Put the colors of a level's rays into a picture, [3, rows, stride]."""
         camera = level.rays.camera
-        self._composite.place_colours(
+        self._composite.place_colors(
             items=level.rays.counted,
-            colours=level.colours,
+            colors=level.colors,
             pixels=level.rays.pixels,
             image=image,
             width=camera.width,
@@ -183,25 +183,25 @@ class Levels:
         samples = edges.shape[1] - 1
         tiles = rays.count * samples // SAMPLES
         self.encoding.forward(parameters, Samples(rays.cones, edges))
-        raw_colours, raw_densities = self.network.forward(parameters, tiles)
+        raw_colors, raw_densities = self.network.forward(parameters, tiles)
         weights, left = (
             self.workspace.array(f"field {name} {what}", (rays.count, samples)) for what in ("weights", "left")
         )
-        colours = self.workspace.array(f"field {name} rays", (rays.count, 3))
+        colors = self.workspace.array(f"field {name} rays", (rays.count, 3))
         self._composite.composite_forward(
             items=rays.count,
-            raw_colours=raw_colours,
+            raw_colors=raw_colors,
             raw_densities=raw_densities,
             cones=rays.cones,
             edges=edges,
             background=self.background,
             weights=weights,
             left=left,
-            colours=colours,
+            colors=colors,
             samples=samples,
             rays=rays.count,
         )
-        return SampleLevel(rays, samples, edges, raw_colours, raw_densities, weights, left, colours)
+        return SampleLevel(rays, samples, edges, raw_colors, raw_densities, weights, left, colors)
 
 
 def rays_at_a_time(shape: FieldShape) -> int:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.nerf.shape import COLOUR_ROWS, GRID, LAYERS, SAMPLES, DenseLayer, FieldShape, in_blocks
+from clsplat.nerf.shape import COLOR_ROWS, GRID, LAYERS, SAMPLES, DenseLayer, FieldShape, in_blocks
 from clsplat.opencl.device import Array, Device
 from clsplat.render.workspace import Workspace
 
@@ -38,7 +38,7 @@ class Network:
         self._columns = SAMPLES // (BLOCK * int(workspace.device.tuning["LANES"]))
         self._layers = shape.layers
         self._first, self._trunk = self._layers[0], self._layers[1 : shape.depth]
-        self._density, self._bottleneck, self._condition, self._colour = self._layers[shape.depth :]
+        self._density, self._bottleneck, self._condition, self._color = self._layers[shape.depth :]
 
     def position(self, tiles: int) -> tuple[Array, int]:
         """Return the table that the encoded position is in, [tiles, rows, SAMPLES], and its first row there."""
@@ -53,34 +53,34 @@ class Network:
         return self._table("seen", tiles, rows), self.shape.width
 
     def forward(self, parameters: Array, tiles: int) -> tuple[Array, Array]:
-        """Return raw colours and raw densities of samples whose encodings are in place, each [tiles, COLOUR_ROWS,
+        """Return raw colors and raw densities of samples whose encodings are in place, each [tiles, COLOR_ROWS,
         SAMPLES], valid until the next call."""
         x = _Table(*self.position(tiles))
         for i, layer in enumerate([self._first, *self._trunk]):
             after = self._hidden(i, tiles)
             self._apply(layer, parameters, x, after, RELU)
             x = _Table(after)
-        densities = self._table("densities", tiles, COLOUR_ROWS)
-        colours = self._table("colours", tiles, COLOUR_ROWS)
-        seen, behind = self.seen(tiles)[0], self._table("conditioned", tiles, self.shape.colour_width)
+        densities = self._table("densities", tiles, COLOR_ROWS)
+        colors = self._table("colors", tiles, COLOR_ROWS)
+        seen, behind = self.seen(tiles)[0], self._table("conditioned", tiles, self.shape.color_width)
         self._apply(self._density, parameters, x, densities, NO_LIMIT)
         self._apply(self._bottleneck, parameters, x, seen, NO_LIMIT)
         self._apply(self._condition, parameters, _Table(seen), behind, RELU)
-        self._apply(self._colour, parameters, _Table(behind), colours, NO_LIMIT)
-        return colours, densities
+        self._apply(self._color, parameters, _Table(behind), colors, NO_LIMIT)
+        return colors, densities
 
-    def backward(self, parameters: Array, by_colours: Array, by_densities: Array, gradient: Array) -> Array:
+    def backward(self, parameters: Array, by_colors: Array, by_densities: Array, gradient: Array) -> Array:
         """Add the derivatives by the parameters to `gradient`, [P], from those by the outputs of the last `forward`.
 
         Returns those by the features of the grid, [tiles, grid_rows, SAMPLES], valid until the next call.
         """
-        tiles, width = by_colours.shape[0], self.shape.width
+        tiles, width = by_colors.shape[0], self.shape.width
         last, seen = _Table(self._hidden(self.shape.depth - 1, tiles)), _Table(self.seen(tiles)[0])
-        behind = _Table(self._table("conditioned", tiles, self.shape.colour_width))
-        by_behind = self._table("by conditioned", tiles, self.shape.colour_width)
+        behind = _Table(self._table("conditioned", tiles, self.shape.color_width))
+        by_behind = self._table("by conditioned", tiles, self.shape.color_width)
         by_seen, by_x = self._table("by seen", tiles, width), self._table("by hidden", tiles, width)
-        self._sum(self._colour, behind, by_colours)
-        self._derive(self._colour, parameters, by_colours, behind, by_behind, RELU)
+        self._sum(self._color, behind, by_colors)
+        self._derive(self._color, parameters, by_colors, behind, by_behind, RELU)
         self._sum(self._condition, seen, by_behind)
         self._derive(self._condition, parameters, by_behind, seen, by_seen, NO_LIMIT)
         self._sum(self._density, last, by_densities)

@@ -77,8 +77,8 @@ class GridShape(Settings):
 
 LAYERS = constants("layers.h")
 BLOCK, SAMPLES, LINE = (int(LAYERS[name]) for name in ("BLOCK", "SAMPLES", "PARAMETER_LINE"))
-COLOUR_ROWS = int(constants("composite.cl")["COLOUR_ROWS"])
-COLOURS, DENSITIES = 3, 1  # outputs of the network
+COLOR_ROWS = int(constants("composite.cl")["COLOR_ROWS"])
+COLORS, DENSITIES = 3, 1  # outputs of the network
 LANES_MAX = 16
 assert FEATURES == BLOCK  # of a level of a grid: so its rows are whole blocks
 Features = Annotated[int, Field(ge=BLOCK, le=1024, multiple_of=BLOCK)]
@@ -129,7 +129,7 @@ class FieldShape(Settings):
     """Outputs of each of them."""
     skip: Annotated[int, Field(ge=0)] | None = 4
     """Layer of the trunk, counted from 0, whose outputs the encoded position joins; without it, none."""
-    colour_width: Features = 128
+    color_width: Features = 128
     """Outputs of the layer that reads the direction."""
     degrees: Annotated[int, Field(ge=0, le=24)] = 16
     """Frequencies of the position's encoding: 1, 2, 4, …; none where a grid alone is read."""
@@ -170,14 +170,14 @@ class FieldShape(Settings):
 
     @property
     def layers(self) -> list[DenseLayer]:
-        """The layers in their order: the trunk, density, bottleneck, condition, colour."""
+        """The layers in their order: the trunk, density, bottleneck, condition, color."""
         width, position, direction = self.width, self.position_parts, 3 + 6 * self.direction_degrees
         described = [("trunk 0", position, width)]  # the parts of the inputs, each in whole blocks; the outputs
         for i in range(1, self.depth):
             described.append((f"trunk {i}", [width, *position] if i - 1 == self.skip else [width], width))
         described += [("density", [width], DENSITIES), ("bottleneck", [width], width)]
-        described += [("condition", [width, direction], self.colour_width)]
-        described += [("colour", [self.colour_width], COLOURS)]
+        described += [("condition", [width, direction], self.color_width)]
+        described += [("color", [self.color_width], COLORS)]
         found, first = list[DenseLayer](), 0
         for name, parts, outputs in described:
             inputs, rows = list[int](), 0

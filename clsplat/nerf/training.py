@@ -13,13 +13,13 @@ from pydantic import TypeAdapter, ValidationError
 from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
 from clsplat.nerf.field import Draw, Field, RayTarget, rays_at_a_time
 from clsplat.nerf.network import CHUNK, PLACE_ROWS
-from clsplat.nerf.shape import COLOUR_ROWS, SAMPLES, FieldShape, GridShape, WrittenShape
+from clsplat.nerf.shape import COLOR_ROWS, SAMPLES, FieldShape, GridShape, WrittenShape
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import DeviceCamera
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.scene.viewpoint import centre_of
+from clsplat.scene.viewpoint import center_of
 from clsplat.training.field import Tables, TrainedField
 from clsplat.training.memory import DeviceLimits
 
@@ -172,14 +172,14 @@ class LearnedField(TrainedField):
     ) -> None:
         """Add the derivatives by the rays of one photograph, in passes."""
         levels = self.field.levels
-        colours = shown.photograph.planes(self.field.workspace).colours
+        colors = shown.photograph.planes(self.field.workspace).colors
         scales = coarse_weight * scale, scale
         for first in range(0, shown.rays, levels.rays_at_a_time):
             own = Draw(draw.seed, draw.step, draw.first + first)
             rays = levels.drawn(shown.camera, own, min(levels.rays_at_a_time, shown.rays - first))
             rendered = levels.render(self.field.parameters, rays)
             for level, of_level, squares in zip(rendered, scales, errors, strict=True):
-                target = RayTarget(colours, of_level, squares)
+                target = RayTarget(colors, of_level, squares)
                 levels.differentiate(self.field.parameters, level, target, self._gradient)
 
 
@@ -234,7 +234,7 @@ def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
     samples = rays_at_a_time(shape) * max(shape.coarse_samples, shape.fine_samples)
     hidden = (shape.depth + 3) * shape.width  # outputs of the trunk, and derivatives by three layers
     encoded = shape.position_rows + shape.grid_rows + PLACE_ROWS + shape.direction_rows
-    rows = hidden + encoded + shape.width + 2 * shape.colour_width + 4 * COLOUR_ROWS
+    rows = hidden + encoded + shape.width + 2 * shape.color_width + 4 * COLOR_ROWS
     chunks = -(-samples // (SAMPLES * CHUNK))
     return FieldPlan(4 * shape.parameters, 4 * rows * samples, 4 * chunks * shape.of_network, photographs)
 
@@ -258,7 +258,7 @@ def require_seen(shape: FieldShape, scene: Scene) -> None:
         fault = f"none of the scene's {len(points):,} points lies in it"
     else:
         return
-    least, most, seen = (_told(point) for point in (corner, corner + side, centre_of(views)))
+    least, most, seen = (_told(point) for point in (corner, corner + side, center_of(views)))
     raise ConfigError(
         f"train_field.field.grid: its cube is from {least} to {most}, scene units, and {fault} ({scene.path}); "
         f"expected one about what the cameras look at, near {seen}: set `corner` and `side`, and `near` and `far` "

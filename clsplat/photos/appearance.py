@@ -1,4 +1,4 @@
-"""What is common to the colours of photographs, and tables of numbers with a row for each photograph."""
+"""What is common to the colors of photographs, and tables of numbers with a row for each photograph."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from clsplat.opencl.device import constants
 Floats = NDArray[np.float64]
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # BT.601
 IDENTITY = np.eye(3, 4)
-MEANING = "a colour c of the model, red, green and blue, is min(1, E c + b) in the photograph"
+MEANING = "a color c of the model, red, green and blue, is min(1, E c + b) in the photograph"
 
 # Adam on numbers by name, which lie in one dictionary with their moments, as a run keeps it in its checkpoints.
 
@@ -67,20 +67,20 @@ class ViewTable:
         return self.keys(self.views[0])[0] in numbers
 
     def begin(self, numbers: dict[str, float], rows: Mapping[str, Floats]) -> None:
-        """Set every row, to 0 where none is given, then `centre`."""
+        """Set every row, to 0 where none is given, then `center`."""
         for view in self.views:
             values = rows.get(view, np.zeros(len(self.columns)))
             numbers.update(zip(self.keys(view), map(float, values), strict=True))
-        self.centre(numbers)
+        self.center(numbers)
 
     def update(self, numbers: dict[str, float], view: str, gradient: Floats, rate: float) -> None:
-        """Change the row of a view by Adam, with a count of updates of its own, then `centre` where it is centered."""
+        """Change the row of a view by Adam, with a count of updates of its own, then `center` where it is centered."""
         values = {key: numbers.get(key, 0.0) for key in self.keys(view)}
         adam_step(numbers, values, dict(zip(values, map(float, gradient), strict=True)), rate)
         if self.is_centered:
-            self.centre(numbers)
+            self.center(numbers)
 
-    def centre(self, numbers: dict[str, float]) -> None:
+    def center(self, numbers: dict[str, float]) -> None:
         """Subtract from each column its mean over the views; the sum is exact, so that no order matters."""
         for column in zip(*map(self.keys, self.views), strict=True):
             mean = math.fsum(numbers[key] for key in column) / len(column)

@@ -17,7 +17,7 @@ from clsplat.core.settings import Settings
 Floats = NDArray[np.float64]
 LEVELS = 2048  # bounds of the frequency, from 0 to the highest of each direction
 KNOTS = 32  # published
-NO_DETAIL = 1e-3  # of the amplitudes: the rounding of an image of one colour
+NO_DETAIL = 1e-3  # of the amplitudes: the rounding of an image of one color
 LEAST = 0.25  # of the amplitudes, that the smallest size of any photograph shows: published
 
 

@@ -1,6 +1,6 @@
 """How bright photographs are beside each other, from the pixels in which they show the same points.
 
-ln y = e + a for a photograph's exposure e and a point's colour a, for each channel.  Both come from the least sum of
+ln y = e + a for a photograph's exposure e and a point's color a, for each channel.  Both come from the least sum of
 |ln y - e - a| exp(a), so that many of a photograph's points may be hidden, glossy or misplaced: a difference counts as
 much as it is in the image, where haze on a dark point is little.  They are found by least squares, in turn with weights
 1 / |ln y - e - a|, by conjugate gradients on sums in a fixed order.
@@ -150,7 +150,7 @@ def _fitted(
 
 
 def _corrections(photograph: Integers, point: Integers, rest: Floats, weights: Floats, count: int) -> Floats:
-    """The exposures, [count], that with a colour of each point leave least of the squares of `rest`, by conjugate
+    """The exposures, [count], that with a color of each point leave least of the squares of `rest`, by conjugate
     gradients."""
 
     def gathered(values: Floats) -> Floats:

@@ -28,18 +28,18 @@ class Photograph:
     """One photograph on the device, and its camera."""
 
     camera: DeviceCamera
-    colours: Array  # [3, height, width] uint8
+    colors: Array  # [3, height, width] uint8
     mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None: all count
     empty: bool = False  # whether the mask leaves out every pixel
     transparency: Array | None = None  # [1, height, width] uint8, 255: the background alone; None: opaque, or not kept
 
     @property
     def nbytes(self) -> int:
-        return sum(array.nbytes for array in (self.colours, self.mask, self.transparency) if array)
+        return sum(array.nbytes for array in (self.colors, self.mask, self.transparency) if array)
 
     def image(self) -> NDArray[np.uint8]:
-        """Return the colours on the host, [height, width, 3]."""
-        return np.asarray(self.colours.get().transpose(1, 2, 0))
+        """Return the colors on the host, [height, width, 3]."""
+        return np.asarray(self.colors.get().transpose(1, 2, 0))
 
     def counted(self) -> Mask | None:
         """Return which pixels count, [height, width], or None when all do."""
@@ -56,11 +56,11 @@ class Photograph:
 
         backgrounds: that of the photographs, and what is behind transparent pixels in its place; each [3] in [0, 1].
         """
-        colours = unpack(workspace, self.camera, self.colours, 1 / 255, "photograph")
+        colors = unpack(workspace, self.camera, self.colors, 1 / 255, "photograph")
         if backgrounds and self.transparency:
-            change_background(workspace, self.camera, colours, self.transparency, *backgrounds)
+            change_background(workspace, self.camera, colors, self.transparency, *backgrounds)
         mask = unpack(workspace, self.camera, self.mask, 1.0, "mask") if self.mask else None
-        planes = Planes(workspace, self.camera, colours, mask)
+        planes = Planes(workspace, self.camera, colors, mask)
         for transform in transforms:
             planes = transform.apply(planes, step)
         return planes
@@ -69,7 +69,7 @@ class Photograph:
 class Pixels(NamedTuple):
     """A photograph on the host: [height, width] uint8 of each channel."""
 
-    colours: NDArray[np.uint8]  # [3, height, width]
+    colors: NDArray[np.uint8]  # [3, height, width]
     mask: NDArray[np.uint8]  # [0 or 1, height, width]
     transparency: NDArray[np.uint8] | None
 
@@ -125,11 +125,11 @@ class Photographs:
         photograph = self._held.pop(key, None)
         if photograph is None:
             reading = self._reading.pop(key, None)
-            colours, mask, shows = reading.result() if reading else self._read(view)
-            self._make_room(colours.nbytes + mask.nbytes + (0 if shows is None else shows.nbytes))
+            colors, mask, shows = reading.result() if reading else self._read(view)
+            self._make_room(colors.nbytes + mask.nbytes + (0 if shows is None else shows.nbytes))
             mask_on_device, empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
             transparency = None if shows is None else self.device.upload(shows)
-            photograph = Photograph(self.camera(view), self.device.upload(colours), mask_on_device, empty, transparency)
+            photograph = Photograph(self.camera(view), self.device.upload(colors), mask_on_device, empty, transparency)
         elif (camera := placed_camera(photograph.camera, view)) is not photograph.camera:
             photograph = replace(photograph, camera=camera)
         self._held[key] = photograph
@@ -188,16 +188,16 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
 
 
 def change_background(
-    workspace: Workspace, camera: DeviceCamera, colours: Array, transparency: Array, background: Array, behind: Array
+    workspace: Workspace, camera: DeviceCamera, colors: Array, transparency: Array, background: Array, behind: Array
 ) -> None:
-    """Put the colour `behind`, [3], in the place of the `background` of colours [3, rows, stride].
+    """Put the color `behind`, [3], in the place of the `background` of colors [3, rows, stride].
 
     transparency: [1, height, width] uint8, 255 where the background alone is seen.
     """
     shown = unpack(workspace, camera, transparency, 1 / 255, "transparency")
     pixels = camera.rows * camera.stride
     workspace.device.program("loss.cl").change_background(
-        items=(pixels, 3), colours=colours, transparency=shown, background=background, behind=behind, pixels=pixels
+        items=(pixels, 3), colors=colors, transparency=shown, background=background, behind=behind, pixels=pixels
     )
 
 
@@ -249,7 +249,7 @@ def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], sh
     counts = np.zeros(BINS, np.int64)
     for photograph in photographs:
         camera, planes = photograph.camera, photograph.planes(workspace)
-        inside = known_gradient(workspace, camera, planes.colours, planes.mask).get()[: camera.height, : camera.width]
+        inside = known_gradient(workspace, camera, planes.colors, planes.mask).get()[: camera.height, : camera.width]
         counts += np.histogram(inside, BINS, (0, MAX_MAGNITUDE))[0]  # without values below 0
     below = np.searchsorted(np.cumsum(counts), share * counts.sum())
     return float(below + 1) * MAX_MAGNITUDE / BINS

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.sky import corners, neighbours, places, weights
+from clsplat.gaussians.sky import corners, neighbors, places, weights
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import upward
@@ -73,12 +73,12 @@ def looked_at(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) ->
 
 
 def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32], Mask] | None:
-    """Return the first colours of a map of directions, [side * side, 3], and its texels that are sky, [side * side].
+    """Return the first colors of a map of directions, [side * side, 3], and its texels that are sky, [side * side].
 
     A texel is sky where a photograph shows it so, or one near it, or where none shows it at all.  It has the mean
-    colour of its pixels; the others have that of all pixels of sky.  None where no photograph shows any.
+    color of its pixels; the others have that of all pixels of sky.  None where no photograph shows any.
     """
-    colours, of_sky, of_all = np.zeros((side**2, 3)), np.zeros(side**2), np.zeros(side**2)
+    colors, of_sky, of_all = np.zeros((side**2, 3)), np.zeros(side**2), np.zeros(side**2)
     for one in seen:
         place = places(one.directions, side)
         first = np.floor(place).astype(np.int64)
@@ -89,14 +89,14 @@ def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32
         values = one.image[one.mask].astype(np.float64) / 255
         for channel in range(3):
             shares = weight * values[:, channel, None]
-            colours[:, channel] += np.bincount(texels.ravel(), shares.ravel(), side**2)
+            colors[:, channel] += np.bincount(texels.ravel(), shares.ravel(), side**2)
     if not of_sky.any():
         return None
     free = of_sky > 0
     for _ in range(BEYOND):
-        free = np.asarray(free[neighbours(side)].any(axis=1))
-    mean = colours.sum(axis=0) / of_sky.sum()
-    found = np.where(of_sky[:, None] > 0, colours / np.maximum(of_sky, 1e-9)[:, None], mean)
+        free = np.asarray(free[neighbors(side)].any(axis=1))
+    mean = colors.sum(axis=0) / of_sky.sum()
+    found = np.where(of_sky[:, None] > 0, colors / np.maximum(of_sky, 1e-9)[:, None], mean)
     return found.astype(np.float32), free | (of_all == 0)
 
 

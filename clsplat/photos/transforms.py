@@ -20,7 +20,7 @@ class Planes:
 
     workspace: Workspace
     camera: DeviceCamera
-    colours: Array  # [3, rows, stride] in [0, 1]
+    colors: Array  # [3, rows, stride] in [0, 1]
     mask: Array | None  # [1, rows, stride], 1 in pixels that count, else 0; None: all count
 
 
@@ -66,12 +66,12 @@ def _averaged(planes: Planes, reach: int, falloff: float) -> Planes:
     program, mask = device.program("blur.cl"), planes.mask
     program.blur_rows(
         items=items,
-        image=planes.colours,
+        image=planes.colors,
         mask=mask or sums,
         sums=sums,
         masked=int(mask is not None),
         falloff=falloff,
         **size,
     )
-    program.blur_columns(items=items, sums=sums, image=planes.colours, falloff=falloff, **size)
+    program.blur_columns(items=items, sums=sums, image=planes.colors, falloff=falloff, **size)
     return planes

@@ -131,7 +131,7 @@ def explain(error: ValidationError, root: type[BaseModel], path: Path, document:
 def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[Place, str]:
     """Return the first fault, with its place in the file.
 
-    A misspelt key comes before a missing one, because it is often the reason.
+    A misspelled key comes before a missing one, because it is often the reason.
     """
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     place, model, annotation = _follow(first["loc"], root)

@@ -49,7 +49,7 @@ class SceneSettings(Settings):
     """Folder of masks that something else has made, for a dataset without: `a.png` or `a.jpg.png` of the photograph
     a.jpg, of its size, white in pixels that count.  A photograph without one counts whole."""
     background: Literal["auto", "black", "white"] = "auto"
-    """Colour behind the scene; auto: white for Blender scenes, else black."""
+    """Color behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
     """MiB of photographs on the device; without it, a quarter of its memory."""
     holdout: Chosen = HOLDOUT

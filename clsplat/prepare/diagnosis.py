@@ -15,7 +15,7 @@ from clsplat.prepare.database import feature_counts, verified
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS
 from clsplat.scene.quality import is_blurred, sharpness_of
 
-FEW_FEATURES = 300  # of a photograph: a wall of one colour has tens, a garden thousands
+FEW_FEATURES = 300  # of a photograph: a wall of one color has tens, a garden thousands
 TEXTURED = 1000  # features: photographs with as many are not weakly textured; three times FEW_FEATURES
 FEW_MATCHES = 30  # of a photograph with the points of a model: COLMAP places none with fewer
 SHARPNESS_OF = 15  # placed photographs that the others are compared with

@@ -28,7 +28,7 @@ from clsplat.prepare.database import (
 )
 from clsplat.prepare.gather import gather, list_photographs, warn_of
 from clsplat.prepare.shared_intrinsics import Cameras, sharing, sharing_text
-from clsplat.scene.images import read_grey
+from clsplat.scene.images import read_gray
 
 LOG = logging.getLogger("clsplat")
 CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
@@ -38,7 +38,7 @@ LEVELS = 512  # of a root of a share, as COLMAP stores it; larger ones than 255 
 
 @dataclass(frozen=True)
 class Sought:
-    """Which features: at most `count` in an image of `long_side` px; `contrast` is a share of the range of grey."""
+    """Which features: at most `count` in an image of `long_side` px; `contrast` is a share of the range of gray."""
 
     long_side: int = 1600
     count: int = 12288
@@ -80,7 +80,7 @@ def add_features(images: Path, database: Path, sought: Sought) -> None:
     with explained(images, "find features"), opened(pycolmap, database) as rows:
         missing = without_features(rows)
         for number, name in counted(missing.items(), "photographs with features", len(missing)):
-            pixels, (across, down) = read_grey(images / name, sought.long_side)
+            pixels, (across, down) = read_gray(images / name, sought.long_side)
             keypoints, descriptors = sift(pixels, sought)
             keypoints[:, :3] *= across, down, (across + down) / 2
             with pycolmap.DatabaseTransaction(rows):
@@ -93,7 +93,7 @@ def sift(pixels: NDArray[np.uint8], sought: Sought) -> tuple[NDArray[np.float32]
     """Return features as COLMAP stores them, those of the highest contrast: x, y, scale in px and angle [M, 4], with
     the descriptors [M, 128].
 
-    Pixel (0, 0) has its centre at (0.5, 0.5).  Descriptors are RootSIFT (Arandjelović and Zisserman 2012).
+    Pixel (0, 0) has its center at (0.5, 0.5).  Descriptors are RootSIFT (Arandjelović and Zisserman 2012).
     """
     detector = cv2.SIFT.create(
         nfeatures=sought.count,

@@ -24,7 +24,7 @@ from clsplat.scene.images import (
     decode_image,
     exposure_of,
     parse_header,
-    read_grey,
+    read_gray,
     write_exposures,
 )
 from clsplat.scene.multicamera import VIDEO_SUFFIXES
@@ -164,7 +164,7 @@ def _gather_one(source: Path, target: Path) -> None:
     data = read_file(source, "an image", limit=MAX_BYTES)
     if data.startswith(JPEG) and (header := parse_header(data, data[-TAIL_SIZE:], lambda: data)):
         is_upright = header.orientation == 1
-        pixels = read_grey(source, CHECKED_SIDE)[0] if is_upright else decode_image(data, source, upright=True)
+        pixels = read_gray(source, CHECKED_SIDE)[0] if is_upright else decode_image(data, source, upright=True)
     else:
         stored, pixels = decode_image(data, source), decode_image(data, source, upright=True)
         is_upright = stored.shape[:2] == pixels.shape[:2] and bool((stored[:, :, :3] == pixels[:, :, :3]).all())

@@ -37,7 +37,7 @@ LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
 MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
 WORDS = 1024  # of a vocabulary learned from the photographs (Sivic and Zisserman 2003)
-SAMPLES = 40  # descriptors for each word, from which the words are learnt
+SAMPLES = 40  # descriptors for each word, from which the words are learned
 ROUNDS = 10  # of k-means
 
 
@@ -46,7 +46,7 @@ class Pairing:
     """Which pairs are matched, and by how many threads: see match_features."""
 
     matching: Matching = "auto"
-    neighbours: int = 10
+    neighbors: int = 10
     threads: int = 1
 
     @classmethod
@@ -56,9 +56,9 @@ class Pairing:
 
 
 def match_features(
-    source: Path, out: Path, matching: Matching = "auto", neighbours: int = 10, threads: int = 1
+    source: Path, out: Path, matching: Matching = "auto", neighbors: int = 10, threads: int = 1
 ) -> dict[str, Any]:
-    """Match features between photographs: all pairs, each with the `neighbours` next ones by name, or similar ones.
+    """Match features between photographs: all pairs, each with the `neighbors` next ones by name, or similar ones.
 
     `auto` matches all pairs of up to 200 photographs; of more, each with the most similar ones.  More than one thread
     is faster and not repeatable to the bit: in one call of a hundred, pycolmap 4.2 finds other matches of two pairs.
@@ -70,17 +70,17 @@ def match_features(
         half = out / f".{DATABASE}"
         shutil.copyfile(source / DATABASE, half)
         half.replace(database)
-    pairing = Pairing(matching, neighbours, threads)
+    pairing = Pairing(matching, neighbors, threads)
     write_text(out / MATCHING, json.dumps(asdict(pairing)) + "\n")
     chosen = match_within(database, pairing)
     return {"matching": chosen, "pairs": len(verified(pycolmap, database))}
 
 
-def most_pairs(photographs: int, matching: Matching, neighbours: int) -> int:
+def most_pairs(photographs: int, matching: Matching, neighbors: int) -> int:
     """Return the largest number of pairs that match_features looks at."""
     every = photographs * (photographs - 1) // 2
     is_each = matching == "exhaustive" or (matching == "auto" and photographs <= MAX_EXHAUSTIVE)
-    return every if is_each else min(every, 2 * neighbours * photographs)
+    return every if is_each else min(every, 2 * neighbors * photographs)
 
 
 def match_within(database: Path, how: Pairing) -> Matching:
@@ -89,19 +89,19 @@ def match_within(database: Path, how: Pairing) -> Matching:
     Raises DataError.
     """
     pycolmap = require_pycolmap()
-    count, matching, neighbours = len(image_names(pycolmap, database)), how.matching, how.neighbours
+    count, matching, neighbors = len(image_names(pycolmap, database)), how.matching, how.neighbors
     chosen = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
     common = _options(pycolmap, how.threads)
     LOG.info("matching %d photographs, %s", count, chosen)
     with explained(database, "match photographs"):
         if chosen == "sequential":
             pairing = pycolmap.SequentialPairingOptions()
-            pairing.overlap, pairing.quadratic_overlap = neighbours, True
-            steps = {*range(1, neighbours + 1), *(1 << power for power in range(neighbours))}
+            pairing.overlap, pairing.quadratic_overlap = neighbors, True
+            steps = {*range(1, neighbors + 1), *(1 << power for power in range(neighbors))}
             with _counted(database, sum(max(0, count - step) for step in steps)):
                 pycolmap.match_sequential(str(database), pairing_options=pairing, **common)
         elif chosen == "vocabulary":
-            pairs = _alike_pairs(pycolmap, database, 2 * neighbours)
+            pairs = _alike_pairs(pycolmap, database, 2 * neighbors)
             with _counted(database, len(pairs)):
                 _match_listed(database, pairs, common)
         else:
@@ -180,7 +180,7 @@ def _match_listed(database: Path, pairs: Sequence[tuple[str, str]], options: dic
     pycolmap.match_image_pairs(str(database), pairing_options=imported, **options)
 
 
-def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[tuple[str, str]]:
+def _alike_pairs(pycolmap: ModuleType, database: Path, neighbors: int) -> list[tuple[str, str]]:
     with opened(pycolmap, database) as rows:
         images = sorted(rows.read_all_images(), key=lambda image: image.name)
         tables = _descriptors(rows, images)
@@ -188,7 +188,7 @@ def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[
         raise DataError(
             f"'{spaced[0]}': COLMAP's lists of pairs allow no spaces in names; rename it, or match all pairs"
         )
-    return [(images[i].name, images[j].name) for i, j in alike(tables, neighbours)]
+    return [(images[i].name, images[j].name) for i, j in alike(tables, neighbors)]
 
 
 def _descriptors(rows: Any, images: Sequence[Any]) -> list[NDArray[np.float32]]:
@@ -208,11 +208,11 @@ def _counted(database: Path, pairs: int) -> Iterator[None]:
     count.reach(pairs)
 
 
-def alike(tables: Sequence[NDArray[np.float32]], neighbours: int) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, of each photograph with the `neighbours` most similar ones, by `likeness`."""
+def alike(tables: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:
+    """Return pairs (i, j), i < j, of each photograph with the `neighbors` most similar ones, by `likeness`."""
     close = likeness(tables)
     np.fill_diagonal(close, -1)
-    nearest = np.argsort(-close, axis=1, kind="stable")[:, : min(neighbours, len(tables) - 1)]
+    nearest = np.argsort(-close, axis=1, kind="stable")[:, : min(neighbors, len(tables) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row})
 
 
@@ -241,7 +241,7 @@ def likeness(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
 
 
 def _words(sample: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Centres of k-means, [at most WORDS, 128]."""
+    """Centers of k-means, [at most WORDS, 128]."""
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0)
     count, labels = min(WORDS, len(sample)), np.empty(0, np.int32)

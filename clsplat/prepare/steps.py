@@ -109,16 +109,16 @@ class MatchFeatures(Step):
 
     matching: Matching = "auto"
     """Which pairs of photographs are matched; auto: exhaustive, and vocabulary for more than 200 photographs."""
-    neighbours: Positive = 10
+    neighbors: Positive = 10
     """Number of photographs that each is matched with, where not with all."""
     threads: Positive = 1
     """Number of threads; more than one are faster, and the result does not always repeat to the bit."""
 
     def pieces(self, photographs: int) -> tuple[int, str]:
-        return most_pairs(photographs, self.matching, self.neighbours), "pairs"
+        return most_pairs(photographs, self.matching, self.neighbors), "pairs"
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        return match_features(source, out, self.matching, self.neighbours, self.threads)
+        return match_features(source, out, self.matching, self.neighbors, self.threads)
 
 
 class MapCameras(Step):

@@ -14,12 +14,12 @@ class Backdrop(Settings):
 
 
 class Directions(Backdrop):
-    """A colour for each direction, learned with the Gaussians: the sky, which no point is near.
+    """A color for each direction, learned with the Gaussians: the sky, which no point is near.
 
-    A pixel has the colour C + T b: b in the direction of its ray, T what the Gaussians leave.  Colours are those of an
+    A pixel has the color C + T b: b in the direction of its ray, T what the Gaussians leave.  Colors are those of an
     octahedral map, bilinear, with Adam of its own; in directions in which photographs show no sky they stay
     as they begin.
-    Where a photograph shows the map's colour, Gaussians have a loss of what they cover there (splatfacto-w, Xu et al.
+    Where a photograph shows the map's color, Gaussians have a loss of what they cover there (splatfacto-w, Xu et al.
     2024), so that they leave the sky.
     """
 
@@ -30,11 +30,11 @@ class Directions(Backdrop):
     side: Annotated[int, Field(ge=SIDES[0], le=SIDES[1])] = 64
     """Texels in a row of the map, which is square; 64 are 3 degrees from one to the next."""
     rate: NonNegative = 5.0e-3
-    """Learning rate of the colours, by Adam, by step."""
+    """Learning rate of the colors, by Adam, by step."""
     cover: NonNegative = 0.05
     """Factor of the loss of what covers the sky: the mean over the image of alpha in pixels that show it; by step."""
     difference: NonNegative = 0.05
-    """Difference of the colours, the mean of the channels, up to which a pixel of a photograph shows the map."""
+    """Difference of the colors, the mean of the channels, up to which a pixel of a photograph shows the map."""
 
 
 class Auto(Backdrop):

@@ -92,7 +92,7 @@ def upload_camera(device: Device, view: View) -> DeviceCamera:
 def camera_values(view: View, tile: int) -> NDArray[Any]:
     """Return a view's camera_t, [].
 
-    Rays are clamped 30 % of half the field of view beyond the image's edges (gsplat's off-centre form).
+    Rays are clamped 30 % of half the field of view beyond the image's edges (gsplat's off-center form).
     Raises DataError when the image has more tiles to a side than kernels can name, or more pixels than they can index.
     """
     camera = view.camera

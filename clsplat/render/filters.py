@@ -1,4 +1,4 @@
-"""The settings of `model:`: the degree of the colours and the two low-pass filters, as numbers.
+"""The settings of `model:`: the degree of the colors and the two low-pass filters, as numbers.
 
 A world filter writes `filter_variance`, scene units², which is added to the squared scales of each Gaussian.  A screen
 filter is three numbers of the model.  Rendering reads these numbers and has no case for a filter.
@@ -143,7 +143,7 @@ def _of_a_box(variance: float) -> float:
 
 
 class BoxFilter(ScreenFilter):
-    """Integrate every splat over the box of each pixel, instead of taking its value at the pixel's centre.
+    """Integrate every splat over the box of each pixel, instead of taking its value at the pixel's center.
 
     Where a splat is larger than a pixel this differs little from a Gaussian blur of the box's variance, 1/12 px², which
     programs that know no box draw instead.  The integral is that of `cl_kernels/pixel_box.h`.

@@ -46,7 +46,7 @@ def at_moment(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) ->
     return replace(model, gaussians=_with_tables(gaussians, moved))
 
 
-def to_centres(model: DeviceModel, camera: DeviceCamera, gradients: GaussianGradients) -> None:
+def to_centers(model: DeviceModel, camera: DeviceCamera, gradients: GaussianGradients) -> None:
     """Make gradients by a moving model at the time of a camera those by the model and its motion; a static one has
     them already."""
     gaussians = model.gaussians

@@ -1,4 +1,4 @@
-"""A layer of splats of its own before an image: the colours of both, and the gradients of each."""
+"""A layer of splats of its own before an image: the colors of both, and the gradients of each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> 
 
 
 def look_behind(workspace: Workspace, frame: Frame, gradient: Array) -> None:
-    """Make the gradient by the colours of both, [3 or 4, rows, stride], that by the image behind, in place."""
+    """Make the gradient by the colors of both, [3 or 4, rows, stride], that by the image behind, in place."""
     camera = frame.camera
     workspace.device.program("layer.cl").look_behind(
         groups=(1, camera.rows),

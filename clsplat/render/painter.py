@@ -12,7 +12,7 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace
 
-# What a view shows, on the host: colour, coverage and depth.
+# What a view shows, on the host: color, coverage and depth.
 
 Floats = NDArray[np.float32]
 

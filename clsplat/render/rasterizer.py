@@ -13,7 +13,7 @@ from clsplat.gaussians.sh_offload import slots_of
 from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Array, Device, Program, constants
 from clsplat.render.camera import DeviceCamera
-from clsplat.render.motion import at_moment, to_centres
+from clsplat.render.motion import at_moment, to_centers
 from clsplat.render.sky import Skies
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
@@ -150,8 +150,8 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
 
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 MAX_PAIRS = 2**31  # more than fit in memory, and few enough for sums of 32 bits: no other limit
-Content = Literal["colour", "depth", "entropy", "inverse_depth"]
-# channels: colour, or (depth of the mean in scene units, 1, 0); or colour and a fourth plane, the entropy of weights or
+Content = Literal["color", "depth", "entropy", "inverse_depth"]
+# channels: color, or (depth of the mean in scene units, 1, 0); or color and a fourth plane, the entropy of weights or
 # the blended inverse depth of the means
 FOURTH_PLANE: dict[Content, str] = {"entropy": "WEIGHT_ENTROPY", "inverse_depth": "INVERSE_DEPTH"}
 
@@ -194,13 +194,11 @@ class Rasterizer:
         self.skies = Skies(device, self.workspace)
         self._black = device.zeros(3)
         device.program("project.cl")  # built at once, as the others
-        self._blend("colour")
+        self._blend("color")
         self._lanes = int(device.tuning["LANES"])
         self._gradients: GaussianGradients | None = None  # allocated at first use
 
-    def forward(
-        self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "colour"
-    ) -> Frame:
+    def forward(self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "color") -> Frame:
         """Render the model.  background: [3], where the model has no sky.
 
         Where the pairs of all tiles are more than the budget or the device's memory, the frame is rendered in bands of
@@ -364,5 +362,5 @@ class Rasterizer:
         )
         if frame.content == "inverse_depth":
             add_inverse_depth_gradient(self.workspace, frame.camera, frame.splats, gradients["means"])
-        to_centres(model, frame.camera, gradients)
+        to_centers(model, frame.camera, gradients)
         return gradients

@@ -37,7 +37,7 @@ class Runs:
 
 
 def directions_of(values: NDArray[np.void], width: int, height: int) -> NDArray[np.float64]:
-    """Return the directions of the rays through the centres of pixels in the scene, [height, width, 3], of any length.
+    """Return the directions of the rays through the centers of pixels in the scene, [height, width, 3], of any length.
 
     values: camera_t.
     """

@@ -66,7 +66,7 @@ class Extras:
     """What a film has beside its pictures."""
 
     side: str | None = None  # PHOTOGRAPH, or a model file or run folder
-    layers: tuple[str, ...] = ("colour",)
+    layers: tuple[str, ...] = ("color",)
     save_path: Path | None = None  # a camera_path.json to write
 
 

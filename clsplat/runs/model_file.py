@@ -244,7 +244,7 @@ def write_pictures(
 ) -> list[Path]:
     """Write images (`kind` png) or float32 arrays (npy) of the layers of each view; return their files.
 
-    A layer but the colours has its name in that of the file.  photographs: files that no picture may mix with; film:
+    A layer but the colors has its name in that of the file.  photographs: files that no picture may mix with; film:
     the views are a film, and frames of this kind that an earlier one has left are removed at the end.
     """
     own = image_paths(out, [view.name for view in views], f".{kind}")
@@ -340,7 +340,7 @@ class ModelFile:
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)
         self.background = self.loaded.rendering.background or self.scene.background
-        self.colours = measured_beside(self.source.file)
+        self.colors = measured_beside(self.source.file)
 
     @property
     def gaussians(self) -> Model:
@@ -384,7 +384,7 @@ class ModelFile:
                     results = measure(
                         *(self.painter, views, photographs, perceptual),
                         finite=True,
-                        colours=self.colours,
+                        colors=self.colors,
                         trained=scene.split("train"),
                     )
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)

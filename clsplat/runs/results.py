@@ -31,12 +31,12 @@ class Averages(BaseModel):
     ssim: float
     lpips: float | None = None
     views: int
-    psnr_colour_views: int | None = None  # None: all of them
+    psnr_color_views: int | None = None  # None: all of them
 
     @property
-    def colour_views(self) -> int:
-        """The number of views that `psnr_colour` is the mean of."""
-        return self.views if self.psnr_colour_views is None else self.psnr_colour_views
+    def color_views(self) -> int:
+        """The number of views that `psnr_color` is the mean of."""
+        return self.views if self.psnr_color_views is None else self.psnr_color_views
 
     def figure(self, metric: str) -> float | None:
         """Return a metric by name; None when it was not measured."""

@@ -176,7 +176,7 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     if page:
         more = f"; `clsplat resume {in_shell(folder)} --steps {2 * metrics['steps']}` trains longer"
         if metrics.get("by_heart"):
-            more = "; the photographs are learnt by heart: more of them help most"
+            more = "; the photographs are learned by heart: more of them help most"
         elif kept and (kept["refit"] or kept["step"] < kept["last"]["step"]):  # validation has found where to end
             more = ""
         yield f"next: open {page} in a browser{more}"

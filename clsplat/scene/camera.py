@@ -67,8 +67,8 @@ Floats = NDArray[np.float64]
 Distortion = Callable[[Floats, Floats, Sequence[float]], tuple[Floats, Floats]]
 BORDER_POINTS = 200  # along each edge of a photograph
 MAX_ROUNDS = 50  # of Newton's method
-MAX_ERROR = 1.0e-6  # of its result, normalised units
-MAX_DIFFERENCE = 1.0e-3  # of a ray that was distorted and undistorted, normalised units
+MAX_ERROR = 1.0e-6  # of its result, normalized units
+MAX_DIFFERENCE = 1.0e-3  # of a ray that was distorted and undistorted, normalized units
 MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond, a pinhole image is mostly stretched edges
 MAX_GROWTH = 2.0  # of an undistorted photograph's size by the photograph's
 
@@ -157,7 +157,7 @@ class Lens:
         return "FISHEYE" in self.model or any(self._split[4])
 
     def distort(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
-        """Return the pixels of normalised coordinates."""
+        """Return the pixels of normalized coordinates."""
         fx, fy, cx, cy, rest = self._split
         x, y = MODELS[self.model][1](u, v, rest)
         return fx * x + cx, fy * y + cy
@@ -167,7 +167,7 @@ class Lens:
         return np.stack(self.distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]), axis=1)
 
     def undistort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return the normalised coordinates of pixels, by Newton's method; NaN where it does not converge."""
+        """Return the normalized coordinates of pixels, by Newton's method; NaN where it does not converge."""
         fx, fy, cx, cy, rest = self._split
         distortion = MODELS[self.model][1]
         goal = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
@@ -236,7 +236,7 @@ class Lens:
 
 
 def _rays(camera: Camera) -> tuple[Floats, Floats]:
-    """Normalised coordinates of all pixel centres, [H, W] each."""
+    """Normalized coordinates of all pixel centers, [H, W] each."""
     u, v = np.meshgrid(
         (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
         (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
@@ -245,7 +245,7 @@ def _rays(camera: Camera) -> tuple[Floats, Floats]:
 
 
 def _nearer(distortion: Distortion, k: Sequence[float], point: Floats, goal: Floats) -> Floats:
-    """One step of Newton's method towards the points [2, M] that are distorted to `goal`."""
+    """One step of Newton's method toward the points [2, M] that are distorted to `goal`."""
     step, (u, v) = 1e-7, point
     a, b = distortion(u, v, k)
     au, bu = distortion(u + step, v, k)
@@ -258,7 +258,7 @@ def _nearer(distortion: Distortion, k: Sequence[float], point: Floats, goal: Flo
 
 @lru_cache(maxsize=2)  # of a phone held upright and across; each has 8 bytes a pixel
 def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where in the photograph the pixels of `pinhole` lie, [H, W] each; OpenCV's pixels have whole centres."""
+    """Where in the photograph the pixels of `pinhole` lie, [H, W] each; OpenCV's pixels have whole centers."""
     x, y = lens.distort(*_rays(lens.pinhole))
     return (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)
 

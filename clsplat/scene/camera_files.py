@@ -64,7 +64,7 @@ LOG = logging.getLogger("clsplat")
 TOLERANCE = 0.5  # px: less is no more than a convention about the middle of a pixel
 
 
-def centre_lost(path: Path, cameras: Sequence[Camera], readers: str) -> None:
+def center_lost(path: Path, cameras: Sequence[Camera], readers: str) -> None:
     """Warn where readers of a file look for the principal point elsewhere than it is."""
     off = max(max(abs(c.cx - c.width / 2), abs(c.cy - c.height / 2)) for c in cameras)
     if off > TOLERANCE:
@@ -94,7 +94,7 @@ MAX_VIEWS = 100_000
 def write_inria(out: Path, views: list[Posed], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
     """Write out/cameras.json; return it.  Points and tracks have no place in it.  Raises OutputError."""
     write_text(out / INRIA_FILE, json.dumps([_camera(one, i) for i, one in enumerate(views)], indent=1) + "\n")
-    centre_lost(out / INRIA_FILE, [one.view.camera for one in views], "other programs")
+    center_lost(out / INRIA_FILE, [one.view.camera for one in views], "other programs")
     return [out / INRIA_FILE]
 
 

@@ -177,7 +177,7 @@ def _id(word: str) -> int:
 
 def _byte(word: str) -> int:
     if not 0 <= int(word) <= 255:
-        raise ValueError(f"colour {word} is not in 0..255")
+        raise ValueError(f"color {word} is not in 0..255")
     return int(word)
 
 

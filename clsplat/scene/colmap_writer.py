@@ -78,9 +78,9 @@ def _points(points: PointCloud, shown: Sequence[NDArray[Any]]) -> list[bytes]:
     for number, table in enumerate(shown, 1):
         for place, point in enumerate(table["point"].tolist()):
             tracks[point - 1] += struct.pack("<II", number, place)
-    rgb = np.rint(points.colours * 255).astype(np.uint8)
+    rgb = np.rint(points.colors * 255).astype(np.uint8)
     rows = zip(points.positions.astype(float), rgb, tracks, strict=True)
     return [
-        struct.pack("<Q3d3BdQ", i, *position, *colour, 0.0, len(track) // 8) + track
-        for i, (position, colour, track) in enumerate(rows, 1)
+        struct.pack("<Q3d3BdQ", i, *position, *color, 0.0, len(track) // 8) + track
+        for i, (position, color, track) in enumerate(rows, 1)
     ]

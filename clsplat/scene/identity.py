@@ -212,7 +212,7 @@ def _row(view: View, files: Mapping[Path, ImageFile]) -> Row:
 
 
 def _points_hash(points: PointCloud) -> str:
-    return _hash(points.positions, points.colours, *([] if points.times is None else [points.times]))
+    return _hash(points.positions, points.colors, *([] if points.times is None else [points.times]))
 
 
 def _hash(*arrays: ArrayLike, text: str = "") -> str:

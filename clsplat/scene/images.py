@@ -152,7 +152,7 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines n
 logger = logging.getLogger("clsplat")
 Missing = Literal["refuse", "skip"]  # what to do about photographs that a dataset names and does not have
 MAX_BYTES = (1 << 31) - 1  # of an image file: OpenCV decodes no longer ones
-REDUCED = {  # what OpenCV decodes to grey, by the divisor of the size
+REDUCED = {  # what OpenCV decodes to gray, by the divisor of the size
     1: cv2.IMREAD_GRAYSCALE,
     2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
     4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
@@ -226,8 +226,8 @@ def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
     return decode_image(read_file(path, "an image", limit=MAX_BYTES), path, upright)
 
 
-def read_grey(path: Path, long_side: int) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """Return a photograph as stored in grey, [H, W], no side longer than `long_side` px, and the stored px of one px.
+def read_gray(path: Path, long_side: int) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+    """Return a photograph as stored in gray, [H, W], no side longer than `long_side` px, and the stored px of one px.
 
     A JPEG decoder makes half, a quarter or an eighth of the size for less.  Raises DataError as decode_image does.
     """
@@ -257,7 +257,7 @@ def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]
 
 
 def _decoded(data: bytes, path: Path, flags: int) -> NDArray[Any]:
-    if is_cut(data):  # some versions of OpenCV fill the rest with grey
+    if is_cut(data):  # some versions of OpenCV fill the rest with gray
         raise DataError(f"{path}: the end of the file is missing; copy it again")
     pixels, fault = None, ""
     try:  # not cv2.imread: that needs ASCII paths on Windows

@@ -1,4 +1,4 @@
-"""The photograph of a view for training: its colours and its mask."""
+"""The photograph of a view for training: its colors and its mask."""
 
 import hashlib
 import logging

@@ -1,7 +1,7 @@
 """Points from the photographs of a scene: a plane sweep over them (Collins 1996).
 
-For every photograph and each of PLANES depths, the neighbours are projected onto the plane at that depth.  The surface
-lies at the depth where they agree best.  A pixel can become a point when its neighbours find the same depth.
+For every photograph and each of PLANES depths, the neighbors are projected onto the plane at that depth.  The surface
+lies at the depth where they agree best.  A pixel can become a point when its neighbors find the same depth.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,16 +20,16 @@ Places = NDArray[np.integer]
 LONG_SIDE = 160  # px of the photographs that are compared
 PLANES = 64  # evenly spaced in inverse depth
 MIN_DEPTH, MAX_DEPTH = 0.1, 20.0  # times the distance to what the cameras look at
-NEIGHBOURS = 4  # photographs that each is compared with
+NEIGHBORS = 4  # photographs that each is compared with
 WINDOW = 5  # px
 MAX_COST_SHARE = 0.6  # of the best plane, by the mean of all planes
-MIN_VOTES = 2  # neighbours that find the depth of a point too
+MIN_VOTES = 2  # neighbors that find the depth of a point too
 MAX_DIFFERENCE = 1.5  # of agreeing depths, planes
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What a small photograph shows where its neighbours agree on the depth."""
+    """What a small photograph shows where its neighbors agree on the depth."""
 
     view: View
     image: Floats  # [H, W, 3] float32, in [0, 1]
@@ -49,7 +49,7 @@ class Surface:
 
 def swept_points(
     views: Sequence[View],
-    centre: Floats,
+    center: Floats,
     load: Callable[[View], NDArray[np.uint8]],
     count: int,
     seed: int,
@@ -57,15 +57,15 @@ def swept_points(
     beside: Floats | None = None,
     shown: Callable[[View], NDArray[np.bool_] | None] = lambda view: None,
 ) -> PointCloud:
-    """Return at most `count` coloured points on the surfaces that neighbouring views agree on, perhaps none.
+    """Return at most `count` colored points on the surfaces that neighboring views agree on, perhaps none.
 
-    centre: what the cameras look at, [3].  `load` returns the photograph of a view, [H, W, 3].  `chance` returns the
+    center: what the cameras look at, [3].  `load` returns the photograph of a view, [H, W, 3].  `chance` returns the
     chance of each pixel of a photograph in [0, 1] to be taken, [H, W]; then points have sizes, that of the pixels
     between them at their depth.  Without it all pixels are alike.  beside: points [M, 3] that are there already; pixels
     that are not new beside them give none.  `shown` returns which pixels of a view may give points, [H, W]; None: all.
     """
-    positions, colours, sizes = [], [], []
-    for i, surface in enumerate(surfaces(views, centre, load)):
+    positions, colors, sizes = [], [], []
+    for i, surface in enumerate(surfaces(views, center, load)):
         view, image, taken = surface.view, surface.image, surface.inverse > 0
         if (may := shown(view)) is not None:
             taken &= may
@@ -76,9 +76,9 @@ def swept_points(
         rows, columns = np.nonzero(taken)
         depth = 1 / surface.inverse[taken]
         positions.append(_lifted(view, rows, columns, depth))
-        colours.append(image[taken])
+        colors.append(image[taken])
         sizes.append(depth / view.camera.fx * spacing(chances[taken], view.camera.width))
-    everywhere, everything = np.concatenate(positions), np.concatenate(colours)
+    everywhere, everything = np.concatenate(positions), np.concatenate(colors)
     chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(everywhere))[:count])
     if chance is None:
         return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen])
@@ -87,15 +87,15 @@ def swept_points(
     return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen], sizes=size)
 
 
-def surfaces(views: Sequence[View], centre: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:
-    """Return what each view shows where its neighbours agree; arguments as of `swept_points`."""
+def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:
+    """Return what each view shows where its neighbors agree; arguments as of `swept_points`."""
     small = [
         view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
         for view in views
     ]
     images = [load(view).astype(np.float32) / 255 for view in small]
-    near = [_neighbours(i, small) for i in range(len(small))]
-    distance = float(np.median([np.linalg.norm(view.position - centre) for view in small]))
+    near = [_neighbors(i, small) for i in range(len(small))]
+    distance = float(np.median([np.linalg.norm(view.position - center) for view in small]))
     inverse = np.linspace(1 / (MAX_DEPTH * distance), 1 / (MIN_DEPTH * distance), PLANES)
     planes = [_best_planes(i, small, images, near[i], inverse) for i in range(len(small))]
     step = float(inverse[1] - inverse[0])
@@ -105,19 +105,19 @@ def surfaces(views: Sequence[View], centre: Floats, load: Callable[[View], NDArr
     ]
 
 
-def _neighbours(i: int, views: Sequence[View]) -> list[int]:
+def _neighbors(i: int, views: Sequence[View]) -> list[int]:
     """The views nearest to one, among those that look the same way within 60 degrees."""
     position, direction = views[i].position, views[i].world_to_camera[2, :3]
     alike = [j for j, view in enumerate(views) if j != i and view.world_to_camera[2, :3] @ direction > 0.5]
-    return sorted(alike, key=lambda j: float(np.linalg.norm(views[j].position - position)))[:NEIGHBOURS]
+    return sorted(alike, key=lambda j: float(np.linalg.norm(views[j].position - position)))[:NEIGHBORS]
 
 
 def _best_planes(
     i: int, views: Sequence[View], images: Sequence[Floats], near: Sequence[int], inverse: Floats
 ) -> NDArray[np.int64]:
-    """The plane of each pixel, [H, W], on which the better half of the neighbours differs least from it.
+    """The plane of each pixel, [H, W], on which the better half of the neighbors differs least from it.
 
-    0 where no plane stands out: flat colours, and what no neighbour shows.
+    0 where no plane stands out: flat colors, and what no neighbor shows.
     """
     view, image = views[i], images[i]
     costs = np.empty((len(inverse), *image.shape[:2]), np.float32)
@@ -138,7 +138,7 @@ def _best_planes(
 def _homography(view: View, other: View, inverse_depth: float) -> Floats:
     """Pixels of `view` to those of `other` for points on the plane at that depth before `view`, [3, 3].
 
-    OpenCV's pixels have whole centres, hence the halves.
+    OpenCV's pixels have whole centers, hence the halves.
     """
     rotation = other.world_to_camera[:, :3] @ view.world_to_camera[:, :3].T
     translation = other.world_to_camera[:, 3] - rotation @ view.world_to_camera[:, 3]
@@ -175,7 +175,7 @@ def _pixels(view: View, points: Floats) -> tuple[NDArray[np.bool_], Places, Plac
 def _confirmed(
     i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], near: Sequence[int], inverse: Floats
 ) -> NDArray[np.bool_]:
-    """Which pixels, [H, W], lie where enough neighbours find a surface too, and not on the first or last plane."""
+    """Which pixels, [H, W], lie where enough neighbors find a surface too, and not on the first or last plane."""
     shape = planes[i].shape
     rows, columns = (index.ravel() for index in np.indices(shape))
     points = _lifted(views[i], rows, columns, 1 / inverse[planes[i].ravel()])

@@ -1,4 +1,4 @@
-"""Read and write sparse coloured points as PLY."""
+"""Read and write sparse colored points as PLY."""
 
 import io
 import logging
@@ -49,10 +49,10 @@ class PointTable(NamedTuple):
         kept = self.kept()
         if not kept.all():
             logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~kept):,}")
-        colours = np.asarray(self.rgb[kept], np.float32) / np.float32(255)
+        colors = np.asarray(self.rgb[kept], np.float32) / np.float32(255)
         moments = clock.of_points(self.file, self.times[kept]) if clock and len(self.times) else None
         times = None if moments is None else np.asarray(moments, np.float32)
-        return PointCloud(np.asarray(self.positions[kept], np.float32), colours, times)
+        return PointCloud(np.asarray(self.positions[kept], np.float32), colors, times)
 
 
 def read_points_ply(path: Path, clock: Clock | None = None) -> PointCloud:
@@ -90,7 +90,7 @@ def write_points_ply(path: Path, points: PointCloud) -> None:
     for i, name in enumerate("xyz"):
         table[name] = points.positions[:, i]
     for i, name in enumerate(RGB):
-        table[name] = np.rint(points.colours[:, i] * 255)
+        table[name] = np.rint(points.colors[:, i] * 255)
     properties = [f"{'uchar' if kind[name] == np.uint8 else 'float'} {name}" for name in kind.names or ()]
     with atomic(path) as file:
         file.write(format_ply_header((), vertex=(len(points), properties)) + table.tobytes())

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.scene.images import read_grey
+from clsplat.scene.images import read_gray
 from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, load_mask, load_transparency, some_of
@@ -65,20 +65,20 @@ BLURRED = 0.25  # share of the middle of a set: six captures have 0.4 and more, 
 SIDE = 480  # px: sharpness is measured at this size: at full size, noise counts as detail
 
 
-def sharpness(grey: NDArray[np.uint8]) -> float:
-    """Return the variance of the Laplacian of an image [H, W], grey levels²."""
-    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
+def sharpness(gray: NDArray[np.uint8]) -> float:
+    """Return the variance of the Laplacian of an image [H, W], gray levels²."""
+    return float(cv2.Laplacian(gray, cv2.CV_64F).var())
 
 
-def both_sharpnesses(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
+def both_sharpnesses(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the sharpness of an image [H, W], and it by the square of its mean, which a darker copy has too, [2]."""
-    found = sharpness(grey)
-    return np.array([found, found / max(float(grey.mean()), 1.0) ** 2])
+    found = sharpness(gray)
+    return np.array([found, found / max(float(gray.mean()), 1.0) ** 2])
 
 
 def sharpness_of(path: Path) -> NDArray[np.float64]:
     """Return both sharpnesses of a photograph, reduced to SIDE px.  Raises DataError when it cannot be read."""
-    return both_sharpnesses(read_grey(path, SIDE)[0])
+    return both_sharpnesses(read_gray(path, SIDE)[0])
 
 
 def is_blurred(own: NDArray[np.float64], middle: NDArray[np.float64]) -> bool:
@@ -98,9 +98,9 @@ MAX_SPACING = 0.1  # by the width of the photograph (Meuleman et al. 2025)
 def laplacian_chance(image: Floats) -> Floats:
     """Return the chance, [H, W], with which a pixel of a photograph, [H, W, 3] in [0, 1], becomes a point.
 
-    It is min(1, ‖∇²I‖₁) with the Laplacian of five points, summed over the colours (Meuleman et al. 2025).  There it is
+    It is min(1, ‖∇²I‖₁) with the Laplacian of five points, summed over the colors (Meuleman et al. 2025).  There it is
     averaged over a disc of weight 1; here photographs are so small that each pixel is an average already, and the
-    factor stays 1.  A pixel that differs from the mean of its neighbours by a twelfth of the range in each colour has
+    factor stays 1.  A pixel that differs from the mean of its neighbors by a twelfth of the range in each color has
     the chance 1.
     """
     framed = np.pad(image.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")

@@ -95,7 +95,7 @@ class Reader(ABC):
             parts.views = list(scene.views)
             parts.expected = [view.image_path for view in scene.views]
         if scene is not None and scene.points is not None:
-            rgb = np.rint(scene.points.colours * 255)
+            rgb = np.rint(scene.points.colors * 255)
             parts.points = PointTable(parts.path, scene.points.positions, rgb)
 
 

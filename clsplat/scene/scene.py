@@ -2,10 +2,10 @@
 
 Conventions of the whole project
     camera      OpenCV: x right, y down, z forward; `world_to_camera` is row-major [3, 4]
-    pixels      pixel (0, 0) has its centre at (0.5, 0.5)
+    pixels      pixel (0, 0) has its center at (0.5, 0.5)
     quaternions (w, x, y, z)
     lengths     scene units; screen quantities in pixels
-    colours     as the image files store them, in [0, 1]
+    colors     as the image files store them, in [0, 1]
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -48,10 +48,10 @@ SPLITS = ("train", "test", "validation")
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Sparse coloured points."""
+    """Sparse colored points."""
 
     positions: Floats  # [M, 3] float32, scene units
-    colours: Floats  # [M, 3] float32, in [0, 1]
+    colors: Floats  # [M, 3] float32, in [0, 1]
     times: Floats | None = None  # [M] float32, in [0, 1], at which they were seen, where a moving scene has that
     sizes: Floats | None = None  # [M] float32, scene units, of the Gaussians they become; NaN and None: unknown
 
@@ -60,7 +60,7 @@ class PointCloud:
 
     def joined(self, other: "PointCloud") -> "PointCloud":
         """Return these points, then those of another cloud; with times where both have them, sizes where one has."""
-        pairs = [(self.positions, other.positions), (self.colours, other.colours)]
+        pairs = [(self.positions, other.positions), (self.colors, other.colors)]
         pairs += [(self.times, other.times)] if self.times is not None and other.times is not None else []
         both = PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
         if self.sizes is None and other.sizes is None:
@@ -192,22 +192,22 @@ def make_scene(
 
 
 def camera_extent(views: list[View]) -> float:
-    """Return the radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023).
+    """Return the radius of the cameras: 1.1 x the largest distance of a center from their mean (Kerbl et al. 2023).
 
     Cameras far away from all others do not count: one wrong pose changes every size and rate of the scene.
     """
-    centres = np.stack([v.position for v in views])[~strayed(views)]
-    radius = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    centers = np.stack([v.position for v in views])[~strayed(views)]
+    radius = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     return radius if radius > 0 else 1.0
 
 
 def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
-    """Return which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median centre.
+    """Return which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median center.
 
     Where that is more than MAX_STRAYED_SHARE of all, the scene has several groups of cameras, and all are False.
     """
-    centres = np.stack([v.position for v in views])
-    distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    centers = np.stack([v.position for v in views])
+    distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     far = distance > MAX_DISTANCE * np.median(distance)
     return far if np.median(distance) > 0 and far.mean() <= MAX_STRAYED_SHARE else np.zeros(len(views), bool)
 

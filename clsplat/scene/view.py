@@ -92,20 +92,20 @@ class View:
 
         Raises ValueError where there is no such view: the target is the position, or lies along `up`.
         """
-        centre, point, above = (np.asarray(vector, np.float64) for vector in (position, target, up))
-        if not centre.shape == point.shape == above.shape == (3,):
+        center, point, above = (np.asarray(vector, np.float64) for vector in (position, target, up))
+        if not center.shape == point.shape == above.shape == (3,):
             raise ValueError(f"{quoted(name)}: expected a position, a target and `up` of 3 numbers each")
-        forward = point - centre
+        forward = point - center
         right = np.cross(forward, above)
         axes = np.stack([right, np.cross(forward, right), forward])
         if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(above):
             raise ValueError(f"{quoted(name)}: expected a target away from the position, and not along `up`")
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-        return cls(name, camera, np.column_stack([axes, -axes @ centre]))
+        return cls(name, camera, np.column_stack([axes, -axes @ center]))
 
     @property
     def position(self) -> Floats:
-        """Camera centre in world coordinates, [3]."""
+        """Camera center in world coordinates, [3]."""
         rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
         return -rotation.T @ translation
 
@@ -129,27 +129,27 @@ class View:
         `picture.background`.  Raises DataError when the file cannot be read or is not the camera's image, ValueError
         for another background.
         """
-        red, green, blue = colour_of(background).tolist()
+        red, green, blue = color_of(background).tolist()
         return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)
 
 
-def colour_of(background: ArrayLike) -> Floats:
+def color_of(background: ArrayLike) -> Floats:
     """Return a background as three numbers.  Raises ValueError unless it is one number or three in [0, 1]."""
     try:
-        colour = np.asarray(background, np.float64)
+        color = np.asarray(background, np.float64)
     except (ValueError, TypeError):
         raise ValueError(f"the background is {quoted(background)}; expected one number or three in [0, 1]") from None
-    if colour.shape not in ((), (3,)):
-        raise ValueError(f"the background has shape {colour.shape}; expected one number or three")
-    if not ((colour >= 0) & (colour <= 1)).all():
+    if color.shape not in ((), (3,)):
+        raise ValueError(f"the background has shape {color.shape}; expected one number or three")
+    if not ((color >= 0) & (color <= 1)).all():
         raise ValueError(f"the background is {quoted(background)}; expected one number or three in [0, 1]")
-    return np.broadcast_to(colour, (3,))
+    return np.broadcast_to(color, (3,))
 
 
 def load_image(view: View, background: tuple[float, float, float] | Floats = BLACK) -> NDArray[np.uint8]:
     """Return the photograph of `view` at its camera's size, RGB, [H, W, 3]; alpha is composited on `background`.
 
-    `background` is a colour in [0, 1], black by default.  Raises DataError when the file cannot be read as an 8- or
+    `background` is a color in [0, 1], black by default.  Raises DataError when the file cannot be read as an 8- or
     16-bit image, or when it is not the camera's image before downscaling.
     """
     pixels = _as_taken(view, view.image_path)
@@ -165,8 +165,8 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     if opaque:
         return np.asarray(np.rint(values * (255 / limit)), np.uint8)
     unit = values / limit
-    colour, alpha = unit[:, :, :3], unit[:, :, 3:]
-    composite = colour * alpha + np.asarray(background) * (1 - alpha)
+    color, alpha = unit[:, :, :3], unit[:, :, 3:]
+    composite = color * alpha + np.asarray(background) * (1 - alpha)
     slack = 1e-3 if resized else 0.0  # OpenCV's area weights are single precision: rounding must not lower a level
     return np.asarray(composite * 255 + slack, np.uint8)  # truncated, as in the reference (Kerbl et al. 2023)
 

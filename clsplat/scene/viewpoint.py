@@ -42,9 +42,9 @@ class Stand:
             eye = middle + DISTANCE * radius * np.array([0.35, -0.25, -0.9])
             return cls(middle, up, radius, START.fx, View.looking_at(eye, middle, up, START, "start"))
         poses = np.stack([view.world_to_camera for view in views])
-        centres = np.stack([view.position for view in views])
-        pivot = closest_point(centres, poses[:, 2, :3], middle)
-        radius = float(np.median(np.linalg.norm(centres - pivot, axis=1))) or spread or 1.0
+        centers = np.stack([view.position for view in views])
+        pivot = closest_point(centers, poses[:, 2, :3], middle)
+        radius = float(np.median(np.linalg.norm(centers - pivot, axis=1))) or spread or 1.0
         return cls(pivot, upward(views), radius, float(np.median([view.camera.fx for view in views])), first)
 
 
@@ -74,16 +74,16 @@ def across(up: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def closest_point(
-    centres: NDArray[np.floating], axes: NDArray[np.floating], prior: NDArray[np.floating]
+    centers: NDArray[np.floating], axes: NDArray[np.floating], prior: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Return the point, [3], with the least squared distances to lines; weakly drawn to `prior`.
 
-    centres, axes: [V, 3], a point of each line and its unit direction.
+    centers, axes: [V, 3], a point of each line and its unit direction.
     """
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    weight = PRIOR * len(centres)
+    weight = PRIOR * len(centers)
     matrix = across.sum(axis=0) + weight * np.eye(3)
-    return np.asarray(np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centres) + weight * prior))
+    return np.asarray(np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centers) + weight * prior))
 
 
 # What the cameras of a scene look at: a point, a box around it, and random points in the box.
@@ -92,21 +92,21 @@ RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: the value of
 
 
 def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
-    """Return grey points, uniform in a box around the point that the training cameras look at."""
-    centre, half_side = looked_at_box(scene)
+    """Return gray points, uniform in a box around the point that the training cameras look at."""
+    center, half_side = looked_at_box(scene)
     rng = np.random.default_rng([seed, count])
     spread = rng.uniform(-half_side, half_side, (count, 3))
-    return PointCloud((centre + spread).astype(np.float32), np.full((count, 3), 127 / 255, np.float32))
+    return PointCloud((center + spread).astype(np.float32), np.full((count, 3), 127 / 255, np.float32))
 
 
 def looked_at_box(scene: Scene) -> tuple[NDArray[np.floating], float]:
-    """Return the centre, [3], and half the side of a box around the point that the training cameras look at."""
+    """Return the center, [3], and half the side of a box around the point that the training cameras look at."""
     views = scene.split("train")
-    positions, centre = np.stack([view.position for view in views]), centre_of(views)
-    return centre, RANDOM_BOX * float(np.median(np.linalg.norm(positions - centre, axis=1)))
+    positions, center = np.stack([view.position for view in views]), center_of(views)
+    return center, RANDOM_BOX * float(np.median(np.linalg.norm(positions - center, axis=1)))
 
 
-def centre_of(views: Sequence[View]) -> NDArray[np.floating]:
+def center_of(views: Sequence[View]) -> NDArray[np.floating]:
     """Return the point that the cameras look at, [3] scene units."""
     return looked_at(np.stack([v.position for v in views]), np.stack([v.world_to_camera[2, :3] for v in views]))
 

@@ -1,7 +1,7 @@
 """Points for photographs with transparency: the visual hull of their silhouettes (Laurentini 1994).
 
 A box is split into cells, as an octree (Szeliski 1993).  A cell that lies outside the silhouette of one view is empty;
-one that lies inside all silhouettes is full; the others are split.  The last of them are full where their centre is.
+one that lies inside all silhouettes is full; the others are split.  The last of them are full where their center is.
 """
 
 import math
@@ -22,7 +22,7 @@ Cells = NDArray[np.integer]  # [M, 3], places in a grid
 LONG_SIDE = 400  # px, of the photographs that are read
 MAX_VIEWS = 64  # that are read
 COARSEST, FINEST = 16, 256  # cells along a side of the box
-HALF, OPAQUE = 127, 250  # alpha from which a pixel belongs to the silhouette, and shows its colour alone
+HALF, OPAQUE = 127, 250  # alpha from which a pixel belongs to the silhouette, and shows its color alone
 LEAST_VIEWS, LEAST_SHARE = 2, 0.25  # that see a cell, in number and of all
 HALF_DIAGONAL = 0.75**0.5  # of a cube of side 1
 BEHIND = 2.0  # sides of a cell that a point may lie behind the first one of its place in the image, and be visible
@@ -72,13 +72,13 @@ class Projection:
 
 def hull_points(
     views: Sequence[View],
-    centre: Floats,
+    center: Floats,
     half_side: float,
     load: Callable[[View], NDArray[np.uint8] | None],
     count: int,
     seed: int,
 ) -> PointCloud:
-    """Return at most `count` coloured points on the hull, in a box of 2 `half_side` around `centre` [3], perhaps none.
+    """Return at most `count` colored points on the hull, in a box of 2 `half_side` around `center` [3], perhaps none.
 
     `load` returns a photograph with its alpha, [H, W, 4], or None without transparency.  The last cells are those of
     which there are `count` or more on the surface, about, unless they would be smaller than the box by FINEST.
@@ -87,22 +87,22 @@ def hull_points(
     full, number = np.zeros((COARSEST,) * 3, bool), COARSEST
     cells: Cells = np.argwhere(~full)
     while True:
-        centres, side = _centres(cells, centre, half_side, number)
-        inside, cut = _within(silhouettes, centres, HALF_DIAGONAL * side)
+        centers, side = _centers(cells, center, half_side, number)
+        inside, cut = _within(silhouettes, centers, HALF_DIAGONAL * side)
         full[tuple(cells[inside].T)] = True
         cells, number = _split(cells[cut]), 2 * number
         full = full.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
         if cut.sum() >= count or number == FINEST:
             break
-    inside, _ = _within(silhouettes, _centres(cells, centre, half_side, number)[0], 0)
+    inside, _ = _within(silhouettes, _centers(cells, center, half_side, number)[0], 0)
     full[tuple(cells[inside].T)] = True
-    points, side = _centres(
-        np.argwhere(full & ~scipy.ndimage.binary_erosion(full, border_value=1)), centre, half_side, number
+    points, side = _centers(
+        np.argwhere(full & ~scipy.ndimage.binary_erosion(full, border_value=1)), center, half_side, number
     )
-    colours, seen = _colours(silhouettes, points, side)
-    points, colours = points[seen], colours[seen]
+    colors, seen = _colors(silhouettes, points, side)
+    points, colors = points[seen], colors[seen]
     chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(points))[:count])
-    return PointCloud(points[chosen], colours[chosen])
+    return PointCloud(points[chosen], colors[chosen])
 
 
 def _silhouettes(views: Sequence[View], load: Callable[[View], NDArray[np.uint8] | None]) -> Iterator[Silhouette]:
@@ -119,18 +119,18 @@ def _split(cells: Cells) -> Cells:
     return (2 * cells[:, None] + np.indices((2, 2, 2)).reshape(3, -1).T).reshape(-1, 3)
 
 
-def _centres(cells: Cells, centre: Floats, half_side: float, number: int) -> tuple[NDArray[np.float32], float]:
-    """The centres of cells of a box that has `number` along a side, [M, 3], and their side."""
+def _centers(cells: Cells, center: Floats, half_side: float, number: int) -> tuple[NDArray[np.float32], float]:
+    """The centers of cells of a box that has `number` along a side, [M, 3], and their side."""
     side = 2 * half_side / number
-    return (centre - half_side + side * (cells + 0.5)).astype(np.float32), side
+    return (center - half_side + side * (cells + 0.5)).astype(np.float32), side
 
 
-def _within(silhouettes: Sequence[Silhouette], centres: NDArray[np.float32], radius: float) -> tuple[Bools, Bools]:
+def _within(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], radius: float) -> tuple[Bools, Bools]:
     """Which balls around points, [M], lie inside all silhouettes in whose images they are, and which on the edge of one
     and outside none.  Neither are those that few views see: nobody knows what is there."""
-    full, left, seen = np.ones(len(centres), bool), np.arange(len(centres)), np.zeros(len(centres), int)
+    full, left, seen = np.ones(len(centers), bool), np.arange(len(centers)), np.zeros(len(centers), int)
     for silhouette in silhouettes:
-        place = silhouette.project(centres[left])
+        place = silhouette.project(centers[left])
         if not len(place.depth):
             continue
         around = np.ones((2 * silhouette.radius(radius, place.depth) + 1,) * 2, np.uint8)
@@ -140,16 +140,16 @@ def _within(silhouettes: Sequence[Silhouette], centres: NDArray[np.float32], rad
         stays = ~place.inside
         stays[place.inside] = cv2.dilate(silhouette.alpha, around)[place.row, place.column] > HALF
         left = left[stays]
-    touched = np.zeros(len(centres), bool)
+    touched = np.zeros(len(centers), bool)
     touched[left] = True
     touched &= seen >= max(LEAST_VIEWS, LEAST_SHARE * len(silhouettes))
     return touched & full, touched & ~full
 
 
-def _colours(
+def _colors(
     silhouettes: Sequence[Silhouette], points: NDArray[np.float32], side: float
 ) -> tuple[NDArray[np.float32], Bools]:
-    """The mean colours of points, [M, 3] in [0, 1], in the views that show them, and which are shown."""
+    """The mean colors of points, [M, 3] in [0, 1], in the views that show them, and which are shown."""
     total, number = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
     for silhouette in silhouettes:
         place, camera = silhouette.project(points), silhouette.view.camera

@@ -162,7 +162,7 @@ class PruneLeast(Scheduled):
 class ReduceSh(Scheduled):
     """Drop bands of spherical harmonics: those above a degree, and of the others those that matter least.
 
-    What a band of a Gaussian matters is the mean square of its colours over all directions, times the Gaussian's weight
+    What a band of a Gaussian matters is the mean square of its colors over all directions, times the Gaussian's weight
     in the training views.  Bands that are dropped by `share` are zeros, which formats store in few bytes; training that
     follows gives them values again.
     """

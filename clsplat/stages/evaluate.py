@@ -10,7 +10,7 @@ from clsplat.core.files import fault_of_output
 from clsplat.core.settings import ReadPath
 from clsplat.gaussians.model import load
 from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
-from clsplat.metrics.views import mean, measure, tell_of_colours
+from clsplat.metrics.views import mean, measure, tell_of_colors
 from clsplat.render.painter import Painter, SplatPainter
 from clsplat.scene.view import some_of
 from clsplat.training.modules.base import learned_scene, measured_as
@@ -93,10 +93,8 @@ class Evaluate(Scheduled):
             views = some_of(found, self.most or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            trained, colours = run.scene.split("train"), measured_as(run)
-            results = measure(
-                painter, views, photographs, perceptual, colours=colours, counted=counted, trained=trained
-            )
+            trained, colors = run.scene.split("train"), measured_as(run)
+            results = measure(painter, views, photographs, perceptual, colors=colors, counted=counted, trained=trained)
             if not results:
                 continue
             for result in results:
@@ -109,4 +107,4 @@ class Evaluate(Scheduled):
                 *(run.model_step, f"{self.file}, " if self.file else "", self.split, downscale),
                 *(averages["psnr"], averages["ssim"], amount(len(results), "view")),
             )
-            tell_of_colours(averages)
+            tell_of_colors(averages)

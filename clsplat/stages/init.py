@@ -20,7 +20,7 @@ from clsplat.scene.quality import is_transparent, laplacian_chance, opaque_pixel
 from clsplat.scene.reprojection import require_ahead
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View, load_image, load_rgba
-from clsplat.scene.viewpoint import centre_of, looked_at_box, random_points
+from clsplat.scene.viewpoint import center_of, looked_at_box, random_points
 from clsplat.scene.visual_hull import hull_points
 from clsplat.stages.init_motion import moving, require_times, with_motion
 from clsplat.training.memory import first_tables, last_place
@@ -47,7 +47,7 @@ def own_points(scene: Scene) -> PointCloud:
 def swept(run: Run, count: int, chance: Chance | None) -> PointCloud:
     """Return at most `count` points of a sweep over the training photographs; `chance` as of `swept_points`."""
     views = _views(run)
-    return swept_points(views, centre_of(views), load_image, count, run.seed, chance)
+    return swept_points(views, center_of(views), load_image, count, run.seed, chance)
 
 
 def points_and_sweep(run: Run, count: int, chance: Chance | None) -> PointCloud:
@@ -57,7 +57,7 @@ def points_and_sweep(run: Run, count: int, chance: Chance | None) -> PointCloud:
     """
     own, views = own_points(run.scene), _views(run)
     beside = own.positions.astype(np.float64)
-    new = swept_points(views, centre_of(views), load_image, count, run.seed, chance, beside, opaque_pixels)
+    new = swept_points(views, center_of(views), load_image, count, run.seed, chance, beside, opaque_pixels)
     if not len(new):
         LOG.warning("the photographs agree on no points beside the scene's; starting from these alone")
     return own.joined(new)
@@ -94,7 +94,7 @@ CHANCES = {"uniform": None, "laplacian": laplacian_chance}  # of a pixel to beco
 
 
 class Init(Stage):
-    """Make Gaussians: isotropic, as large as the mean distance to the three nearest neighbours (Kerbl et al. 2023).
+    """Make Gaussians: isotropic, as large as the mean distance to the three nearest neighbors (Kerbl et al. 2023).
 
     `source: auto` uses the scene's points if it has points.  Without points it uses a plane sweep over the photographs,
     or, where these have transparent pixels, what `transparent` says: random points in a box around the point
@@ -123,12 +123,12 @@ class Init(Stage):
     swept: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
     detail: Literal["uniform", "laplacian"] = "uniform"
-    """Which pixels of a sweep become points: all with the same chance, and sizes are those of neighbours; or where the
+    """Which pixels of a sweep become points: all with the same chance, and sizes are those of neighbors; or where the
     photographs have detail, by their Laplacian, and sizes are the distances of such pixels."""
     times: Literal["uniform", "per_frame"] = "uniform"
     """Where Gaussians move, the time of each: drawn, or that at which its point was seen, where the dataset says so.
-    Points whose neighbours were seen at all times begin as what stands still; others have the spread of those times as
-    their duration, and the velocity of those neighbours."""
+    Points whose neighbors were seen at all times begin as what stands still; others have the spread of those times as
+    their duration, and the velocity of those neighbors."""
     duration: Annotated[float, Field(gt=0)] = 4.0
     """Standard deviation of the time around that, by the scene's duration; a long one begins as a scene that stands
     still."""

@@ -11,7 +11,7 @@ from clsplat.render.filters import Motion
 from clsplat.scene.scene import Scene
 
 STREAM = 4  # of the random numbers, beside those of the points
-NEIGHBOURS = 16  # whose times say whether a point stands still (ours)
+NEIGHBORS = 16  # whose times say whether a point stands still (ours)
 STANDS = 0.18  # spread of those times above which it does (ours); below it moves as they do
 
 
@@ -50,7 +50,7 @@ def moving(
         spread, velocities = drift(parameters["means"].astype(np.float64), times)
         table[:, fields["velocity"]] = np.where(spread > STANDS, 0, velocities.T).T
         duration = np.log(np.where(spread > STANDS, durations[0], np.maximum(spread, durations[1])))
-    table[:, fields["time_centre"]] = times[:, None]
+    table[:, fields["time_center"]] = times[:, None]
     table[:, fields["log_duration"]] = duration[:, None]
     return {**parameters, MOTION: table}
 
@@ -64,7 +64,7 @@ def drift(
     What stands still is seen at the same place at all moments: 0.29, if they are evenly spread.  What moves is there
     for a while.
     """
-    nearest = scipy.spatial.cKDTree(positions).query(positions, k=min(NEIGHBOURS, len(positions)), workers=-1)[1]
+    nearest = scipy.spatial.cKDTree(positions).query(positions, k=min(NEIGHBORS, len(positions)), workers=-1)[1]
     nearest = nearest.reshape(len(positions), -1)
     apart = times[nearest] - times[nearest].mean(axis=1, keepdims=True)
     square = (apart**2).sum(axis=1)

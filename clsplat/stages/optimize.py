@@ -48,7 +48,7 @@ class Keeping(Training):
 
     keep: Literal["last", "best"] = "last"
     """Model that the training leaves: that of its last step, or the one with the best PSNR at the validation views, in
-    the photographs' colours where all measured views have that figure."""
+    the photographs' colors where all measured views have that figure."""
     patience: Annotated[int, Field(gt=0)] | None = None
     """Measurements of the validation views without a better one after which the training ends; without it, none."""
     refit: bool = False
@@ -182,10 +182,10 @@ class Keeping(Training):
 
 
 def compared(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
-    """Return the PSNR of averages of metrics, dB, None where there is none: in the photographs' colours where all have
+    """Return the PSNR of averages of metrics, dB, None where there is none: in the photographs' colors where all have
     it of all their views."""
-    whole = all(one.get("psnr_colour") is not None and "psnr_colour_reason" not in one for one in measured)
-    return [one.get("psnr_colour" if whole else "psnr") for one in measured]
+    whole = all(one.get("psnr_color") is not None and "psnr_color_reason" not in one for one in measured)
+    return [one.get("psnr_color" if whole else "psnr") for one in measured]
 
 
 def _validates(stage: Scheduled) -> bool:
@@ -242,7 +242,7 @@ class Optimize(Keeping):
     views: ViewSettings = ViewSettings()
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
-    """Losses and penalties; training minimises their sum."""
+    """Losses and penalties; training minimizes their sum."""
     modules: list[OneOf[TrainingModule]] = Field([])
     """What takes part in a step next to the Gaussians, in the order of the forward pass; each once.  `--set` addresses
     one by its type: `optimize.modules.TYPE.KEY=…`; `optimize.modules.TYPE={}` adds it at its place, `=null` removes

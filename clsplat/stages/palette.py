@@ -35,7 +35,7 @@ class PaletteSh(Scheduled):
     """Give each Gaussian one of the vectors of a palette of harmonics, as a SOG holds them.
 
     Errors count by how they show in the training views: by what a Gaussian contributes there, in the directions from
-    which it is seen, and without what the base colour takes up, which is changed by it.  Training that follows with a
+    which it is seen, and without what the base color takes up, which is changed by it.  Training that follows with a
     rate of 0 for `sh_rest` adapts the other tables to them, and the SOG then loses nothing of its harmonics.  Harmonics
     that are vectors of a palette already keep it, and are rounded to the numbers that a SOG has.
     """
@@ -184,7 +184,7 @@ class RoundTables(Stage):
     log_scales: Step | None = None
     """Step of the logarithms of standard deviations."""
     sh_base: Step | None = None
-    """Step of the coefficients of band 0; 1 changes a colour by 0.28."""
+    """Step of the coefficients of band 0; 1 changes a color by 0.28."""
 
     def run(self, run: Run) -> None:
         gaussians = run.model.gaussians

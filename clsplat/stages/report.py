@@ -28,14 +28,14 @@ from clsplat.training.modules.base import learned_scene, measured_as, unlisted
 from clsplat.training.records import VIEWS, over_views
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
-from clsplat.viewer.charts import COLOURS, Line, Marks, curve, plan
+from clsplat.viewer.charts import COLORS, Line, Marks, curve, plan
 
 # What would make a scene better, in sentences for the page of a run.
 
 MOST = 24  # training views that are measured, evenly spaced
 NAMED = 3  # photographs in a sentence
 APART = 5.0  # dB below the median of the views
-GAINED = 1.0  # dB by three numbers for the colours of each photograph
+GAINED = 1.0  # dB by three numbers for the colors of each photograph
 FEW = 24  # training photographs
 AIMED = 0.8  # mean cosine between a camera's axis and the direction of the middle: cameras that look at one place
 AROUND = 0.3  # of the distance to the middle, across the upward axis: cameras that stand around it
@@ -49,29 +49,29 @@ def advice(run: Run) -> list[str]:
     views = learned_scene(run).downscaled(run.downscale).split("train")
     chosen = some_of(views, MOST)
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
-    found = measure(run.painter(), chosen, run.photographs, colours=Gains(), counted=counted)
+    found = measure(run.painter(), chosen, run.photographs, colors=Gains(), counted=counted)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
     return [
-        *of_training_views(found, has_colours=measured_as(run) is not None),
+        *of_training_views(found, has_colors=measured_as(run) is not None),
         *of_test_views(test),
         *of_capture(views, run.original.views),
         *(sentence for kind in unlisted().values() for sentence in kind.advice(run)),
     ]
 
 
-def of_training_views(found: Sequence[ViewMetrics], has_colours: bool) -> Iterator[str]:
-    """What the figures of training views tell.  has_colours: whether photographs have colours of their own."""
+def of_training_views(found: Sequence[ViewMetrics], has_colors: bool) -> Iterator[str]:
+    """What the figures of training views tell.  has_colors: whether photographs have colors of their own."""
     if names := far_below({one.view: one.psnr for one in found}):
         yield (
             f"{_listed(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the others: look for blur, "
             "a wrong camera, or what has moved, and leave such photographs out, or mask what has moved"
         )
-    gains = [one.colours["psnr_colour"] - one.psnr for one in found if "psnr_colour" in one.colours]
+    gains = [one.colors["psnr_color"] - one.psnr for one in found if "psnr_color" in one.colors]
     gained = float(np.mean(gains)) if gains else 0.0
-    if not has_colours and gained >= GAINED:
+    if not has_colors and gained >= GAINED:
         yield (
-            f"exposures or colours differ: in their own colours photographs would be {gained:.1f} dB nearer; "
+            f"exposures or colors differ: in their own colors photographs would be {gained:.1f} dB nearer; "
             "try `--set optimize.modules.exposure={}`"
         )
 
@@ -105,9 +105,9 @@ def widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
     """
     if len(views) < 3:
         return None
-    centres = np.stack([view.position for view in views])
+    centers = np.stack([view.position for view in views])
     axes = np.stack([view.world_to_camera[2, :3] for view in views])
-    from_middle = centres - closest_point(centres, axes, centres.mean(axis=0))
+    from_middle = centers - closest_point(centers, axes, centers.mean(axis=0))
     distances = np.linalg.norm(from_middle, axis=1)
     angles, aside = _around(from_middle, upward(views))
     aimed = -(axes * from_middle).sum(axis=1) / np.maximum(distances, 1e-12)
@@ -156,8 +156,8 @@ def cameras(run: Run) -> list[Markup]:
         if views:
             directions = np.stack([view.world_to_camera[2, :3] for view in views])
             marks.append(Marks(split, flat(np.stack([view.position for view in views])), flat(directions)))
-    centres = np.concatenate([one.centres for one in marks])
-    middle, reach = centres.mean(axis=0), FAR * float(np.abs(centres - centres.mean(axis=0)).max())
+    centers = np.concatenate([one.centers for one in marks])
+    middle, reach = centers.mean(axis=0), FAR * float(np.abs(centers - centers.mean(axis=0)).max())
     means = run.model.gaussians.get("means") if run.gaussians else np.zeros((0, 3), np.float32)
     points = flat(means[:: max(1, len(means) // MOST_POINTS)].astype(np.float64))
     near = points[(np.abs(points - middle) < max(reach, 1e-9)).all(axis=1)]
@@ -184,7 +184,7 @@ def training_charts(run: Run) -> list[Markup]:
     running = DOTTED if any(line.name == NAMES["train"] for line in measured) else 0
     psnr = list(zip([r["step"] for r in train], over_views([r["psnr"] for r in train]), strict=True))
     line = {key: [(r["step"], r[key]) for r in train if key in r] for key in ("loss", "gaussians", "ms")}
-    seen = Line(psnr, f"training views, mean of the last {VIEWS}", COLOURS[0], running)
+    seen = Line(psnr, f"training views, mean of the last {VIEWS}", COLORS[0], running)
     return charts(
         [
             curve("PSNR, dB", [seen, *measured]),
@@ -205,8 +205,8 @@ def _measured(run: Run, trial: bool = False) -> list[Line]:
     for line in run.records.read("evaluate", trial):
         if line["downscale"] == run.downscale:
             points[line["split"]][line["step"]] = line["psnr"]
-    colours = dict(zip(NAMES, COLOURS, strict=False))
-    return [Line(sorted(one.items()), NAMES[split], colours[split]) for split, one in points.items() if one]
+    colors = dict(zip(NAMES, COLORS, strict=False))
+    return [Line(sorted(one.items()), NAMES[split], colors[split]) for split, one in points.items() if one]
 
 
 def gaussians_charts(run: Run) -> list[Markup]:
@@ -255,7 +255,7 @@ def _psnr_by_gaussians(run: Run) -> list[Line]:
     return [Line(list(points.values()))] if len(points) > 1 else []
 
 
-# Whether a model has learnt its photographs by heart, in words.
+# Whether a model has learned its photographs by heart, in words.
 
 REMEDY = (
     "More photographs, from places between these, help most; `scene.validation: auto` with `optimize.keep: best`, in a "
@@ -275,7 +275,7 @@ def overfitting_note(run: Run) -> str:
 
 
 def is_by_heart(run: Run) -> bool:
-    """Return whether the model of a run has learnt its photographs by heart, as far as that is known."""
+    """Return whether the model of a run has learned its photographs by heart, as far as that is known."""
     now = run.best.found if run.best else _psnr_elsewhere(run)[1]
     return now is not None and now.is_apart
 
@@ -379,8 +379,8 @@ def _figure(record: dict[str, Any], image: Image, photograph: Image) -> ViewFigu
 
 LOG = logging.getLogger("clsplat")
 MORE = {  # of clsplat/metrics/views.py: name and unit
-    "psnr_colour": ("PSNR in the photographs' colours", "dB"),
-    "psnr_affine": ("PSNR with colours fitted", "dB"),
+    "psnr_color": ("PSNR in the photographs' colors", "dB"),
+    "psnr_affine": ("PSNR with colors fitted", "dB"),
     "psnr_held_out_moments": ("PSNR at held-out moments", "dB"),
     "psnr_other_moments": ("PSNR at other moments", "dB"),
     "psnr_static": ("PSNR of static pixels", "dB"),

@@ -12,7 +12,7 @@ from clsplat.training.stage import ALL_HARMONICS, Scheduled, Stage
 
 
 class RaiseSh(Scheduled):
-    """Add one band of spherical harmonics to the colours."""
+    """Add one band of spherical harmonics to the colors."""
 
     stage: Literal["raise_sh"] = "raise_sh"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})

@@ -25,7 +25,7 @@ LOG = logging.getLogger("clsplat")
 
 
 class TrainField(Training):
-    """Train a field of densities and colours on random rays of the photographs (Mip-NeRF, Barron et al. 2021).
+    """Train a field of densities and colors on random rays of the photographs (Mip-NeRF, Barron et al. 2021).
 
     A step draws its rays from one photograph, or from several, as many from each.  Where photographs have several
     sizes, the loss is that of all their pixels, each counted as its area (section 4): so all sizes count alike.

@@ -156,7 +156,7 @@ class Video(Stage):
 
         canvas = Canvas(run.painter())
         with heard_by(run.status.count):
-            shoot(canvas, film, {"colour": path}, None, through)
+            shoot(canvas, film, {"color": path}, None, through)
         LOG.info("video of %d frames written to %s, %.2f MB", len(film.views), path, path.stat().st_size / 1e6)
 
 

@@ -12,7 +12,7 @@ from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel
 from clsplat.gaussians.model import WIDTHS
 
 FOLDER = "best/"  # before the names of its tables in a checkpoint
-APART = 6.0  # dB: a model that is so much better where it was trained has learnt its photographs by heart (ours)
+APART = 6.0  # dB: a model that is so much better where it was trained has learned its photographs by heart (ours)
 Tables = dict[str, NDArray[np.float32]]
 Count = Annotated[int, Field(ge=0)]
 
@@ -28,7 +28,7 @@ class Measured(BaseModel):
 
     @property
     def is_apart(self) -> bool:
-        """Whether the model has learnt its photographs by heart."""
+        """Whether the model has learned its photographs by heart."""
         return self.train - self.validation > APART
 
     def told(self, views: str) -> str:
@@ -39,7 +39,7 @@ class Measured(BaseModel):
     def heart(self, first: "Measured | None" = None) -> str:
         """Return how far apart they are, in words; "" where that is little.  first: the first model that had more."""
         since = f" since step {first.step:,}" if first and first.step < self.step else ""
-        return f", more than {APART:g} dB apart{since}: the photographs are learnt by heart" if self.is_apart else ""
+        return f", more than {APART:g} dB apart{since}: the photographs are learned by heart" if self.is_apart else ""
 
 
 class Best(BaseModel):
@@ -62,7 +62,7 @@ class Best(BaseModel):
     since: Count
     """Of them after the best."""
     apart: Measured | None
-    """The first that had learnt its photographs by heart."""
+    """The first that had learned its photographs by heart."""
     last: Measured
     """The last that was measured."""
     growth_ended: Count | None = None

@@ -29,7 +29,7 @@ class MotionRates(Settings):
 
     velocity: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
     """Of velocities, as shares of the scene's extent; they fall, as in FreeTimeGS."""
-    time_centre: Rate = 1.0e-3
+    time_center: Rate = 1.0e-3
     """Of the times at which Gaussians are most opaque."""
     log_duration: Rate = 1.0e-2
     """Of the logarithms of durations."""

@@ -108,9 +108,9 @@ class StepTrainer:
         now.image, now.gradient = now.frame.image, workspace.array("grad_image", now.frame.image.shape)
         for module in now.modules:
             module.after_render(now)
-        target, mask = now.planes.colours, now.planes.mask
+        target, mask = now.planes.colors, now.planes.mask
         now.comparison = comparison = Comparison(workspace, camera, now.image, target, now.gradient, mask, step)
-        if content != "colour":  # losses of colours overwrite three planes alone
+        if content != "color":  # losses of colors overwrite three planes alone
             now.gradient.fill(0)
             comparison.accumulate = True
         if mask is not None:  # pixels that do not count are black in both images and have no gradient
@@ -133,7 +133,7 @@ class StepTrainer:
         for module in reversed(now.modules):
             module.backward(now)
         self.rasterizer.device.timings.section = "statistics"
-        texture = known_gradient(workspace, now.camera, now.planes.colours, mask) if count > TEXTURE else None
+        texture = known_gradient(workspace, now.camera, now.planes.colors, mask) if count > TEXTURE else None
         now.pixel_sums = self.rasterizer.pixel_sums(now.model, now.frame, now.gradient, count, texture, now.behind)
         for module in reversed(now.modules):
             module.after_backward(now)

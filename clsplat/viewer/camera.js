@@ -50,10 +50,10 @@ function between(a, b, t) { // on the way from one camera to another
 }
 
 // A camera turned by an angle about an axis of the world through a point.
-function turned(camera, about, angle, centre) {
+function turned(camera, about, angle, center) {
   const c = Math.cos(angle), s = Math.sin(angle);
   const turn = v => add(add(scaled(v, c), cross(about, v), s), about, dot(about, v) * (1 - c));
-  return {...camera, eye: add(centre, turn(add(camera.eye, centre, -1))),
+  return {...camera, eye: add(center, turn(add(camera.eye, center, -1))),
     rotation: [0, 1, 2].flatMap(i => turn(axis(camera, i)))};
 }
 

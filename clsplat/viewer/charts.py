@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 WIDTH, HEIGHT = 460, 220  # px
 LEFT, BOTTOM, TOP, RIGHT = 56, 30, 26, 12
-COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5", "#b83280", "#0f8a9d", "#8a6d1b", "#4a5568")
+COLORS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5", "#b83280", "#0f8a9d", "#8a6d1b", "#4a5568")
 DASHES = (("", ""), ("7 4", "dashed"), ("2 3", "dotted"), ("9 3 2 3", "dash-dotted"))  # of a stroke, and in words
 MAX_MARKED_POINTS = 12  # of a line; a longer one shows no circles
 LEGEND_ROW, LEGEND_LETTERS = 14, 66  # px of a row; letters that fit in one, about
@@ -22,8 +22,8 @@ class Line:
 
     points: Sequence[tuple[float, float]]
     name: str = ""  # in the legend
-    colour: str = ""  # by default the next one
-    dash: int = 0  # place in DASHES, for lines of one colour
+    color: str = ""  # by default the next one
+    dash: int = 0  # place in DASHES, for lines of one color
 
 
 def curve(
@@ -65,13 +65,13 @@ def curve(
         x, _ = place(tick, y_low)
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{html.escape(label)}</text>')
     for i, line in enumerate(drawn):
-        colour, (dash, _) = _colour(line, i), _dash(line)
+        color, (dash, _) = _color(line, i), _dash(line)
         dashed = f' stroke-dasharray="{dash}"' if dash else ""
         places = [place(*point) for point in line.points]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-        parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"{dashed}/>')
+        parts.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.8"{dashed}/>')
         if len(places) <= MAX_MARKED_POINTS:
-            parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{colour}"/>' for x, y in places]
+            parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{color}"/>' for x, y in places]
     return "".join([*parts, "</svg>"])
 
 
@@ -92,7 +92,7 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
         if count:
             tall = count / max(counts) * height
             place = f'x="{LEFT + i * width / bins + 1:.1f}" y="{HEIGHT - BOTTOM - tall:.1f}"'
-            parts.append(f'<rect {place} width="{width / bins - 2:.1f}" height="{tall:.1f}" fill="{COLOURS[0]}"/>')
+            parts.append(f'<rect {place} width="{width / bins - 2:.1f}" height="{tall:.1f}" fill="{COLORS[0]}"/>')
     columns = _ticks(0, high)
     for tick, label in zip(columns, _numbers(columns), strict=True):
         x = LEFT + tick / high * width
@@ -118,8 +118,8 @@ def _drawn(line: Line, logarithmic: bool) -> Line:
     return replace(line, points=[(x, math.log10(y)) for x, y in points if y > 0] if logarithmic else points)
 
 
-def _colour(line: Line, index: int) -> str:
-    return line.colour or COLOURS[index % len(COLOURS)]
+def _color(line: Line, index: int) -> str:
+    return line.color or COLORS[index % len(COLORS)]
 
 
 def _dash(line: Line) -> tuple[str, str]:
@@ -127,7 +127,7 @@ def _dash(line: Line) -> tuple[str, str]:
 
 
 def _legend(lines: Sequence[Line]) -> list[str]:
-    """Rows of names in their lines' colours; none for a single line."""
+    """Rows of names in their lines' colors; none for a single line."""
     rows: list[str] = []
     room = 0
     for i, line in enumerate(lines if len(lines) > 1 else []):
@@ -138,7 +138,7 @@ def _legend(lines: Sequence[Line]) -> list[str]:
             rows.append("")
             room = LEGEND_LETTERS
         gap = ' dx="12"' if rows[-1] else ""
-        rows[-1] += f'<tspan{gap} style="fill:{_colour(line, i)}">{html.escape(name)}</tspan>'
+        rows[-1] += f'<tspan{gap} style="fill:{_color(line, i)}">{html.escape(name)}</tspan>'
         room -= len(name) + 2
     return rows
 
@@ -189,13 +189,13 @@ class Marks:
     """Cameras of one kind."""
 
     name: str
-    centres: NDArray[np.float64]  # [M, 2], scene units
+    centers: NDArray[np.float64]  # [M, 2], scene units
     directions: NDArray[np.float64]  # [M, 2]
 
 
 def plan(title: str, marks: Sequence[Marks], points: NDArray[np.float64]) -> str:
     """Draw points [N, 2], and each camera as a triangle that opens where it looks.  Both axes have one scale."""
-    everything = np.concatenate([points, *(one.centres for one in marks)])
+    everything = np.concatenate([points, *(one.centers for one in marks)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     room = np.array([PLAN_WIDTH - 2 * MARGIN, PLAN_HEIGHT - TITLE - 2 * MARGIN])
     scale = float((room / np.maximum(high - low, 1e-12)).min())
@@ -209,12 +209,12 @@ def plan(title: str, marks: Sequence[Marks], points: NDArray[np.float64]) -> str
     dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in placed(points))
     parts.append(f'<path d="{dots}" class="dots"/>')
     for i, one in enumerate(marks):
-        colour = COLOURS[i % len(COLOURS)]
-        shapes = "".join(map(_triangle, placed(one.centres), one.directions))
-        parts.append(f'<path d="{shapes}" fill="{colour}" fill-opacity=".75" stroke="{colour}"/>')
-        name = f"{len(one.centres)} {one.name}"
+        color = COLORS[i % len(COLORS)]
+        shapes = "".join(map(_triangle, placed(one.centers), one.directions))
+        parts.append(f'<path d="{shapes}" fill="{color}" fill-opacity=".75" stroke="{color}"/>')
+        name = f"{len(one.centers)} {one.name}"
         parts.append(
-            f'<text x="{PLAN_WIDTH - MARGIN}" y="{18 + 14 * i}" text-anchor="end" style="fill:{colour}">'
+            f'<text x="{PLAN_WIDTH - MARGIN}" y="{18 + 14 * i}" text-anchor="end" style="fill:{color}">'
             f"{html.escape(name)}</text>"
         )
     return "".join([*parts, "</svg>"])

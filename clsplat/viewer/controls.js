@@ -46,10 +46,10 @@ class Controls {
   }
 
   // Tilt about the axis to the right, but not over the zenith.
-  tilt(camera, angle, centre) {
-    const after = turned(camera, axis(camera, 0), angle, centre);
-    const towards = Math.abs(dot(axis(after, 2), this.viewer.up));
-    return towards > Math.cos(LEAST_TILT) && towards > Math.abs(dot(axis(camera, 2), this.viewer.up)) ? camera : after;
+  tilt(camera, angle, center) {
+    const after = turned(camera, axis(camera, 0), angle, center);
+    const toward = Math.abs(dot(axis(after, 2), this.viewer.up));
+    return toward > Math.cos(LEAST_TILT) && toward > Math.abs(dot(axis(camera, 2), this.viewer.up)) ? camera : after;
   }
 
   orbit([x, y]) {

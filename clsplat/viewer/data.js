@@ -22,8 +22,8 @@ async function inflated(text) {
   return (await Promise.all([new Response(stream.readable).arrayBuffer(), written]))[0];
 }
 
-// texels of 16 bytes that hold the colours of a splat: 3 (degree + 1)² codes
-const colourTexels = degree => Math.ceil(3 * (degree + 1) ** 2 / 16);
+// texels of 16 bytes that hold the colors of a splat: 3 (degree + 1)² codes
+const colorTexels = degree => Math.ceil(3 * (degree + 1) ** 2 / 16);
 const splatsInRow = texels => Math.floor(ROW / texels);
 const rowsOf = (count, texels) => Math.max(1, Math.ceil(count / splatsInRow(texels)));
 
@@ -32,7 +32,7 @@ const padded = (kind, count, texels, each) => new kind(rowsOf(count, texels) * s
 
 // header, buffer: of packing.py; most: rows that a texture may have.  Splats beyond are left out: the least important.
 function unpacked(header, buffer, most) {
-  const whole = header.count, texels = colourTexels(header.degree);
+  const whole = header.count, texels = colorTexels(header.degree);
   const count = Math.min(whole, most * splatsInRow(texels), most * ROW);
   let place = 0;
   const take = (kind, length) => {
@@ -60,9 +60,9 @@ function unpacked(header, buffer, most) {
   }
   const sizes = interleaved(shapes, whole, count, 4, padded(Uint8Array, count, 1, 4), 4);
   const each = 16 * texels, motion = header.motion && moved(header.motion.columns, buffer, place, whole, count);
-  const colours = interleaved(codes, whole, count, codes.length / whole, padded(Uint8Array, count, texels, 16), each);
+  const colors = interleaved(codes, whole, count, codes.length / whole, padded(Uint8Array, count, texels, 16), each);
   return {count, whole, texels, tables, positions, motion, places, sizes: new Uint32Array(sizes.buffer),
-    colours: new Uint32Array(colours.buffer)};
+    colors: new Uint32Array(colors.buffer)};
 }
 
 // Planes [columns, whole] of half floats as rows of texels: {rows, wide: texels of a row}.

@@ -54,7 +54,7 @@ class Painter {
 
   // The programs of models that stand still, or of those that move.
   of(motion) {
-    return this.programs[motion] ??= {colours: program(this.gl, COVER, colours(motion)),
+    return this.programs[motion] ??= {colors: program(this.gl, COVER, colors(motion)),
       splats: program(this.gl, splatVertex(motion), SPLAT_FRAGMENT)};
   }
 
@@ -81,7 +81,7 @@ class Painter {
     layer.tables = texture(gl, gl.R32F, 256, 4, gl.RED, gl.FLOAT, data.tables);
     layer.places = texture(gl, gl.RGBA32UI, ROW, rows, words, gl.UNSIGNED_INT, data.places);
     layer.sizes = texture(gl, gl.R32UI, ROW, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, data.sizes);
-    layer.codes = texture(gl, gl.RGBA32UI, wide, high, words, gl.UNSIGNED_INT, data.colours);
+    layer.codes = texture(gl, gl.RGBA32UI, wide, high, words, gl.UNSIGNED_INT, data.colors);
     layer.shown = this.surface(ROW, rows, gl.NEAREST);
     layer.ids = gl.createBuffer();
     layer.array = gl.createVertexArray();
@@ -124,9 +124,9 @@ class Painter {
     this.gl.uniform1f(used.at("moment"), moment);
   }
 
-  // Compute the colours of the first splats, unless it was done for this place of the camera and this moment.
+  // Compute the colors of the first splats, unless it was done for this place of the camera and this moment.
   shade(layer, eye, first, moment) {
-    const key = [...eye, first, layer.motions ? moment : 0].join(), gl = this.gl, used = layer.colours;
+    const key = [...eye, first, layer.motions ? moment : 0].join(), gl = this.gl, used = layer.colors;
     if (key === layer.key) return;
     layer.key = key;
     this.bind(used, {tables: layer.tables, places: layer.places, codes: layer.codes, ...moving(layer)});
@@ -151,7 +151,7 @@ class Painter {
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    const shapes = {tables: layer.tables, places: layer.places, sizes: layer.sizes, colours: layer.shown.texture};
+    const shapes = {tables: layer.tables, places: layer.places, sizes: layer.sizes, colors: layer.shown.texture};
     this.bind(used, {...shapes, ...moving(layer)});
     this.move(used, layer, moment);
     gl.uniformMatrix3fv(used.at("rotation"), true, frame.rotation);

@@ -1,6 +1,6 @@
 // The cameras of the views as small pyramids over the picture.
 
-const DEPTH = 0.07, COLOUR = {train: "#63b3ed", test: "#f6ad55"}; // of a pyramid, in radii of the scene
+const DEPTH = 0.07, COLOR = {train: "#63b3ed", test: "#f6ad55"}; // of a pyramid, in radii of the scene
 
 class Frustums {
   constructor(viewer, views) {
@@ -11,7 +11,7 @@ class Frustums {
         const ray = [(x - cx) / fx, (y - cy) / fy, 1];
         return eye.map((v, i) => v + far * (ray[0] * rotation[i] + ray[1] * rotation[3 + i] + rotation[6 + i]));
       });
-      return {points: [eye, ...corners], colour: COLOUR[view.split]};
+      return {points: [eye, ...corners], color: COLOR[view.split]};
     });
     if (!views.length) find("cameras").previousElementSibling.hidden = find("cameras").hidden = true;
   }
@@ -25,8 +25,8 @@ class Frustums {
     for (const [left, top] of corners) {
       pen.setTransform(ratio, 0, 0, ratio, left * ratio, top * ratio);
       pen.lineWidth = 1.3;
-      for (const {points, colour} of this.shapes) {
-        pen.strokeStyle = colour;
+      for (const {points, color} of this.shapes) {
+        pen.strokeStyle = color;
         this.pyramid(pen, points.map(point => projected(frame, point)));
       }
     }

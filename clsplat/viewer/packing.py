@@ -1,11 +1,11 @@
 """A model as bytes that a page decodes: a header, and planes of one component of all splats each.
 
-    tables    [4, 256] float32: scale, opacity, colour of band 0, colour of the other bands; bytes below are indices
+    tables    [4, 256] float32: scale, opacity, color of band 0, color of the other bands; bytes below are indices
     blocks    [B, 6] float32: least t of x, y, z, then step, of BLOCK splats that follow each other
     positions [6, N] uint8: low bytes of x, y, z, then high bytes; t = least + step · (low + 256 high), and a position
               is origin + unit · sign(t) (e^|t| - 1): as fine as cameras in the middle see it, near and far
     quats     [N] uint32: index of the largest component in bits 31-30, the others, from x on, 10 bits each
-    scales    [3, N], opacity [1, N], colours [3 K, N] uint8: indices; colours by coefficient, then channel
+    scales    [3, N], opacity [1, N], colors [3 K, N] uint8: indices; colors by coefficient, then channel
     motion    [columns, N] float16, where the model moves: those of clsplat/formats/splats.py, the turn as change of
               the unit quaternion above, x, y, z, w
 
@@ -32,7 +32,7 @@ MIN_NORM2 = 1e-12  # shorter quaternions have no direction (QUAT_NORM2_MIN)
 FLATTEST = 9.0  # log of the largest by the smallest scale: thinner ones look the same under the screen filter
 STEPS = 2**14 - 1  # of a block's extent
 RANK_SHARE = 0.25  # of a table's spacing; the rest is by value
-KNEE = 0.5  # of colours of bands above 0: below it the table is even, above it logarithmic
+KNEE = 0.5  # of colors of bands above 0: below it the table is even, above it logarithmic
 LEAST_RANGE = 3.0  # of that table: finer steps than of 0.01 cost bytes and show nothing
 BITS = 10  # of a component of a quaternion
 MAX_HALF = 65504.0  # of half floats

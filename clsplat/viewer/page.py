@@ -55,7 +55,7 @@ MOMENTS = 31  # from the first to the last, where the page has no views of sever
 MAX_SIZE = 200.0  # MB: browsers need several times as much memory
 MARGIN = 0.97  # of that size, for splats that pack worse than the average
 MARK = b'<canvas id="frustums"'  # of viewer.html.j2
-COLOURS = {"black": [0, 0, 0], "white": [1, 1, 1]}
+COLORS = {"black": [0, 0, 0], "white": [1, 1, 1]}
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Page:
             "models": [{"name": name, **packed.header} for name, packed in self.models.items()],
             "views": self.views,
             "first": first,
-            "background": COLOURS[self.background],
+            "background": COLORS[self.background],
             "file": re.sub(r"[^\w.-]+", "_", self.title),
             **({"moments": self._moments} if self.moves else {}),
         }

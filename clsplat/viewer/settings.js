@@ -21,7 +21,7 @@ class Settings extends Panel {
   }
 
   background(name) {
-    this.viewer.background = {black: [0, 0, 0], white: [1, 1, 1], grey: [0.22, 0.23, 0.26]}[name];
+    this.viewer.background = {black: [0, 0, 0], white: [1, 1, 1], gray: [0.22, 0.23, 0.26]}[name];
     press("backgrounds", "background", name);
     this.viewer.change();
   }

@@ -3,7 +3,7 @@
 const HEAD = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
 #define SHELL 1.2             // radius of an ellipsoid in standard deviations
-uniform sampler2D tables;  // [4, 256]: scale, opacity, colour of band 0, colour of the other bands
+uniform sampler2D tables;  // [4, 256]: scale, opacity, color of band 0, color of the other bands
 uniform usampler2D places; // position and quaternion of a splat
 float entry(int table, uint code) { return texelFetch(tables, ivec2(int(code), table), 0).x; }
 ivec2 spot(int i) { return ivec2(i & 4095, i >> 12); }`;
@@ -40,12 +40,12 @@ vec4 turned(int i, vec4 q) {
 const COVER = `#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }`;
 
-// Colours of all splats for one place of the camera: max(0, 1/2 + sum_k basis_k(d) sh_k), one texel each.
-const colours = motion => HEAD + motion + `
+// Colors of all splats for one place of the camera: max(0, 1/2 + sum_k basis_k(d) sh_k), one texel each.
+const colors = motion => HEAD + motion + `
 uniform usampler2D codes;
 uniform vec3 eye;
 uniform int degree, texels, count;
-out vec4 colour;
+out vec4 color;
 uint code(uvec4 a[3], int b) { return (a[b >> 4][(b >> 2) & 3] >> uint(8 * (b & 3))) & 255u; }
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
@@ -69,16 +69,16 @@ void main() {
     sum += basis[k] * vec3(entry(table, code(a, 3 * k)), entry(table, code(a, 3 * k + 1)),
                            entry(table, code(a, 3 * k + 2)));
   }
-  colour = vec4(max(sum, 0.), 1);
+  color = vec4(max(sum, 0.), 1);
 }`;
 
 const splatVertex = motion => HEAD + motion + `
 uniform usampler2D sizes;
-uniform sampler2D colours;
+uniform sampler2D colors;
 uniform mat3 rotation;       // world to camera
 uniform vec3 translation;
 uniform vec4 intrinsics;     // fx, fy, cx, cy of the target, px
-uniform vec4 limits;         // of x/z and y/z in the linearised projection: least x, most x, least y, most y
+uniform vec4 limits;         // of x/z and y/z in the linearized projection: least x, most x, least y, most y
 uniform vec2 size;           // of the target, px
 uniform vec3 filters;        // near plane, screen variance in px^2, compensate
 uniform int mode;            // 0 splats, 1 points, 2 ellipsoids, 3 opacity
@@ -136,7 +136,7 @@ void main() {
   if (mode == 2 && (opacity < .2 || reach * radii.x > .3 * max(size.x, size.y))) return;  // what would hide the rest
   vec2 at = intrinsics.xy * m.xy / m.z + intrinsics.zw + offset;
   gl_Position = vec4(at.x / size.x * 2. - 1., 1. - at.y / size.y * 2., 0, 1);
-  shade = vec4(mode == 3 ? ramp(opacity) : texelFetch(colours, spot(i), 0).rgb, opacity);
+  shade = vec4(mode == 3 ? ramp(opacity) : texelFetch(colors, spot(i), 0).rgb, opacity);
 }`;
 
 const SPLAT_FRAGMENT = `#version 300 es

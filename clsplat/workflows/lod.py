@@ -58,7 +58,7 @@ class LodPlan:
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """One level; PSNR in dB, before it is quantised, where there are photographs."""
+    """One level; PSNR in dB, before it is quantized, where there are photographs."""
 
     model: Model
     merged_psnr: float | None = None  # before it was trained
@@ -101,14 +101,14 @@ class LevelTrainer:
         return DetailLevel(found, merged.psnr, self.measured(found).psnr)
 
 
-NEIGHBOURS = 8  # of a Gaussian, among which its partner is
+NEIGHBORS = 8  # of a Gaussian, among which its partner is
 BLOCK = 1 << 16  # pairs whose costs are computed together
 LOG_SCALES, LOGIT = (-17.0, 60.0), 80.0  # beyond which numbers that follow from them leave float64
 Tables = dict[str, Floats]
 
 
 def decimated(model: Model, keep: float = 0.5) -> Model:
-    """Return a model with a share of the Gaussians, one at least, of which neighbours are merged.
+    """Return a model with a share of the Gaussians, one at least, of which neighbors are merged.
 
     A world filter is baked.  Raises ConfigError for what is no share, DataError for values that are not finite.
     """
@@ -130,7 +130,7 @@ def decimated(model: Model, keep: float = 0.5) -> Model:
 
 def matched(tables: Tables) -> tuple[Rows, Rows]:
     """Return pairs of rows, the cheapest first, of which none shares a row: one at least, where there are two rows."""
-    one, two = _neighbours(tables["means"])
+    one, two = _neighbors(tables["means"])
     cost = pair_cost(tables, one, two)
     order = np.lexsort((two, one, np.where(np.isfinite(cost), cost, np.inf)))
     free = bytearray(b"\1") * len(tables["means"])
@@ -161,13 +161,13 @@ def _block_cost(tables: Tables, mass: Floats, size: Floats, first: Rows, second:
     return cost
 
 
-def _neighbours(means: Floats) -> tuple[Rows, Rows]:
-    """Pairs of a row and one of its nearest neighbours, the lower row first, each once and in ascending order.
+def _neighbors(means: Floats) -> tuple[Rows, Rows]:
+    """Pairs of a row and one of its nearest neighbors, the lower row first, each once and in ascending order.
 
-    Of rows in one place, each has the next one, and the first one has neighbours in other places.
+    Of rows in one place, each has the next one, and the first one has neighbors in other places.
     """
     places, first, place = np.unique(means, axis=0, return_index=True, return_inverse=True)
-    found = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))[1].reshape(len(places), -1)
+    found = cKDTree(places).query(places, k=min(NEIGHBORS + 1, len(places)))[1].reshape(len(places), -1)
     one, two = first[np.repeat(np.arange(len(places)), found.shape[1])], first[found.ravel()]
     by_place = np.argsort(place.ravel(), kind="stable")
     same = np.diff(place.ravel()[by_place]) == 0

@@ -260,8 +260,8 @@ def test_a_camera_with_part_of_a_pixel_is_refused(changes, device, rng):
 
 @on_one_setting
 @pytest.mark.parametrize("background", [np.nan, 5, -1, "white", [0, 0.5, 2]])
-def test_a_background_that_is_no_colour_is_refused(background, device, rng):
+def test_a_background_that_is_no_color_is_refused(background, device, rng):
     view = clsplat.View("front", CAMERA, np.eye(3, 4))
-    for paint in (Renderer(model_of(random_case(rng, 5)), device).render, lambda view, colour: view.photograph(colour)):
+    for paint in (Renderer(model_of(random_case(rng, 5)), device).render, lambda view, color: view.photograph(color)):
         with pytest.raises(ValueError, match=r"^the background is .*; expected one number or three in \[0, 1\]$"):
             paint(view, background)

@@ -257,5 +257,5 @@ def test_the_background_is_that_of_the_model(device, rng):
     case = random_case(rng, 3, *SIZE)
     model = model_of(case)
     white = replace(model, rendering=replace(model.rendering, background="white"))
-    images = [Renderer(one, device).render(case.view, colour).image for one, colour in ((white, None), (model, 1.0))]
+    images = [Renderer(one, device).render(case.view, color).image for one, color in ((white, None), (model, 1.0))]
     np.testing.assert_array_equal(*images)

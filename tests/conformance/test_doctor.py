@@ -26,7 +26,7 @@ from tests.support.doctor_worker import worker
 from tests.support.html_page import Page
 
 WRONG = Figure("blend_backward", "gradients of conics, 17 Gaussians", 3e-2, 2e-4)
-RIGHT = Figure("blend_backward", "gradients of colours", 1e-6, 2e-4)
+RIGHT = Figure("blend_backward", "gradients of colors", 1e-6, 2e-4)
 
 
 def checks(*names: str) -> list[Check]:
@@ -218,7 +218,7 @@ def test_the_page_shows_every_figure_and_the_head_of_a_build_log(info):
     for text in (
         info.platform,
         "gradients of conics, 17 Gaussians",
-        "gradients of colours",
+        "gradients of colors",
         "error: &lt;unknown&gt;",
         "<i>worst</i>: the largest error",
     ):

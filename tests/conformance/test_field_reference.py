@@ -24,8 +24,8 @@ def test_ray_meets_pixel_center_and_cone_has_its_width(rng):
     camera = PinholeCamera(np.eye(3, 4), 20.0, 24.0, 8.0, 6.0, 16, 12)
     (ray,) = nerf.cones(camera, np.array([3 * 16 + 5]))
     np.testing.assert_allclose(ray[3:6], [(5.5 - 8) / 20, (3.5 - 6) / 24, 1])
-    neighbour = nerf.cones(camera, np.array([3 * 16 + 6]))[0]
-    assert ray[6] == pytest.approx(np.linalg.norm(neighbour[3:6] - ray[3:6]) * 2 / np.sqrt(12))
+    neighbor = nerf.cones(camera, np.array([3 * 16 + 6]))[0]
+    assert ray[6] == pytest.approx(np.linalg.norm(neighbor[3:6] - ray[3:6]) * 2 / np.sqrt(12))
     assert ray[7] == pytest.approx(np.linalg.norm(ray[3:6]))
 
 
@@ -64,7 +64,7 @@ def test_fine_edges_are_where_the_weights_are():
     weights[5] = 1.0
     fine = nerf.fine_edges(edges, weights, 100)
     assert (np.diff(fine) >= 0).all()
-    inside = (fine >= edges[4]) & (fine <= edges[7])  # the interval and its neighbours: weights are blurred
+    inside = (fine >= edges[4]) & (fine <= edges[7])  # the interval and its neighbors: weights are blurred
     assert inside.mean() > 0.95
 
 
@@ -93,15 +93,15 @@ def test_the_gradient_of_a_field_is_that_of_finite_differences(rng, skip):
     wanted = rng.random((rays, 3))
 
     def composite() -> tuple[nerf.Composite, nerf.Inputs]:
-        colours, densities, inputs = network.forward(weights, positions, directions)
-        shaped = colours.reshape(rays, SAMPLES, 3), densities.reshape(rays, SAMPLES)
+        colors, densities, inputs = network.forward(weights, positions, directions)
+        shaped = colors.reshape(rays, SAMPLES, 3), densities.reshape(rays, SAMPLES)
         return nerf.Composite(*shaped, lengths, background), inputs
 
     def loss() -> float:
-        return float(((composite()[0].colours() - wanted) ** 2).sum())
+        return float(((composite()[0].colors() - wanted) ** 2).sum())
 
     found, inputs = composite()
-    by_raw, by_densities = found.backward(2 * (found.colours() - wanted))
+    by_raw, by_densities = found.backward(2 * (found.colors() - wanted))
     gradient, _ = network.backward(weights, inputs, by_raw.reshape(-1, 3), by_densities.reshape(-1, 1))
     for own, expected in zip(weights, gradient, strict=True):
         for values, derivative in zip(own, expected, strict=True):

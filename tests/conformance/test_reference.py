@@ -25,25 +25,25 @@ def simple_camera(width: int = WIDTH, height: int = HEIGHT, focal: float = 40.0)
     return ref.PinholeCamera(np.eye(3, 4), focal, focal, width / 2, height / 2, width, height)
 
 
-def isotropic(mean: list[float], scale: float, opacity: float, colour: list[float]) -> ref.RawGaussians:
-    """One round Gaussian of constant colour."""
+def isotropic(mean: list[float], scale: float, opacity: float, color: list[float]) -> ref.RawGaussians:
+    """One round Gaussian of constant color."""
     return ref.RawGaussians(
         means=[mean],
         quats=[[1, 0, 0, 0]],
         log_scales=[[np.log(scale)] * 3],
         logit_opacity=[np.log(opacity / (1 - opacity))],
-        sh=[[(np.array(colour) - 0.5) / 0.28209479177387814]],
+        sh=[[(np.array(color) - 0.5) / 0.28209479177387814]],
     )
 
 
-def flat_splats(depth: list[float], opacity: list[float], colour: list[list[float]]) -> ref.Splats:
+def flat_splats(depth: list[float], opacity: list[float], color: list[list[float]]) -> ref.Splats:
     """Splats so wide that alpha is the opacity everywhere."""
     count = len(depth)
     return ref.Splats(
         mean2d=np.zeros((count, 2)),
         conic=np.zeros((count, 3)),
         opacity=np.array(opacity),
-        colour=np.array(colour, np.float64),
+        color=np.array(color, np.float64),
         depth=np.array(depth, np.float64),
         radius=np.ones(count),
         visible=np.ones(count, bool),
@@ -157,12 +157,12 @@ def test_chain_clamped_ray(rng, side):
     check_chain(rng, gaussians, camera, 1)
 
 
-def test_chain_clamped_colour(rng):
+def test_chain_clamped_color(rng):
     """A channel below zero is black and has no gradient; the others keep theirs."""
     camera = general_camera()
     gaussians = random_gaussians(rng, camera, 1, FEW)
     gaussians.sh[1, 0, 2] = -6
-    assert ref.project(gaussians, camera, 1).colour[1, 2] == 0
+    assert ref.project(gaussians, camera, 1).color[1, 2] == 0
     grad = check_chain(rng, gaussians, camera, 1)
     assert np.all(grad["sh"][1, :4, 2] == 0)
     assert np.all(grad["sh"][1, :4, :2] != 0)
@@ -277,19 +277,19 @@ def test_harmonics_gradient(rng):
 def test_single_isotropic_gaussian():
     """On the axis the footprint is a disc of variance (f s / z)² + 0.3."""
     scale, depth, opacity, focal = 0.2, 2.5, 0.8, 40.0
-    colour = np.array([0.9, 0.3, 0.1])
+    color = np.array([0.9, 0.3, 0.1])
     camera = simple_camera(focal=focal)
-    gaussians = isotropic([0, 0, depth], scale, opacity, colour)
+    gaussians = isotropic([0, 0, depth], scale, opacity, color)
     frame = ref.render(gaussians, camera, BACKGROUND, 0, thresholds=ref.SMOOTH)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     alpha = opacity * np.exp(-0.5 * (x**2 + y**2) / ((focal * scale / depth) ** 2 + 0.3))
-    expected = colour[:, None, None] * alpha + BACKGROUND[:, None, None] * (1 - alpha)
+    expected = color[:, None, None] * alpha + BACKGROUND[:, None, None] * (1 - alpha)
     np.testing.assert_allclose(frame.image, expected, rtol=1e-13)
     np.testing.assert_allclose(frame.transmittance, 1 - alpha, rtol=1e-13)
     assert np.all(frame.blended == 1)
 
 
-def test_pixel_centres_and_axes():
+def test_pixel_centers_and_axes():
     """x/z = 0.1 and y/z = -0.2 at f = 40 lie 4 px right of and 8 px above the principal point."""
     splats = ref.project(isotropic([0.3, -0.6, 3], 0.1, 0.5, [1, 1, 1]), simple_camera(), 0)
     np.testing.assert_allclose(splats.mean2d, [[24, 7]], rtol=1e-14)
@@ -324,12 +324,12 @@ def test_limits_of_the_ray():
     camera = ref.PinholeCamera(np.eye(3, 4), fx=40, fy=60, cx=10, cy=20, width=40, height=30)
     expected = [[-(10 / 40 + 0.15), 30 / 40 + 0.15], [-(20 / 60 + 0.075), 10 / 60 + 0.075]]
     np.testing.assert_allclose(ref.ray_limits(camera), expected, rtol=1e-14)
-    half = 1.3 * np.array([0.5, 0.375])  # the 1.3 tan of the centred camera
+    half = 1.3 * np.array([0.5, 0.375])  # the 1.3 tan of the centered camera
     np.testing.assert_allclose(ref.ray_limits(simple_camera()), np.stack([-half, half], axis=1), rtol=1e-14)
     np.testing.assert_allclose(ref.clamped_ray(simple_camera(), np.array([9.0, -0.5, 2.0])), [1.3, -0.5])
 
 
-def test_colour_from_the_world_direction():
+def test_color_from_the_world_direction():
     """Camera at (1, 2, 3) looking along world +x; the Gaussian is in front of it, so d = (1, 0, 0)."""
     rotation = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     position = np.array([1.0, 2.0, 3.0])
@@ -340,8 +340,8 @@ def test_colour_from_the_world_direction():
     splats = ref.project(gaussians, camera, 1)
     np.testing.assert_allclose(splats.mean2d, [[20, 15]])
     expected = 0.5 - 0.4886025119029199 * np.array([0.1, 0.2, -3])
-    np.testing.assert_allclose(splats.colour[0], expected)
-    np.testing.assert_allclose(ref.project(gaussians, camera, 0).colour[0], 0.5)
+    np.testing.assert_allclose(splats.color[0], expected)
+    np.testing.assert_allclose(ref.project(gaussians, camera, 0).color[0], 0.5)
 
 
 def test_covariance_of_a_rotated_gaussian():
@@ -351,7 +351,7 @@ def test_covariance_of_a_rotated_gaussian():
     gaussians.quats = np.array([[3.0, 0.0, 0.0, 3.0]])
     splats = ref.project(gaussians, simple_camera(), 0, variance=0.3)
     np.testing.assert_allclose(splats.conic, [[1 / (64 + 0.3), 0, 1 / (4 + 0.3)]], atol=1e-15)
-    gaussians.quats = np.array([[np.cos(0.3), 0.0, 0.0, np.sin(0.3)]])  # by 0.6, x towards y
+    gaussians.quats = np.array([[np.cos(0.3), 0.0, 0.0, np.sin(0.3)]])  # by 0.6, x toward y
     rotation = np.array([[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]])
     inverse = np.linalg.inv(rotation @ np.diag([4.0, 64.0]) @ rotation.T + 0.3 * np.eye(2))
     splats = ref.project(gaussians, simple_camera(), 0, variance=0.3)
@@ -376,7 +376,7 @@ def test_filters_in_closed_form():
 
 def test_two_splats_by_hand():
     """Front 0.5 red, behind it 0.4 green, background blue: 0.5 + 0.2 + 0.3."""
-    splats = flat_splats(depth=[2, 1], opacity=[0.4, 0.5], colour=[[0, 1, 0], [1, 0, 0]])
+    splats = flat_splats(depth=[2, 1], opacity=[0.4, 0.5], color=[[0, 1, 0], [1, 0, 0]])
     image, transmittance, count = ref.blend(splats, 1, 1, np.array([0, 0, 1]))
     np.testing.assert_allclose(image[:, 0, 0], [0.5, 0.2, 0.3])
     np.testing.assert_allclose(transmittance, 0.3)
@@ -384,7 +384,7 @@ def test_two_splats_by_hand():
 
 
 def test_equal_depths_keep_the_order_of_indices():
-    splats = flat_splats(depth=[1, 1, 1], opacity=[0.5, 0.5, 0.5], colour=np.eye(3))
+    splats = flat_splats(depth=[1, 1, 1], opacity=[0.5, 0.5, 0.5], color=np.eye(3))
     image, _, _ = ref.blend(splats, 1, 1, np.zeros(3))
     np.testing.assert_allclose(image[:, 0, 0], [0.5, 0.25, 0.125])
 
@@ -404,19 +404,19 @@ def test_order_of_gaussians_does_not_matter(rng):
 
 
 def test_alpha_is_capped():
-    splats = flat_splats(depth=[1], opacity=[0.999], colour=[[1, 1, 1]])
+    splats = flat_splats(depth=[1], opacity=[0.999], color=[[1, 1, 1]])
     image, transmittance, _ = ref.blend(splats, 1, 1, np.zeros(3))
     np.testing.assert_allclose(image, 0.99)
     np.testing.assert_allclose(transmittance, 0.01)
     grad = ref.blend_backward(splats, 1, 1, np.zeros(3), np.ones((3, 1, 1)))
     assert grad.opacity[0] == 0
-    np.testing.assert_allclose(grad.colour, 0.99)
+    np.testing.assert_allclose(grad.color, 0.99)
 
 
 def test_faint_alpha_is_skipped():
     """alpha < 1/255 is skipped, alpha = 1/255 is not."""
     limit = 1 / 255
-    splats = flat_splats(depth=[1, 2], opacity=[np.nextafter(limit, 0), limit], colour=[[1, 0, 0], [0, 1, 0]])
+    splats = flat_splats(depth=[1, 2], opacity=[np.nextafter(limit, 0), limit], color=[[1, 0, 0], [0, 1, 0]])
     image, _, count = ref.blend(splats, 1, 1, np.zeros(3))
     np.testing.assert_allclose(image[:, 0, 0], [0, limit, 0])
     assert count[0, 0] == 1
@@ -424,7 +424,7 @@ def test_faint_alpha_is_skipped():
 
 def test_negative_sigma_is_skipped():
     """No projection makes such a conic, but rounding does."""
-    splats = flat_splats(depth=[1], opacity=[0.5], colour=[[1, 1, 1]])
+    splats = flat_splats(depth=[1], opacity=[0.5], color=[[1, 1, 1]])
     splats.conic[0] = [-1e-3, 0, -1e-3]
     assert ref.blend(splats, 1, 1, np.zeros(3))[2][0, 0] == 0
     splats.conic[0] = [1e-3, 0, 1e-3]
@@ -433,19 +433,19 @@ def test_negative_sigma_is_skipped():
 
 def test_stopping_splat_is_excluded():
     """0.1 · 0.02 · 0.02 < 1e-4: the third splat stops the pixel unseen, and the faint fourth is not reached."""
-    splats = flat_splats(depth=[1, 2, 3, 4], opacity=[0.9, 0.98, 0.98, 0.1], colour=[*np.eye(3).tolist(), [9, 9, 9]])
+    splats = flat_splats(depth=[1, 2, 3, 4], opacity=[0.9, 0.98, 0.98, 0.1], color=[*np.eye(3).tolist(), [9, 9, 9]])
     image, transmittance, count = ref.blend(splats, 1, 1, np.ones(3))
     np.testing.assert_allclose(image[:, 0, 0], [0.9 + 0.002, 0.098 + 0.002, 0.002])
     np.testing.assert_allclose(transmittance, 0.002)
     assert count[0, 0] == 2
     grad = ref.blend_backward(splats, 1, 1, np.ones(3), np.ones((3, 1, 1)))
     assert np.all(grad.opacity[2:] == 0)
-    assert np.all(grad.colour[2:] == 0)
+    assert np.all(grad.color[2:] == 0)
 
 
 def test_transmittance_of_the_threshold_itself_does_not_stop():
     thresholds = ref.Thresholds(transmittance_min=0.25)
-    splats = flat_splats(depth=[1, 2, 3], opacity=[0.5, 0.5, 0.01], colour=np.eye(3))
+    splats = flat_splats(depth=[1, 2, 3], opacity=[0.5, 0.5, 0.01], color=np.eye(3))
     _, transmittance, count = ref.blend(splats, 1, 1, np.zeros(3), thresholds)
     assert count[0, 0] == 2
     assert transmittance[0, 0] == 0.25
@@ -453,7 +453,7 @@ def test_transmittance_of_the_threshold_itself_does_not_stop():
 
 def test_margin():
     """The second splat is too faint, the third stops the pixel, so that the fourth does not count."""
-    splats = flat_splats(depth=[1, 1.25, 2, 3], opacity=[0.5, 0.02, 0.9, 0.0301], colour=np.ones((4, 3)))
+    splats = flat_splats(depth=[1, 1.25, 2, 3], opacity=[0.5, 0.02, 0.9, 0.0301], color=np.ones((4, 3)))
     thresholds = ref.Thresholds(alpha_min=0.03, alpha_max=0.99, transmittance_min=0.08)
     margin = ref.margin(splats, 1, 1, thresholds)
     np.testing.assert_allclose(margin.alpha, 1 - 0.02 / 0.03)
@@ -674,23 +674,23 @@ def test_opacity_reset():
     np.testing.assert_allclose(opacity(ref.reset_logit(logit, 0.5)), [0.02, opacity(-7.0)])
 
 
-def test_gradients_of_the_colours_of_a_photograph(rng):
+def test_gradients_of_the_colors_of_a_photograph(rng):
     """By the image, by the matrix, and by the exposure and white balance that it is made of; some pixels are cut."""
     numbers, gradient = rng.normal(0, 0.2, 3), rng.normal(size=(3, 6, 7))
     image = rng.uniform(-0.2, 1.4, gradient.shape)
     matrix = np.column_stack([np.eye(3) + rng.normal(0, 0.2, (3, 3)), rng.normal(0, 0.1, 3)])
-    assert 0.1 < np.mean(ref.coloured(image, matrix) == 1) < 0.7
-    by_image, by_matrix = ref.coloured_backward(image, matrix, gradient)
+    assert 0.1 < np.mean(ref.colored(image, matrix) == 1) < 0.7
+    by_image, by_matrix = ref.colored_backward(image, matrix, gradient)
     for analytic, array in ((by_image, image), (by_matrix, matrix)):
-        numeric = five_point(lambda: (gradient * ref.coloured(image, matrix)).sum(), array)
+        numeric = five_point(lambda: (gradient * ref.colored(image, matrix)).sum(), array)
         assert relative_error(analytic, numeric) < FD_TOLERANCE
-    _, by_gains = ref.coloured_backward(image, ref.gain_matrix(*numbers), gradient)
-    numeric = five_point(lambda: (gradient * ref.coloured(image, ref.gain_matrix(*numbers))).sum(), numbers)
+    _, by_gains = ref.colored_backward(image, ref.gain_matrix(*numbers), gradient)
+    numeric = five_point(lambda: (gradient * ref.colored(image, ref.gain_matrix(*numbers))).sum(), numbers)
     assert relative_error(ref.gain_gradient(*numbers, by_gains), numeric) < FD_TOLERANCE
 
 
 @pytest.mark.parametrize("nodes", [(3, 2, 4), (1, 4, 2), (2, 1, 1)])
-def test_gradients_of_a_grid_of_colours(rng, nodes):
+def test_gradients_of_a_grid_of_colors(rng, nodes):
     """By the image, through the luminance too, by the grid, and of its smoothness; some pixels are cut."""
     gradient, grid = rng.normal(size=(3, 5, 6)), rng.normal(0, 0.2, (3, 4, *nodes))
     image = rng.uniform(-0.2, 1.3, gradient.shape)
@@ -706,18 +706,18 @@ def test_gradients_of_a_grid_of_colours(rng, nodes):
 
 def test_grid_of_one_matrix_is_it_and_corners_are_nodes(rng):
     image, grid = rng.uniform(0, 1, (3, 6, 7)), rng.normal(0, 0.2, (3, 4, 1, 1, 1))
-    expected = ref.coloured(image, np.eye(3, 4) + grid[:, :, 0, 0, 0])
+    expected = ref.colored(image, np.eye(3, 4) + grid[:, :, 0, 0, 0])
     np.testing.assert_allclose(ref.gridded(image, np.tile(grid, (1, 1, 4, 3, 2))), expected)
-    grey = np.full((3, 1, 1), 1 / 3)  # the second of four levels, in the middle of the image
+    gray = np.full((3, 1, 1), 1 / 3)  # the second of four levels, in the middle of the image
     grid = rng.normal(0, 0.2, (3, 4, 4, 3, 3))
     matrix = np.eye(3, 4) + grid[:, :, 1, 1, 1]
-    np.testing.assert_allclose(ref.gridded(grey, grid), ref.coloured(grey, matrix))
+    np.testing.assert_allclose(ref.gridded(gray, grid), ref.colored(gray, matrix))
 
 
 def test_mean_of_grids_is_removed_and_local_differences_stay(rng):
     vignette = np.zeros((4, 3, 4, 2, 3, 3))
     vignette[..., 1, 1] = 0.3  # in the middle of all photographs
-    found = ref.centred_grids(vignette + rng.normal(size=(1, 3, 4, 2, 1, 1)))
+    found = ref.centered_grids(vignette + rng.normal(size=(1, 3, 4, 2, 1, 1)))
     np.testing.assert_allclose(found.mean(axis=(0, 4, 5)), 0, atol=1e-15)
     np.testing.assert_allclose(found[..., 1, 1] - found[..., 0, 0], 0.3)
 
@@ -751,7 +751,7 @@ def test_gradients_of_a_layer_before_an_image(rng):
 
 
 def test_a_sky_has_no_seam(rng):
-    """Neighbouring directions have neighbouring colours everywhere, and a colour of all texels is that of the sky."""
+    """Neighboring directions have neighboring colors everywhere, and a color of all texels is that of the sky."""
     texels, directions = rng.random((9, 9, 3)), rng.normal(size=(40, 50, 3))
     directions[:10, :, 0] = 0  # where octants meet
     near = directions + 1e-7 * rng.normal(size=directions.shape)
@@ -768,7 +768,7 @@ def test_pixels_show_the_sky_where_six_of_nine_match():
 
 @pytest.mark.parametrize(("degree", "turns"), each_once([1, 2, 3], [False, True]))
 def test_gradients_of_a_motion(rng, degree, turns):
-    """By the motion and by the logit at the centre, of a sum over what is there at a time."""
+    """By the motion and by the logit at the center, of a sum over what is there at a time."""
     count, time = 6, 0.4
     motion = rng.normal(0, 0.4, (count, 2 + 3 * degree + 4 * turns))
     motion[:, 3], motion[:, 4] = rng.uniform(0.2, 0.6, count), rng.normal(-1, 0.2, count)

@@ -118,12 +118,12 @@ stages:
               - {{type: split_textured, texture_above: {texture_above}, gradient_above: {texture_gradient_above}}}
               - {{type: split_oversized, rms_above: {rms_above}}}
               - {{type: prune_faint, opacity_below: {opacity_below}}}
-              - {{type: merge_neighbours, distance_below: {distance_below}, colour_below: {colour_below}}}
+              - {{type: merge_neighbors, distance_below: {distance_below}, color_below: {color_below}}}
 """
 AT_LEAST_ONE = ("resolution", "max_gaussians")
 NOT_NEGATIVE = ("rate_means", "rate_sh_rest", "sigma", "texture_above", "texture_gradient_above")
 LARGER_THAN_ZERO = (
-    *("gradient_above", "size_below", "size_above", "rms_above", "opacity_below", "distance_below", "colour_below"),
+    *("gradient_above", "size_below", "size_above", "rms_above", "opacity_below", "distance_below", "color_below"),
 )
 ANY = ("loss_weight", "penalty_weight")
 PLACES = (*AT_LEAST_ONE, *NOT_NEGATIVE, *LARGER_THAN_ZERO, *ANY)
@@ -155,7 +155,7 @@ def test_every_number_that_may_change_takes_every_notation(recipe, schedule):
         *(optimize.rates.means, optimize.rates.sh_rest, optimize.views.resolution, optimize.views.transforms[0].sigma),
         *(loss.weight for loss in optimize.losses),
         *(densify.max_gaussians, clone.gradient_above, clone.size_below, split.size_above, textured.texture_above),
-        *(textured.gradient_above, oversized.rms_above, faint.opacity_below, merge.distance_below, merge.colour_below),
+        *(textured.gradient_above, oversized.rms_above, faint.opacity_below, merge.distance_below, merge.color_below),
     ]
     assert len(values) == len(PLACES)
     at_25 = {"2": 2, "[": 3.925, "{p": 1, "{i": 4 ** (1 - 20 / 30)}

@@ -1,4 +1,4 @@
-"""Variants: known as soon as their class is defined, named by a word or by a mapping, and explained when misspelt."""
+"""Variants: known as soon as their class is defined, named by a word or by a mapping, and explained when misspelled."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -25,7 +25,7 @@ from tests.support.refusals import refusal
 
 @pytest.fixture
 def video(tmp_path: Path, rng: np.random.Generator) -> Path:
-    """Thirty frames whose grey level is their number; only every third is not blurred."""
+    """Thirty frames whose gray level is their number; only every third is not blurred."""
     path = tmp_path / "v.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (96, 64))
     noise = rng.integers(0, 60, (64, 96, 1))

@@ -54,15 +54,15 @@ class Server(http.server.SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def web(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Path, str, type[Server]]]:
-    """A folder, its address, and the server's behaviour."""
+    """A folder, its address, and the server's behavior."""
     folder = tmp_path / "web"
     folder.mkdir()
-    behaviour = type("Behaviour", (Server,), {"asked": []})
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(behaviour, directory=str(folder)))
+    behavior = type("Behavior", (Server,), {"asked": []})
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(behavior, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     monkeypatch.setattr(fetching, "PAUSE", 0)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    yield folder, f"http://127.0.0.1:{server.server_port}", behaviour
+    yield folder, f"http://127.0.0.1:{server.server_port}", behavior
     server.shutdown()
     server.server_close()
 

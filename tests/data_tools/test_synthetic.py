@@ -49,14 +49,14 @@ def frames(dataset: Path, split: str) -> list[tuple[Array, float, Array]]:
 
 
 def test_sphere_distance_is_closed_form() -> None:
-    ball = Sphere(centre=(0, 0, 2), radius=0.5, paint=plain)
+    ball = Sphere(center=(0, 0, 2), radius=0.5, paint=plain)
     origins = np.array([[0, 0, 0], [0.3, 0, 0], [0.6, 0, 0], [0, 0, 2], [0, 0, 3]]).T
-    expected = [1.5, 2 - 0.4, np.inf, 0.5, np.inf]  # centre, chord, past it, from inside, behind
+    expected = [1.5, 2 - 0.4, np.inf, 0.5, np.inf]  # center, chord, past it, from inside, behind
     np.testing.assert_allclose(ball.intersect(origins, column(0, 0, 1)), expected, rtol=1e-12)
 
 
 def test_box_faces_turn_with_it() -> None:
-    box = Cuboid(centre=(1, 2, 3), half=(0.5, 0.25, 0.1), paint=plain, yaw=30)
+    box = Cuboid(center=(1, 2, 3), half=(0.5, 0.25, 0.1), paint=plain, yaw=30)
     side, top = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0]), np.array([0, 0, 1])
     points = np.stack([[1, 2, 3] + 0.5 * side, [1, 2, 3] + 0.1 * top], axis=1)
     outward = np.stack([side, top], axis=1)
@@ -65,7 +65,7 @@ def test_box_faces_turn_with_it() -> None:
 
 
 def test_cylinder_has_a_side_and_caps() -> None:
-    can = Cylinder(centre=(0, 0, 1), radius=0.5, half=0.2, paint=plain)
+    can = Cylinder(center=(0, 0, 1), radius=0.5, half=0.2, paint=plain)
     origins = np.array([[2, 0, 1.1], [0.3, 0.3, 5], [0.4, 0.4, 5]]).T
     directions = np.array([[-1, 0, 0], [0, 0, -1], [0, 0, -1]]).T
     np.testing.assert_allclose(can.intersect(origins, directions), [1.5, 3.8, np.inf], rtol=1e-12)
@@ -74,7 +74,7 @@ def test_cylinder_has_a_side_and_caps() -> None:
 
 
 def test_a_tilted_cylinder_lies_along_minus_y() -> None:
-    rod = Cylinder(centre=(0, 0, 0), radius=0.1, half=1, paint=plain, tilt=90)
+    rod = Cylinder(center=(0, 0, 0), radius=0.1, half=1, paint=plain, tilt=90)
     np.testing.assert_allclose(rod.intersect(column(0, -3, 0), column(0, 1, 0)), 2, rtol=1e-12)
 
 
@@ -141,7 +141,7 @@ def test_points_lie_on_the_surfaces(dataset: Path) -> None:
     gap = np.min([np.abs(distance_to_surface(shape, points.positions.T)) for shape in SCENE], axis=0)
     assert gap.max() < 5 * synthetic.POINT_NOISE  # the largest of 8000 normal deviates is near 4
     assert 0.8 < np.sqrt((gap**2).mean()) / synthetic.POINT_NOISE < 1.1
-    assert np.ptp(points.colours, axis=0).min() > 0.5
+    assert np.ptp(points.colors, axis=0).min() > 0.5
 
 
 def test_same_arguments_same_bytes(dataset: Path, tmp_path: Path) -> None:

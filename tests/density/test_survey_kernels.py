@@ -25,9 +25,9 @@ def look_at(
 ) -> SurveyView:
     """The view of a case, with a random photograph."""
     camera, (width, height) = case.device_camera(device), case.size
-    colours = np.zeros((3, height, width)) if rng is None else rng.integers(0, 256, (3, height, width))
+    colors = np.zeros((3, height, width)) if rng is None else rng.integers(0, 256, (3, height, width))
     uploaded = None if mask is None else device.upload(mask[None].astype(np.uint8))
-    photograph = Photograph(camera, device.upload(colours.astype(np.uint8)), uploaded)
+    photograph = Photograph(camera, device.upload(colors.astype(np.uint8)), uploaded)
     return SurveyView.at(Rasterizer(device, "radix", budget), case.model(device), photograph, device.upload(BACKGROUND))
 
 

@@ -25,13 +25,13 @@ def error_of(seen: SimpleNamespace, coefficients: int) -> VisibleError:
 
 
 def shown(seen: SimpleNamespace, i: int, error: np.ndarray) -> float:
-    """The squared error of a Gaussian's colours over the views, after the best change of its base colour."""
+    """The squared error of a Gaussian's colors over the views, after the best change of its base color."""
     directions = seen.means[i] - POSITIONS
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    colours = ref.sh_basis(directions, 3)[:, 1 : 1 + len(error) // 3] @ error.reshape(-1, 3)
+    colors = ref.sh_basis(directions, 3)[:, 1 : 1 + len(error) // 3] @ error.reshape(-1, 3)
     weight = seen.weights[:, i].astype(np.float64)[:, None]
-    best = (weight * colours).sum(axis=0) / weight.sum()
-    return float((weight * np.square(colours - best)).sum())
+    best = (weight * colors).sum(axis=0) / weight.sum()
+    return float((weight * np.square(colors - best)).sum())
 
 
 @pytest.mark.parametrize("coefficients", [3, 8, 15])
@@ -46,13 +46,13 @@ def test_the_form_is_the_error_that_the_views_show(seen, rng, coefficients):
     assert forms[59] > 0, "a Gaussian that no view shows has a form"
 
 
-def test_the_base_colour_takes_up_the_mean_of_an_error(seen, rng):
+def test_the_base_color_takes_up_the_mean_of_an_error(seen, rng):
     found, error = error_of(seen, 15), rng.normal(size=(60, 45))
     change = found.base_change(error)
     directions = seen.means[7] - POSITIONS
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    colours = ref.sh_basis(directions, 3)[:, 1:] @ error[7].reshape(15, 3)
-    mean = np.average(colours, axis=0, weights=seen.weights[:, 7])
+    colors = ref.sh_basis(directions, 3)[:, 1:] @ error[7].reshape(15, 3)
+    mean = np.average(colors, axis=0, weights=seen.weights[:, 7])
     np.testing.assert_allclose(change[7] * 0.28209479177387814, mean, rtol=1e-6)
 
 

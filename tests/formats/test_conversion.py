@@ -160,7 +160,7 @@ def test_a_mip_model_is_not_merged_with_another(source, tmp_path, rng):
 
 
 def test_a_transform_turns_harmonics_as_directions_say(source, tmp_path, rng):
-    """The colour towards a turned direction is that of the source towards the direction."""
+    """The color toward a turned direction is that of the source toward the direction."""
     text = "rotate=20,-50,130 scale=3 translate=1,2,3"
     clsplat.convert(source, tmp_path / "b.ply", transform=text)
     before, after = load(source), load(tmp_path / "b.ply")
@@ -412,11 +412,11 @@ def test_a_format_that_knows_no_empty_model_refuses_one(name, tmp_path, rng):
     assert verdict(clsplat.check(tmp_path / "a.ply")).endswith("it holds no Gaussians; export it again")
 
 
-def test_bright_colours_are_coefficients(tmp_path, rng):
-    """All above grey, but beyond what a colour can be."""
+def test_bright_colors_are_coefficients(tmp_path, rng):
+    """All above gray, but beyond what a color can be."""
     model = splats(rng, 60)
     model.parameters["sh_base"][:] = rng.uniform(0.02, 1.7, (60, 3))
-    assert not [text for text in checked(tmp_path, model)["findings"] if "colours" in text]
+    assert not [text for text in checked(tmp_path, model)["findings"] if "colors" in text]
 
 
 def checked(tmp_path, model):

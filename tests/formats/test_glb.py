@@ -58,8 +58,8 @@ def test_a_glb_is_what_the_specification_says(tmp_path, rng):
     np.testing.assert_allclose(
         attribute(tree, binary, f"{KHR}:SCALE"), np.exp(source.parameters["log_scales"]), rtol=1e-6
     )
-    colour = np.clip(0.28209479 * source.parameters["sh_base"] + 0.5, 0, 1)
-    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    color = np.clip(0.28209479 * source.parameters["sh_base"] + 0.5, 0, 1)
+    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
     shown = attribute(tree, binary, "COLOR_0")
     np.testing.assert_allclose(shown[:, :3] / 255, linear, atol=0.0021)
     np.testing.assert_allclose(shown[:, 3:] / 255, opacities(source.parameters["logit_opacity"]), atol=0.0021)

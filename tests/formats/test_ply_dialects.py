@@ -86,15 +86,15 @@ def test_a_compressed_ply_comes_back_within_its_steps(tmp_path, rng, count, degr
     assert_close(found, expected, 0.25, **bounds)
 
 
-def test_a_compressed_ply_without_ranges_of_colours(tmp_path, rng):
+def test_a_compressed_ply_without_ranges_of_colors(tmp_path, rng):
     header, body = packed(rng, tmp_path, 3, 0)
     for end in ("min", "max"):
-        for colour in "rgb":
-            header = header.replace(f"property float {end}_{colour}\n".encode(), b"")
+        for color in "rgb":
+            header = header.replace(f"property float {end}_{color}\n".encode(), b"")
     (tmp_path / "b.ply").write_bytes(header + b"end_header\n" + body[:48] + body[72:])
-    colours = read(tmp_path / "b.ply").parameters["sh_base"] * 0.28209479177387814 + 0.5
+    colors = read(tmp_path / "b.ply").parameters["sh_base"] * 0.28209479177387814 + 0.5
     levels = np.frombuffer(body[72:], "<u4").reshape(3, 4)[:, 3] >> np.uint32(24)
-    np.testing.assert_allclose(colours[:, 0], levels / 255, atol=1e-6)
+    np.testing.assert_allclose(colors[:, 0], levels / 255, atol=1e-6)
 
 
 def test_no_splats_are_a_model_too(tmp_path, rng):

@@ -202,13 +202,13 @@ def test_the_mean_of_harmonics_follows_from_their_second_moments(count, rng):
 
 
 def test_band_0_takes_up_what_is_the_same_from_all_cameras(rng):
-    """The least squares of colours over the directions themselves."""
+    """The least squares of colors over the directions themselves."""
     directions = rng.normal((0, 0, 2), size=(40, 3))
     values = basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     base, lacking = rng.normal(size=(20, 3)), rng.normal(0, 0.1, (20, 15, 3))
     found = base_for(base, lacking.reshape(20, 45), values.T @ values)
-    colours = np.einsum("dk,nkc->ndc", values, lacking)
-    np.testing.assert_allclose((found - base) * SH_C0, colours.mean(axis=1), atol=1e-5)
+    colors = np.einsum("dk,nkc->ndc", values, lacking)
+    np.testing.assert_allclose((found - base) * SH_C0, colors.mean(axis=1), atol=1e-5)
 
 
 def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
@@ -264,7 +264,7 @@ def test_the_gzip_of_an_spz_is_one_that_other_programs_read(tmp_path, rng):
 
 
 @pytest.mark.parametrize(("count", "entries"), [(1, 1), (40, 40), (700, 30), (1500, 300)])
-def test_a_palette_for_neighbours_has_the_means_of_its_parts(count, entries, rng):
+def test_a_palette_for_neighbors_has_the_means_of_its_parts(count, entries, rng):
     rest = seen_from_one_side(rng, count).parameters["sh_rest"]
     weights = rng.normal(size=count)
     vectors, labels = tree_palette(rest, weights, entries, 1.0)

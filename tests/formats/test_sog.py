@@ -59,7 +59,7 @@ def test_a_sog_comes_back_within_its_steps(tmp_path, rng, count, degree):
 
 
 def test_a_palette_of_as_many_entries_as_differ_is_exact(tmp_path, rng):
-    """Eight different colours in a thousand Gaussians."""
+    """Eight different colors in a thousand Gaussians."""
     source = splats(rng, 1024)
     source.parameters["sh_rest"][:] = source.parameters["sh_rest"][rng.integers(0, 8, 1024)].round(1)
     found = there_and_back(tmp_path / "a.sog", source).parameters["sh_rest"]
@@ -192,7 +192,7 @@ def test_a_palette_does_not_depend_on_the_number_of_threads(rng):
     np.testing.assert_array_equal(before[1], after[1])
 
 
-def test_a_transparent_splat_keeps_its_colour(tmp_path, rng):
+def test_a_transparent_splat_keeps_its_color(tmp_path, rng):
     source = splats(rng, 100, 0)
     source.parameters["logit_opacity"][:] = -20
     found = there_and_back(tmp_path / "a.sog", source, Writing(quality="high"))

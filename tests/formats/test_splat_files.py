@@ -55,7 +55,7 @@ def test_what_a_splat_does_not_hold_is_said(tmp_path, rng, caplog):
     source.parameters["sh_base"][:] = 0
     source.parameters["sh_base"][4:7] = -3
     write(tmp_path / "a.splat", source)
-    assert "splat holds colours from 0 to 1; those of 3 Gaussians were cut" in caplog.text
+    assert "splat holds colors from 0 to 1; those of 3 Gaussians were cut" in caplog.text
     assert "splat holds no harmonics" in caplog.text
 
 

@@ -112,12 +112,12 @@ def test_harmonics_beyond_one_are_cut_and_said(tmp_path, rng, caplog):
     assert 127 / 128 <= np.abs(found.parameters["sh_rest"]).max() <= 1
 
 
-def test_colours_and_scales_that_no_byte_holds_are_cut_and_said(tmp_path, rng, caplog):
+def test_colors_and_scales_that_no_byte_holds_are_cut_and_said(tmp_path, rng, caplog):
     source = splats(rng, 10)
     source.parameters["sh_base"][2:4, 1] = 9
     source.parameters["log_scales"][5, 0] = -12
     there_and_back(tmp_path / "a.spz", source)
-    assert "colours from -0.44 to 1.44; those of 2 Gaussians were cut" in caplog.text
+    assert "colors from -0.44 to 1.44; those of 2 Gaussians were cut" in caplog.text
     assert "scales from 4.5e-05 to 379; those of 1 Gaussians were cut" in caplog.text
 
 

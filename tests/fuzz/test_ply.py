@@ -79,6 +79,6 @@ def test_damaged_points_are_read_or_refused(folder):
         points = outcome(read_points_ply, folder / "points.ply")
         if points is not None:
             assert np.isfinite(points.positions).all()
-            assert ((points.colours >= 0) & (points.colours <= 1)).all()
+            assert ((points.colors >= 0) & (points.colors <= 1)).all()
 
     reads()

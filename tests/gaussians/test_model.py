@@ -49,9 +49,9 @@ def test_views_are_the_values_after_activation(rng):
     exact = case.gaussians()
     np.testing.assert_allclose(model.scales, np.exp(exact.log_scales), rtol=1e-6)
     np.testing.assert_allclose(model.opacities, 1 / (1 + np.exp(-exact.logit_opacity)), rtol=1e-6)
-    np.testing.assert_allclose(model.colours, 0.5 + exact.sh[:, 0] * sh_basis(np.array([[0, 0, 1.0]]), 0)[0], atol=1e-6)
+    np.testing.assert_allclose(model.colors, 0.5 + exact.sh[:, 0] * sh_basis(np.array([[0, 0, 1.0]]), 0)[0], atol=1e-6)
     assert (len(model), model.sh_degree, model.opacities.shape) == (9, 3, (9,))
-    assert all(table.dtype == np.float32 for table in (model.scales, model.opacities, model.colours))
+    assert all(table.dtype == np.float32 for table in (model.scales, model.opacities, model.colors))
 
 
 def test_rows_are_chosen_by_mask_slice_index_and_indices(rng):

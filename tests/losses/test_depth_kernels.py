@@ -57,7 +57,7 @@ def test_reference_gradient_is_that_of_finite_differences(rng):
 
     splats = ref.project(gaussians, camera, case.degree, **numbers)
     found, by_depth = ref.inverse_depth_backward(splats, 24, 20, weights, ref.SMOOTH)
-    upstream = found.mean2d, found.conic, found.opacity, found.colour
+    upstream = found.mean2d, found.conic, found.opacity, found.color
     settings = case.degree, case.variance, case.compensate
     gradients = ref.project_backward(gaussians, camera, *settings, splats, *upstream)
     gradients["means"] = gradients["means"] + by_depth[:, None] * camera.rotation[2]
@@ -150,6 +150,6 @@ def test_two_fourth_planes_are_refused(device, rng):
     assert trainer.compare(photograph, 6).frame.content == "entropy", "a loss without weight reads nothing"
 
 
-def test_a_training_also_needs_a_loss_on_colours():
+def test_a_training_also_needs_a_loss_on_colors():
     with pytest.raises(ValueError, match="at least one loss that compares images"):
         Optimize(steps=3, losses=[InverseDepth()])

@@ -1,4 +1,4 @@
-"""A plain wall between two textured ones, begun at the wrong depth: colours do not tell it, its points do."""
+"""A plain wall between two textured ones, begun at the wrong depth: colors do not tell it, its points do."""
 
 from dataclasses import replace
 
@@ -59,5 +59,5 @@ def error_after(device, weight: float) -> float:
 def test_points_halve_the_error_of_a_plain_wall(device):
     without, found = (error_after(device, weight) for weight in (0.0, 1.0))
     print(without, found)
-    assert without > 0.5 * (DEPTH - BEGUN), "colours alone do not tell it"
+    assert without > 0.5 * (DEPTH - BEGUN), "colors alone do not tell it"
     assert found < 0.5 * without

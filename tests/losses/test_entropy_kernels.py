@@ -48,14 +48,14 @@ def gradients_of(m: np.ndarray) -> dict[str, np.ndarray]:
     return {
         "opacity": m[:, 0],
         "conic": np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1),
-        "colour": m[:, 6:9],
+        "color": m[:, 6:9],
     }
 
 
 def oracle(case: Case, weights: np.ndarray) -> dict[str, np.ndarray]:
     splats = case.project()
     grad = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights.astype(np.float64))
-    return {"opacity": grad.opacity * splats.opacity, "conic": grad.conic, "colour": grad.colour}
+    return {"opacity": grad.opacity * splats.opacity, "conic": grad.conic, "color": grad.color}
 
 
 def test_the_reference_is_the_entropy_of_shares_of_a_pixel():
@@ -82,7 +82,7 @@ def test_reference_gradient_is_that_of_finite_differences(rng):
         return float((weights[:3] * image).sum() + (weights[3] * entropy).sum())
 
     capped = splats.opacity > 0.98
-    for name in ("mean2d", "conic", "opacity", "colour"):
+    for name in ("mean2d", "conic", "opacity", "color"):
         values = getattr(found, name)
         for place in np.ndindex(values.shape):
             if capped[place[0]]:
@@ -171,11 +171,11 @@ def mean_difference(image: np.ndarray, photograph: np.ndarray) -> tuple[float, n
     return float(np.abs(difference).mean()), np.sign(difference) / difference.size
 
 
-@on_devices("first, colours", product([True, False], [L1(), HostLoss(mean_difference)]))
-def test_the_trainer_adds_it_to_other_losses_in_any_order(device, rng, colours, first):
+@on_devices("first, colors", product([True, False], [L1(), HostLoss(mean_difference)]))
+def test_the_trainer_adds_it_to_other_losses_in_any_order(device, rng, colors, first):
     """With a mask, whose pixels count in no plane."""
     entropy = WeightEntropy(weight=0.3)
-    losses = [entropy, colours, entropy] if first else [colours, entropy, entropy]
+    losses = [entropy, colors, entropy] if first else [colors, entropy, entropy]
     trainer, photograph = trainer_of(device, rng, losses)
     comparison = trainer.differentiate(photograph, 1).comparison
     image, gradient = comparison.image.get()[:, :30, :40], comparison.gradient.get()
@@ -196,6 +196,6 @@ def test_steps_with_the_loss_alone_make_pixels_clearer(device, rng):
     assert values[-1] < 0.8 * values[0]
 
 
-def test_a_training_also_needs_a_loss_on_colours():
+def test_a_training_also_needs_a_loss_on_colors():
     with pytest.raises(ValueError, match="at least one loss that compares images"):
         Optimize(steps=3, losses=[WeightEntropy()])

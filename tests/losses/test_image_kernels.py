@@ -95,19 +95,19 @@ def test_ssim_against_scikit_image(device, rng):
 @on_devices("width, height", SIZES[3:9])
 def test_a_mask_blackens_what_it_leaves_out(device, rng, width, height):
     camera = camera_of(device, width, height)
-    colours = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
+    colors = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
     mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
-    photograph = Photograph(camera, device.upload(colours), device.upload(mask))
+    photograph = Photograph(camera, device.upload(colors), device.upload(mask))
     assert photograph.nbytes == 4 * width * height
-    np.testing.assert_array_equal(photograph.image(), colours.transpose(1, 2, 0))
+    np.testing.assert_array_equal(photograph.image(), colors.transpose(1, 2, 0))
     np.testing.assert_array_equal(photograph.counted(), mask[0] > 0)
     workspace = Workspace(device)
     planes = photograph.planes(workspace)
-    before, counted = planes.colours.get(), planes.mask.get()
+    before, counted = planes.colors.get(), planes.mask.get()
     np.testing.assert_array_equal(counted[:, :height, :width], mask)
     assert (counted[:, height:] == 0).all()
-    apply_mask(workspace, camera, planes.colours, planes.mask)
-    np.testing.assert_array_equal(planes.colours.get(), before * counted)
+    apply_mask(workspace, camera, planes.colors, planes.mask)
+    np.testing.assert_array_equal(planes.colors.get(), before * counted)
 
 
 @on_one_setting

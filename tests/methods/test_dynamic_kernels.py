@@ -56,11 +56,11 @@ def test_what_travels_far_is_two_on_the_same_path(device, rng):
             np.testing.assert_allclose(_places(after, time)[children], _places(before, time)[chosen], atol=1e-4)
     np.testing.assert_allclose(after.motion[early, 3] + after.motion[late, 3], 2 * before.motion[chosen, 3], atol=1e-5)
     np.testing.assert_allclose(np.exp(after.motion[early, 4]), 0.8 * duration[chosen], rtol=1e-5)
-    at_centre = [
+    at_center = [
         after.opacities[children] * presence(_since(after.motion[children], before.motion[chosen, 3]), 0)
         for children in (early, late)
     ]
-    together = 1 - (1 - at_centre[0]) * (1 - at_centre[1])
+    together = 1 - (1 - at_center[0]) * (1 - at_center[1])
     capped = after.opacities[early] > 0.999
     np.testing.assert_allclose(together[~capped], before.opacities[chosen][~capped], rtol=1e-3)
 

@@ -55,9 +55,9 @@ def stats_of(device, count, exposure, losses, mask=None, views=1) -> SplatStats:
         Rasterizer(device, "radix"), model, Adam(model.gaussians), stats, background, losses=losses, rates=rates
     )
     for step in range(1, views + 1):
-        colours = (4 * rng.integers(0, 60, (3, 32, 48)) * exposure).astype(np.uint8)
+        colors = (4 * rng.integers(0, 60, (3, 32, 48)) * exposure).astype(np.uint8)
         uploaded = None if mask is None else device.upload(mask[None].astype(np.uint8))
-        trainer.step(Photograph(case.device_camera(device), device.upload(colours), uploaded), step)
+        trainer.step(Photograph(case.device_camera(device), device.upload(colors), uploaded), step)
     return stats
 
 

@@ -34,9 +34,9 @@ def image_of(case: Case, rows: np.ndarray, exposure: float = 1.0) -> np.ndarray:
 def survey_of(device: Device, case: Case, photographs: list, masks: list, exposure: float = 1.0) -> Survey:
     camera = case.device_camera(device)
     held = []
-    for colours, mask in zip(photographs, masks, strict=True):
+    for colors, mask in zip(photographs, masks, strict=True):
         uploaded = None if mask is None else device.upload(mask[None].astype(np.uint8))
-        held.append(Photograph(camera, device.upload(colours), uploaded))
+        held.append(Photograph(camera, device.upload(colors), uploaded))
     source = SimpleNamespace(get=lambda view: held[view], background=device.upload(np.float32(exposure) * BACKGROUND))
     return Survey(Rasterizer(device, "radix"), case.model(device), source, range(len(held)), 0, 0)
 
@@ -50,8 +50,8 @@ def photographs_like(rng, case: Case, count: int) -> list[np.ndarray]:
 
 def error_of(case: Case, rows: np.ndarray, photographs: list, masks: list) -> float:
     image, total = image_of(case, rows), 0.0
-    for colours, mask in zip(photographs, masks, strict=True):
-        squares = (image - colours.transpose(1, 2, 0) / 255) ** 2
+    for colors, mask in zip(photographs, masks, strict=True):
+        squares = (image - colors.transpose(1, 2, 0) / 255) ** 2
         total += squares[np.ones(squares.shape[:2], bool) if mask is None else mask].sum()
     return total
 
@@ -98,7 +98,7 @@ def test_half_the_exposure_gives_the_same_choice(device, rng):
     dim.parameters["sh_rest"][:] *= 0.5
     masks = [None, None]
     bright = pruned(survey_of(device, case, photographs, masks), PruneSpare(error_rise=0.1))
-    half = [colours // 2 for colours in photographs]
+    half = [colors // 2 for colors in photographs]
     assert 0 < len(bright) < 40
     np.testing.assert_array_equal(pruned(survey_of(device, dim, half, masks, 0.5), PruneSpare(error_rise=0.1)), bright)
 

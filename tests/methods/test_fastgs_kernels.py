@@ -29,8 +29,8 @@ def surveyed(device: Device, case: Case, photographs: list[np.ndarray], masks: l
     """A survey whose views have one camera and these photographs, [3, height, width] uint8."""
     camera = case.device_camera(device)
     held = [
-        Photograph(camera, device.upload(colours), mask if mask is None else device.upload(mask[None].astype(np.uint8)))
-        for colours, mask in zip(photographs, masks or [None] * len(photographs), strict=True)
+        Photograph(camera, device.upload(colors), mask if mask is None else device.upload(mask[None].astype(np.uint8)))
+        for colors, mask in zip(photographs, masks or [None] * len(photographs), strict=True)
     ]
     source = SimpleNamespace(get=lambda view: held[view], background=device.upload(BACKGROUND))
     return Survey(Rasterizer(device, "radix"), case.model(device), source, range(len(held)), seed=1, step=600)
@@ -54,8 +54,8 @@ def expected_wrong(
     image = ref.render(case.gaussians(), case.camera(), BACKGROUND.astype(np.float64), case.degree).image
     blended = ref.blend_weights(case.project(), width, height) > 0
     total, weighted = np.zeros(len(blended), int), np.zeros(len(blended))
-    for colours, mask in zip(photographs, masks, strict=True):
-        truth, counted = colours / 255, np.ones((height, width), bool) if mask is None else mask
+    for colors, mask in zip(photographs, masks, strict=True):
+        truth, counted = colors / 255, np.ones((height, width), bool) if mask is None else mask
         error = np.abs(image - truth).mean(axis=0)
         least, most = error[counted].min(), error[counted].max()
         share = (error - least) / (most - least)

@@ -42,7 +42,7 @@ def through(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> 
     counted = None if mask is None else planes_of(device, camera, mask[None])
     numbers = {"haar/scale": HAAR @ taps, "haar/leak": LEAK @ taps}
     planes = Planes(Workspace(device), camera, planes_of(device, camera, image), counted)
-    return apply_filter(planes, numbers).colours.get()[:, : camera.height, : camera.width]
+    return apply_filter(planes, numbers).colors.get()[:, : camera.height, : camera.width]
 
 
 @on_devices("width, height, share", each_once(SIZES, [None, 0.7, 0.1]))
@@ -124,9 +124,9 @@ def trainer_of(device, rng, losses, masked: bool = True, **settings) -> tuple[St
     parts = Adam(model.gaussians), SplatStats(model.gaussians), device.zeros(3)
     haar = HaarState(Haar(**settings))
     trainer = StepTrainer(Rasterizer(device, "radix"), model, *parts, losses, Rates(), modules=[haar])
-    colours = rng.integers(0, 256, (3, 30, 41)).astype(np.uint8)
+    colors = rng.integers(0, 256, (3, 30, 41)).astype(np.uint8)
     mask = device.upload((rng.random((1, 30, 41)) < 0.7).astype(np.uint8)) if masked else None
-    return trainer, haar, Photograph(case.device_camera(device), device.upload(colours), mask)
+    return trainer, haar, Photograph(case.device_camera(device), device.upload(colors), mask)
 
 
 @on_devices("learn, masked", product(["filter", "scale"], [False, True]))
@@ -138,11 +138,11 @@ def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked)
     before, counted = dict(haar.numbers), photograph.counted()
     view = trainer.differentiate(photograph, 1)
     image = view.comparison.image.get()[:, :30, :41].astype(np.float64)
-    colours = photograph.image().transpose(2, 0, 1) / 255
+    colors = photograph.image().transpose(2, 0, 1) / 255
 
     def total(numbers: dict[str, float]) -> float:
         taps = taps_of(numbers)
-        found = ref.haar_filtered(colours, taps, counted) * (1 if counted is None else counted)
+        found = ref.haar_filtered(colors, taps, counted) * (1 if counted is None else counted)
         parts = ((0.8, ref.l1), (0.2, ref.dssim), (3.0, ref.l2))
         images = sum(weight * loss(image, found)[0] for weight, loss in parts)
         return images + 0.01 * 2 * ((taps - HAAR) ** 2).sum()
@@ -187,8 +187,8 @@ def test_differentiating_changes_no_number(device, rng):
 @on_devices("masked", [False, True])
 def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
     """The filter's derivatives are those without it, and it adds to the gradient as elsewhere."""
-    of_colours, moments = [L1(weight=0.8), Dssim(weight=0.2)], []
-    for losses in (of_colours, [WeightEntropy(weight=0.3), *of_colours]):
+    of_colors, moments = [L1(weight=0.8), Dssim(weight=0.2)], []
+    for losses in (of_colors, [WeightEntropy(weight=0.3), *of_colors]):
         trainer, haar, photograph = trainer_of(device, np.random.default_rng(5), losses, masked)
         view = trainer.step(photograph, 1)
         moments.append({name: value for name, value in haar.numbers.items() if name.endswith("moment1")})

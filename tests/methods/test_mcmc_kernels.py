@@ -41,11 +41,11 @@ def some_gaussians(device, rng, count: int, faint: int, opacity=(0.2, 0.95)) -> 
 
 def relocated(gaussians: Gaussians, limit: int | None = None, before=(), after=(), **settings) -> np.ndarray:
     """Apply the rule; return the old row of each new row, [M]."""
-    colours = gaussians.get("sh_rest")
+    colors = gaussians.get("sh_rest")
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3)
     rules = [*before, Relocate(**settings), *after]
     densify(edit, rules, Rasterizer(gaussians.device, "radix").tiler, limit)
-    return np.array([int(np.flatnonzero((colours == row).all(axis=1))[0]) for row in gaussians.get("sh_rest")])
+    return np.array([int(np.flatnonzero((colors == row).all(axis=1))[0]) for row in gaussians.get("sh_rest")])
 
 
 def shrinkage(opacity: float, new: float, copies: int) -> float:
@@ -206,8 +206,8 @@ def test_places_of_many_draws_do_not_overflow():
 
 
 @pytest.mark.parametrize(("opacity", "rows"), each_once([0.05, 0.3, 0.73, 0.95, 0.999], [1, 2, 50, 20, 5]))
-def test_rows_in_one_place_keep_the_centre_and_the_integral(opacity, rows):
-    """Equations 8 and 9: o at the centre, and 1 - (1 - o' G(x / factor))^n has the integral of o G(x) over a line."""
+def test_rows_in_one_place_keep_the_center_and_the_integral(opacity, rows):
+    """Equations 8 and 9: o at the center, and 1 - (1 - o' G(x / factor))^n has the integral of o G(x) over a line."""
     (new,), (factor,) = divided(np.array([opacity]), np.array([rows]), 1e-9)
     assert 1 - (1 - new) ** rows == pytest.approx(opacity, rel=1e-6)
     x = np.linspace(-40, 40, 200_001)

@@ -20,7 +20,7 @@ LOSSES = f"optimize.losses=[{{type: l1, weight: [[10, 0.8], [40, 0.4]]}}, {{type
 RULES = (
     "densify.rules=[{type: clone}, {type: split_textured, texture_above: {quantile: 0.5, of: pixels}, "
     "gradient_above: 0.0, radius_above: 0.5}, {type: split_oversized, pixels: 1.5, radius_above: 0.5}, "
-    "{type: merge_neighbours}, {type: prune_unimportant, share: 0.01}]"
+    "{type: merge_neighbors}, {type: prune_unimportant, share: 0.01}]"
 )
 PLAIN = ("densify.rules=[{type: prune_faint}]", "optimize.steps=20")
 SETTINGS = (LOSSES, RULES, "optimize.log_every=5", "optimize.checkpoint.keep=9")
@@ -35,7 +35,7 @@ def finished(tiny_scene, tmp_path_factory):
 def test_every_rule_and_penalty_acts(finished):
     lines = [json.loads(line) for line in (finished.out / "metrics.jsonl").read_text().splitlines()]
     edits = [line for line in lines if line["kind"] == "densify"]
-    growing, thinning = ("clone", "split_textured", "split_oversized"), ("merge_neighbours", "prune_unimportant")
+    growing, thinning = ("clone", "split_textured", "split_oversized"), ("merge_neighbors", "prune_unimportant")
     for name in (*growing, *thinning):
         total, grown = (sum(edit[key][name] for edit in edits) for key in ("causes", "grown"))
         assert total > 0, name
@@ -51,7 +51,7 @@ def test_every_rule_and_penalty_acts(finished):
 
 
 def test_legends_stay_below_the_title_and_break_into_rows():
-    names = ["clone", "split_textured", "split_oversized", "prune_unimportant", "merge_neighbours", "prune_faint"]
+    names = ["clone", "split_textured", "split_oversized", "prune_unimportant", "merge_neighbors", "prune_faint"]
     chart = curve("Gaussians changed by each rule", [Line([(0.0, 0.0), (1.0, 1.0)], name) for name in names])
     rows = re.findall(r'<text x="56" y="(\d+)">(<tspan.*?)</text>', chart)
     assert [y for y, _ in rows] == ["29", "43"]

@@ -12,7 +12,7 @@ from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale
 from clsplat.gaussians.gaussians import INTERVAL2
 from clsplat.methods.adc import Clone, PruneFaint
-from clsplat.methods.micro_splatting import MergeNeighbours, PruneUnimportant, SplitOversized, SplitTextured
+from clsplat.methods.micro_splatting import MergeNeighbors, PruneUnimportant, SplitOversized, SplitTextured
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
 from tests.support.devices import on_devices, on_one_setting
@@ -43,7 +43,7 @@ class Edited:
         return densify(edit, rules, self.tiler, limit)
 
     def rows_of(self, source: int) -> np.ndarray:
-        """Rows that carry the colours of an old row, which no edit changes."""
+        """Rows that carry the colors of an old row, which no edit changes."""
         return np.flatnonzero((self.gaussians.get("sh_rest") == self.before["sh_rest"][source]).all(axis=1))
 
 
@@ -131,9 +131,9 @@ def test_oversized_ones_split(device, rng, rms_above, pixels):
     bound = pixels * interval if pixels else 0.01 * EXTENT
     if isinstance(rms_above, Quantile):
         bound = np.sqrt(np.sort(trace)[-13] / 3)  # a fifth of them are larger
-    penalised = trace > 1.0001 * 3 * bound**2  # P > 0
-    assert 5 < penalised.sum() < 55
-    assert [len(case.rows_of(n)) for n in range(60)] == np.where(penalised, 2, 1).tolist()
+    penalized = trace > 1.0001 * 3 * bound**2  # P > 0
+    assert 5 < penalized.sum() < 55
+    assert [len(case.rows_of(n)) for n in range(60)] == np.where(penalized, 2, 1).tolist()
 
 
 @on_one_setting
@@ -180,17 +180,17 @@ def test_least_important_ones_go(device, rng):
 
 @on_one_setting
 def test_merged_neighbors_have_the_mean_and_covariance_of_both(device, rng):
-    """Twins merge; a stranger of another colour and one far away stay."""
+    """Twins merge; a stranger of another color and one far away stay."""
     case = Edited(device, rng, 4)
     means = np.array([[0, 0, 4], [0.01, 0, 4], [5, 0, 4], [5.01, 0, 4]], np.float32)
-    colours = np.array([[0.2] * 3, [0.21] * 3, [0.2] * 3, [2.0] * 3], np.float32)
+    colors = np.array([[0.2] * 3, [0.21] * 3, [0.2] * 3, [2.0] * 3], np.float32)
     case.gaussians.set("means", means)
-    case.gaussians.set("sh_base", colours)
+    case.gaussians.set("sh_base", colors)
     case.gaussians.set("log_scales", np.log(np.full((4, 3), [0.05, 0.04, 0.03], np.float32)))
     case.gaussians.set("logit_opacity", np.array([[-1.0], [-1.5], [1.0], [0.0]], np.float32))
     before = {name: case.gaussians.get(name).astype(np.float64) for name in ("quats", "log_scales", "logit_opacity")}
     moments = {name: case.gaussians.get(f"adam/{name}/moment1") for name in ("means", "quats", "log_scales")}
-    assert case.apply(MergeNeighbours()).after == 3
+    assert case.apply(MergeNeighbors()).after == 3
     tables = {**before, "means": means.astype(np.float64)}
     mass = mass_of(tables)[:2]
     weights = mass / mass.sum()
@@ -202,7 +202,7 @@ def test_merged_neighbors_have_the_mean_and_covariance_of_both(device, rng):
     np.testing.assert_allclose(got["means"][0], mean, atol=1e-6)
     np.testing.assert_allclose(covariance_of(got["quats"][:1], got["log_scales"][:1])[0], covariance, atol=1e-7)
     np.testing.assert_allclose(mass_of(got)[0], mass.sum(), rtol=1e-4)
-    np.testing.assert_allclose(got["sh_base"][0], weights @ colours[:2], rtol=1e-5)
+    np.testing.assert_allclose(got["sh_base"][0], weights @ colors[:2], rtol=1e-5)
     after = {name: case.gaussians.get(f"adam/{name}/moment1") for name in moments}
     np.testing.assert_array_equal(after["means"][0], moments["means"][0])  # the heavier one's
     for name in ("quats", "log_scales"):
@@ -216,7 +216,7 @@ def test_twins_in_one_place_merge(device, rng):
     case = Edited(device, rng, 40)
     for name in ("means", "sh_base"):
         case.gaussians.set(name, np.repeat(case.gaussians.get(name)[::2], 2, axis=0))
-    assert case.apply(MergeNeighbours()).after == 20
+    assert case.apply(MergeNeighbors()).after == 20
 
 
 @on_one_setting
@@ -225,7 +225,7 @@ def test_nothing_merges_where_a_mean_is_not_finite(device, rng):
     means = case.gaussians.get("means")
     means[1] = np.nan
     case.gaussians.set("means", means)
-    assert case.apply(MergeNeighbours(distance_below=1e9, colour_below=1e9)).after == 4
+    assert case.apply(MergeNeighbors(distance_below=1e9, color_below=1e9)).after == 4
 
 
 def test_a_merged_covariance_is_that_of_the_mixture(rng):

@@ -83,7 +83,7 @@ def test_they_lie_on_the_surface_that_is_seen(tiny_scene, tmp_path):
 
 
 def test_its_colors_are_the_models_where_photographs_have_own(tiny_scene, tmp_path):
-    grey = opened(tiny_scene, plane(), tmp_path / "model")
+    gray = opened(tiny_scene, plane(), tmp_path / "model")
     stages = [
         {"init": {"source": "model", "file": str(tmp_path / "model.ply")}},
         {"optimize": {"steps": 2, "losses": ["l1"], "modules": ["exposure"], "update": "seen"}},
@@ -92,13 +92,13 @@ def test_its_colors_are_the_models_where_photographs_have_own(tiny_scene, tmp_pa
     ]
     (tmp_path / "x.yaml").write_text(json.dumps({"name": "x", "model": {"sh_degree": 1}, "stages": stages}))
     run = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "x.yaml"))
-    ReinitFromDepth(stage="reinit_from_depth").act(grey)
-    of_photographs, of_model = (np.median(np.abs(one.model.gaussians.get("sh_base"))) for one in (grey, run))
-    assert of_model < 0.1 < 0.3 < of_photographs, "the model is grey"
+    ReinitFromDepth(stage="reinit_from_depth").act(gray)
+    of_photographs, of_model = (np.median(np.abs(one.model.gaussians.get("sh_base"))) for one in (gray, run))
+    assert of_model < 0.1 < 0.3 < of_photographs, "the model is gray"
 
 
-def test_they_lie_where_the_cameras_were_learnt_to_be(tiny_scene, tmp_path):
-    """All cameras were learnt to be a shift beside their places; the depths that they see are those of the model."""
+def test_they_lie_where_the_cameras_were_learned_to_be(tiny_scene, tmp_path):
+    """All cameras were learned to be a shift beside their places; the depths that they see are those of the model."""
     run, moved = opened(tiny_scene, plane(), tmp_path / "run"), opened(tiny_scene, plane(), tmp_path / "moved")
     poses = CameraState(CameraOptimizer(), moved.scene.split("train"), moved.original.views)
     poses.numbers |= {f"{DEPTHS}/{view.name}": 1.0 for view in poses.views}
@@ -124,7 +124,7 @@ def test_pixel_is_drawn_once_with_its_position_and_color(rng):
     columns, rows = np.floor(at).astype(int).T
     np.testing.assert_allclose(at - 0.5, np.stack([columns, rows], axis=1), atol=1e-9)
     np.testing.assert_allclose(seen[:, 2], depth[rows, columns])
-    np.testing.assert_array_equal(found.colours, image[rows, columns] / 255)
+    np.testing.assert_array_equal(found.colors, image[rows, columns] / 255)
     assert len(np.unique(rows * 30 + columns)) == 200
     assert rows.min() == 4
     assert (columns < 15).sum() > 5 * (columns >= 15).sum()

@@ -39,7 +39,7 @@ def loss_of(alpha: np.ndarray, splats: ref.Splats, weights: np.ndarray) -> float
     """Σ weights · image, blended from planes of alpha, [N,H,W]."""
     image, left = np.zeros(weights.shape), np.ones(weights.shape[1:])
     for i in np.argsort(splats.depth):
-        image += splats.colour[i][:, None, None] * alpha[i] * left
+        image += splats.color[i][:, None, None] * alpha[i] * left
         left = left * (1 - alpha[i])
     return float(((image + BACKGROUND[:, None, None] * left) * weights).sum())
 
@@ -224,7 +224,7 @@ class Edited:
         return densify(edit, rules, self.tiler, limit)
 
     def rows_of(self, source: int) -> np.ndarray:
-        """Rows that carry the colours of an old row."""
+        """Rows that carry the colors of an old row."""
         return np.flatnonzero((self.gaussians.get("sh_rest") == self.before["sh_rest"][source]).all(axis=1))
 
 

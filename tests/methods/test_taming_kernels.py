@@ -34,7 +34,7 @@ def test_scores_are_those_of_the_formula(device, rng):
     case.parameters["means"][4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
     photographs = rng.integers(0, 256, (2, 3, 17, 33)).astype(np.uint8)
     camera = case.device_camera(device)
-    held = {f"{i}": Photograph(camera, device.upload(colours)) for i, colours in enumerate(photographs)}
+    held = {f"{i}": Photograph(camera, device.upload(colors)) for i, colors in enumerate(photographs)}
     views = [SimpleNamespace(name=name, world_to_camera=case.view.world_to_camera) for name in held]
     source = SimpleNamespace(get=lambda view: held[view.name], background=device.upload(BACKGROUND))
     survey = Survey(Rasterizer(device, "radix"), case.model(device), source, views, seed=0, step=0)
@@ -46,8 +46,8 @@ def test_scores_are_those_of_the_formula(device, rng):
     assert not seen[4]
     kernel = np.array([[0, 1, 0], [1, -4, 1], [0, 1, 0]])
     expected, total = np.zeros(30), 0.0
-    for colours in photographs:
-        truth = colours / 255
+    for colors in photographs:
+        truth = colors / 255
         edges = np.abs(convolve(truth.mean(axis=0), kernel, mode="nearest"))
         plane = shares(np.abs(image - truth).mean(axis=0)) + shares(edges)
         loss = 0.8 * ref.l1(image, truth)[0] + 0.2 * ref.dssim(image, truth)[0]

@@ -1,4 +1,4 @@
-"""Figures in the colours of the photographs, beside PSNR."""
+"""Figures in the colors of the photographs, beside PSNR."""
 
 import re
 
@@ -8,11 +8,11 @@ import pytest
 from clsplat.metrics.images import MAX_PSNR, psnr, to_8_bits
 from clsplat.metrics.views import (
     PIXELS,
-    colour_figures,
+    color_figures,
     corrected_by_regression,
-    in_colours_of,
+    in_colors_of,
     mean_figures,
-    tell_of_colours,
+    tell_of_colors,
 )
 from clsplat.stages.optimize import compared
 from clsplat.training.modules.exposure import Affine, Gain
@@ -32,32 +32,32 @@ def everywhere(image: np.ndarray) -> np.ndarray:
 def test_exposure_costs_psnr_but_nothing_in_photograph_colors(image):
     photograph = to_8_bits(image * GAINS.astype(np.float32))
     assert psnr(image, photograph) < 25
-    found = colour_figures(image, photograph, None, Gain())
-    assert found["psnr_colour"] > 50
+    found = color_figures(image, photograph, None, Gain())
+    assert found["psnr_color"] > 50
     assert found["psnr_affine"] > 50
 
 
 def test_equal_images_stay_equal(image):
     photograph = to_8_bits(image)
     for model in (Gain(), Affine()):
-        assert colour_figures(photograph / np.float32(255), photograph, None, model)["psnr_colour"] == MAX_PSNR
+        assert color_figures(photograph / np.float32(255), photograph, None, model)["psnr_color"] == MAX_PSNR
 
 
-def test_no_pixel_is_measured_in_colours_that_were_fitted_to_it(image):
+def test_no_pixel_is_measured_in_colors_that_were_fitted_to_it(image):
     """What is true of one half alone does not help there."""
     photograph = to_8_bits(image)
     photograph[:, :15] = to_8_bits(image[:, :15] * 0.5)
-    changed = in_colours_of(image.astype(np.float64), photograph, everywhere(image), Gain())
+    changed = in_colors_of(image.astype(np.float64), photograph, everywhere(image), Gain())
     assert changed[:, :15] == pytest.approx(image[:, :15], abs=0.01), "as the right half asks for"
     assert changed[:, 15:] == pytest.approx(0.5 * image[:, 15:], abs=0.01)
 
 
-def test_white_black_and_masked_pixels_say_nothing_of_colours(image, rng):
+def test_white_black_and_masked_pixels_say_nothing_of_colors(image, rng):
     truth = np.minimum(image * 1.5, 1)
     photograph, counted = to_8_bits(truth), rng.random(image.shape[:2]) < 0.8
     assert (photograph == 255).any()
     photograph[~counted] = 128
-    changed = in_colours_of(image.astype(np.float64), photograph, counted, Gain())
+    changed = in_colors_of(image.astype(np.float64), photograph, counted, Gain())
     assert changed[counted] == pytest.approx(truth[counted], abs=0.01)
 
 
@@ -69,64 +69,64 @@ def test_half_with_too_few_pixels_gives_no_color_figure(image, model, numbers, h
     rows, columns = np.nonzero(~counted)
     for number, has in ((PIXELS * numbers - 1, False), (PIXELS * numbers, True)):
         counted[rows[:number], columns[:number]] = True
-        found = colour_figures(image, photograph, counted, model)
-        assert ("psnr_colour" in found) == has
+        found = color_figures(image, photograph, counted, model)
+        assert ("psnr_color" in found) == has
         assert "psnr_affine" in found
 
 
 @pytest.mark.parametrize("model", [Gain(), Affine()])
 def test_which_views_have_the_figure_is_independent_of_the_model(image, model):
-    """Else two steps are compared on different views.  A picture that is white everywhere is bad in any colours."""
+    """Else two steps are compared on different views.  A picture that is white everywhere is bad in any colors."""
     photograph = to_8_bits(0.5 * image)
     for step in (image, image + 2, np.ones_like(image), np.full_like(image, np.inf), np.full_like(image, np.nan)):
-        assert "psnr_colour" in colour_figures(step, photograph, None, model)
-    assert colour_figures(np.ones_like(image), photograph, None, model)["psnr_colour"] < 22, "one colour"
-    bright = colour_figures(image / 0.05, to_8_bits(image), None, model)
-    assert bright["psnr_colour"] > 50, "beyond white a picture still says which colours it asks for"
+        assert "psnr_color" in color_figures(step, photograph, None, model)
+    assert color_figures(np.ones_like(image), photograph, None, model)["psnr_color"] < 22, "one color"
+    bright = color_figures(image / 0.05, to_8_bits(image), None, model)
+    assert bright["psnr_color"] > 50, "beyond white a picture still says which colors it asks for"
 
 
 def test_pixels_beyond_white_are_dropped_where_enough_remain(image):
     photograph, bright = to_8_bits(0.5 * image), image.astype(np.float64)
     bright[:5] = 3
-    changed = in_colours_of(bright, photograph, everywhere(image), Gain())
+    changed = in_colors_of(bright, photograph, everywhere(image), Gain())
     assert changed[5:] == pytest.approx(0.5 * image[5:], abs=0.01)
 
 
 def test_a_mean_says_of_how_many_views_it_is():
-    both, one = {"psnr_colour": 30.0, "psnr_affine": 32.0}, {"psnr_affine": 20.0}
+    both, one = {"psnr_color": 30.0, "psnr_affine": 32.0}, {"psnr_affine": 20.0}
     assert mean_figures([both, both]) == both
     assert mean_figures([{}, {}]) == {}
     assert mean_figures([both, one]) == {
-        "psnr_colour": 30.0,
+        "psnr_color": 30.0,
         "psnr_affine": 26.0,
-        "psnr_colour_views": 1,
-        "psnr_colour_reason": "1 of 2 views have a half with too few pixels to fit colours to",
+        "psnr_color_views": 1,
+        "psnr_color_reason": "1 of 2 views have a half with too few pixels to fit colors to",
     }
     none = mean_figures([one])
-    assert (none["psnr_colour"], none["psnr_colour_views"]) == (None, 0)
+    assert (none["psnr_color"], none["psnr_color_views"]) == (None, 0)
 
 
 def test_the_log_says_of_how_many_views_the_mean_is(caplog):
     caplog.set_level("INFO", "clsplat")
-    whole = {"psnr": 20.0, "psnr_colour": 24.0}
-    tell_of_colours({"psnr": 20.0})
+    whole = {"psnr": 20.0, "psnr_color": 24.0}
+    tell_of_colors({"psnr": 20.0})
     assert not caplog.messages
     for averages, said in (
         (whole, r"PSNR 24.00 dB; exposures of these photographs differ"),
-        ({**whole, "psnr_colour_views": 1, "psnr_colour_reason": "why"}, r"PSNR 24.00 dB, the mean of 1 view: why$"),
+        ({**whole, "psnr_color_views": 1, "psnr_color_reason": "why"}, r"PSNR 24.00 dB, the mean of 1 view: why$"),
         (
-            {"psnr": 20.0, "psnr_colour": None, "psnr_colour_reason": "why"},
-            r"^no PSNR in the .* colours: why$",
+            {"psnr": 20.0, "psnr_color": None, "psnr_color_reason": "why"},
+            r"^no PSNR in the .* colors: why$",
         ),
     ):
         caplog.clear()
-        tell_of_colours(averages)
+        tell_of_colors(averages)
         (message,) = caplog.messages
         assert re.search(said, message)
 
 
 def test_best_model_is_chosen_by_psnr_where_no_view_has_colors():
-    fitted, bare = {"psnr": 20.0, "psnr_colour": 24.0}, {"psnr": 21.0, "psnr_colour": None}
+    fitted, bare = {"psnr": 20.0, "psnr_color": 24.0}, {"psnr": 21.0, "psnr_color": None}
     assert compared([fitted, fitted]) == [24.0, 24.0]
     assert compared([fitted, bare]) == compared([fitted, {"psnr": 21.0}]) == [20.0, 21.0]
     assert compared([fitted, {}]) == [20.0, None]
@@ -134,10 +134,10 @@ def test_best_model_is_chosen_by_psnr_where_no_view_has_colors():
 
 def test_steps_compare_by_psnr_where_some_views_lack_colors():
     """30 dB of one view is no better than 31 and 22 dB of two."""
-    first = {"psnr": 20.0, **mean_figures([{"psnr_colour": 30.0}, {"psnr_affine": 20.0}])}
-    second = {"psnr": 21.0, **mean_figures([{"psnr_colour": 31.0}, {"psnr_colour": 22.0}])}
-    assert (first["psnr_colour"], second["psnr_colour"]) == (30.0, 26.5)
-    whole = {"psnr": 22.0, "psnr_colour": 29.0}
+    first = {"psnr": 20.0, **mean_figures([{"psnr_color": 30.0}, {"psnr_affine": 20.0}])}
+    second = {"psnr": 21.0, **mean_figures([{"psnr_color": 31.0}, {"psnr_color": 22.0}])}
+    assert (first["psnr_color"], second["psnr_color"]) == (30.0, 26.5)
+    whole = {"psnr": 22.0, "psnr_color": 29.0}
     assert compared([whole, first]) == [22.0, 20.0]
     assert compared([first, whole]) == [20.0, 22.0]
     assert compared([whole, second]) == [29.0, 26.5]

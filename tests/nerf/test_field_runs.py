@@ -55,7 +55,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory, pipelin
 def test_a_run_of_a_field_leaves_what_one_of_gaussians_does(finished):
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["gaussians"] is None
-    assert metrics["parameters"] == FieldShape(depth=2, width=32, skip=0, colour_width=16).learned
+    assert metrics["parameters"] == FieldShape(depth=2, width=32, skip=0, color_width=16).learned
     assert set(metrics["test"]) == {"1", "2", "4"}
     assert all(one["views"] == 2 for one in metrics["test"].values())
     assert json.loads((finished / "status.json").read_text())["state"] == "done"
@@ -295,7 +295,7 @@ def paint(field: Field, view: View) -> np.ndarray:
 @pytest.fixture(scope="module")
 def small_field() -> Field:
     device = open_device()
-    shape = FieldShape(coarse_samples=16, fine_samples=16, depth=1, skip=None, width=4, colour_width=4, degrees=2)
+    shape = FieldShape(coarse_samples=16, fine_samples=16, depth=1, skip=None, width=4, color_width=4, degrees=2)
     return Field.first(shape, 1, device.upload(np.array([1.0, 0.5, 0.0], np.float32)))
 
 
@@ -315,7 +315,7 @@ def test_no_rays_are_no_picture(small_field):
     camera = upload_camera(small_field.workspace.device, View("v", Camera(4, 4, 9.0, 9.0, 2.0, 2.0), np.eye(3, 4)))
     rays = small_field.levels.cast(camera, small_field.workspace.device.upload(np.zeros(0, np.uint32)))
     levels = list(small_field.levels.render(small_field.parameters, rays))
-    assert [level.colours.shape for level in levels] == [(0, 3), (0, 3)]
+    assert [level.colors.shape for level in levels] == [(0, 3), (0, 3)]
 
 
 def test_a_parameter_that_is_not_a_number_is_seen_in_the_picture(small_field):

@@ -1,4 +1,4 @@
-"""Colours of each photograph: their numbers, their table, and whole runs with them."""
+"""Colors of each photograph: their numbers, their table, and whole runs with them."""
 
 import numpy as np
 import pytest
@@ -70,11 +70,11 @@ def test_table_changes_its_views_row_and_keeps_means_at_zero(rng):
 
 
 def test_a_view_has_one_row_at_all_its_sizes():
-    colours = ExposureState(Exposure(), ("a", "b", "a"))
-    colours.rate = 0.01
-    colours.begin_with({})
-    colours.learn(2, -IDENTITY, step=1)
-    assert colours.matrix(0)[0, 0] == colours.matrix(2)[0, 0] > 1 > colours.matrix(1)[0, 0]
+    colors = ExposureState(Exposure(), ("a", "b", "a"))
+    colors.rate = 0.01
+    colors.begin_with({})
+    colors.learn(2, -IDENTITY, step=1)
+    assert colors.matrix(0)[0, 0] == colors.matrix(2)[0, 0] > 1 > colors.matrix(1)[0, 0]
 
 
 def test_rates_follow_how_often_a_photograph_is_visited():

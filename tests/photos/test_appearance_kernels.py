@@ -1,11 +1,11 @@
-"""The colours of a photograph (colours.cl) against float64, and in a training step."""
+"""The colors of a photograph (colors.cl) against float64, and in a training step."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.appearance import colour_figures
+from clsplat.conformance.checks.appearance import color_figures
 from clsplat.conformance.checks.images import camera_of, planes_of
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
@@ -15,7 +15,7 @@ from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, Gain, change_colours
+from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, Gain, change_colors
 from clsplat.training.trainer import StepTrainer
 from tests.support.devices import on_devices, on_one_setting, product
 from tests.support.figures import hold
@@ -27,21 +27,21 @@ SIZES = ((1, 1), (2, 1), (15, 4), (16, 16), (17, 5), (33, 18), (127, 32), (129, 
 
 @on_devices("width, height", SIZES)
 def test_image_and_derivatives(device, rng, width, height):
-    hold(colour_figures(device, rng, width, height))
+    hold(color_figures(device, rng, width, height))
 
 
 @on_one_setting
 def test_no_change_cuts_white_alone(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera = camera_of(device, 33, 18)
-    found = change_colours(Workspace(device), camera, planes_of(device, camera, image), IDENTITY).get()
+    found = change_colors(Workspace(device), camera, planes_of(device, camera, image), IDENTITY).get()
     assert (found[:, :18, :33] == np.minimum(image, 1)).all()
 
 
 class Case:
-    """A trainer of a random scene; its photograph is the second of two, which have colours of their own."""
+    """A trainer of a random scene; its photograph is the second of two, which have colors of their own."""
 
-    def __init__(self, device, rng, colours=None, losses=SMOOTH, share=None) -> None:
+    def __init__(self, device, rng, colors=None, losses=SMOOTH, share=None) -> None:
         case, self.numbers = random_case(rng, 40, 50, 36), {}
         model, pixels = case.model(device), rng.integers(0, 256, (3, 36, 50)).astype(np.uint8)
         mask = None if share is None else device.upload((rng.random((1, 36, 50)) < share).astype(np.uint8))
@@ -49,8 +49,8 @@ class Case:
         self.photograph = Photograph(camera, device.upload(pixels), mask)
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         self.trainer = StepTrainer(*parts, device.upload(BACKGROUND), losses, Rates())
-        if colours:
-            state, gains = ExposureState(Exposure(model=colours), ("a", "b")), np.array([0.3, 0.1, -0.2])
+        if colors:
+            state, gains = ExposureState(Exposure(model=colors), ("a", "b")), np.array([0.3, 0.1, -0.2])
             state.rate, state.numbers = 0.01, self.numbers
             state.begin_with({"a": -gains, "b": gains})
             self.trainer.modules = [state]
@@ -61,10 +61,10 @@ class Case:
         return self.trainer.compare(self.photograph, 1).loss
 
 
-@on_devices("colours, share", product([Gain(), Affine(weight=0.3)], [None, 0.7]))
-def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, monkeypatch, colours, share):
+@on_devices("colors, share", product([Gain(), Affine(weight=0.3)], [None, 0.7]))
+def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, monkeypatch, colors, share):
     """By finite differences of the loss; l2 is smooth."""
-    case, found = Case(device, rng, colours, share=share), []
+    case, found = Case(device, rng, colors, share=share), []
     table, step = case.trainer.modules[0].table, 2e-3
     numeric = [(case.loss(key, step) - case.loss(key, -step)) / (2 * step) for key in table.keys("b")]
     case.trainer.modules[0].numbers = case.numbers
@@ -75,9 +75,9 @@ def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, monkeypatch, 
     assert gradient == pytest.approx(np.array(numeric), rel=0.02, abs=2e-4)
 
 
-def gradients_of(device, rng, colours, losses) -> dict[str, np.ndarray]:
+def gradients_of(device, rng, colors, losses) -> dict[str, np.ndarray]:
     """Of the parameters of the Gaussians, at one view."""
-    trainer = (case := Case(device, rng, colours, losses)).trainer
+    trainer = (case := Case(device, rng, colors, losses)).trainer
     gaussians = trainer.model.gaussians
     for name in ("sh_base", "sh_rest"):  # no pixel is beyond white, where the image would be cut
         gaussians.set(name, gaussians.get(name) * np.float32(0.2))
@@ -99,7 +99,7 @@ def test_numbers_of_no_change_give_the_gradients_of_none(device, rng, monkeypatc
         assert np.linalg.norm(found[name] - expected) < 1e-4 * np.linalg.norm(expected), name
 
 
-def test_a_mask_hides_pixels_whatever_their_colours_become(device, rng):
+def test_a_mask_hides_pixels_whatever_their_colors_become(device, rng):
     """An offset makes black pixels bright."""
     case = Case(device, rng, Affine(), share=0.5)
     case.numbers.update({key: 0.2 for key in case.trainer.modules[0].table.keys("b") if key.endswith("1")})

@@ -19,17 +19,17 @@ from clsplat.render.painter import SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState
-from clsplat.training.modules.exposure import ColourState, Exposure, ExposureState, Gain
+from clsplat.training.modules.exposure import ColorState, Exposure, ExposureState, Gain
 from clsplat.training.trainer import StepTrainer
 
 VIEWS, STEPS = 8, 240
 NAMES = [str(number) for number in range(VIEWS)]
-RATES = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=2e-2, sh_rest=0)  # the colours alone are unknown
+RATES = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=2e-2, sh_rest=0)  # the colors alone are unknown
 LUMINANCE = np.array([0.299, 0.587, 0.114])
 
 
 class Capture:
-    """Photographs of a model of one colour a Gaussian from places beside each other, each with its gains, in 8 bits."""
+    """Photographs of a model of one color a Gaussian from places beside each other, each with its gains, in 8 bits."""
 
     def __init__(
         self,
@@ -39,14 +39,14 @@ class Capture:
         bright: float = 0.0,
         local: Callable[[np.ndarray, int], np.ndarray] | None = None,
     ) -> None:
-        """bright: added to the colours of the model; local: the logarithms of more gains, [H, W, 1], by the rendered
+        """bright: added to the colors of the model; local: the logarithms of more gains, [H, W, 1], by the rendered
         image, [H, W, 3], and the number of the photograph."""
         case = replace(random_case(rng, 80, 48, 36), degree=0)
         device = Device(info)
         self.model, self.rasterizer = case.model(device), Rasterizer(device)
         self.background, self.photographs = device.upload(np.full(3, 0.3, np.float32)), list[Photograph]()
-        self.colours = 0.5 * case.parameters["sh_base"] + np.float32(bright)
-        self.model.gaussians.set("sh_base", self.colours)
+        self.colors = 0.5 * case.parameters["sh_base"] + np.float32(bright)
+        self.model.gaussians.set("sh_base", self.colors)
         for number, gains in enumerate(log_gains):
             moved = case.view.world_to_camera + np.column_stack(
                 [np.zeros((3, 3)), [0.1 * number - 0.4, 0.05 * number, 0]]
@@ -58,7 +58,7 @@ class Capture:
             self.photographs.append(Photograph(replace(camera, view=number), device.upload(pixels)))
 
     def rendered(self, camera: DeviceCamera) -> np.ndarray:
-        """The model's own colours, [H, W, 3]."""
+        """The model's own colors, [H, W, 3]."""
         return render_floats(SplatPainter(self.rasterizer, self.model, self.background), camera)
 
     @property
@@ -66,10 +66,10 @@ class Capture:
         """The share of values that are white."""
         return float(np.mean([photograph.image() == 255 for photograph in self.photographs]))
 
-    def trained(self, rng: np.random.Generator, state: ColourState) -> StepTrainer:
-        """Train from other colours; return the trainer, whose module is the state."""
+    def trained(self, rng: np.random.Generator, state: ColorState) -> StepTrainer:
+        """Train from other colors; return the trainer, whose module is the state."""
         gaussians = self.model.gaussians
-        gaussians.set("sh_base", self.colours + rng.normal(0, 0.3, self.colours.shape).astype(np.float32))
+        gaussians.set("sh_base", self.colors + rng.normal(0, 0.3, self.colors.shape).astype(np.float32))
         state.rate = state.settings.rate_of(STEPS, VIEWS, False)
         state.begin_with({})
         parts = self.rasterizer, self.model, Adam(gaussians), SplatStats(gaussians, []), self.background
@@ -85,13 +85,13 @@ class Capture:
         return np.log([np.diag(state.matrix(number)) for number in range(VIEWS)])
 
     def shown(self, trainer: StepTrainer, number: int) -> np.ndarray:
-        """The image of a training view in the colours of its photograph, [H, W, 3]."""
+        """The image of a training view in the colors of its photograph, [H, W, 3]."""
         view = trainer.compare(self.photographs[number], STEPS)
         height, width = view.frame.camera.height, view.frame.camera.width
         return view.comparison.image.get()[:3, :height, :width].transpose(1, 2, 0)
 
     def fit(self, trainer: StepTrainer) -> float:
-        """The mean PSNR at the training views in the colours of their photographs, dB."""
+        """The mean PSNR at the training views in the colors of their photographs, dB."""
         pairs = ((self.shown(trainer, number), one.image()) for number, one in enumerate(self.photographs))
         return float(np.mean([psnr(image, photograph) for image, photograph in pairs]))
 
@@ -129,8 +129,8 @@ def test_blown_out_white_pixels_do_not_darken_the_scene(rng, info):
     found = capture.learned(rng)
     assert rms(found - truth) < 0.03
     model = capture.model.gaussians.get("sh_base")
-    seen = np.abs(model - capture.colours).max(axis=1) < 0.25
-    assert np.median((model - capture.colours)[seen]) == pytest.approx(0, abs=0.03)
+    seen = np.abs(model - capture.colors).max(axis=1) < 0.25
+    assert np.median((model - capture.colors)[seen]) == pytest.approx(0, abs=0.03)
 
 
 def test_grids_find_known_exposures_too(rng, info):

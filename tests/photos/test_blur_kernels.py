@@ -11,7 +11,7 @@ from clsplat.core.schedule import at_step
 from clsplat.photos.transforms import Blur, MeanFilter
 from clsplat.pipeline.loading import load
 from clsplat.stages.optimize import Optimize
-from tests.support.device_images import colours_of, planes_of
+from tests.support.device_images import colors_of, planes_of
 from tests.support.devices import each_once, on_devices, product
 
 SIZES = ((1, 1), (2, 3), (15, 4), (16, 16), (17, 5), (33, 18), (63, 3), (64, 2), (65, 7))  # tiles and groups
@@ -21,7 +21,7 @@ SIZES = ((1, 1), (2, 3), (15, 4), (16, 16), (17, 5), (33, 18), (63, 3), (64, 2),
 def test_the_blur_is_the_oracles(device, rng, width, height, sigma, share):
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     mask = None if share is None else rng.random((height, width)) < share
-    found = colours_of(Blur(sigma=sigma).apply(planes_of(device, image, mask), step=1))
+    found = colors_of(Blur(sigma=sigma).apply(planes_of(device, image, mask), step=1))
     np.testing.assert_allclose(found, blurred(image.astype(np.float64), sigma, mask), rtol=2e-5, atol=1e-6)
 
 
@@ -29,7 +29,7 @@ def test_a_pixel_keeps_its_value_where_nothing_near_it_counts(device, rng):
     image = rng.uniform(0, 1, (3, 20, 40)).astype(np.float32)
     mask = np.zeros((20, 40), bool)
     mask[10, 5] = True
-    found = colours_of(Blur(sigma=1.0).apply(planes_of(device, image, mask), step=1))
+    found = colors_of(Blur(sigma=1.0).apply(planes_of(device, image, mask), step=1))
     near = np.zeros((20, 40), bool)
     near[7:14, 2:9] = True
     np.testing.assert_array_equal(found[:, ~near], image[:, ~near])
@@ -42,16 +42,16 @@ def test_neither_the_edge_nor_a_mask_darkens_a_flat_image(device, rng, masked):
     mask = rng.random((18, 33)) < 0.5 if masked else None
     if mask is not None:
         image[:, ~mask] = 0
-    found = colours_of(Blur(sigma=4.0).apply(planes_of(device, image, mask), step=1))
+    found = colors_of(Blur(sigma=4.0).apply(planes_of(device, image, mask), step=1))
     np.testing.assert_allclose(found, 0.75, rtol=1e-6)
 
 
 def test_without_a_sigma_the_photograph_stays(device, rng):
     image = rng.uniform(0, 1, (3, 5, 9)).astype(np.float32)
     blur = Blur(sigma={"points": [[0, 0.0], [10, 2.0]], "between": "steps"})
-    np.testing.assert_array_equal(colours_of(blur.apply(planes_of(device, image), step=9)), image)
+    np.testing.assert_array_equal(colors_of(blur.apply(planes_of(device, image), step=9)), image)
     expected = blurred(image.astype(np.float64), 2.0)
-    np.testing.assert_allclose(colours_of(blur.apply(planes_of(device, image), step=10)), expected, rtol=2e-5)
+    np.testing.assert_allclose(colors_of(blur.apply(planes_of(device, image), step=10)), expected, rtol=2e-5)
 
 
 @on_devices(
@@ -61,7 +61,7 @@ def test_without_a_sigma_the_photograph_stays(device, rng):
 def test_the_mean_filter_is_the_oracles(device, rng, share, reach, masked):
     image = rng.uniform(0, 1, (3, 17, 20)).astype(np.float32)
     mask = rng.random((17, 20)) < 0.5 if masked else None
-    found = colours_of(MeanFilter(width=share).apply(planes_of(device, image, mask), step=1))
+    found = colors_of(MeanFilter(width=share).apply(planes_of(device, image, mask), step=1))
     if reach == 0:
         np.testing.assert_array_equal(found, image)
     np.testing.assert_allclose(found, averaged(image.astype(np.float64), reach, 0.0, mask), rtol=2e-5, atol=1e-6)

@@ -43,13 +43,13 @@ def test_largest_divisor_is_of_the_most_detailed_and_limited():
 
 
 def test_without_detail_the_size_is_full_from_the_start():
-    grey = DetailDivisor(follows="detail", until=900).of([np.full((40, 60, 3), 77, np.uint8)])
-    assert grey.points == [[0, 1]]
-    assert "full size" in course(grey)
+    gray = DetailDivisor(follows="detail", until=900).of([np.full((40, 60, 3), 77, np.uint8)])
+    assert gray.points == [[0, 1]]
+    assert "full size" in course(gray)
 
 
 @pytest.mark.parametrize("size", [(48, 64), (33, 57), (1, 20)])
-def test_a_spectrum_sums_what_the_centred_window_holds(size):
+def test_a_spectrum_sums_what_the_centered_window_holds(size):
     image = np.random.default_rng(3).integers(0, 256, (*size, 3), dtype=np.uint8)
     amplitudes = np.abs(np.fft.fft2(image.astype(np.float64), axes=(0, 1))).sum(axis=2)
     spectrum = Spectrum.of(image)

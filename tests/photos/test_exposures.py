@@ -95,7 +95,7 @@ def test_photographs_that_agree_but_for_their_gains_are_no_fault(rng, spread):
     wall = Wall(rng)
     log_gains = wall.log_gains[:, 0] * (spread / 0.25)
     photograph, point = (part.ravel() for part in np.indices((8, POINTS)))
-    values = wall.colours[point, 0] * np.exp(log_gains[photograph])
+    values = wall.colors[point, 0] * np.exp(log_gains[photograph])
     assert _fitted(photograph, point, values, 8)[0] == pytest.approx(log_gains - log_gains.mean(), abs=1e-6)
 
 
@@ -121,11 +121,11 @@ def test_light_that_changes_with_view_direction_is_no_exposure(rng):
     """Each photograph of a point differs for itself."""
     wall = Wall(rng)
     wall.log_gains[:] = 0
-    colours = wall.colours
-    glossy = {view.name: colours * np.exp(rng.normal(0, 0.3, (POINTS, 1))) for view in wall.views}
+    colors = wall.colors
+    glossy = {view.name: colors * np.exp(rng.normal(0, 0.3, (POINTS, 1))) for view in wall.views}
 
     def photograph(view: View) -> np.ndarray:
-        wall.colours = glossy[view.name]
+        wall.colors = glossy[view.name]
         return Wall.photograph(wall, view)
 
     found = measured(wall.tracks, wall.views, lambda view: (photograph(view), None))
@@ -148,7 +148,7 @@ def test_points_count_where_a_photograph_shows_them(rng):
     image, mask = wall.photograph(wall.views[0]), np.zeros((SIZE, SIZE), bool)
     rows, values = samples(wall.tracks, view, image, None)
     assert (rows == np.arange(POINTS)).all()
-    assert values == pytest.approx(wall.colours * np.exp(wall.log_gains[0]), abs=3e-3)
+    assert values == pytest.approx(wall.colors * np.exp(wall.log_gains[0]), abs=3e-3)
     mask[:, : SIZE // 2] = True
     assert len(samples(wall.tracks, view, image, mask)[0]) == pytest.approx(POINTS / 2, abs=20)
     behind = replace(wall.tracks, positions=-wall.tracks.positions)
@@ -157,7 +157,7 @@ def test_points_count_where_a_photograph_shows_them(rng):
 
 def test_tracks_are_written_and_read(rng, tmp_path):
     wall = Wall(rng, overlap=60)
-    points = PointCloud(wall.tracks.positions.astype(np.float32), wall.colours.astype(np.float32))
+    points = PointCloud(wall.tracks.positions.astype(np.float32), wall.colors.astype(np.float32))
     write_model(tmp_path, wall.views, points, wall.tracks)
     images, read = read_images(tmp_path), read_point_table(tmp_path)
     tracks = tracks_of(images, read)

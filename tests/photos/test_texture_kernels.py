@@ -46,7 +46,7 @@ def test_image_gradient(device, rng, width, height):
 
 @on_devices("width, height", SIZES)
 def test_what_is_masked_has_no_texture(device, rng, width, height):
-    """Nor have its neighbours, and neither the texture nor its quantiles depend on what is hidden."""
+    """Nor have its neighbors, and neither the texture nor its quantiles depend on what is hidden."""
     camera, workspace = camera_of(device, width, height), Workspace(device)
     mask = rng.random((height, width)) < 0.9
     known = ndimage.minimum_filter(mask, 3, mode="nearest")
@@ -57,7 +57,7 @@ def test_what_is_masked_has_no_texture(device, rng, width, height):
             camera, device.upload(pixels.astype(np.uint8)), device.upload(mask[None].astype(np.uint8))
         )
         planes = photograph.planes(workspace)
-        texture = known_gradient(workspace, camera, planes.colours, planes.mask).get()
+        texture = known_gradient(workspace, camera, planes.colors, planes.mask).get()
         expected = np.where(known, magnitude_of(pixels / 255), -1)
         np.testing.assert_allclose(texture[:height, :width], expected, atol=1e-6)
         texture[:height, :width] = 0

@@ -145,7 +145,7 @@ def test_before_preparation_it_says_what_is_undecided():
     ("adapt", "complaint"),
     [
         ("{type: counted, key: model.sh_degre}", "adapt: counted: "),
-        ("{type: counted, key: optimise.steps}", "adapt: counted: optimise.steps: no 'optimise'"),
+        ("{type: counted, key: optimize.steps}", "adapt: counted: optimize.steps: no 'optimize'"),
         ("{type: counted, key: scene.downscale}", "scene.downscale is used before photographs are measured"),
         ("{type: counted, key: optimize.steps}", r"optimize\.steps.* --set of one of its keys wins: optimize\.steps, "),
         ("photo", "no adaptation named 'photo'; did you mean 'photos'"),

@@ -102,18 +102,18 @@ def test_files_without_a_matrix_are_pipelines(write):
 
 
 REFUSED = {
-    "misspelt axis": (SMALL.replace("seeds:", "seds:"), r"x.yaml:3: matrix.seds: unknown key 'seds'; did you mean"),
+    "misspelled axis": (SMALL.replace("seeds:", "seds:"), r"x.yaml:3: matrix.seds: unknown key 'seds'; did you mean"),
     "no axis": ("name: s\nmatrix: {}\n" + STAGES, r"x.yaml:2: matrix: expected one of pipelines, scenes, seeds"),
     "empty axis": ("name: s\nmatrix: {set: {init.count: []}}\n" + STAGES, r"init.count: expected a list of at least 1"),
     "not a list": (SMALL.replace("[4, 6]", "4"), r"x.yaml:5: matrix.set.optimize.steps: expected a list, got 4"),
     "text for a seed": (SMALL.replace("[0, 1]", "[0, one]"), r"matrix.seeds\[1\]: expected a whole number, got 'one'"),
-    "misspelt setting": (
+    "misspelled setting": (
         SMALL.replace("optimize.steps", "optimize.stps"),
         r"x.yaml:5: matrix.set.optimize.stps\[0\]: unknown key 'stps'; did you mean 'steps'",
     ),
-    "misspelt stage": (
-        SMALL.replace("optimize.steps", "optimise.steps"),
-        r"x.yaml:5: matrix.set.optimise.steps\[0\]: no 'optimise' in this pipeline; did you mean optimize",
+    "misspelled stage": (
+        SMALL.replace("optimize.steps", "optimize.steps"),
+        r"x.yaml:5: matrix.set.optimize.steps\[0\]: no 'optimize' in this pipeline; did you mean optimize",
     ),
     "wrong value": (
         SMALL.replace("[4, 6]", "[4, 30k]"),

@@ -18,7 +18,7 @@ PIXELS = "optimize.losses=[l1, {type: covariance_trace, pixels: 2.0}]"
     ("override", "what"),
     [
         ("model.world_filter=smoothing", "model.world_filter: 'smoothing'"),
-        ("densify.rules=[merge_neighbours]", "stages[1].optimize.during[1].densify.rules[0]: 'merge_neighbours'"),
+        ("densify.rules=[merge_neighbors]", "stages[1].optimize.during[1].densify.rules[0]: 'merge_neighbors'"),
         (PIXELS, "stages[1].optimize.losses[1]: 'covariance_trace'"),
     ],
 )

@@ -119,7 +119,7 @@ STAGE = ("budget", "every", "grow_until", "inside", "max_gaussians", "patience",
 THINNING = {
     *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
     *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),
-    *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
+    *(f"densify~3.rules.merge_neighbors{key}" for key in ("", ".start", ".color_below", ".distance_below")),
 }
 LIMITED = {  # a limit of the opacity, in front of the resets
     *("reset_opacity.every", "reset_opacity.to", "reset_opacity~2.every", "reset_opacity~2.stop"),
@@ -322,20 +322,20 @@ def replaced(old: str, new: str) -> str:
 
 
 REFUSED = {
-    "misspelt key": (
+    "misspelled key": (
         replaced("weight: 0.8", "wieght: 0.8"),
         r"x.yaml:7: stages\[1\].optimize.losses\[0\].wieght: unknown key 'wieght'; did you mean 'weight'",
     ),
-    "misspelt stage": (replaced("- evaluate", "- evalute"), r"no stage named 'evalute'; did you mean 'evaluate'\?"),
-    "misspelt loss": (
+    "misspelled stage": (replaced("- evaluate", "- evalute"), r"no stage named 'evalute'; did you mean 'evaluate'\?"),
+    "misspelled loss": (
         replaced("type: dssim", "type: dsim"),
         r"x.yaml:8: stages\[1\].optimize.losses\[1\].*no loss named 'dsim'; did you mean 'dssim'\?",
     ),
-    "misspelt rule": (
+    "misspelled rule": (
         replaced("type: clone", "type: clon"),
         r"during\[0\].densify.rules\[0\].*no rule named 'clon'; did you mean 'clone'\?",
     ),
-    "misspelt top key": (replaced("name: small", "nam: small"), "unknown key 'nam'; did you mean 'name'"),
+    "misspelled top key": (replaced("name: small", "nam: small"), "unknown key 'nam'; did you mean 'name'"),
     "text for a number": (
         replaced("steps: 10", "steps: 30k"),
         r"x.yaml:5: stages\[1\].optimize.steps: expected a whole number, got '30k'",
@@ -527,8 +527,8 @@ SCHEMA_REFUSES = {
     "no cadence, with a name": replaced("checkpoint: {every: 5}", "checkpoint"),
     "no cadence": replaced("checkpoint: {every: 5}", "checkpoint: {}"),
     "no stages": "name: x\n",
-    **{case: REFUSED[case][0] for case in ("misspelt key", "misspelt stage", "misspelt loss", "misspelt rule")},
-    **{case: REFUSED[case][0] for case in ("misspelt top key", "text for a number", "negative", "missing steps")},
+    **{case: REFUSED[case][0] for case in ("misspelled key", "misspelled stage", "misspelled loss", "misspelled rule")},
+    **{case: REFUSED[case][0] for case in ("misspelled top key", "text for a number", "negative", "missing steps")},
     **{case: REFUSED[case][0] for case in ("stage not for during", "two keys in a stage", "unsafe name")},
 }
 

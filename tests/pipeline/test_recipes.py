@@ -29,7 +29,7 @@ LOOKS_AT_VIEWS = {"fastgs_7k", "speedy_7k", "mini_7k", "taming_7k"}
 ACTS = {  # what decides in a family of recipes; `clone` in all others
     "auto": "clone split prune_spare", "fast": "clone prune_useless",
     "fastgs": "split prune_inaccurate", "gdgs": "clone_crowded", "mcmc": "relocate",
-    "micro_splatting_v2": "split_textured merge_neighbours prune_unimportant",
+    "micro_splatting_v2": "split_textured merge_neighbors prune_unimportant",
     "mini": "clone prune_useless", "speedy": "prune_least", "steep": "split_saddle",
 }  # fmt: skip
 LEARNS = {"auto_opti3dgs_7k"}

@@ -21,7 +21,7 @@ from clsplat.prepare.gather import gather, left_out, list_photographs
 from clsplat.prepare.mapping import map_cameras
 from clsplat.prepare.matching import match_features
 from clsplat.prepare.rotation_only import without_depth
-from clsplat.scene.images import copied, exposure_of, optics_of, read_grey, read_header, read_image
+from clsplat.scene.images import copied, exposure_of, optics_of, read_gray, read_header, read_image
 from tests.support.pictures import blocks
 from tests.support.refusals import refusal
 
@@ -128,10 +128,10 @@ def test_reduced_photographs_tell_where_their_pixels_were(tmp_path):
     cv2.circle(pixels, (1000, 700), 24, (200, 200, 200), -1)
     cv2.imwrite(str(tmp_path / "a.jpg"), pixels)
     for long_side in (2000, 800, 300, 160):
-        grey, (across, down) = read_grey(tmp_path / "a.jpg", long_side)
-        assert max(grey.shape) == min(long_side, 1203)
-        weight = np.maximum(grey.astype(float) - 80, 0)
-        y, x = (np.indices(grey.shape) * weight).sum(axis=(1, 2)) / weight.sum()
+        gray, (across, down) = read_gray(tmp_path / "a.jpg", long_side)
+        assert max(gray.shape) == min(long_side, 1203)
+        weight = np.maximum(gray.astype(float) - 80, 0)
+        y, x = (np.indices(gray.shape) * weight).sum(axis=(1, 2)) / weight.sum()
         np.testing.assert_allclose([(x + 0.5) * across, (y + 0.5) * down], [1000.5, 700.5], atol=0.3)
 
 
@@ -323,7 +323,7 @@ def test_sets_that_cannot_work_end_in_a_sentence(tmp_path, dense, pixels, senten
 def test_plain_photographs_not_fully_matched_end_in_a_sentence(tmp_path, dense):
     """More pairs are looked for among photographs without features."""
     plain = [np.full((180, 240, 3), 100 + number, np.uint8) for number in range(12)]
-    matches, cameras = prepared(tmp_path, plain, matching="sequential", neighbours=2)
+    matches, cameras = prepared(tmp_path, plain, matching="sequential", neighbors=2)
     with pytest.raises(DataError, match="none has features, where thousands"):
         map_cameras(matches, cameras)
 
@@ -339,7 +339,7 @@ def test_only_attempts_that_are_made_count(tmp_path, dense, caplog):
 
 
 def test_copies_among_photographs_tell_nothing_of_the_camera(tmp_path, dense):
-    """Three neighbours that shift before a wall, each with two copies, which match it best: it has not turned."""
+    """Three neighbors that shift before a wall, each with two copies, which match it best: it has not turned."""
     wide = blocks(1, 400, 180)
     matches, _ = prepared(tmp_path, [wide[:, 30 * (number // 3) :][:, :240] for number in range(9)])
     pycolmap = pytest.importorskip("pycolmap")

@@ -406,7 +406,7 @@ def test_the_command_line(scene, tmp_path):
     page = (tmp_path / "page.html").read_text()
     assert "Ready to train" in page
     data = json.loads(page.partition('<script type="application/json">')[2].partition("</script>")[0])
-    assert (len(data["names"]), len(data["cameras"]), len(data["colours"])) == (24, 24, 200)
+    assert (len(data["names"]), len(data["cameras"]), len(data["colors"])) == (24, 24, 200)
     assert sorted({camera[0] for camera in data["cameras"]}) == [0, 1]
     assert "://" not in page  # nothing from outside
 

@@ -48,7 +48,7 @@ def place(photos: Path, out: Path, **matching: object) -> Path:
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Fourteen neighbouring photographs."""
+    """Fourteen neighboring photographs."""
     pytest.importorskip("pycolmap")
     source = data_set("fox_opencv")
     folder = tmp_path_factory.mktemp("photos")
@@ -120,7 +120,7 @@ def read_model(folder: Path):
 
 @pytest.mark.parametrize("matching", ["sequential", "vocabulary"])
 def test_other_ways_to_match(photos, tmp_path, matching):
-    placed = place(photos, tmp_path, matching=matching, neighbours=3)
+    placed = place(photos, tmp_path, matching=matching, neighbors=3)
     assert len(read_scene(placed).views) >= 12
 
 
@@ -450,7 +450,7 @@ def test_undistorted_scene(tmp_path, lens, blank):
     y, x = np.nonzero(mask)
     u, v = (x + 0.5 - view.camera.cx) / view.camera.fx, (y + 0.5 - view.camera.cy) / view.camera.fy
     px, py = lens.distort(u, v)
-    inside = (px > 0.5) & (py > 0.5) & (px < lens.width - 0.5) & (py < lens.height - 0.5)  # between pixel centres
+    inside = (px > 0.5) & (py > 0.5) & (px < lens.width - 0.5) & (py < lens.height - 0.5)  # between pixel centers
     assert inside.mean() > 0.95
     assert np.abs(shown[y, x, 0] - pattern(u, v))[inside].max() < 1
 

@@ -19,7 +19,7 @@ WORK = {
 
 
 def save(path: Path, rng: np.random.Generator, value: float) -> Path:
-    """Gaussians around the centre of the scene, with coefficients of this size: of 3e38 a sixth overflow."""
+    """Gaussians around the center of the scene, with coefficients of this size: of 3e38 a sixth overflow."""
     model = model_of(random_case(rng, 200))
     tables = {"means": rng.normal(0, 0.5, (200, 3)), "log_scales": np.full((200, 3), -2.0)}
     tables |= {"sh_base": value * rng.choice([-1, 1], (200, 3)), "sh_rest": value * rng.choice([-1, 1], (200, 45))}

@@ -8,7 +8,7 @@ import pytest
 import clsplat
 from clsplat.core.settings import variants
 from clsplat.photos.transforms import PhotographTransform
-from tests.support.device_images import colours_of, planes_of
+from tests.support.device_images import colors_of, planes_of
 from tests.support.devices import each_once, on_devices
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -37,5 +37,5 @@ def window_mean(image: np.ndarray, reach: int) -> np.ndarray:
 def test_the_box_blur_is_the_mean_of_a_window(device, rng, width, height, reach):
     image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     transform = variants(PhotographTransform)["box_blur"](reach=reach)
-    found = colours_of(transform.apply(planes_of(device, image), step=1))
+    found = colors_of(transform.apply(planes_of(device, image), step=1))
     np.testing.assert_allclose(found, window_mean(image.astype(np.float64), round(reach)), rtol=1e-5)

@@ -72,7 +72,7 @@ def test_pointers_of_kernels_are_restrict_and_have_a_shape():
     for path in KERNEL_FILES:
         found = kernels(path)
         if {name for name, *_ in found} != set(parse_kernels(path.read_text())):
-            faults.append(f"{path.name}: layout of a kernel is not recognised")
+            faults.append(f"{path.name}: layout of a kernel is not recognized")
         for name, parameters, _ in found:
             for line in parameters.splitlines():
                 if "*" in line.split("//")[0] and not ("restrict" in line and re.search(r"//.*\[", line)):

@@ -287,7 +287,7 @@ def test_every_change_is_named(scene, tmp_path):
     assert said(with_view(0, name="fresh")) == f"1 view ({train[0].name}), gone, 1 view (fresh), new"
     assert opened.points is not None
     assert (
-        said(replace(opened, points=PointCloud(opened.points.positions[1:], opened.points.colours[1:]))) == "the points"
+        said(replace(opened, points=PointCloud(opened.points.positions[1:], opened.points.colors[1:]))) == "the points"
     )
     many = replace(opened, views=tuple(replace(view, image_path=other) for view in opened.views))
     names = ", ".join(view.name for view in train[:3])

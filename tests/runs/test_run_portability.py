@@ -99,7 +99,7 @@ def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
     folder = shutil.copytree(done, tmp_path / "run")
     metrics = json.loads((folder / "metrics.json").read_text())
     (folder / "metrics.json").write_text(json.dumps({**metrics, "by_heart": True}))
-    assert summary(folder)[-1].endswith("in a browser; the photographs are learnt by heart: more of them help most")
+    assert summary(folder)[-1].endswith("in a browser; the photographs are learned by heart: more of them help most")
 
 
 def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):

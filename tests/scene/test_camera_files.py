@@ -80,7 +80,7 @@ def same(old, new, prefix=""):
         assert (b.lens is None) == (a.lens is None)
         assert b.image_path.read_bytes() == a.image_path.read_bytes()
     np.testing.assert_array_equal(new.points.positions, old.points.positions)
-    np.testing.assert_array_equal(new.points.colours, old.points.colours)
+    np.testing.assert_array_equal(new.points.colors, old.points.colors)
 
 
 @pytest.mark.parametrize(("model", "lenses"), list(zip(LENSES, cycle((1, 3)), strict=False)))

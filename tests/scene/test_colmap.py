@@ -52,10 +52,10 @@ def assert_same_images(folder: Path, reconstruction) -> None:
 def assert_same_points(folder: Path, reconstruction) -> None:
     points = read_point_table(folder).cloud()
     assert points is not None
-    assert points.positions.dtype == points.colours.dtype == np.float32
+    assert points.positions.dtype == points.colors.dtype == np.float32
     theirs = reconstruction.points3D.values()
     expected = np.array([[*np.float32(p.xyz), *(np.float32(p.color) / np.float32(255))] for p in theirs], np.float32)
-    ours = np.concatenate([points.positions, points.colours], axis=1)
+    ours = np.concatenate([points.positions, points.colors], axis=1)
     np.testing.assert_array_equal(ours[np.lexsort(ours.T)], expected[np.lexsort(expected.T)])
 
 
@@ -147,8 +147,8 @@ def assert_matches(scene: Scene, model: ColmapModel) -> None:
         image, camera = images[view.name], cameras[images[view.name].camera]
         single = camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
         focals = [camera.params[0]] * 2 if single else list(camera.params[:2])
-        centre = camera.params[1:3] if single else camera.params[2:4]
-        assert view.camera == Camera(camera.width, camera.height, *focals, *centre)
+        center = camera.params[1:3] if single else camera.params[2:4]
+        assert view.camera == Camera(camera.width, camera.height, *focals, *center)
         for axis in np.eye(3):
             np.testing.assert_allclose(view.world_to_camera[:, :3] @ axis, rotated(image.quaternion, axis), atol=1e-12)
         np.testing.assert_array_equal(view.world_to_camera[:, 3], image.translation)
@@ -158,7 +158,7 @@ def assert_matches(scene: Scene, model: ColmapModel) -> None:
         return
     assert scene.points is not None
     np.testing.assert_array_equal(scene.points.positions, np.float32([p.position for p in model.points]))
-    np.testing.assert_allclose(scene.points.colours * 255, [p.rgb for p in model.points], atol=1e-4)
+    np.testing.assert_allclose(scene.points.colors * 255, [p.rgb for p in model.points], atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])

@@ -172,7 +172,7 @@ CASES: dict[str, tuple[Callable[[Path], object], int, str]] = {
     ),
     "a photograph that is a bomb": (with_photo(bomb), 3, "not an image"),
     "a photograph of 16 bits": (with_photo(lambda file: photo(file, np.zeros((48, 64, 3), np.uint16))), 0, ""),
-    "a grey photograph": (with_photo(lambda file: photo(file, np.zeros((48, 64), np.uint8))), 0, ""),
+    "a gray photograph": (with_photo(lambda file: photo(file, np.zeros((48, 64), np.uint8))), 0, ""),
     "a path that leads out": (with_images(ImageEntry("../../a.png")), 3, "not a path below"),
     "an absolute path": (with_images(ImageEntry("/etc/passwd")), 3, "not a path below"),
     "two images of a name": (

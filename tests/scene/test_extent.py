@@ -8,8 +8,8 @@ from clsplat.scene.scene import camera_extent, strayed
 from clsplat.scene.view import View
 
 
-def views_at(centres):
-    poses = [np.column_stack([np.eye(3), -np.asarray(centre, float)]) for centre in centres]
+def views_at(centers):
+    poses = [np.column_stack([np.eye(3), -np.asarray(center, float)]) for center in centers]
     return [View(f"{i}.png", Camera(4, 4, 4, 4, 2, 2), pose, f"{i}.png") for i, pose in enumerate(poses)]
 
 
@@ -27,7 +27,7 @@ def test_a_far_camera_does_not_change_the_extent(distance):
 
 
 @pytest.mark.parametrize(
-    "centres",
+    "centers",
     [
         orbit(),
         [(x, 0, 0) for x in range(100)],
@@ -39,9 +39,9 @@ def test_a_far_camera_does_not_change_the_extent(distance):
     ],
     ids=["orbit", "walk", "one place", "one step", "close-ups and overviews", "two", "one"],
 )
-def test_healthy_cameras_all_count(centres):
-    views = views_at(centres)
+def test_healthy_cameras_all_count(centers):
+    views = views_at(centers)
     assert not strayed(views).any()
-    points = np.asarray(centres, float)
+    points = np.asarray(centers, float)
     radius = 1.1 * np.linalg.norm(points - points.mean(axis=0), axis=1).max()
     assert camera_extent(views) == pytest.approx(radius or 1.0)

@@ -14,14 +14,14 @@ from clsplat.scene.visual_hull import Silhouette, hull_points
 from tests.support.silhouettes import RADIUS, SIZE, ball, ring
 
 
-def test_a_ball_is_found_with_its_colours():
+def test_a_ball_is_found_with_its_colors():
     points = hull_points(ring(), np.zeros(3), 1.0, ball, 4000, 0)
     assert len(points) == 4000
     radius = np.linalg.norm(points.positions, axis=1)
     assert np.abs(radius - RADIUS).max() < 0.05, "no point lies on the planes that few silhouettes leave"
     assert np.abs(radius.mean() - RADIUS) < 0.02
     expected = (points.positions / radius[:, None] + 1) / 2
-    assert np.median(np.abs(points.colours - expected)) < 0.03
+    assert np.median(np.abs(points.colors - expected)) < 0.03
 
 
 @pytest.mark.parametrize("count", [100, 1000, 20_000])
@@ -35,7 +35,7 @@ def test_the_cells_are_as_small_as_the_number_of_points_asks(count):
 def test_the_same_points_every_time_and_others_of_another_seed():
     first, second, other = (hull_points(ring(), np.zeros(3), 1.0, ball, 500, seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.positions, second.positions)
-    np.testing.assert_array_equal(first.colours, second.colours)
+    np.testing.assert_array_equal(first.colors, second.colors)
     assert not np.array_equal(first.positions, other.positions)
 
 
@@ -46,7 +46,7 @@ def test_one_view_showing_the_body_elsewhere_leaves_nothing():
         views,
         np.zeros(3),
         1.0,
-        lambda v: ball(v, centre=(0, 0, 0.9) if v is views[7] else (0, 0, 0), radius=0.3),
+        lambda v: ball(v, center=(0, 0, 0.9) if v is views[7] else (0, 0, 0), radius=0.3),
         500,
         0,
     )
@@ -59,9 +59,9 @@ def narrow_views() -> list[View]:
     return [View(view.name, camera, view.world_to_camera) for view in ring()]
 
 
-def narrow_ball(view: View, centre=(0.0, 0.0, 0.0), radius=0.3) -> np.ndarray:
+def narrow_ball(view: View, center=(0.0, 0.0, 0.0), radius=0.3) -> np.ndarray:
     """The middle of a picture three times as large."""
-    wide = ball(View(view.name, ring(1)[0].camera, view.world_to_camera), centre, radius)
+    wide = ball(View(view.name, ring(1)[0].camera, view.world_to_camera), center, radius)
     large = cv2.resize(wide, None, fx=3, fy=3)
     middle = (len(large) - SIZE) // 2
     return large[middle : middle + SIZE, middle : middle + SIZE]

@@ -26,7 +26,7 @@ def view_of(path: Path, width: int, height: int) -> View:
 
 
 def stored(path: Path, pixels: np.ndarray) -> Path:
-    """Write RGB(A) or grey pixels with OpenCV."""
+    """Write RGB(A) or gray pixels with OpenCV."""
     order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2] if pixels.ndim == 3 else 1)
     assert cv2.imwrite(str(path), pixels if order is None else np.ascontiguousarray(pixels[:, :, order]))
     return path
@@ -55,7 +55,7 @@ def test_name_with_unicode_and_spaces(tmp_path: Path) -> None:
     assert image_size(path) == (6, 4)
 
 
-def test_grey_becomes_rgb(tmp_path: Path) -> None:
+def test_gray_becomes_rgb(tmp_path: Path) -> None:
     pixels = random(4, 6)
     image = load_image(view_of(stored(tmp_path / "a.png", pixels), 6, 4))
     np.testing.assert_array_equal(image, np.repeat(pixels[:, :, None], 3, axis=2))
@@ -71,8 +71,8 @@ def test_sixteen_bits_become_eight(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("background", [BLACK, WHITE, (0.25, 0.5, 1.0)])
 def test_alpha_is_composited_in_double_and_truncated(tmp_path: Path, background) -> None:
-    colours, alphas = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
-    pixels = np.stack([colours, colours[:, ::-1], 255 - alphas, alphas], axis=2)
+    colors, alphas = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
+    pixels = np.stack([colors, colors[:, ::-1], 255 - alphas, alphas], axis=2)
     image = load_image(view_of(stored(tmp_path / "a.png", pixels), 256, 256), background)
     # Transcribed from the reference (3DGS, scene/dataset_readers.py, readCamerasFromTransforms).
     norm = pixels / 255.0
@@ -127,7 +127,7 @@ def test_downscaling_is_a_box_mean(tmp_path: Path, factor: int) -> None:
     assert abs((image - mean).mean()) < 0.02
 
 
-def test_alpha_is_averaged_apart_from_the_colours(tmp_path: Path) -> None:
+def test_alpha_is_averaged_apart_from_the_colors(tmp_path: Path) -> None:
     pixels = random(48, 64, 4)
     image = load_image(view_of(stored(tmp_path / "a.png", pixels), 32, 24), WHITE)
     mean = pixels.reshape(24, 2, 32, 2, 4).mean(axis=(1, 3)) / 255

@@ -73,7 +73,7 @@ def test_static_parts_never_change_and_three_things_do():
     first, last = shapes_at(0.0), shapes_at(0.8)
     assert first[: len(STANDING)] == last[: len(STANDING)] == STANDING
     ball, book, lamp = (first[-3:][i] for i in range(3))
-    assert ball.centre != last[-3].centre
+    assert ball.center != last[-3].center
     assert book.yaw != last[-2].yaw
     p = np.array([[0.1], [0.05], [0.03]])
     assert not np.allclose(lamp.paint(p), last[-1].paint(p))
@@ -84,10 +84,10 @@ def test_points_have_the_moment_at_which_they_were_seen(scene):
     assert points is not None
     assert points.times is not None
     assert set(points.times) == {np.float32(time) for time in moments_of(scene.split("train"))}
-    red = (points.colours[:, 0] > 0.5) & (points.colours[:, 1:].max(axis=1) < 0.25) & (points.positions[:, 2] > 0.03)
+    red = (points.colors[:, 0] > 0.5) & (points.colors[:, 1:].max(axis=1) < 0.25) & (points.positions[:, 2] > 0.03)
     ball = red & (points.positions[:, 1] < -0.2)
     assert ball.sum() > 5
-    way = np.array([shapes_at(float(time))[-3].centre for time in points.times[ball]])
+    way = np.array([shapes_at(float(time))[-3].center for time in points.times[ball]])
     assert np.median(np.linalg.norm(points.positions[ball] - way, axis=1)) == pytest.approx(0.13, abs=0.02)
 
 
@@ -166,7 +166,7 @@ def test_times_of_points_are_written_and_read(tmp_path):
     assert times.tolist() == [0, 0.25, 0.5]
     assert read_points_ply(tmp_path / "p.ply").times is None, "a scene that does not move has no clock"
     assert points.joined(points).times.tolist() == [0, 0.5, 1] * 2
-    assert points.joined(PointCloud(points.positions, points.colours)).times is None
+    assert points.joined(PointCloud(points.positions, points.colors)).times is None
 
 
 def test_times_of_points_in_another_unit_are_refused(tmp_path, caplog):

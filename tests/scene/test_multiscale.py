@@ -27,7 +27,7 @@ def folders(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
 
 
 def test_levels_are_box_means_without_alpha(rng):
-    """Not premultiplied: colours count in full where alpha is zero; truncated, not rounded."""
+    """Not premultiplied: colors count in full where alpha is zero; truncated, not rounded."""
     pixels = rng.integers(0, 256, (16, 24, 4), dtype=np.uint8)
     levels = pyramid(pixels, 4)
     for j, level in enumerate(levels):

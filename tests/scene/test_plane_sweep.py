@@ -22,7 +22,7 @@ from clsplat.scene.plane_sweep import MAX_DEPTH, MIN_DEPTH, PLANES, Surface, swe
 from clsplat.scene.quality import MAX_SPACING, laplacian_chance, opaque_pixels, spacing
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View, load_image
-from clsplat.scene.viewpoint import centre_of
+from clsplat.scene.viewpoint import center_of
 from clsplat.stages.init import Init
 from tests.support.data_sets import data_set
 from tests.support.runs import train
@@ -40,10 +40,10 @@ def wall_views(rng, count=6):
     camera = Camera(120, 90, 100, 100, 60, 45)
     views, photographs = [], {}
     for i in range(count):
-        centre = np.array([0.25 * i - 0.6, 0.1 * (i % 2), 0])
-        views.append(View(str(i), camera, np.column_stack([np.eye(3), -centre]), Path("none")))
+        center = np.array([0.25 * i - 0.6, 0.1 * (i % 2), 0])
+        views.append(View(str(i), camera, np.column_stack([np.eye(3), -center]), Path("none")))
         columns, rows = np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5)
-        x, y = (columns - 60) / 100 * DEPTH + centre[0], (rows - 45) / 100 * DEPTH + centre[1]
+        x, y = (columns - 60) / 100 * DEPTH + center[0], (rows - 45) / 100 * DEPTH + center[1]
         maps = (200 + 50 * x).astype(np.float32), (200 + 50 * y).astype(np.float32)
         photographs[str(i)] = cv2.remap(texture, *maps, cv2.INTER_LINEAR).astype(np.uint8)
     return views, photographs
@@ -58,7 +58,7 @@ def test_a_wall_is_found_where_it_is(rng):
     row = (45 + 100 * (points.positions[:, 1] - 0) / depth).astype(int)  # seen by the view at (-0.1, 0, 0)
     column = (60 + 100 * (points.positions[:, 0] + 0.1) / depth).astype(int)
     seen = (row >= 0) & (row < 90) & (column >= 0) & (column < 120)
-    difference = np.abs(points.colours[seen] * 255 - photographs["2"][row[seen], column[seen]])
+    difference = np.abs(points.colors[seen] * 255 - photographs["2"][row[seen], column[seen]])
     assert np.median(difference) < 12
 
 
@@ -66,7 +66,7 @@ def test_the_same_points_every_time(rng):
     views, photographs = wall_views(rng, 3)
     first, second = (swept_points(views, np.array([0, 0, 4.0]), lambda v: photographs[v.name], 700, 3) for _ in "ab")
     np.testing.assert_array_equal(first.positions, second.positions)
-    np.testing.assert_array_equal(first.colours, second.colours)
+    np.testing.assert_array_equal(first.colors, second.colors)
 
 
 def test_photographs_that_have_nothing_in_common(rng):
@@ -151,11 +151,11 @@ def test_detail_gets_more_points(rng):
     blurred = {name: cv2.GaussianBlur(image, (0, 0), 4) for name, image in photographs.items()}
     half = np.arange(120) < 60
     mixed = {name: np.where(half[:, None], image, blurred[name]) for name, image in photographs.items()}
-    centre, load = np.array([0, 0, DEPTH]), lambda view: mixed[view.name]
+    center, load = np.array([0, 0, DEPTH]), lambda view: mixed[view.name]
     sides = [np.broadcast_to(half, (90, 120)), np.broadcast_to(~half, (90, 120))]
 
     def shares(chance):
-        return [len(swept_points(views, centre, load, 10**6, 0, chance, shown=lambda view, s=s: s)) for s in sides]
+        return [len(swept_points(views, center, load, 10**6, 0, chance, shown=lambda view, s=s: s)) for s in sides]
 
     (sharp, soft), (all_sharp, all_soft) = shares(laplacian_chance), shares(None)
     assert sharp / all_sharp > 3 * soft / all_soft > 0
@@ -191,17 +191,17 @@ def test_what_the_scene_has_is_not_new():
 
 def test_what_the_scene_lacks_is_added(rng):
     views, photographs = wall_views(rng, 4)
-    centre, load = np.array([0, 0, DEPTH]), lambda view: photographs[view.name]
-    alone = swept_points(views, centre, load, 10**6, 0).positions
+    center, load = np.array([0, 0, DEPTH]), lambda view: photographs[view.name]
+    alone = swept_points(views, center, load, 10**6, 0).positions
     left = alone[alone[:, 0] < 0].astype(np.float64)
-    new = swept_points(views, centre, load, 10**6, 0, beside=left).positions
+    new = swept_points(views, center, load, 10**6, 0, beside=left).positions
     assert len(new) < 0.6 * len(alone)
     assert np.mean(new[:, 0] > -0.1) > 0.95
 
 
 def test_points_of_detail_are_the_same_every_time(table, everywhere):
     first, second = everywhere, detailed(table, lambda view: None)
-    for name in ("positions", "colours", "sizes"):
+    for name in ("positions", "colors", "sizes"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     some = swept_points(table[0], LOOK_AT, before_a_sky, 700, 0, laplacian_chance)
     assert len(some) == len(some.sizes) == 700 < len(first)
@@ -209,8 +209,8 @@ def test_points_of_detail_are_the_same_every_time(table, everywhere):
 
 
 def test_sizes_that_are_known_are_those_of_gaussians():
-    places, grey = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32), np.full((3, 3), 0.5, np.float32)
-    known = PointCloud(places[:1], grey[:1]).joined(PointCloud(places[1:], grey[1:], sizes=np.array([0.2, 0.3])))
+    places, gray = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32), np.full((3, 3), 0.5, np.float32)
+    known = PointCloud(places[:1], gray[:1]).joined(PointCloud(places[1:], gray[1:], sizes=np.array([0.2, 0.3])))
     scales = from_points(known, 0.1, 0, scale=2.0)["log_scales"]
     np.testing.assert_allclose(np.exp(scales), np.repeat([[2.0], [0.4], [0.6]], 3, axis=1), rtol=1e-6)
 
@@ -220,9 +220,9 @@ def test_real_surfaces():
     """Nine tenths of what structure from motion found has a swept point within three hundredths of its distance."""
     scene = read_scene(data_set("fox"))
     views = scene.split("train")
-    centre = centre_of(views)
-    points = swept_points(views, centre, load_image, 100_000, 0)
-    distance = np.median([np.linalg.norm(view.position - centre) for view in views])
+    center = center_of(views)
+    points = swept_points(views, center, load_image, 100_000, 0)
+    distance = np.median([np.linalg.norm(view.position - center) for view in views])
     gaps, _ = cKDTree(points.positions).query(scene.points.positions)
     assert np.quantile(gaps, 0.9) < 0.03 * distance
 

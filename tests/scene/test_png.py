@@ -14,13 +14,13 @@ from clsplat.scene.images import pixels_only, read_image
 
 RNG = np.random.default_rng(0)
 KINDS = {
-    "grey": RNG.integers(0, 256, (9, 7), dtype=np.uint8),
-    "colour": RNG.integers(0, 256, (9, 7, 3), dtype=np.uint8),
+    "gray": RNG.integers(0, 256, (9, 7), dtype=np.uint8),
+    "color": RNG.integers(0, 256, (9, 7, 3), dtype=np.uint8),
     "alpha": RNG.integers(0, 256, (9, 7, 4), dtype=np.uint8),
     "16 bits": RNG.integers(0, 65536, (9, 7, 3), dtype=np.uint16),
 }
 METADATA = {
-    "a bad colour profile": (b"iCCP", b"sRGB\0\0" + zlib.compress(b"x" * 200)),
+    "a bad color profile": (b"iCCP", b"sRGB\0\0" + zlib.compress(b"x" * 200)),
     "a gamma of 0": (b"gAMA", b"\0\0\0\0"),
     "a gamma": (b"gAMA", struct.pack(">I", 100_000)),
     "sRGB": (b"sRGB", b"\0"),
@@ -57,7 +57,7 @@ def test_metadata_change_no_pixel_and_print_nothing(kind, what, wrong, tmp_path,
 
 
 def test_what_a_valid_file_shows_is_independent_of_cut_metadata():
-    data = with_chunk(encoded(KINDS["colour"]), chunk(*METADATA["a gamma"]) + chunk(*METADATA["primaries"]))
+    data = with_chunk(encoded(KINDS["color"]), chunk(*METADATA["a gamma"]) + chunk(*METADATA["primaries"]))
     whole, cut = (cv2.imdecode(np.frombuffer(one, np.uint8), -1) for one in (data, pixels_only(data)))
     np.testing.assert_array_equal(whole, cut)
     assert len(pixels_only(data)) < len(data)
@@ -65,13 +65,13 @@ def test_what_a_valid_file_shows_is_independent_of_cut_metadata():
 
 def test_transparency_of_a_palette_and_orientation_stay():
     for kind in (b"tRNS", b"eXIf"):
-        data = with_chunk(encoded(KINDS["colour"]), chunk(kind, b"\0\1\0\1\0\1"))
+        data = with_chunk(encoded(KINDS["color"]), chunk(kind, b"\0\1\0\1\0\1"))
         assert pixels_only(data) == data
 
 
 @pytest.mark.parametrize("name", ["IHDR", "IDAT"])
 def test_a_damaged_chunk_is_named_with_its_place(name, tmp_path, capfd):
-    data = bytearray(encoded(KINDS["colour"]))
+    data = bytearray(encoded(KINDS["color"]))
     at = data.index(name.encode())
     length = struct.unpack_from(">I", data, at - 4)[0]
     data[at + 4 + length] ^= 1  # of the checksum
@@ -83,7 +83,7 @@ def test_a_damaged_chunk_is_named_with_its_place(name, tmp_path, capfd):
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".webp"])
 def test_a_cut_image_prints_nothing(suffix, tmp_path: Path, capfd):
-    data = cv2.imencode(suffix, KINDS["colour"])[1].tobytes()
+    data = cv2.imencode(suffix, KINDS["color"])[1].tobytes()
     for length in range(0, len(data), 7):
         (tmp_path / "a").write_bytes(data[:length])
         with suppress(DataError):
@@ -93,4 +93,4 @@ def test_a_cut_image_prints_nothing(suffix, tmp_path: Path, capfd):
 
 def test_a_chunk_whose_name_is_no_text_is_named_in_one_line():
     with pytest.raises(ValueError, match=r"the checksum of the chunk 'A\\r\\n ' is wrong"):
-        pixels_only(with_chunk(encoded(KINDS["grey"]), chunk(b"A\r\n ", b"", wrong=1)))
+        pixels_only(with_chunk(encoded(KINDS["gray"]), chunk(b"A\r\n ", b"", wrong=1)))

@@ -53,7 +53,7 @@ def test_ply_dialects(tmp_path: Path, form: str, dialect: str) -> None:
     path.write_bytes(ply(form, properties, rows))
     points = read_points_ply(path)
     np.testing.assert_array_equal(points.positions, np.float32(ROWS[:, :3]))
-    np.testing.assert_allclose(points.colours, ROWS[:, 3:] / 255, atol=1e-7)
+    np.testing.assert_allclose(points.colors, ROWS[:, 3:] / 255, atol=1e-7)
 
 
 def test_ply_with_crlf_header_and_faces(tmp_path: Path) -> None:
@@ -85,18 +85,18 @@ def test_ply_written_and_read(tmp_path: Path) -> None:
     write_points_ply(tmp_path / "new" / "p.ply", cloud)
     points = read_points_ply(tmp_path / "new" / "p.ply")
     np.testing.assert_array_equal(points.positions, cloud.positions)
-    np.testing.assert_array_equal(points.colours, cloud.colours)
+    np.testing.assert_array_equal(points.colors, cloud.colors)
 
 
 def test_every_level_survives_writing(tmp_path: Path) -> None:
     levels = np.arange(256)
     write_points_ply(tmp_path / "p.ply", PointCloud(np.zeros((256, 3), np.float32), np.float32([levels] * 3).T / 255))
-    np.testing.assert_array_equal(np.rint(read_points_ply(tmp_path / "p.ply").colours[:, 1] * 255), levels)
+    np.testing.assert_array_equal(np.rint(read_points_ply(tmp_path / "p.ply").colors[:, 1] * 255), levels)
 
 
-def test_colours_are_rounded(tmp_path: Path) -> None:
+def test_colors_are_rounded(tmp_path: Path) -> None:
     write_points_ply(tmp_path / "p.ply", PointCloud(np.zeros((1, 3), np.float32), np.float32([[0.999, 0.5, 0.001]])))
-    assert (read_points_ply(tmp_path / "p.ply").colours * 255).round().tolist() == [[255, 128, 0]]
+    assert (read_points_ply(tmp_path / "p.ply").colors * 255).round().tolist() == [[255, 128, 0]]
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
@@ -110,7 +110,7 @@ def test_real_ply() -> None:
     points = read_points_ply(data_set("fox_peers") / "points_10k.ply")
     assert len(points) == 10_000
     assert np.ptp(points.positions, axis=0).min() > 1
-    assert 0.1 < points.colours.mean() < 0.9
+    assert 0.1 < points.colors.mean() < 0.9
 
 
 DAMAGE = [
@@ -128,7 +128,7 @@ DAMAGE = [
     (b"float y", b"float w"),
     (b"float y", b"quad y"),
     (b"float y", b"list uchar float y"),
-    (b"end_header", b"property list uchar int neighbours\nend_header"),
+    (b"end_header", b"property list uchar int neighbors\nend_header"),
     (b"uchar green", b"float green"),
 ]
 

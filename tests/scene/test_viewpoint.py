@@ -78,10 +78,10 @@ def test_all_on_their_side_have_the_mean_of_their_upward_axes():
 
 
 def test_the_pivot_is_where_the_axes_meet():
-    centre = np.array([1.0, -2.0, 3.0])
+    center = np.array([1.0, -2.0, 3.0])
     places = np.random.default_rng(0).normal(0, 4, (12, 3))
-    axes = (centre - places) / np.linalg.norm(centre - places, axis=1, keepdims=True)
-    np.testing.assert_allclose(closest_point(places, axes, centre + 5), centre, atol=0.02)
+    axes = (center - places) / np.linalg.norm(center - places, axis=1, keepdims=True)
+    np.testing.assert_allclose(closest_point(places, axes, center + 5), center, atol=0.02)
 
 
 def test_parallel_axes_meet_at_the_depth_of_the_splats():

@@ -11,7 +11,7 @@ from clsplat.core.progress import Progress
 from clsplat.density.outliers import PruneFar, PruneWide
 from clsplat.gaussians.model import Model
 from clsplat.methods.adc import PruneFaint
-from clsplat.methods.micro_splatting import MergeNeighbours
+from clsplat.methods.micro_splatting import MergeNeighbors
 from clsplat.methods.mini_splatting import PruneUseless
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner
@@ -123,11 +123,11 @@ def test_a_model_of_which_nothing_would_be_left_is_refused(tiny_scene, spoilt, t
 
 
 def test_undeclared_rewriting_rule_leaves_the_model_as_it_was(tiny_scene, spoilt, tmp_path, monkeypatch):
-    monkeypatch.setattr(MergeNeighbours, "rewrites", False)
+    monkeypatch.setattr(MergeNeighbors, "rewrites", False)
     run = opened(tiny_scene, spoilt, tmp_path / "run")
     before = {name: run.model.gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
     with pytest.raises(ConfigError, match=r"a rule writes .* of Gaussians that stay; expected rules that remove"):
-        Cleanup(stage="cleanup", rules=[MergeNeighbours()]).act(run)
+        Cleanup(stage="cleanup", rules=[MergeNeighbors()]).act(run)
     for name, table in before.items():
         np.testing.assert_array_equal(run.model.gaussians.get(name), table)
     assert run.whole
@@ -185,7 +185,7 @@ def test_refusal_keeps_trained_state_without_earlier_checkpoint(finished, tiny_s
     [
         ("[]", "expected a list of at least 1"),
         ("[clone]", "the rule 'clone' is of growth; expected rules that remove"),
-        ("[merge_neighbours]", "the rule 'merge_neighbours' changes Gaussians that stay; use it in densify"),
+        ("[merge_neighbors]", "the rule 'merge_neighbors' changes Gaussians that stay; use it in densify"),
         (
             "[{type: prune_faint, start: 9}]",
             "the rule 'prune_faint' has a start, and cleanup applies it once; expected",

@@ -106,8 +106,8 @@ def test_energy_of_bands_is_the_mean_square_over_directions(rng, degree):
     assert found.shape == (4, degree)
     for band in range(degree):
         only = np.where(columns_of(np.arange(degree)[None].repeat(4, axis=0) == band), rest, 0)
-        colours = np.einsum("dk,nkc->dnc", basis, only.reshape(4, -1, 3).astype(np.float64))
-        np.testing.assert_allclose(found[:, band], np.square(colours).sum(axis=2).mean(axis=0), rtol=0.03)
+        colors = np.einsum("dk,nkc->dnc", basis, only.reshape(4, -1, 3).astype(np.float64))
+        np.testing.assert_allclose(found[:, band], np.square(colors).sum(axis=2).mean(axis=0), rtol=0.03)
 
 
 def test_a_lower_degree_keeps_the_lower_bands(tiny_scene, pipeline, tmp_path):
@@ -131,13 +131,13 @@ def test_the_bands_that_matter_least_become_zero(tiny_scene, pipeline, tmp_path)
 
 
 def test_the_measured_file_is_read_again(finished, tiny_scene):
-    """Metrics are those of the quantised file, not those of the model that it was made from."""
+    """Metrics are those of the quantized file, not those of the model that it was made from."""
     from clsplat.runs.model_file import evaluate
 
     found = json.loads((finished.out / "metrics.json").read_text())["test"]["1"]
-    quantised = evaluate(finished.out / "model.sog", tiny_scene)["test"]["1"]
+    quantized = evaluate(finished.out / "model.sog", tiny_scene)["test"]["1"]
     exact = evaluate(finished.out / "point_cloud.ply", tiny_scene)["test"]["1"]
-    assert found["psnr"] == pytest.approx(quantised["psnr"], abs=1e-6)
+    assert found["psnr"] == pytest.approx(quantized["psnr"], abs=1e-6)
     assert abs(found["psnr"] - exact["psnr"]) > 1e-4
 
 

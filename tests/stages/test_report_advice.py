@@ -27,7 +27,7 @@ def around(degrees: list[float], outward: bool = False) -> list[View]:
 
 
 def measured(psnr: list[float], gained: float = 0.0) -> list[ViewMetrics]:
-    return [ViewMetrics(f"{i}.jpg", one, 0.9, {}, {"psnr_colour": one + gained}) for i, one in enumerate(psnr)]
+    return [ViewMetrics(f"{i}.jpg", one, 0.9, {}, {"psnr_color": one + gained}) for i, one in enumerate(psnr)]
 
 
 def test_views_far_below_the_median_are_named_the_worst_first():
@@ -37,24 +37,24 @@ def test_views_far_below_the_median_are_named_the_worst_first():
 
 
 def test_training_photographs_that_disagree_are_named():
-    (text,) = of_training_views(measured([30, 31, 10, 30]), has_colours=False)
+    (text,) = of_training_views(measured([30, 31, 10, 30]), has_colors=False)
     assert text.startswith("2.jpg disagrees with the others")
-    (text,) = of_training_views(measured([30] * 9 + [10, 11, 12, 13, 14]), has_colours=False)
+    (text,) = of_training_views(measured([30] * 9 + [10, 11, 12, 13, 14]), has_colors=False)
     assert text.startswith("9.jpg, 10.jpg, 11.jpg and 2 more disagree with")
-    assert not [*of_training_views([], has_colours=False)]
+    assert not [*of_training_views([], has_colors=False)]
 
 
-@pytest.mark.parametrize(("gained", "has_colours", "said"), [(0.9, False, 0), (1.5, False, 1), (1.5, True, 0)])
-def test_colours_that_differ_are_said_where_none_are_trained(gained, has_colours, said):
-    texts = [*of_training_views(measured([30, 30, 31], gained), has_colours)]
+@pytest.mark.parametrize(("gained", "has_colors", "said"), [(0.9, False, 0), (1.5, False, 1), (1.5, True, 0)])
+def test_colors_that_differ_are_said_where_none_are_trained(gained, has_colors, said):
+    texts = [*of_training_views(measured([30, 30, 31], gained), has_colors)]
     assert len(texts) == said
     assert all("1.5 dB nearer" in text and "optimize.modules.exposure={}" in text for text in texts)
 
 
 def test_photographs_whose_colors_cannot_be_fitted_are_ignored():
     found = [*measured([30, 30], 1.5), ViewMetrics("half.jpg", 30, 0.9, {}, {"psnr_affine": 90.0})]
-    assert "1.5 dB nearer" in "".join(of_training_views(found, has_colours=False))
-    assert not [*of_training_views(found[2:], has_colours=False)]
+    assert "1.5 dB nearer" in "".join(of_training_views(found, has_colors=False))
+    assert not [*of_training_views(found[2:], has_colors=False)]
 
 
 def test_test_views_that_are_much_worse_are_named():

@@ -30,12 +30,12 @@ def planes_of(device, image: np.ndarray, mask: np.ndarray | None = None) -> Plan
     return Planes(workspace, camera, device.upload(padded(image)), uploaded)
 
 
-def colours_of(planes: Planes) -> np.ndarray:
-    """The colours inside the image, [3, H, W]; outside it they must be zero."""
-    colours, camera = planes.colours.get(), planes.camera
-    assert (colours[:, camera.height :] == 0).all()
-    assert (colours[:, :, camera.width :] == 0).all()
-    return colours[:, : camera.height, : camera.width]
+def colors_of(planes: Planes) -> np.ndarray:
+    """The colors inside the image, [3, H, W]; outside it they must be zero."""
+    colors, camera = planes.colors.get(), planes.camera
+    assert (colors[:, camera.height :] == 0).all()
+    assert (colors[:, :, camera.width :] == 0).all()
+    return colors[:, : camera.height, : camera.width]
 
 
 # around the window (11), vectors (8, 16), tiles (16) and the columns of a group (256)
@@ -63,7 +63,7 @@ def trainer_of(device: Device, rng: np.random.Generator, losses: list[Loss]) -> 
         losses,
         Rates(),
     )
-    colours = rng.integers(0, 256, (3, 30, 40)).astype(np.uint8)
+    colors = rng.integers(0, 256, (3, 30, 40)).astype(np.uint8)
     mask = np.ones((1, 30, 40), np.uint8)
     mask[:, :, :13] = 0
-    return trainer, Photograph(case.device_camera(device), device.upload(colours), device.upload(mask))
+    return trainer, Photograph(case.device_camera(device), device.upload(colors), device.upload(mask))

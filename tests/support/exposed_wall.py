@@ -15,11 +15,11 @@ SIZE, POINTS = 64, 400
 
 
 class Wall:
-    """Points on a wall, photographed from places beside each other, in squares of one colour each."""
+    """Points on a wall, photographed from places beside each other, in squares of one color each."""
 
     def __init__(self, rng: np.random.Generator, photographs: int = 8, overlap: int = POINTS) -> None:
         side = 20
-        self.colours = rng.uniform(0.1, 0.6, (POINTS, 3))
+        self.colors = rng.uniform(0.1, 0.6, (POINTS, 3))
         at = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
         positions = np.column_stack([(3 * at + 2 - SIZE / 2) / SIZE, np.ones(POINTS)])
         camera = Camera(SIZE, SIZE, SIZE, SIZE, SIZE / 2, SIZE / 2)
@@ -35,13 +35,13 @@ class Wall:
     def photograph(self, view: View) -> np.ndarray:
         """Squares of 3 x 3 px, 8 bits."""
         image = np.zeros((SIZE, SIZE, 3))
-        for (x, y), colour in zip(self.at, self.colours, strict=True):
-            image[y : y + 3, x : x + 3] = colour
+        for (x, y), color in zip(self.at, self.colors, strict=True):
+            image[y : y + 3, x : x + 3] = color
         return np.rint(np.minimum(image * np.exp(self.log_gains[self.views.index(view)]), 1) * 255).astype(np.uint8)
 
     def write(self, folder: Path) -> None:
         """Write a COLMAP scene."""
-        points = PointCloud(self.tracks.positions.astype(np.float32), self.colours.astype(np.float32))
+        points = PointCloud(self.tracks.positions.astype(np.float32), self.colors.astype(np.float32))
         write_model(folder / "sparse" / "0", self.views, points, self.tracks)
         for view in self.views:
             write_image(folder / "images" / view.name, self.photograph(view))

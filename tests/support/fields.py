@@ -11,7 +11,7 @@ from pathlib import Path
 from clsplat.training import checkpoint
 from tests.support.runs import ONE_CORE, train
 
-SHAPE = "{near: 0.5, far: 9, coarse_samples: 16, fine_samples: 16, depth: 2, width: 32, skip: 0, colour_width: 16}"
+SHAPE = "{near: 0.5, far: 9, coarse_samples: 16, fine_samples: 16, depth: 2, width: 32, skip: 0, color_width: 16}"
 
 
 PIPELINE = f"""

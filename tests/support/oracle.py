@@ -11,7 +11,7 @@ BACKGROUND = np.array([0.2, 0.5, 0.9])
 
 
 def general_camera() -> ref.PinholeCamera:
-    """Rotated, moved, off-centre, fx != fy."""
+    """Rotated, moved, off-center, fx != fy."""
     rotation = ref.rotation_matrix(np.array([0.9, 0.2, -0.3, 0.15]))
     return ref.PinholeCamera(np.column_stack([rotation, [0.3, -0.2, 0.5]]), 37.0, 43.0, 17.0, 16.5, WIDTH, HEIGHT)
 

@@ -1,4 +1,4 @@
-"""A capture of known colours: a ground of squares under a painted sky, before a camera that turns and walks."""
+"""A capture of known colors: a ground of squares under a painted sky, before a camera that turns and walks."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ WIDTH, HEIGHT, FOCAL = 64, 48, 40.0
 
 
 def painted(directions: np.ndarray) -> np.ndarray:
-    """The colours of the sky in directions, [..., 3] with y down: blue, brighter to the horizon, with wide clouds."""
+    """The colors of the sky in directions, [..., 3] with y down: blue, brighter to the horizon, with wide clouds."""
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     up = np.clip(-unit[..., 1:2], 0, 1)
     cloud = 0.15 * np.sin(3 * unit[..., 0:1] + 1) * np.cos(4 * unit[..., 2:])
@@ -41,7 +41,7 @@ class Yard:
         return np.column_stack([turn, -turn @ [walked - 1, 0, 0]]).astype(np.float32)
 
     def ground(self, x: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Colours of places on the ground."""
+        """Colors of places on the ground."""
         return self.squares[np.clip(x + 20, 0, 39).astype(int), np.clip(z + 20, 0, 39).astype(int)]
 
     def rays(self, view: View) -> np.ndarray:
@@ -55,8 +55,8 @@ class Yard:
         down = np.maximum(rays[..., 1], 1e-3)
         place = view.position + rays / down[..., None]
         above = painted(rays) if self.clear else np.full(rays.shape, 0.2)
-        colours = np.where(rays[..., 1:2] > 0, self.ground(place[..., 0], place[..., 2]), above)
-        return np.rint(255 * colours).astype(np.uint8)
+        colors = np.where(rays[..., 1:2] > 0, self.ground(place[..., 0], place[..., 2]), above)
+        return np.rint(255 * colors).astype(np.uint8)
 
     def write(self, folder: Path) -> Path:
         """Write a COLMAP scene; return its folder."""

@@ -13,8 +13,8 @@ def blocks(seed: int, width: int, height: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     pixels = np.full((height, width, 3), 128, np.uint8)
     for _ in range(width * height // 300):
-        x, y, colour = int(rng.integers(width)), int(rng.integers(height)), rng.integers(0, 256, 3).tolist()
-        cv2.rectangle(pixels, (x, y), (x + int(rng.integers(3, 25)), y + int(rng.integers(3, 25))), colour, -1)
+        x, y, color = int(rng.integers(width)), int(rng.integers(height)), rng.integers(0, 256, 3).tolist()
+        cv2.rectangle(pixels, (x, y), (x + int(rng.integers(3, 25)), y + int(rng.integers(3, 25))), color, -1)
     return cv2.GaussianBlur(pixels, (0, 0), 0.8)
 
 
@@ -38,7 +38,7 @@ def store(path: Path, pixels: np.ndarray) -> Path:
 
 
 def masked_scene(source: Path, out: Path, filling: int) -> Path:
-    """The scene with a square of every photograph masked by its alpha, and filled with a colour."""
+    """The scene with a square of every photograph masked by its alpha, and filled with a color."""
     shutil.copytree(source, out)
     for photo in out.rglob("*.png"):
         pixels = cv2.imread(str(photo), cv2.IMREAD_UNCHANGED)[:, :, :3].copy()

@@ -21,14 +21,14 @@ def ring(count: int = 40) -> list[View]:
     return views
 
 
-def ball(view: View, centre=(0.0, 0.0, 0.0), radius=RADIUS) -> np.ndarray:
-    """A ball whose colour is its direction, drawn by rays: [H, W, 4]."""
+def ball(view: View, center=(0.0, 0.0, 0.0), radius=RADIUS) -> np.ndarray:
+    """A ball whose color is its direction, drawn by rays: [H, W, 4]."""
     columns, rows = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
     rays = np.stack([(columns - SIZE / 2) / 150, (rows - SIZE / 2) / 150, np.ones_like(rows)], -1)
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ view.world_to_camera[:, :3]
-    to = np.asarray(centre) - view.position
+    to = np.asarray(center) - view.position
     along = rays @ to
     inside = radius**2 - (to @ to - along**2)
     hit = inside > 0
-    normal = (view.position + rays * (along - np.sqrt(np.maximum(inside, 0)))[..., None] - centre) / radius
+    normal = (view.position + rays * (along - np.sqrt(np.maximum(inside, 0)))[..., None] - center) / radius
     return np.where(hit[..., None], np.dstack([(normal + 1) * 127, 255 * hit]), 0).astype(np.uint8)

@@ -36,7 +36,7 @@ def frames(*names: str, **values) -> list[dict]:
 
 
 def write(path: Path, name: str = "transforms.json", size: tuple[int, int] = (64, 48), **table) -> Path:
-    """Write one JSON file and a grey image for each of its frames; return the folder."""
+    """Write one JSON file and a gray image for each of its frames; return the folder."""
     path.mkdir(parents=True, exist_ok=True)
     (path / name).write_text(json.dumps(table))
     for frame in table["frames"]:

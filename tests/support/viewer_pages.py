@@ -38,13 +38,13 @@ def moving(model: Model, width: int = 15, seed: int = 1) -> Model:
     spread = {"velocity": 0.8, "acceleration": 0.5, "jerk": 0.5, "turn": 1.0}
     for name, columns in fields.items():
         motion[:, columns] = rng.normal(0, spread.get(name, 0.0), (len(model), columns.stop - columns.start))
-    motion[:, fields["time_centre"]] = rng.uniform(0, 1, (len(model), 1))
+    motion[:, fields["time_center"]] = rng.uniform(0, 1, (len(model), 1))
     motion[:, fields["log_duration"]] = rng.normal(-1.2, 1, (len(model), 1))
     return replace(model, motion=motion.astype(np.float32))
 
 
 def views() -> list[View]:
-    """Four views: centred, off-centre and of two focal lengths, rolled, and inside of the ball."""
+    """Four views: centered, off-center and of two focal lengths, rolled, and inside of the ball."""
     width, height = SIZE
     lenses = [
         Camera(width, height, 90.0, 90.0, width / 2, height / 2),

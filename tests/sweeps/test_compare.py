@@ -32,7 +32,7 @@ WHITE = (1.0, 1.0, 1.0)  # behind the photographs of a Blender scene
 
 @pytest.fixture
 def make_run(tiny_scene, tmp_path):
-    """Write the folder of a run that never was; its renders are the photographs, darker by `error` grey levels."""
+    """Write the folder of a run that never was; its renders are the photographs, darker by `error` gray levels."""
 
     def make(name: str, *overrides: str, psnr: float = 20.0, error: int = 10, **changes: object) -> Path:
         folder = tmp_path / name
@@ -310,10 +310,10 @@ def test_means_over_other_numbers_of_views_are_marked(make_run, tmp_path, size, 
     def averages(size: str, **figures: object) -> dict[str, object]:
         return {size: {"psnr": 20, "ssim": 0.5, "views": 7, **figures}}
 
-    few = {"psnr_colour": 30.0, "psnr_colour_views": 1, "psnr_colour_reason": "why"}
+    few = {"psnr_color": 30.0, "psnr_color_views": 1, "psnr_color_reason": "why"}
     one, two = make_run("one", test=averages(size, **few)), make_run("two", "init.opacity=0.3", test=averages(size))
-    three = make_run("three", "init.opacity=0.4", test=averages(size, psnr_colour=25.0))
-    said = f"The number of {words} with a PSNR in the photographs' colours is not the same in all runs (1, 7)."
+    three = make_run("three", "init.opacity=0.4", test=averages(size, psnr_color=25.0))
+    said = f"The number of {words} with a PSNR in the photographs' colors is not the same in all runs (1, 7)."
     assert said in html.unescape(page_of(tmp_path, one, two, three))
     assert "not the same" not in page_of(tmp_path, two, three), "what has no figure is not compared"
 

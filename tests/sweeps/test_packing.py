@@ -20,7 +20,7 @@ CPU = DeviceInfo("a", "b", "CPU", "1", 4, 1 << 30, 1 << 29, 1 << 15, 64, 8, (0, 
 GPU = replace(CPU, name="g", kind="GPU")
 
 
-def test_cores_are_shared_in_equal_parts_of_neighbours():
+def test_cores_are_shared_in_equal_parts_of_neighbors():
     assert machine.shares((0, 1, 2, 5, 6, 7), 2) == [(0, 1, 2), (5, 6, 7)]
     assert machine.shares(range(6), 4) == [(0,), (1,), (2,), (3,)], "all have as many"
 

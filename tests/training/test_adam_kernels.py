@@ -57,10 +57,10 @@ def changed_rows(before: dict[str, np.ndarray], after: dict[str, np.ndarray]) ->
 
 
 def touches_a_pixel(case: Case) -> np.ndarray:
-    """Whether a Gaussian is not fainter than 1/255 at the centre of any pixel, by the reference."""
+    """Whether a Gaussian is not fainter than 1/255 at the center of any pixel, by the reference."""
     truth, (width, height) = case.project(), case.size
-    centres = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 1, 2) + 0.5
-    dx, dy = np.moveaxis(truth.mean2d - centres, -1, 0)
+    centers = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 1, 2) + 0.5
+    dx, dy = np.moveaxis(truth.mean2d - centers, -1, 0)
     xx, xy, yy = truth.conic.T
     alpha = truth.opacity * np.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
     return truth.visible & (alpha >= 1 / 255).any(axis=0)

@@ -1,4 +1,4 @@
-"""Whole runs in which photographs have colours of their own."""
+"""Whole runs in which photographs have colors of their own."""
 
 import json
 from pathlib import Path
@@ -38,30 +38,30 @@ def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp
     run = train(tiny_scene, tmp_path / "run", *GAIN)
     names = [view.name for view in run.scene.split("train")]
     numbers = run.modules["exposure"].numbers
-    updates = [numbers.get(f"colours/{name}/exposure/updates", 0) for name in names]
+    updates = [numbers.get(f"colors/{name}/exposure/updates", 0) for name in names]
     assert sum(updates) == 12
     assert len(set(updates)) > 1, "eight photographs, twelve steps"
     for column in ("exposure", "red", "blue"):
-        values = [numbers[f"colours/{name}/{column}"] for name in names]
+        values = [numbers[f"colors/{name}/{column}"] for name in names]
         assert sum(values) == pytest.approx(0, abs=1e-12)
         assert max(map(abs, values)) > 1e-3
     assert digest(tmp_path / "run") != digest(few_steps)
 
 
 def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few_steps):
-    data = json.loads((with_gains / "view_colours.json").read_text())
+    data = json.loads((with_gains / "view_colors.json").read_text())
     assert (data["type"], data["model"]) == ("exposure", "gain")
     assert len(data["photographs"]) == 8
     for row in data["photographs"].values():
         luminance = np.log(np.diag(row["matrix"])) @ [0.299, 0.587, 0.114]
         assert luminance == pytest.approx(row["exposure"])
     measured = json.loads((with_gains / "metrics.json").read_text())["test"]["1"]
-    assert {"psnr_colour", "psnr_affine"} < measured.keys()
+    assert {"psnr_color", "psnr_affine"} < measured.keys()
     pages = [(out / "report.html").read_text() for out in (with_gains, few_steps)]
-    assert [f"{measured['psnr_colour']:.2f} dB" in page and "colours fitted" in page for page in pages] == [True, False]
-    assert "view_colours.json" in json.loads((with_gains / "checksums.json").read_text())
-    assert not (few_steps / "view_colours.json").exists()
-    assert "psnr_colour" not in json.loads((few_steps / "metrics.json").read_text())["test"]["1"]
+    assert [f"{measured['psnr_color']:.2f} dB" in page and "colors fitted" in page for page in pages] == [True, False]
+    assert "view_colors.json" in json.loads((with_gains / "checksums.json").read_text())
+    assert not (few_steps / "view_colors.json").exists()
+    assert "psnr_color" not in json.loads((few_steps / "metrics.json").read_text())["test"]["1"]
 
 
 def test_a_comparison_has_a_column_for_them(with_gains, few_steps):
@@ -69,21 +69,21 @@ def test_a_comparison_has_a_column_for_them(with_gains, few_steps):
         main_table(next(iter(RunComparison.read(folders).scenes.values()))) for folders in ([with_gains], [few_steps])
     ]
     headings = [[column.heading for group in table.groups for column in group.columns] for table in tables]
-    assert ["PSNR, colours fitted ↑" in found for found in headings] == [True, False]
+    assert ["PSNR, colors fitted ↑" in found for found in headings] == [True, False]
 
 
-def test_a_run_folder_is_measured_in_the_photographs_colours_too(with_gains, few_steps, tmp_path):
+def test_a_run_folder_is_measured_in_the_photographs_colors_too(with_gains, few_steps, tmp_path):
     measured = json.loads((with_gains / "metrics.json").read_text())["test"]["1"]
     again = evaluate(with_gains)["test"]["1"]
-    assert again["psnr_colour"] == pytest.approx(measured["psnr_colour"], abs=1e-6)
-    assert "psnr_colour" not in evaluate(few_steps)["test"]["1"]
+    assert again["psnr_color"] == pytest.approx(measured["psnr_color"], abs=1e-6)
+    assert "psnr_color" not in evaluate(few_steps)["test"]["1"]
     for damage in ("[]", '{"type": "lens"}'):
-        (tmp_path / "view_colours.json").write_text(damage)
-        with pytest.raises(DataError, match=r"the type of colours is .* expected one of \w+"):
+        (tmp_path / "view_colors.json").write_text(damage)
+        with pytest.raises(DataError, match=r"the type of colors is .* expected one of \w+"):
             measured_beside(tmp_path / "point_cloud.ply")
 
 
-def test_where_colours_began_is_kept_with_them(rng, tmp_path):
+def test_where_colors_began_is_kept_with_them(rng, tmp_path):
     """The rate depends on it, also where the file that told it is gone."""
     wall = Wall(rng)
     wall.write(tmp_path / "scene")
@@ -99,7 +99,7 @@ def test_where_colours_began_is_kept_with_them(rng, tmp_path):
     assert again.modules["exposure"].numbers == run.modules["exposure"].numbers
 
 
-def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_path):
+def test_the_best_model_is_left_with_the_colors_of_its_step(tiny_scene, tmp_path):
     wild = "optimize.rates.means=[[8, 1.0e-3], [9, 0.9]]"
     kept = (
         "scene.validation=2",
@@ -111,8 +111,8 @@ def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_pat
     assert run.best.found.step == 8, "the last steps ruin it"
     then, _ = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
     assert run.modules["exposure"].numbers == then.modules["exposure"]
-    (row, *_) = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"].items()
-    assert row[1]["exposure"] == then.modules["exposure"][f"colours/{row[0]}/exposure"]
+    (row, *_) = json.loads((tmp_path / "run" / "view_colors.json").read_text())["photographs"].items()
+    assert row[1]["exposure"] == then.modules["exposure"][f"colors/{row[0]}/exposure"]
 
 
 def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_path, few_steps):
@@ -135,7 +135,7 @@ def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
     assert found.chosen == "on"
     assert "exposures of 8 photographs differ by" in found.reason
-    photographs = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"]
+    photographs = json.loads((tmp_path / "run" / "view_colors.json").read_text())["photographs"]
     gains = np.log([np.diag(photographs[view.name]["matrix"]) for view in wall.views])
     assert gains == pytest.approx(wall.log_gains, abs=0.06), "twelve steps do not move them far"
     with run_folder.opened(tmp_path / "run", "resume", step=0) as status:

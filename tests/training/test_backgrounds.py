@@ -18,7 +18,7 @@ from tests.support.runs import digest, train
 RANDOM = "optimize.modules.random_background={}"
 
 
-def test_colours_depend_on_the_seed_and_the_step_alone():
+def test_colors_depend_on_the_seed_and_the_step_alone():
     device = Device(choose())
     drawn = [tuple(drawn_background(device, seed, step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
     assert len(set(drawn)) == 3
@@ -33,7 +33,7 @@ def test_photograph_has_the_drawn_color_where_transparent(tiny_scene):
 
     def shown() -> np.ndarray:
         planes = photographs.get(view).planes(Workspace(device), backgrounds=(photographs.background, behind))
-        return planes.colours.get()[:, :height, :width].transpose(1, 2, 0)
+        return planes.colors.get()[:, :height, :width].transpose(1, 2, 0)
 
     on_white = load_image(view, (1.0, 1.0, 1.0)) / 255
     np.testing.assert_allclose(shown(), on_white, atol=1e-6)  # transparency is not kept unless it is asked for

@@ -385,10 +385,10 @@ def test_a_checkpoint_without_its_best_model_is_damaged(best):
     ("train_", "validation", "expected"),
     [
         (26.0, 20.0, "At step 8 the model has 26.0 dB at training views and 20.0 dB at validation views."),
-        (26.1, 20.0, "20.0 dB at validation views, more than 6 dB apart: the photographs are learnt by heart."),
+        (26.1, 20.0, "20.0 dB at validation views, more than 6 dB apart: the photographs are learned by heart."),
     ],
 )
-def test_six_decibels_apart_are_learnt_by_heart(train_, validation, expected):
+def test_six_decibels_apart_are_learned_by_heart(train_, validation, expected):
     assert expected in Measured(step=8, train=train_, validation=validation).told("validation")
 
 
@@ -400,6 +400,6 @@ def test_run_without_validation_is_told_when_it_overfits(tiny_scene, tmp_path, p
     run.records.add(8, "evaluate", split="train", downscale=1, psnr=40.0, ssim=1.0)
     run.records.write()
     assert "40.0 dB at training views" in overfitting_note(run)
-    assert "dB at test views, more than 6 dB apart: the photographs are learnt by heart" in overfitting_note(run)
+    assert "dB at test views, more than 6 dB apart: the photographs are learned by heart" in overfitting_note(run)
     assert "`scene.validation: auto` with `optimize.keep: best`" in overfitting_note(run)
     assert is_by_heart(run)

@@ -1,4 +1,4 @@
-"""The colours of a photograph by place and luminance (colour_grid.cl and its tables) against float64, and in a step."""
+"""The colors of a photograph by place and luminance (color_grid.cl and its tables) against float64, and in a step."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState
-from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, change_back, change_colours
+from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, change_back, change_colors
 from clsplat.training.trainer import StepTrainer
 from tests.support.devices import on_devices, on_one_setting, product
 from tests.support.figures import hold
@@ -54,10 +54,10 @@ def test_an_image_of_one_luminance_reads_the_levels_about_it(device):
     values = np.zeros((3, 3, 4, 3, 2, 2), np.float32)
     values[1, range(3), 3] = np.array([0.1, 0.3, 0.2], np.float32)[:, None, None]  # added at each level
     grids.load({}, {"values": values.reshape(grids.shape)})
-    for grey, expected in ((-0.2, 0.1), (0.0, 0.1), (0.25, 0.2), (0.5, 0.3), (0.6, 0.28)):
-        planes = planes_of(device, camera, np.full((3, 5, 20), grey, np.float32))
+    for gray, expected in ((-0.2, 0.1), (0.0, 0.1), (0.25, 0.2), (0.5, 0.3), (0.6, 0.28)):
+        planes = planes_of(device, camera, np.full((3, 5, 20), gray, np.float32))
         found = grids.changed(Workspace(device), camera, planes, 1).get()[:, :5, :20]
-        assert found == pytest.approx(grey + expected, abs=1e-6), grey
+        assert found == pytest.approx(gray + expected, abs=1e-6), gray
 
 
 class Case:
@@ -95,7 +95,7 @@ def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, share):
     found = case.state.tables()
     assert found["moment1"][1].ravel()[places] == pytest.approx(0.1 * np.array(numeric), rel=0.02, abs=2e-6)
     assert not found["moment1"][0].any(), "the other photograph has no update"
-    assert case.state.numbers["colours/b/updates"] == 1
+    assert case.state.numbers["colors/b/updates"] == 1
 
 
 @on_one_setting
@@ -125,7 +125,7 @@ def test_one_matrix_is_the_affine_kind(device, rng):
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
     image, gradient = (planes_of(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))
     found = grids.changed(workspace, camera, image, 1).get()
-    expected = change_colours(workspace, camera, image, affine.matrix(1)).get()
+    expected = change_colors(workspace, camera, image, affine.matrix(1)).get()
     assert found == pytest.approx(expected, abs=1e-6)
     passed, by_grid = grids.differentiated(workspace, camera, image, gradient, 1)
     passed, by_grid = passed.get(), by_grid.get()
@@ -135,7 +135,7 @@ def test_one_matrix_is_the_affine_kind(device, rng):
 
 
 @on_one_setting
-def test_a_mask_hides_pixels_whatever_their_colours_become(device, rng):
+def test_a_mask_hides_pixels_whatever_their_colors_become(device, rng):
     case = Case(device, rng, share=0.5)
     values = case.values.copy().reshape(2, 12, -1)
     values[1, [3, 7, 11]] = 0.2  # added to black

@@ -1,4 +1,4 @@
-"""Grids of the photographs' colours: their settings, whole runs with them, and what these leave."""
+"""Grids of the photographs' colors: their settings, whole runs with them, and what these leave."""
 
 import hashlib
 import json
@@ -31,11 +31,11 @@ from tests.support.runs import FEW, ONE_CORE, digest, train
 
 PLAIN = '''
 from typing import Literal
-from clsplat.training.modules.exposure import IDENTITY, Appearance, ColourState, Gain, Written
+from clsplat.training.modules.exposure import IDENTITY, Appearance, ColorState, Gain, Written
 
 
 class Plain(Appearance):
-    """Colours as they are."""
+    """Colors as they are."""
 
     type: Literal["plain"] = "plain"
 
@@ -47,16 +47,16 @@ class Plain(Appearance):
         return Gain()
 
 
-class Views(ColourState):
+class Views(ColorState):
     def begin_with(self, log_gains):
-        self.numbers |= {f"colours/{view}/steps": 0.0 for view in self.views}
+        self.numbers |= {f"colors/{view}/steps": 0.0 for view in self.views}
 
     def written(self):
-        steps = {view: self.numbers[f"colours/{view}/steps"] for view in self.views}
+        steps = {view: self.numbers[f"colors/{view}/steps"] for view in self.views}
         return Written(dict.fromkeys(self.views, IDENTITY), {"meaning": "none", "type": "plain", "photographs": steps})
 
     def update(self, step):
-        self.numbers[f"colours/{self.views[step.view]}/steps"] += 1
+        self.numbers[f"colors/{self.views[step.view]}/steps"] += 1
 '''
 GRID = (*FEW, "optimize.modules.bilateral_grid={cells: [3, 2, 4]}")
 
@@ -131,7 +131,7 @@ def test_one_core_gives_the_same_bits(info):
 
 @pytest.mark.slow
 def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps, tmp_path):
-    data = json.loads((with_grids / "view_colours.json").read_text())
+    data = json.loads((with_grids / "view_colors.json").read_text())
     found = np.load(with_grids / data["file"], allow_pickle=False)
     assert (data["type"], data["cells"]) == ("bilateral_grid", [3, 2, 4])
     assert found.shape == (8, 4, 2, 3, 3, 4)
@@ -139,12 +139,12 @@ def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps,
     assert found.mean(axis=(0, 2, 3)) == pytest.approx(np.tile(np.eye(3, 4), (4, 1, 1)), abs=1e-6)
     for row in data["photographs"].values():
         assert row["matrix"] == pytest.approx(found[row["row"]].mean(axis=(0, 1, 2)), abs=1e-6)
-    assert {"view_colours.json", "view_colours.npy"} < json.loads((with_grids / "checksums.json").read_text()).keys()
+    assert {"view_colors.json", "view_colors.npy"} < json.loads((with_grids / "checksums.json").read_text()).keys()
     measured = json.loads((with_grids / "metrics.json").read_text())["test"]["1"]
-    assert measured["psnr_colour"] == pytest.approx(evaluate(with_grids)["test"]["1"]["psnr_colour"], abs=1e-6)
+    assert measured["psnr_color"] == pytest.approx(evaluate(with_grids)["test"]["1"]["psnr_color"], abs=1e-6)
     assert measured_beside(with_grids / "point_cloud.ply") == Gain()
     assert digest(with_grids) != digest(few_steps)
-    assert f"  colours  {with_grids}/view_colours.json" in summary(with_grids)
+    assert f"  colors  {with_grids}/view_colors.json" in summary(with_grids)
 
 
 @pytest.mark.slow
@@ -156,7 +156,7 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
     _, tables = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
     own, _ = archive.split(tables, "modules/bilateral_grid/")
     expected = own["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
-    found = np.load(tmp_path / "run" / "view_colours.npy")
+    found = np.load(tmp_path / "run" / "view_colors.npy")
     assert (found == expected + np.eye(3, 4, dtype=np.float32)).all()
 
 
@@ -172,7 +172,7 @@ def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
     (other,) = attached([BilateralGrid(cells=cells)], run, 24)
     assert other is run.modules["bilateral_grid"] is not before
     assert not other.tables()["values"].any()
-    assert other.numbers[f"colours/{other.names[0]}/updates"] == 0 < before.numbers[f"colours/{other.names[0]}/updates"]
+    assert other.numbers[f"colors/{other.names[0]}/updates"] == 0 < before.numbers[f"colors/{other.names[0]}/updates"]
 
 
 @pytest.mark.slow
@@ -209,7 +209,7 @@ def test_a_dry_run_checks_them(tiny_scene, tmp_path):
 
 def test_damaged_tables_are_refused():
     good = {name: np.zeros((2, 12, 2, 1, 1), np.float32) for name in ("values", "moment1", "moment2")}
-    rows = {"colours/a/row": 0.0, "colours/b/row": 1.0}
+    rows = {"colors/a/row": 0.0, "colors/b/row": 1.0}
     BilateralGrid.check_saved(rows, good)
     BilateralGrid.check_saved(rows, {"values": good["values"]})
     for damaged in (
@@ -222,8 +222,8 @@ def test_damaged_tables_are_refused():
     ):
         with pytest.raises(DataError, match=r"its grids are not|of its BilateralGrid is not"):
             BilateralGrid.check_saved(rows, damaged)
-    for damage in ({"colours/b/row": 6.0}, {"colours/a/row": 0.5}, {"colours/c/row": 2.0}):
-        with pytest.raises(DataError, match="grids of the colours of 2 photographs"):
+    for damage in ({"colors/b/row": 6.0}, {"colors/a/row": 0.5}, {"colors/c/row": 2.0}):
+        with pytest.raises(DataError, match="grids of the colors of 2 photographs"):
             BilateralGrid.check_saved(rows | damage, good)
 
 
@@ -245,7 +245,7 @@ def test_a_kind_of_a_plug_in_is_trained_with(tiny_scene, few_steps, tmp_path):
     (tmp_path / "mine.py").write_text(PLAIN)
     plugins.load_file(tmp_path / "mine.py")
     train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.plain={}")
-    data = json.loads((tmp_path / "run" / "view_colours.json").read_text())
+    data = json.loads((tmp_path / "run" / "view_colors.json").read_text())
     assert data["type"] == "plain"
     assert sum(data["photographs"].values()) == 12
     assert digest(tmp_path / "run") == digest(few_steps)

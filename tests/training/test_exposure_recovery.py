@@ -10,7 +10,7 @@ import pytest
 
 import clsplat
 from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
-from clsplat.metrics.views import colour_figures
+from clsplat.metrics.views import color_figures
 from clsplat.training.modules.exposure import Gain
 from tests.support.runs import train
 
@@ -45,13 +45,13 @@ def changed(source: Path, out: Path, rng: np.random.Generator) -> dict[str, floa
 
 
 def held_out(run: Path) -> float:
-    """The mean PSNR of the test views in the colours of their photographs, dB."""
+    """The mean PSNR of the test views in the colors of their photographs, dB."""
     renderer, scene = clsplat.Renderer(clsplat.load(run)), clsplat.read_scene(run.parent / f"{run.name}_scene")
     found = []
     for view in scene.split("test"):
         picture = renderer.render(view)
         photograph = np.rint(255 * view.photograph(picture.background)).astype(np.uint8)
-        found.append(colour_figures(picture.image, photograph, None, Gain())["psnr_colour"])
+        found.append(color_figures(picture.image, photograph, None, Gain())["psnr_color"])
     return float(np.mean(found))
 
 
@@ -61,7 +61,7 @@ def test_known_exposures_are_found_again_from_scratch(as_they_are, rng, tmp_path
     shutil.copytree(tmp_path / "gain_scene", tmp_path / "none_scene")
     for name, more in (("gain", (GAIN,)), ("none", ())):
         train(tmp_path / f"{name}_scene", tmp_path / name, *FEW, *more)
-    table = json.loads((tmp_path / "gain" / "view_colours.json").read_text())["photographs"]
+    table = json.loads((tmp_path / "gain" / "view_colors.json").read_text())["photographs"]
     names = list(table)
     found = np.array([table[name]["exposure"] for name in names])
     known = np.array([truth[Path(name).stem] for name in names])

@@ -61,11 +61,11 @@ def test_random_points_beyond_the_memory_are_not_made(bytes_each, info, tiny_sce
         train(tiny_scene, tmp_path / "run", "init.source=random", f"init.count={count}")
 
 
-def test_points_beyond_the_memory_have_no_neighbours_looked_for(tiny_scene, tmp_path, monkeypatch):
+def test_points_beyond_the_memory_have_no_neighbors_looked_for(tiny_scene, tmp_path, monkeypatch):
     def looked_for(*_):
-        raise AssertionError("neighbours are looked for")
+        raise AssertionError("neighbors are looked for")
 
-    monkeypatch.setattr("clsplat.gaussians.conversion.neighbour_distance2", looked_for)
+    monkeypatch.setattr("clsplat.gaussians.conversion.neighbor_distance2", looked_for)
     tight = MemoryPlan(gaussian=1000, pair=0, fixed=0, largest_table=1, memory=9000, allocation=10**9)
     monkeypatch.setattr("clsplat.training.run.plan", lambda *_: tight)
     with pytest.raises(MemoryLimitError):

@@ -1,7 +1,7 @@
 """Rectangles before a scene in some of its photographs cost much, and little where pixels or Gaussians take them up.
 
 Scenes are ray-cast, so that the photographs without rectangles are there to compare with.  The rectangles have one
-colour and stand about the middle, where they look like one thing that many photographs show.
+color and stand about the middle, where they look like one thing that many photographs show.
 """
 
 import json

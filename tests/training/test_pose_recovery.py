@@ -26,13 +26,13 @@ STILL = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=0, sh_res
 
 
 def errors(truth: list[View], found: list[np.ndarray]) -> tuple[float, float]:
-    """The largest angle in rad, and the largest distance of centres."""
+    """The largest angle in rad, and the largest distance of centers."""
     angles = [
         Rotation.from_matrix(pose[:, :3] @ view.world_to_camera[:, :3].T).magnitude()
         for view, pose in zip(truth, found, strict=True)
     ]
-    centres = [-pose[:, :3].T @ pose[:, 3] - view.position for view, pose in zip(truth, found, strict=True)]
-    return max(angles), float(np.linalg.norm(centres, axis=1).max())
+    centers = [-pose[:, :3].T @ pose[:, 3] - view.position for view, pose in zip(truth, found, strict=True)]
+    return max(angles), float(np.linalg.norm(centers, axis=1).max())
 
 
 def learned(

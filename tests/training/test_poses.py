@@ -54,7 +54,7 @@ def test_derivatives_by_a_pose_are_those_of_the_image(screen, outside):
 
     splats = ref.project(gaussians, camera, degree, thresholds=ref.SMOOTH, **screen)
     of_splats = ref.blend_backward(splats, camera.width, camera.height, BACKGROUND, weights, ref.SMOOTH)
-    upstream = of_splats.mean2d, of_splats.conic, of_splats.opacity, of_splats.colour
+    upstream = of_splats.mean2d, of_splats.conic, of_splats.opacity, of_splats.color
     numbers = screen["variance"], screen.get("compensate", 0.0)
     shift, turn, zoom = ref.pose_gradient(gaussians, camera, degree, *numbers, splats, *upstream)
     assert shift == pytest.approx(numeric(lambda change: value(change, np.zeros(3))), rel=1e-6)
@@ -75,9 +75,9 @@ def test_derivatives_by_numbers_are_those_of_the_moved_scene(rng, depth):
 
     move = Move(turn, shift, depth)
     at = move.of(pose)
-    centre = -at[:, :3].T @ at[:, 3]
+    center = -at[:, :3].T @ at[:, 3]
     by_points = (weights * np.cos(points @ at[:, :3].T + at[:, 3])) @ at[:, :3]
-    by_turn, by_shift = move.gradients(at, by_points.sum(axis=0), np.cross(points - centre, by_points).sum(axis=0))
+    by_turn, by_shift = move.gradients(at, by_points.sum(axis=0), np.cross(points - center, by_points).sum(axis=0))
     assert by_turn == pytest.approx(numeric(lambda change: value(turn + change, shift)), rel=1e-7)
     assert by_shift == pytest.approx(numeric(lambda change: value(turn, shift + change)), rel=1e-7)
     at_pivot = at[:, :3] @ (shift - pose[:, :3].T @ pose[:, 3] + depth * pose[2, :3]) + at[:, 3]

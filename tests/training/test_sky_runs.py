@@ -172,7 +172,7 @@ def test_what_a_run_chose_is_no_setting_of_its_pipeline():
 
 
 def test_directions_without_visible_sky_are_left_to_gaussians(yard):
-    """The sky begins with the colours of the photographs."""
+    """The sky begins with the colors of the photographs."""
     _, folder = yard
     scene = clsplat.read_scene(folder)
     photographs = [(view, np.rint(255 * view.photograph()).astype(np.uint8), None) for view in scene.views]
@@ -180,7 +180,7 @@ def test_directions_without_visible_sky_are_left_to_gaussians(yard):
     directions = texel_directions(32)
     looked = np.abs(directions[:, 1]) < 0.4
     assert not free[looked & (directions[:, 1] > 0.35)].any()
-    assert np.ptp(texels[~free], axis=0).max() == 0, "one colour, which stays"
+    assert np.ptp(texels[~free], axis=0).max() == 0, "one color, which stays"
     sky = looked & (directions[:, 1] < -0.2)
     assert free[sky].all()
     np.testing.assert_allclose(texels[sky], painted(directions[sky]), atol=0.1)
@@ -249,19 +249,19 @@ def test_an_export_of_splats_shows_the_sky_without_its_file(yard, learned, tmp_p
     assert np.abs(found - expected).mean() < 0.02
 
 
-def test_gaussians_of_a_sky_have_its_colours_in_all_directions(rng, learned):
+def test_gaussians_of_a_sky_have_its_colors_in_all_directions(rng, learned):
     model = clsplat.load(learned)
     baked = with_sky_splats(model, 500)
     added = baked[len(model) :]
     directions = added.means - np.median(model.means, axis=0)
     expected = np.clip(sampled(model.sky.texels, directions), 0, 1)
-    np.testing.assert_allclose(added.colours, expected, atol=2e-3)
+    np.testing.assert_allclose(added.colors, expected, atol=2e-3)
     assert with_sky_splats(baked) is baked
 
 
 def test_what_a_sky_cannot_be_is_said(tiny_scene, yard, tmp_path, caplog):
     """Of transparent photographs, and as splats of a model that has none."""
-    transparent = "the photographs have transparency: what is learned and exported as a sky is the colour that"
+    transparent = "the photographs have transparency: what is learned and exported as a sky is the color that"
     nothing = "export.sky: splats changes nothing: the model has no sky"
     few = ("optimize.steps=2", "init.count=60", "optimize.during=[]")
     for scene, key, said in (

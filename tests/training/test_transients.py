@@ -66,12 +66,12 @@ def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_p
         "optimize.modules.transients={start: 150}",
     )
     photograph = run.photographs.get(run.scene.split("train")[3])
-    pixels = photograph.colours.get()
+    pixels = photograph.colors.get()
     pixels[:, 12:24, 10:22] = np.array([255, 0, 255])[:, None, None]
-    photograph.colours.set(pixels)
+    photograph.colors.set(pixels)
     workspace, planes = run.rasterizer.workspace, photograph.planes(run.rasterizer.workspace)
     image = run.rasterizer.forward(run.model, photograph.camera, run.photographs.background).image
-    residuals, _ = measure_residuals(workspace, photograph.camera, image, planes.colours, None)
+    residuals, _ = measure_residuals(workspace, photograph.camera, image, planes.colors, None)
     settings = Transients(start=150, tail=0)
     threshold = settings.threshold(run.modules["transients"].numbers, 151)
     assert threshold is not None

@@ -125,9 +125,9 @@ def test_between_two_views_the_lens_is_between_theirs(oblique):
 def test_what_a_path_loses_of_a_lens_is_said(oblique, tmp_path, caplog):
     caplog.clear()
     camera_path.write(tmp_path / "p.json", oblique.views, 30)
-    centre, sides = caplog.messages
-    assert f"{tmp_path / 'p.json'}: " in centre
-    assert "the middle of the image for the principal point, which is up to 40.0 px away" in centre
+    center, sides = caplog.messages
+    assert f"{tmp_path / 'p.json'}: " in center
+    assert "the middle of the image for the principal point, which is up to 40.0 px away" in center
     assert "the vertical focal length for the horizontal one, which moves the sides by up to 64.0 px" in sides
     caplog.clear()
     camera_path.write(tmp_path / "p.json", camera_path.read(tmp_path / "p.json").views, 30)

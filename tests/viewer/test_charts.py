@@ -47,7 +47,7 @@ def test_ticks_of_steps_are_integers_and_those_of_measures_not():
     assert rows(histogram("points", [1.0, 5.0])) == ["0", "1"]
 
 
-def test_lines_of_one_colour_differ_in_their_strokes():
+def test_lines_of_one_color_differ_in_their_strokes():
     points = [(0.0, 0.0), (1.0, 1.0)]
     chart = curve("PSNR", [Line(points, "A one", "#123456"), Line(points, "A two", "#123456", dash=1)])
     assert re.findall(r">([^<]+)</tspan>", chart) == ["A one", "A two (dashed)"]

@@ -1,4 +1,4 @@
-"""Films of a model by command and by function: colours, depth, coverage, photographs and models beside."""
+"""Films of a model by command and by function: colors, depth, coverage, photographs and models beside."""
 
 import json
 import shutil
@@ -162,8 +162,8 @@ def test_depth_and_coverage_are_pictures_and_arrays(few_steps, tmp_path):
     assert 0.9 < alpha.max() <= 1
     seen = depth[alpha > 0.5]
     assert 1 < seen.min() < seen.max() < 8
-    grey = read_image(tmp_path / "png" / "test" / "r_000_alpha.png")
-    np.testing.assert_allclose(grey[:, :, 1] / 255, alpha, atol=0.5 / 255)
+    gray = read_image(tmp_path / "png" / "test" / "r_000_alpha.png")
+    np.testing.assert_allclose(gray[:, :, 1] / 255, alpha, atol=0.5 / 255)
 
 
 def test_depths_go_from_red_to_blue():

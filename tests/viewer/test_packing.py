@@ -114,7 +114,7 @@ def test_splats_at_one_place_and_of_one_size():
     np.testing.assert_allclose(np.log(found.scales), same["log_scales"], rtol=1e-5)
 
 
-def test_colours_far_beyond_the_usual_ones():
+def test_colors_far_beyond_the_usual_ones():
     model = spread(300)
     wild = replace(model, sh_rest=model.sh_rest * 60, sh_base=model.sh_base * 20)
     found = unpacked(pack(wild))
@@ -134,7 +134,7 @@ def test_the_numbers_for_rendering_and_a_world_filter():
     assert packed == pack(model.baked())
 
 
-def test_zero_colours_stay_zero():
+def test_zero_colors_stay_zero():
     model = replace(spread(64), sh_rest=np.zeros((64, 45), np.float32))
     assert (unpacked(pack(model)).sh[:, 1:] == 0).all()
     assert len(gzip.decompress(pack(model).data)) == 4 * 1024 + 24 + 64 * (6 + 4 + 4 + 48)

@@ -22,7 +22,7 @@ from tests.support.viewer_pages import cloud, scene, views
 
 
 def flat(view):
-    """A photograph of one colour."""
+    """A photograph of one color."""
     return np.full((view.camera.height, view.camera.width, 3), 90, np.uint8)
 
 
@@ -169,8 +169,8 @@ def test_where_a_page_begins(tmp_path):
     assert stand.up @ [0, -1, 0] > 0.8
     alone = Stand.of(model.means, (), None)
     forward = alone.start.world_to_camera[2, :3]
-    towards = alone.pivot - alone.start.position
-    np.testing.assert_allclose(forward, towards / np.linalg.norm(towards), atol=1e-9)
+    toward = alone.pivot - alone.start.position
+    np.testing.assert_allclose(forward, toward / np.linalg.norm(toward), atol=1e-9)
     assert Stand.of(model.means[:0], (), None).radius > 0
     model.means[::3] = np.nan
     assert np.isfinite(Stand.of(model.means, (), None).start.world_to_camera).all()

@@ -21,7 +21,7 @@ SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
 PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "store", "viewer", "live")
 FOLDER = Path(package.__file__).parent / "core" / "templates"
 DRAWINGS = {"clsplat/viewer/charts.py"}  # SVG, escaped there
-STATES = ("good", "warn", "bad", "note")  # colours of text with papers of their own
+STATES = ("good", "warn", "bad", "note")  # colors of text with papers of their own
 WITHOUT_TEXT = {  # a background, or text on one that another rule or the page's data fix
     *("td.bar i", "button.grown", ".slider::after", ".space canvas", ".space button:hover", ".space output", ".chip"),
 }
@@ -50,9 +50,9 @@ def test_html_stands_in_templates_only():
     assert drawing == DRAWINGS, "what draws no more is taken from the list"
 
 
-def luminance(colour: str) -> float:
+def luminance(color: str) -> float:
     """Of #rgb or #rrggbb, as WCAG has it."""
-    digits = colour[1:] if len(colour) == 7 else "".join(2 * digit for digit in colour[1:])
+    digits = color[1:] if len(color) == 7 else "".join(2 * digit for digit in color[1:])
     parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
     linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
     return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
@@ -62,8 +62,8 @@ def luminance(colour: str) -> float:
 def test_text_can_be_read_on_its_paper(mode):
     light, dark = re.findall(r":root \{(.*?)\}", (FOLDER / "base.css").read_text(), re.DOTALL)
     found = [dict(re.findall(r"--([\w-]+): (#\w+)", text)) for text in (light, dark)]
-    assert found[0].keys() == found[1].keys(), "a colour of one mode alone"
-    colours = found[mode == "dark"]
+    assert found[0].keys() == found[1].keys(), "a color of one mode alone"
+    colors = found[mode == "dark"]
     on_paper = [(text, "paper") for text in ("ink", "soft", "link", "good", "warn", "bad")]
     for text, paper in [
         *on_paper,
@@ -71,11 +71,11 @@ def test_text_can_be_read_on_its_paper(mode):
         *((name, f"{name}-paper") for name in STATES),
         ("ink", "note-paper"),
     ]:
-        dark, light = sorted((luminance(colours[text]), luminance(colours[paper])))
+        dark, light = sorted((luminance(colors[text]), luminance(colors[paper])))
         assert (light + 0.05) / (dark + 0.05) >= 4.5, f"{text} on {paper}"
 
 
-def test_colours_of_text_and_paper_follow_the_mode():
+def test_colors_of_text_and_paper_follow_the_mode():
     """Where one of both is fixed, so is the other: the page's own is dark or light."""
     faults = []
     for path in (path for path in FOLDER.iterdir() if path.suffix in (".css", ".j2")):
@@ -84,7 +84,7 @@ def test_colours_of_text_and_paper_follow_the_mode():
         for names, rule in re.findall(r"([^{}]+)\{([^{}]*)\}", text if path.suffix == ".css" else "".join(blocks)):
             fixed = {key for key in ("color", "background") if re.search(rf"(?<![-\w]){key}:[^;]*#\w", rule)}
             if len(fixed) == 1 and names.strip() not in WITHOUT_TEXT:
-                faults.append(f"{path.name}: {names.strip()}: one fixed colour")
+                faults.append(f"{path.name}: {names.strip()}: one fixed color")
     assert not faults, "\n".join(faults)
 
 

@@ -42,7 +42,7 @@ def test_a_video_holds_its_pictures(suffix, tmp_path):
     found, fps = decoded(tmp_path / f"a{suffix}")
     assert (len(found), fps) == (9, 12)
     for old, new in zip(pictures(), found, strict=True):
-        assert clsplat.metrics.psnr(new, old) > 26, "colours are in their order and their range"
+        assert clsplat.metrics.psnr(new, old) > 26, "colors are in their order and their range"
     assert [path.name for path in tmp_path.iterdir()] == [f"a{suffix}"]
 
 

@@ -61,8 +61,8 @@ def test_a_pair_becomes_the_moments_of_its_mixture(rng):
         np.testing.assert_allclose(covariance_found, covariance, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(mass, a + b, rtol=1e-9)
         for name in ("sh_base", "sh_rest"):
-            colour = (a * tables[name][i] + b * tables[name][j]) / (a + b)
-            np.testing.assert_allclose(found[name][pair], colour, rtol=1e-12, atol=1e-12)
+            color = (a * tables[name][i] + b * tables[name][j]) / (a + b)
+            np.testing.assert_allclose(found[name][pair], color, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [surface, volume])
@@ -115,7 +115,7 @@ def test_same_model_gives_same_bytes_in_any_row_order(rng):
 
 
 def test_duplicates_in_one_place_become_one(rng):
-    """More of them than there are neighbours."""
+    """More of them than there are neighbors."""
     one = model(rng, 1)
     found = decimated(one[np.zeros(51, int)])
     assert len(found) == 26
@@ -162,7 +162,7 @@ def test_the_cheapest_pair_goes_first_and_none_is_in_two():
     assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(3, 4), (0, 1)]
 
 
-def test_colour_keeps_neighbours_apart():
+def test_color_keeps_neighbors_apart():
     tables = {
         "means": np.array([[0.0, 0, 0], [0.1, 0, 0], [0.25, 0, 0]]),
         "quats": np.tile([1.0, 0, 0, 0], (3, 1)),

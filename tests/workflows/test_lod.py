@@ -270,4 +270,4 @@ def test_the_command_prints_a_table_and_advises_one_file_for_few(few_steps, tmp_
     assert "below a million one SOG is better" in text
     assert "level Gaussians MB PSNR, dB before training" in text
     assert "site/lod-meta.json: " in text.replace(" /", "/")
-    assert "PSNR of test views, not yet quantised" in text
+    assert "PSNR of test views, not yet quantized" in text

@@ -155,8 +155,8 @@ class BenchCase:
         gaussians = Gaussians(device, parameters)
         for name in sorted(optimize.tables):
             gaussians.add(name, 1)
-        colour = device.zeros(3)
-        colour.fill(1.0 if background == "white" else 0.0)
+        color = device.zeros(3)
+        color.fill(1.0 if background == "white" else 0.0)
         model = settings.model.model(gaussians, gaussians.sh_degree)
         least: dict[str, Any] = dict.fromkeys(PARAMETERS, LEAST_RATE)
         motion = MotionRates(**dict.fromkeys(MotionRates.model_fields, LEAST_RATE))
@@ -165,7 +165,7 @@ class BenchCase:
             model,
             Adam(gaussians),
             SplatStats(gaussians, optimize.statistics),
-            colour,
+            color,
             optimize.losses,
             Rates(**least, motion=motion),
             rows=optimize.update,

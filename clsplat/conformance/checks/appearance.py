@@ -1,4 +1,4 @@
-"""The colours of a photograph by place and luminance: a change of an image, its derivatives, and the tables."""
+"""The colors of a photograph by place and luminance: a change of an image, its derivatives, and the tables."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,7 +18,7 @@ from clsplat.render.camera import CAMERA
 from clsplat.render.workspace import Workspace
 from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState, row_length
 from clsplat.training.modules.camera_response import by_numbers, taken
-from clsplat.training.modules.exposure import change_back, change_colours
+from clsplat.training.modules.exposure import change_back, change_colors
 
 CHECKS = Checks()
 MARGIN = 1e-3  # from white, from black and between two levels, where a derivative is that of one side
@@ -68,30 +68,30 @@ def grid_figures(
     image = picture_of(rng, grid, width, height, channels)
     gradient = rng.normal(size=image.shape).astype(np.float32)
     camera, workspace = camera_of(device, width, height), Workspace(device)
-    for name in ("coloured", "grad_coloured"):
+    for name in ("colored", "grad_colored"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
     exact = image[:3].astype(np.float64)
     found = grids.changed(workspace, camera, planes, 1).get()
     expected = ref.gridded(exact, grid)
-    yield by_element("colour_grid_forward", f"colours, {what}", found[:3, :height, :width], expected, 3e-6, floor=1.0)
-    yield equal("colour_grid_forward", f"pixels outside the image, {what}", outside(camera, found[:3]), 0.0)
+    yield by_element("color_grid_forward", f"colors, {what}", found[:3, :height, :width], expected, 3e-6, floor=1.0)
+    yield equal("color_grid_forward", f"pixels outside the image, {what}", outside(camera, found[:3]), 0.0)
     passed, by_grid = grids.differentiated(workspace, camera, planes, uploaded, 1)
     by_image, expected = ref.gridded_backward(exact, grid, gradient[:3].astype(np.float64))
     largest = max(float(np.abs(by_image).max()), 1.0)
     grad_image, grad_grid = passed.get(), by_grid.get()
     yield by_element(
-        "colour_grid_backward", f"gradient, {what}", grad_image[:3, :height, :width], by_image, 1e-5, floor=largest
+        "color_grid_backward", f"gradient, {what}", grad_image[:3, :height, :width], by_image, 1e-5, floor=largest
     )
-    yield equal("colour_grid_backward", f"gradient outside the image, {what}", outside(camera, grad_image[:3]), 0.0)
+    yield equal("color_grid_backward", f"gradient outside the image, {what}", outside(camera, grad_image[:3]), 0.0)
     floor = max(float(np.sqrt(gradient.size)) / 8, 1.0)
-    for kernel in ("colour_grid_row_sums", "colour_grid_gather"):
+    for kernel in ("color_grid_row_sums", "color_grid_gather"):
         yield by_element(
             kernel, f"gradient by the grid, {what}", of_photograph(grids, grad_grid), expected, SUM, floor=floor
         )
     if channels > 3:
-        yield equal("colour_grid_forward", f"fourth plane, {what}", found[3], planes.get()[3])
-        yield equal("colour_grid_backward", f"gradient of the fourth plane, {what}", grad_image[3], uploaded.get()[3])
+        yield equal("color_grid_forward", f"fourth plane, {what}", found[3], planes.get()[3])
+        yield equal("color_grid_backward", f"gradient of the fourth plane, {what}", grad_image[3], uploaded.get()[3])
 
 
 def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Iterator[Figure]:
@@ -106,7 +106,7 @@ def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ..
         by_smoothness = workspace.array("grid smoothness", row_length(nodes)).get()
         smooth, slope = ref.grid_smoothness(of_photograph(grids, expected[1]))
         found, wanted = np.array([shares.get().sum(dtype=np.float64)]), np.array([weight * smooth])
-        kernel = "colour_grid_smoothness"
+        kernel = "color_grid_smoothness"
         yield by_element(kernel, f"value, {what}", found, wanted, SUM, floor=1e-2)
         found, wanted = of_photograph(grids, by_smoothness), weight * slope
         largest = max(float(np.abs(wanted).max()), 1e-6)
@@ -116,33 +116,33 @@ def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ..
         whole = gradient.astype(np.float64) + by_smoothness
         expected[1], moment1, moment2 = ref.adam_step(expected[1], whole, moment1, moment2, step, rate)
         own = np.stack([of_photograph(grids, one) for one in expected])
-        expected = ref.centred_grids(own).reshape(expected.shape)
+        expected = ref.centered_grids(own).reshape(expected.shape)
     tables = {name: table.reshape(3, -1) for name, table in grids.tables().items()}
-    for kernel in ("colour_grid_update", "colour_grid_centre"):
+    for kernel in ("color_grid_update", "color_grid_center"):
         yield by_element(kernel, f"grids, {what}", tables["values"], expected, 2e-6, floor=1.0)
     for name, moment, bound in (("moment1", moment1, SUM), ("moment2", moment2, 3 * SUM)):
         floor = 0.1 * float(np.abs(moment).max())
-        yield by_element("colour_grid_update", f"{name}, {what}", tables[name][1], moment, bound, floor=floor)
-        yield equal("colour_grid_update", f"{name} of other photographs, {what}", tables[name][[0, 2]], 0.0)
+        yield by_element("color_grid_update", f"{name}, {what}", tables[name][1], moment, bound, floor=floor)
+        yield equal("color_grid_update", f"{name} of other photographs, {what}", tables[name][[0, 2]], 0.0)
 
 
-@CHECKS.add("colour_grid_forward", "colour_grid_backward", "colour_grid_row_sums", "colour_grid_gather")
-def colour_grids(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+@CHECKS.add("color_grid_forward", "color_grid_backward", "color_grid_row_sums", "color_grid_gather")
+def color_grids(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for width, height, nodes in CASES:
         yield from grid_figures(device, rng, width, height, nodes)
     yield from grid_figures(device, rng, 33, 18, (4, 4, 4), channels=4)
 
 
-@CHECKS.add("colour_grid_smoothness", "colour_grid_update", "colour_grid_centre")
-def colour_grid_tables(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+@CHECKS.add("color_grid_smoothness", "color_grid_update", "color_grid_center")
+def color_grid_tables(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for nodes in ((4, 4, 4), (1, 1, 1), (5, 1, 3)):
         yield from table_figures(device, rng, nodes)
 
 
-# The colours of a photograph: a change of an image and its derivatives.
+# The colors of a photograph: a change of an image and its derivatives.
 
 
-def colour_figures(
+def color_figures(
     device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3
 ) -> Iterator[Figure]:
     """Compare an image with a third of its pixels beyond white, its gradient, and that by the matrix."""
@@ -153,32 +153,32 @@ def colour_figures(
     image[:, near < MARGIN] = 0
     gradient = rng.normal(size=image.shape).astype(np.float32)
     camera, workspace = camera_of(device, width, height), Workspace(device)
-    for name in ("coloured", "grad_coloured"):
+    for name in ("colored", "grad_colored"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes = planes_of(device, camera, image)
-    found = change_colours(workspace, camera, planes, matrix).get()
+    found = change_colors(workspace, camera, planes, matrix).get()
     exact = image[:3].astype(np.float64)
-    expected = ref.coloured(exact, matrix)
-    yield by_element("colours_forward", f"colours, {what}", found[:3, :height, :width], expected, 2e-6, floor=1.0)
-    yield equal("colours_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)
+    expected = ref.colored(exact, matrix)
+    yield by_element("colors_forward", f"colors, {what}", found[:3, :height, :width], expected, 2e-6, floor=1.0)
+    yield equal("colors_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)
     uploaded = planes_of(device, camera, gradient)
     grad_image, waiting = change_back(workspace, camera, planes, matrix, uploaded)
-    by_image, by_matrix = ref.coloured_backward(exact, matrix, gradient[:3].astype(np.float64))
+    by_image, by_matrix = ref.colored_backward(exact, matrix, gradient[:3].astype(np.float64))
     passed = grad_image.get()
-    yield by_element("colours_backward", f"gradient, {what}", passed[:3, :height, :width], by_image, 2e-6, floor=1.0)
-    yield equal("colours_backward", f"gradient outside the image, {what}", outside(camera, passed), 0.0)
+    yield by_element("colors_backward", f"gradient, {what}", passed[:3, :height, :width], by_image, 2e-6, floor=1.0)
+    yield equal("colors_backward", f"gradient outside the image, {what}", outside(camera, passed), 0.0)
     size = float(np.sqrt(gradient.size))
-    yield by_element("colours_backward", f"gradient by the matrix, {what}", waiting(), by_matrix, SUM, floor=size)
+    yield by_element("colors_backward", f"gradient by the matrix, {what}", waiting(), by_matrix, SUM, floor=size)
     if channels > 3:
-        yield equal("colours_forward", f"fourth plane, {what}", found[3], planes.get()[3])
-        yield equal("colours_backward", f"gradient of the fourth plane, {what}", passed[3], uploaded.get()[3])
+        yield equal("colors_forward", f"fourth plane, {what}", found[3], planes.get()[3])
+        yield equal("colors_backward", f"gradient of the fourth plane, {what}", passed[3], uploaded.get()[3])
 
 
-@CHECKS.add("colours_forward", "colours_backward")
-def colours(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+@CHECKS.add("colors_forward", "colors_backward")
+def colors(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for width, height in SIZES:
-        yield from colour_figures(device, rng, width, height)
-    yield from colour_figures(device, rng, 33, 18, channels=4)
+        yield from color_figures(device, rng, width, height)
+    yield from color_figures(device, rng, 33, 18, channels=4)
 
 
 # What a camera makes of light.

@@ -87,7 +87,7 @@ def sum_figures(case: Case, m: NDArray[Any], weights: NDArray[Any], what: str) -
     yield by_norm(kernel, f"gradients of splat means, {what}", mean2d, truth.mean2d, GRADIENT)
     yield by_norm(kernel, f"gradients of conics, {what}", conic, truth.conic, GRADIENT)
     yield by_norm(kernel, f"gradients of opacities, {what}", m[:, 0], truth.opacity * splats.opacity, GRADIENT)
-    yield by_norm(kernel, f"gradients of colours, {what}", m[:, 6:9], truth.colour, GRADIENT)
+    yield by_norm(kernel, f"gradients of colors, {what}", m[:, 6:9], truth.color, GRADIENT)
     if m.shape[1] > PIXEL_SUMS:
         found = m[:, ABS_X : ABS_X + 2]
         yield by_norm(kernel, f"absolute gradients, {what}", found, truth.mean2d_abs, GRADIENT)
@@ -163,9 +163,7 @@ def entropy_of_weights(device: Device, rng: np.random.Generator) -> Iterator[Fig
         rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
         frame = rasterizer.forward(model, camera, device.upload(BACKGROUND), "entropy")
         planes = frame.image.get()
-        yield equal(
-            "blend_forward", f"colours beside the entropy, {what}", planes[:3], render(device, case).image.get()
-        )
+        yield equal("blend_forward", f"colors beside the entropy, {what}", planes[:3], render(device, case).image.get())
         expected = ref.weight_entropy(case.project(), width, height)
         yield from image_figures("blend_forward", f"entropy, {what}", planes[3:, :height, :width], expected[None])
         weights = np.zeros((4, camera.rows, camera.stride), np.float32)
@@ -187,7 +185,7 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Iterator[F
         sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), behind=behind)
         splats, weights = case.project(), planes[:, :height, :width].astype(np.float64)
         of_image = ref.blend_backward(splats, width, height, BACKGROUND.astype(np.float64), weights[:3])
-        black, only = replace(splats, colour=0 * splats.colour), np.stack([weights[3], *np.zeros((2, height, width))])
+        black, only = replace(splats, color=0 * splats.color), np.stack([weights[3], *np.zeros((2, height, width))])
         of_left = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), only)
         mean2d, conic = gradients_of_sums(splats, sums.get()[:, :count].T.astype(np.float64))
         yield by_norm("blend_backward", f"splat means, {what}", mean2d, of_image.mean2d + of_left.mean2d, GRADIENT)
@@ -270,10 +268,10 @@ def depth_figures(device: Device, case: Case, weights: Floats, what: str) -> Ite
     yield by_norm("blend_backward", f"splat means with depths, {what}", found[0], mean2d, GRADIENT)
     yield by_norm("blend_backward", f"conics with depths, {what}", found[1], conic, GRADIENT)
     yield by_norm("blend_backward", f"opacities with depths, {what}", m[:, 0], opacity * splats.opacity, GRADIENT)
-    yield by_norm("blend_backward", f"colours with depths, {what}", m[:, 6:9], of_image.colour, GRADIENT)
+    yield by_norm("blend_backward", f"colors with depths, {what}", m[:, 6:9], of_image.color, GRADIENT)
     sums = -by_depth * np.where(splats.visible, splats.depth, 0) ** 2
     yield by_norm("sum_inverse_depths", f"sums of inverse depths, {what}", depths, sums, GRADIENT)
-    upstream = mean2d, conic, opacity, of_image.colour
+    upstream = mean2d, conic, opacity, of_image.color
     numbers = case.degree, case.variance, case.compensate
     truth = ref.project_backward(case.gaussians(), case.camera(), *numbers, splats, *upstream)["means"]
     truth = truth + by_depth[:, None] * case.camera().rotation[2]
@@ -290,7 +288,7 @@ def inverse_depths(device: Device, rng: np.random.Generator) -> Iterator[Figure 
             case.model(device), case.device_camera(device), device.upload(BACKGROUND)
         )
         image, *sums = gradients_of(device, case, weights)
-        yield equal("blend_forward", f"colours, {what}", image[:3], plain.image.get()[:, :height, :width])
+        yield equal("blend_forward", f"colors, {what}", image[:3], plain.image.get()[:, :height, :width])
         for one, other in zip(sums, gradients_of(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
             yield equal("sum_inverse_depths", f"against bands of tiles, {what}", other, one)
 
@@ -324,7 +322,7 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Iterator[Figur
 
 
 def layer_figures(device: Device, rng: np.random.Generator, width: int, height: int, channels: int) -> Iterator[Figure]:
-    """Compare the colours of both, the loss and the derivatives; a sign of T says something else."""
+    """Compare the colors of both, the loss and the derivatives; a sign of T says something else."""
     camera, workspace = camera_of(device, width, height), Workspace(device)
     layer, image = (rng.random((number, height, width)).astype(np.float32) for number in (3, channels))
     left = rng.random((height, width)).astype(np.float32)

@@ -226,8 +226,8 @@ SIZES = ((1, 16, 16), (17, 33, 15), (30, 40, 30))  # Gaussians, and px: tiles th
 def photograph_of(device: Device, case: Case, mask: Mask | None = None) -> Photograph:
     """A black photograph at the camera of a scene."""
     camera = case.device_camera(device)
-    colours = device.upload(np.zeros((3, camera.height, camera.width), np.uint8))
-    return Photograph(camera, colours, None if mask is None else device.upload(mask[None].astype(np.uint8)))
+    colors = device.upload(np.zeros((3, camera.height, camera.width), np.uint8))
+    return Photograph(camera, colors, None if mask is None else device.upload(mask[None].astype(np.uint8)))
 
 
 @CHECKS.add("blend_backward")

@@ -132,21 +132,21 @@ def photographs(device: Device, rng: np.random.Generator) -> Iterator[Figure | N
         mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
         camera, workspace, what = camera_of(device, width, height), Workspace(device), f"{width} x {height} px"
         workspace.array("photograph", (3, camera.rows, camera.stride)).fill(9)
-        colours = unpack(workspace, camera, device.upload(pixels), 1 / 255, "photograph")
+        colors = unpack(workspace, camera, device.upload(pixels), 1 / 255, "photograph")
         counted = unpack(workspace, camera, device.upload(mask), 1.0, "mask")
-        found = colours.get()
-        yield by_element("unpack_pixels", f"colours, {what}", found[:, :height, :width], pixels / 255, 1e-6)
+        found = colors.get()
+        yield by_element("unpack_pixels", f"colors, {what}", found[:, :height, :width], pixels / 255, 1e-6)
         yield equal("unpack_pixels", f"pixels outside the image, {what}", outside(camera, found), 0.0)
         yield equal("unpack_pixels", f"mask, {what}", counted.get()[:, :height, :width], mask)
-        apply_mask(workspace, camera, colours, counted)
-        yield equal("apply_mask", f"masked colours, {what}", colours.get(), found * counted.get())
+        apply_mask(workspace, camera, colors, counted)
+        yield equal("apply_mask", f"masked colors, {what}", colors.get(), found * counted.get())
         shows, before, after = pixels[:1], *rng.random((2, 3)).astype(np.float32)
         uploaded = device.upload(np.ascontiguousarray(shows)), device.upload(before), device.upload(after)
-        masked = colours.get()
-        change_background(workspace, camera, colours, *uploaded)
+        masked = colors.get()
+        change_background(workspace, camera, colors, *uploaded)
         truth = masked.astype(np.float64)
         truth[:, :height, :width] += shows / 255 * (after - before.astype(np.float64))[:, None, None]
-        yield by_element("change_background", f"colours, {what}", colours.get(), truth, 1e-6, floor=1.0)
+        yield by_element("change_background", f"colors, {what}", colors.get(), truth, 1e-6, floor=1.0)
 
 
 @CHECKS.add("blur_rows", "blur_columns")
@@ -158,7 +158,7 @@ def blur(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
             camera, workspace = camera_of(device, width, height), Workspace(device)
             counted = None if mask is None else planes_of(device, camera, mask[None])
             planes = Planes(workspace, camera, planes_of(device, camera, image), counted)
-            found = Blur(sigma=sigma).apply(planes, step=1).colours.get()
+            found = Blur(sigma=sigma).apply(planes, step=1).colors.get()
             expected = ref.blurred(image.astype(np.float64), sigma, mask)
             what = f"sigma {sigma:g}, {width} x {height} px"
             yield by_element("blur_columns", what, found[:, :height, :width], expected, 2e-5, floor=0.05)
@@ -177,7 +177,7 @@ def haar_figures(
     counted = None if mask is None else planes_of(device, camera, mask[None])
     numbers = {"haar/scale": (taps[0] - taps[1]) / np.sqrt(2), "haar/leak": taps.sum() / np.sqrt(2)}
     planes = Planes(workspace, camera, planes_of(device, camera, image), counted)
-    found, exact = apply_filter(planes, numbers).colours.get(), image.astype(np.float64)
+    found, exact = apply_filter(planes, numbers).colors.get(), image.astype(np.float64)
     expected = ref.haar_filtered(exact, taps, mask)
     yield by_element("haar_forward", what, found[:, :height, :width], expected, 2e-6, floor=1.0)
     yield equal("haar_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)

@@ -14,7 +14,7 @@ from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import PenaltyInputs
 from clsplat.methods.dynamic import Brevity, Travel
 from clsplat.opencl.device import Device
-from clsplat.render.motion import at_moment, to_centres
+from clsplat.render.motion import at_moment, to_centers
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam
@@ -30,12 +30,12 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
     """Gaussians that move about their places; some come and go, a tenth is not there at TIME, a tenth always."""
     case, fields = random_case(rng, count), fields_of(width)
     motion = rng.normal(0, 0.3, (count, width))
-    centre, duration = rng.uniform(0, 1, count), rng.normal(-1, 0.5, count)
-    apart = np.abs(TIME - centre) / np.exp(duration)
+    center, duration = rng.uniform(0, 1, count), rng.normal(-1, 0.5, count)
+    apart = np.abs(TIME - center) / np.exp(duration)
     duration[(apart > 3) & (apart < 3.7)] += 0.5  # 3.33 is the end of what can be seen
-    centre[::10], duration[::10] = 0.875, -2.5
+    center[::10], duration[::10] = 0.875, -2.5
     duration[5::10] = STILL
-    motion[:, fields["time_centre"]], motion[:, fields["log_duration"]] = centre[:, None], duration[:, None]
+    motion[:, fields["time_center"]], motion[:, fields["log_duration"]] = center[:, None], duration[:, None]
     parameters = {**case.parameters, MOTION: motion.astype(np.float32)}
     return replace(case, parameters=parameters, view=replace(case.view, time=TIME))
 
@@ -62,15 +62,15 @@ def moment_figures(device: Device, rng: np.random.Generator, count: int, width: 
         planes = np.zeros(gradients[name].shape, np.float32)
         planes[:, :count] = values.T
         gradients[name].set(planes)
-    to_centres(model, camera, gradients)
+    to_centers(model, camera, gradients)
     g = {name: values.astype(np.float64) for name, values in given.items()}
     upstream = g["means"], g["quats"], g["logit_opacity"][:, 0]
     by_motion, by_logit = ref.moved_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
-    found, centre = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
+    found, center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
     kernel = "turn_backward" if turns else "move_backward"
     for name, columns in fields_of(width).items():
         yield by_norm(kernel, f"by {name}, {what}", found[:, columns], by_motion[:, columns], CONIC)
-    yield by_norm("move_backward", f"by the logit at the centre, {what}", centre, by_logit, CONIC)
+    yield by_norm("move_backward", f"by the logit at the center, {what}", center, by_logit, CONIC)
 
 
 def still_figures(device: Device, rng: np.random.Generator) -> Iterator[Figure]:

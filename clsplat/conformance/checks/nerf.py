@@ -24,7 +24,7 @@ SHAPE = FieldShape(
     depth=3,
     width=16,
     skip=1,
-    colour_width=12,
+    color_width=12,
     degrees=5,
     direction_degrees=2,
     coarse_samples=16,
@@ -91,7 +91,7 @@ class FieldCase:
         return np.stack(own)
 
     def wanted(self) -> NDArray[np.float64]:
-        """The photograph's colours of the rays that count, [counted, 3]."""
+        """The photograph's colors of the rays that count, [counted, 3]."""
         pixels = self.rays.pixels.get()
         return self.photograph[:, pixels // WIDTH, pixels % WIDTH].T.astype(np.float64)
 
@@ -157,7 +157,7 @@ def encodings(device: Device, rng: np.random.Generator) -> Iterator[Figure | Not
         level = next(case.levels.render(case.on_device, case.rays))
         position, direction = case.encoded(level.edges.get())
         (table, first), (seen, row) = (
-            place(level.raw_colours.shape[0]) for place in (case.levels.network.position, case.levels.network.seen)
+            place(level.raw_colors.shape[0]) for place in (case.levels.network.position, case.levels.network.seen)
         )
         found = rows_of(table, first, case.shape.position_rows)
         yield by_element("encode_frustums", f"{count} rays", found[:, : position.shape[1]], position, ENCODING, 1.0)
@@ -194,7 +194,7 @@ def grids_of_features(device: Device, rng: np.random.Generator) -> Iterator[Figu
         case = FieldCase.of(device, rng, count, Draw(1, 2, 0), grid=GRID)
         level = next(case.levels.render(case.on_device, case.rays))
         at, variances = case.places(level.edges.get())
-        found = rows_of(case.levels.encoding.places(level.raw_colours.shape[0]), 0, PLACE_ROWS)
+        found = rows_of(case.levels.encoding.places(level.raw_colors.shape[0]), 0, PLACE_ROWS)
         yield by_element("grid_places", f"means of {count} rays", found[:, :3], at, 1e-5, 1.0)
         yield by_element("grid_places", f"variances of {count} rays", found[:, 3], variances, 1e-3)
     for tiles, ends, keys in CASES:
@@ -248,7 +248,7 @@ def _grid_figures(
     yield equal("grid_backward", f"parameters of the network, {what}", found[: shape.of_network], 0.0)
 
 
-# A field: its network, colours of rays, all derivatives, pictures and updates.
+# A field: its network, colors of rays, all derivatives, pictures and updates.
 
 FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
     *((count, {}) for count in RAYS),
@@ -262,7 +262,7 @@ FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
     *("composite_forward", "composite_backward"),
 )
 def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
-    """Colours of rays and derivatives by all parameters, through both levels."""
+    """Colors of rays and derivatives by all parameters, through both levels."""
     for count, keys in FIELDS_CASES:
         case = FieldCase.of(device, rng, count, Draw(3, 4, 2), **keys)
         gradient = device.zeros(case.shape.parameters)
@@ -294,7 +294,7 @@ def _gradient_figures(
     used = np.zeros(shape.of_network, bool)
     for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
         of_weights, of_biases = (sum(level[number][part] for level in expected) for part in (0, 1))
-        kernel = "composite_backward" if layer.name in ("density", "colour") else "dense_backward"
+        kernel = "composite_backward" if layer.name in ("density", "color") else "dense_backward"
         for name in (kernel, "dense_weights", "dense_sums"):
             yield by_norm(name, f"weights of {layer.name}, {what}", weights, np.asarray(of_weights), GRADIENT)
         yield by_norm("dense_biases", f"biases of {layer.name}, {what}", biases, np.asarray(of_biases), GRADIENT)
@@ -324,34 +324,34 @@ class _Comparison:
             case.shape.weights(case.parameters),
         )
         edges, samples = level.edges.get().astype(np.float64), level.samples
-        colours, densities, inputs = network.forward(weights, *case.encoded(edges))
+        colors, densities, inputs = network.forward(weights, *case.encoded(edges))
         lengths = np.diff(edges, axis=1) * case.cones[:, 7:8]
         composite = ref.Composite(
-            colours.reshape(-1, samples, 3), densities.reshape(-1, samples), lengths, BACKGROUND.astype(np.float64)
+            colors.reshape(-1, samples, 3), densities.reshape(-1, samples), lengths, BACKGROUND.astype(np.float64)
         )
-        differences = composite.colours()
+        differences = composite.colors()
         differences[: case.rays.counted] -= case.wanted()
-        return cls(level, scale, network, weights, (colours, densities), inputs, composite, differences)
+        return cls(level, scale, network, weights, (colors, densities), inputs, composite, differences)
 
     def figures(self, what: str) -> Iterator[Figure]:
-        colours, densities = (
-            rows_of(table, 0, count) for table, count in ((self.level.raw_colours, 3), (self.level.raw_densities, 1))
+        colors, densities = (
+            rows_of(table, 0, count) for table, count in ((self.level.raw_colors, 3), (self.level.raw_densities, 1))
         )
-        for name, found, expected in (("colours", colours, self.raw[0]), ("densities", densities, self.raw[1])):
+        for name, found, expected in (("colors", colors, self.raw[0]), ("densities", densities, self.raw[1])):
             yield by_element("dense_forward", f"raw {name}, {what}", found, expected, 1e-4, 1.0)
         weights, left = self.composite.weights()
         for name, table, wanted in (("weights", self.level.weights, weights), ("left", self.level.left, left)):
             yield by_element("composite_forward", f"{name}, {what}", table.get(), wanted, 1e-4, 1.0)
-        yield by_element("composite_forward", what, self.level.colours.get(), self.composite.colours(), 1e-4, 1.0)
+        yield by_element("composite_forward", what, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
 
     def backward(self, counted: int) -> tuple[ref.Weights, NDArray[np.float64]]:
-        by_colours = 2 * self.scale * self.differences
-        by_colours[counted:] = 0
-        by_raw, by_densities = self.composite.backward(by_colours)
+        by_colors = 2 * self.scale * self.differences
+        by_colors[counted:] = 0
+        by_raw, by_densities = self.composite.backward(by_colors)
         return self.network.backward(self.weights, self.inputs, by_raw.reshape(-1, 3), by_densities.reshape(-1, 1))
 
 
-@CHECKS.add("place_colours")
+@CHECKS.add("place_colors")
 def pictures_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     """A whole picture: the pixels in their places, zeros around them."""
     case = FieldCase.of(device, rng, 1, Draw(0, 1, 0))
@@ -359,8 +359,8 @@ def pictures_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Fig
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)
     *_, fine = case.levels.render(case.on_device, case.levels.cast(case.rays.camera, device.upload(pixels)))
     expected = np.zeros((3, case.rays.camera.rows, case.rays.camera.stride), np.float32)
-    expected[:, :HEIGHT, :WIDTH] = fine.colours.get()[: len(pixels)].T.reshape(3, HEIGHT, WIDTH)
-    yield equal("place_colours", f"a picture of {WIDTH} x {HEIGHT}", field.paint(case.rays.camera).get(), expected)
+    expected[:, :HEIGHT, :WIDTH] = fine.colors.get()[: len(pixels)].T.reshape(3, HEIGHT, WIDTH)
+    yield equal("place_colors", f"a picture of {WIDTH} x {HEIGHT}", field.paint(case.rays.camera).get(), expected)
 
 
 @CHECKS.add("dense_update")

@@ -62,7 +62,7 @@ def record_figures(device: Device, case: Case, what: str) -> Iterator[Figure]:
     error = np.linalg.norm(conic - truth.conic[drawn], axis=1) / size
     yield Figure(kernel, f"conics, {what}", float(error.max(initial=0)), CONIC)
     yield by_element(kernel, f"opacities, {what}", record[:, 5], truth.opacity[drawn], PROJECTION)
-    yield by_element(kernel, f"colours, {what}", record[:, 6:9], truth.colour[drawn], PROJECTION, floor=1)
+    yield by_element(kernel, f"colors, {what}", record[:, 6:9], truth.color[drawn], PROJECTION, floor=1)
     yield by_element(kernel, f"depths, {what}", keys[drawn].view(np.float32), truth.depth[drawn], DEPTH)
     if not case.pixel_box:
         power_min = -np.log(255 * truth.opacity[drawn])
@@ -90,8 +90,8 @@ def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any])
     if truth.pixel_box:  # of the covariance, a pixel wider
         half_x, half_y = 0.5 + np.sqrt(reach2 * a), 0.5 + np.sqrt(reach2 * c)
     right = np.ones(len(record), bool)
-    for low, high, centre, half in ((11, 12, 0, half_x), (9, 10, 1, half_y)):
-        mean = truth.mean2d[drawn, centre]
+    for low, high, center, half in ((11, 12, 0, half_x), (9, 10, 1, half_y)):
+        mean = truth.mean2d[drawn, center]
         right &= (record[:, high] >= mean + half - 1e-3) & (record[:, low] <= mean - half + 1e-3)
         right &= record[:, high] - record[:, low] <= 2.4 * half + (3 if truth.pixel_box else 1)
     return ~right

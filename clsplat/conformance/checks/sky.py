@@ -129,7 +129,7 @@ def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Figure
         new, first, second = ref.sky_update(expected, (first, second), given, updates, 0.01)
         expected = np.where(free, new, expected)
     found = view.sky.texels.get()
-    yield by_element("sky_update", "colours of texels", found[:, shown], expected, 1e-6, floor=1.0)
+    yield by_element("sky_update", "colors of texels", found[:, shown], expected, 1e-6, floor=1.0)
     yield by_element("sky_update", "their first moments", moments["moment1"].get()[:, shown], first, 1e-5, floor=0.1)
     yield by_element("sky_update", "their second moments", moments["moment2"].get()[:, shown], second, 1e-5, floor=0.1)
     hidden = np.setdiff1d(np.arange(texels), shown)

@@ -73,7 +73,7 @@ def training(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note
     case = random_case(rng, 120, 48, 40)
     start = {name: table.copy() for name, table in case.parameters.items()}
     start["means"] += rng.normal(0, 0.05, start["means"].shape).astype(np.float32)
-    start["sh_base"] *= 0  # grey
+    start["sh_base"] *= 0  # gray
     values, tables = train(device, case, start, STEPS)
     again, same = train(device, case, start, len(values))
     count, what = len(tables["means"]), f"{len(values)} steps"

@@ -2,7 +2,7 @@
 
 Kerbl et al. 2023 (3DGS), with the filters of Yu et al. 2024 (Mip-Splatting).
 
-Conventions: OpenCV camera (x right, y down, z forward); the centre of pixel (0, 0) is (0.5, 0.5); quaternions are
+Conventions: OpenCV camera (x right, y down, z forward); the center of pixel (0, 0) is (0.5, 0.5); quaternions are
 (w, x, y, z); `grad_x` is dL/dx.  Letters: N Gaussians, K harmonics, C = 3 channels, H, W image.
 """
 

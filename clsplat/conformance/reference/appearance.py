@@ -1,4 +1,4 @@
-"""The colours of one photograph by place and luminance: what a bilateral grid makes of an image; how smooth it is.
+"""The colors of one photograph by place and luminance: what a bilateral grid makes of an image; how smooth it is.
 
 Images are [3, H, W]; a grid is [3, 4, nz, ny, nx]: what matrices [E | b] differ from no change.
 """
@@ -37,7 +37,7 @@ def gridded_backward(
 
 
 def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
-    """The sum over the axes of the mean of the squared differences of neighbouring nodes, and its derivatives."""
+    """The sum over the axes of the mean of the squared differences of neighboring nodes, and its derivatives."""
     value, derivatives = 0.0, np.zeros(grid.shape)
     for axis in (2, 3, 4):
         difference = np.diff(grid, axis=axis)
@@ -48,7 +48,7 @@ def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
     return value, derivatives
 
 
-def centred_grids(grids: NDArray[Any]) -> NDArray[Any]:
+def centered_grids(grids: NDArray[Any]) -> NDArray[Any]:
     """Grids [photographs, 3, 4, nz, ny, nx] less the mean, at each level, over the photographs and the places."""
     return grids - grids.mean(axis=(0, 4, 5), keepdims=True)
 
@@ -80,18 +80,18 @@ def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDA
         yield tuple(nodes), np.prod(shares, axis=0), slope
 
 
-# The colours of one photograph: an affine change of an image's colours, cut at white.
+# The colors of one photograph: an affine change of an image's colors, cut at white.
 
 
-def coloured(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
+def colored(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any]:
     """min(1, E c + b) of every pixel."""
     return np.minimum(_changed(image, matrix), 1)
 
 
-def coloured_backward(
+def colored_backward(
     image: NDArray[Any], matrix: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Derivatives of sum(gradient * coloured) by the image and by the matrix; those of what is cut are 0."""
+    """Derivatives of sum(gradient * colored) by the image and by the matrix; those of what is cut are 0."""
     passed = np.where(_changed(image, matrix) < 1, gradient, 0)
     by_image = np.einsum("ab,ahw->bhw", matrix[:, :3], passed)
     with_one = np.concatenate([image, np.ones((1, *image.shape[1:]))])

@@ -18,7 +18,7 @@ from clsplat.conformance.reference.projection import project, project_backward
 Floats = NDArray[Any]
 SLOPE, CUBIC, QUINTIC = 1.5957691, 0.07333173, -0.00059424  # Φ(x) = 1 / (1 + e^-P), P = SLOPE x + CUBIC x³ + …
 REACH = 6.0  # of Φ, standard deviations
-UNIFORM = 0.4  # a pixel below this many standard deviations from its centre to its edge: m and v by their series
+UNIFORM = 0.4  # a pixel below this many standard deviations from its center to its edge: m and v by their series
 STEP = 1e-5  # of finite differences, px or px², by the size of what changes
 
 
@@ -127,7 +127,7 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
 
 
 def planes_behind(background: NDArray[Any]) -> NDArray[Any]:
-    """A background of one colour, [3], or of a picture, [3, H, W], as planes."""
+    """A background of one color, [3], or of a picture, [3, H, W], as planes."""
     array = np.asarray(background)
     return array if array.ndim == 3 else array[:, None, None]
 
@@ -141,7 +141,7 @@ def blend(
     count = np.zeros((height, width), int)
     for step in blend_steps(splats, width, height, thresholds):
         weight = np.where(step.blended, step.alpha * step.before, 0)
-        image += splats.colour[step.splat][:, None, None] * weight
+        image += splats.color[step.splat][:, None, None] * weight
         transmittance = np.where(step.blended, step.before * (1 - step.alpha), transmittance)
         count += step.blended
     return image + planes_behind(background) * transmittance, transmittance, count
@@ -200,9 +200,9 @@ def alpha_gradients(
     behind = image - planes_behind(background) * final  # S_N - S_i, once splat i has been taken off
     for step in blend_steps(splats, width, height, thresholds):
         i, alpha, before = step.splat, step.alpha, step.before
-        colour = splats.colour[i][:, None, None]
-        behind = behind - colour * np.where(step.blended, alpha * before, 0)
-        grad_alpha = np.sum((colour * before - behind / (1 - alpha)) * grad_image, axis=0)
+        color = splats.color[i][:, None, None]
+        behind = behind - color * np.where(step.blended, alpha * before, 0)
+        grad_alpha = np.sum((color * before - behind / (1 - alpha)) * grad_image, axis=0)
         grad_alpha -= final / (1 - alpha) * through_background
         if len(grad_entropy):
             grad_alpha += grad_entropy[0] * next(entropy)
@@ -223,7 +223,7 @@ def blend_backward(
     grad = SplatGradients(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 2)))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         i = step.splat
-        grad.colour[i] = np.sum(grad_image[:3] * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
+        grad.color[i] = np.sum(grad_image[:3] * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
         grad.opacity[i] = np.sum(step.falloff * grad_alpha)
         if splats.pixel_box:
             by = splats.opacity[i] * grad_alpha * np.array(box_derivatives(splats.conic[i], step.dx, step.dy))
@@ -262,7 +262,7 @@ class Margin(NamedTuple):
     alpha: float  # |α / alpha_min - 1| over pixels that have not stopped
     transmittance: float  # |T' / transmittance_min - 1| over splats that are not too faint
     cap: float  # |o e^-σ / alpha_max - 1|: the image is continuous there, its gradient is not
-    depth: float  # relative gap between neighbours in the depth order
+    depth: float  # relative gap between neighbors in the depth order
 
 
 def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> Margin:
@@ -321,7 +321,7 @@ def render_backward(
 ) -> tuple[dict[str, NDArray[Any]], SplatGradients]:
     """Gradients of the parameters, and those of the splats on the way (for density control)."""
     grad = blend_backward(splats, camera.width, camera.height, background, grad_image, thresholds)
-    upstream = grad.mean2d, grad.conic, grad.opacity, grad.colour
+    upstream = grad.mean2d, grad.conic, grad.opacity, grad.color
     return project_backward(gaussians, camera, degree, variance, compensate, splats, *upstream), grad
 
 
@@ -332,7 +332,7 @@ BLACK = np.zeros(3)
 
 def _painted(splats: Splats) -> Splats:
     inverse = np.where(splats.visible, 1 / np.where(splats.visible, splats.depth, 1), 0)
-    return replace(splats, colour=np.stack([inverse, *np.zeros((2, len(inverse)))], axis=1))
+    return replace(splats, color=np.stack([inverse, *np.zeros((2, len(inverse)))], axis=1))
 
 
 def inverse_depth(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> Floats:
@@ -344,11 +344,11 @@ def inverse_depth(splats: Splats, width: int, height: int, thresholds: Threshold
 def inverse_depth_backward(
     splats: Splats, width: int, height: int, grad: Floats, thresholds: Thresholds = Thresholds()
 ) -> tuple[SplatGradients, Floats]:
-    """Gradients of the splats, whose colours have none, and dL/dz, [N]; grad: dL/dD, [H,W]."""
+    """Gradients of the splats, whose colors have none, and dL/dz, [N]; grad: dL/dD, [H,W]."""
     planes = np.stack([grad, *np.zeros((2, *grad.shape))])
     found = blend_backward(_painted(splats), width, height, BLACK, planes, thresholds)
-    by_depth = -found.colour[:, 0] * _painted(splats).colour[:, 0] ** 2
-    return found._replace(colour=0 * found.colour), by_depth
+    by_depth = -found.color[:, 0] * _painted(splats).color[:, 0] ** 2
+    return found._replace(color=0 * found.color), by_depth
 
 
 def inverse_depth_loss(
@@ -361,11 +361,11 @@ def inverse_depth_loss(
     return weights * np.abs(difference), gradient
 
 
-# A layer before an image: the colours of both, the derivatives by the image, and the loss of what the layer covers.
+# A layer before an image: the colors of both, the derivatives by the image, and the loss of what the layer covers.
 
 
 def laid_over(layer: NDArray[Any], left: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
-    """The colours of a layer, [3, H, W] before black, and an image behind it."""
+    """The colors of a layer, [3, H, W] before black, and an image behind it."""
     return np.concatenate([layer + left * image[:3], image[3:]])
 
 

@@ -49,10 +49,10 @@ class PinholeCamera:
 
 @dataclass
 class RawGaussians:
-    """Raw parameters, as optimised."""
+    """Raw parameters, as optimized."""
 
     means: NDArray[Any]  # [N,3]
-    quats: NDArray[Any]  # [N,4] w, x, y, z; not normalised
+    quats: NDArray[Any]  # [N,4] w, x, y, z; not normalized
     log_scales: NDArray[Any]  # [N,3]
     logit_opacity: NDArray[Any]  # [N]
     sh: NDArray[Any]  # [N,K,3]
@@ -73,7 +73,7 @@ class Splats:
     mean2d: NDArray[Any]  # [N,2] px
     conic: NDArray[Any]  # [N,3] A, B, C = xx, xy, yy of the inverse covariance; with the pixel's box the covariance
     opacity: NDArray[Any]  # [N] after both filters
-    colour: NDArray[Any]  # [N,3]
+    color: NDArray[Any]  # [N,3]
     depth: NDArray[Any]  # [N] z
     radius: NDArray[Any]  # [N] px, whole; 0 = not visible to density control; independent of opacity
     visible: NDArray[Any]  # [N] bool: blended
@@ -86,5 +86,5 @@ class SplatGradients(NamedTuple):
     mean2d: NDArray[Any]  # [N,2]
     conic: NDArray[Any]  # [N,3] with respect to the scalars of Splats.conic
     opacity: NDArray[Any]  # [N]
-    colour: NDArray[Any]  # [N,3]
+    color: NDArray[Any]  # [N,3]
     mean2d_abs: NDArray[Any]  # [N,2] sum over pixels of |dL/du|, |dL/dv|

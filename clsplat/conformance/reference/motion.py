@@ -1,6 +1,6 @@
 """Moving Gaussians at one moment, and the gradients by their motion, one Gaussian at a time.
 
-A row of motion: velocity [3], time centre, log of the duration, then acceleration [3] and jerk [3] where the degree is
+A row of motion: velocity [3], time center, log of the duration, then acceleration [3] and jerk [3] where the degree is
 2 or 3, then the turn [4] where Gaussians turn.  FreeTimeGS (Wang et al. 2025), Spacetime Gaussians (Li et al. 2024).
 """
 
@@ -59,15 +59,15 @@ def moved_backward(
     turns: bool,
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """dL/d(motion) [N,W] and dL/d(logit_opacity) [N] from the gradients at the time; those by means and quaternions are
-    the same at the centre.  Zero where nothing can be seen."""
-    grad_motion, grad_centre = np.zeros_like(motion), np.zeros_like(logit_opacity)
+    the same at the center.  Zero where nothing can be seen."""
+    grad_motion, grad_center = np.zeros_like(motion), np.zeros_like(logit_opacity)
     for n, row in enumerate(motion):
         dt, factor, duration = time - row[3], presence(row, time), np.exp(row[4])
         if factor < PRESENCE_MIN:
             continue
         alpha = 1 / (1 + np.exp(-logit_opacity[n]))
         by_alpha_t = grad_logit[n] / (alpha * factor * (1 - alpha * factor))
-        grad_centre[n] = by_alpha_t * factor * alpha * (1 - alpha)
+        grad_center[n] = by_alpha_t * factor * alpha * (1 - alpha)
         by_factor = by_alpha_t * alpha
         for order, vector in enumerate(coefficients(row, degree), 1):
             first = (0, 5, 8)[order - 1]
@@ -78,7 +78,7 @@ def moved_backward(
             grad_motion[n, 3] -= grad_quats[n] @ row[-4:]
         grad_motion[n, 3] += by_factor * factor * dt / duration**2
         grad_motion[n, 4] = by_factor * factor * (dt / duration) ** 2
-    return grad_motion, grad_centre
+    return grad_motion, grad_center
 
 
 def travel(motion: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:

@@ -1,4 +1,4 @@
-"""A field of densities and colours, as a network, and the colours of its rays, forward and backward in float64
+"""A field of densities and colors, as a network, and the colors of its rays, forward and backward in float64
 (Barron et al. 2021, "Mip-NeRF"; the network is that of Mildenhall et al. 2020)."""
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from clsplat.conformance.reference.kinds import PinholeCamera
 from clsplat.conformance.reference.random import philox
 
 Floats = NDArray[np.float64]
-DENSITY_BIAS, COLOUR_PADDING = -1.0, 0.001
+DENSITY_BIAS, COLOR_PADDING = -1.0, 0.001
 Weights = list[tuple[Floats, Floats]]  # of each layer: [inputs, outputs], [outputs]
 Inputs = list[Floats]  # of each layer, [S, inputs]
 
@@ -18,34 +18,34 @@ Inputs = list[Floats]  # of each layer, [S, inputs]
 @dataclass(frozen=True)
 class DenseNetwork:
     """Layers in their order: `depth` of the trunk, of which the one after `skip` reads the position again, density,
-    bottleneck, condition, colour."""
+    bottleneck, condition, color."""
 
     depth: int
     skip: int | None  # layer whose outputs the position joins
 
     def forward(self, weights: Weights, position: Floats, direction: Floats) -> tuple[Floats, Floats, Inputs]:
-        """Raw colours [S, outputs], raw densities [S, outputs], and the inputs of each layer."""
+        """Raw colors [S, outputs], raw densities [S, outputs], and the inputs of each layer."""
         inputs, x = [], position
         for i in range(self.depth):
             inputs.append(x)
             x = np.maximum(x @ weights[i][0] + weights[i][1], 0)
             if i == self.skip:
                 x = np.concatenate([x, position], axis=1)
-        density, bottleneck, condition, colour = weights[self.depth :]
+        density, bottleneck, condition, color = weights[self.depth :]
         seen = np.concatenate([x @ bottleneck[0] + bottleneck[1], direction], axis=1)
         hidden = np.maximum(seen @ condition[0] + condition[1], 0)
         inputs += [x, x, seen, hidden]
-        return hidden @ colour[0] + colour[1], x @ density[0] + density[1], inputs
+        return hidden @ color[0] + color[1], x @ density[0] + density[1], inputs
 
     def backward(
-        self, weights: Weights, inputs: Inputs, by_colours: Floats, by_densities: Floats
+        self, weights: Weights, inputs: Inputs, by_colors: Floats, by_densities: Floats
     ) -> tuple[Weights, Floats]:
         """Derivatives by the weights, and by the encoded position, [S, features], from those by the raw outputs."""
-        density, bottleneck, condition, colour = weights[self.depth :]
+        density, bottleneck, condition, color = weights[self.depth :]
         width = bottleneck[0].shape[1]
-        by_hidden = (by_colours @ colour[0].T) * (inputs[-1] > 0)
+        by_hidden = (by_colors @ color[0].T) * (inputs[-1] > 0)
         by_bottleneck = (by_hidden @ condition[0].T)[:, :width]
-        by_outputs = [by_densities, by_bottleneck, by_hidden, by_colours]
+        by_outputs = [by_densities, by_bottleneck, by_hidden, by_colors]
         by_x = by_densities @ density[0].T + by_bottleneck @ bottleneck[0].T
         by_position = np.zeros_like(inputs[0])
         for i in reversed(range(self.depth)):
@@ -60,18 +60,18 @@ class DenseNetwork:
 
 @dataclass(frozen=True)
 class Composite:
-    """Rays of samples: raw colours [R, N, 3], raw densities [R, N], lengths of the samples [R, N]; background [3]."""
+    """Rays of samples: raw colors [R, N, 3], raw densities [R, N], lengths of the samples [R, N]; background [3]."""
 
-    raw_colours: Floats
+    raw_colors: Floats
     raw_densities: Floats
     lengths: Floats
     background: Floats
 
     @property
     def samples(self) -> tuple[Floats, Floats]:
-        """Colours [R, N, 3] and densities [R, N] of the samples."""
-        colours = (1 + 2 * COLOUR_PADDING) / (1 + np.exp(-self.raw_colours)) - COLOUR_PADDING
-        return colours, np.logaddexp(0, self.raw_densities + DENSITY_BIAS)
+        """Colors [R, N, 3] and densities [R, N] of the samples."""
+        colors = (1 + 2 * COLOR_PADDING) / (1 + np.exp(-self.raw_colors)) - COLOR_PADDING
+        return colors, np.logaddexp(0, self.raw_densities + DENSITY_BIAS)
 
     def weights(self) -> tuple[Floats, Floats]:
         """Weights of the samples, and what is left behind each, [R, N]."""
@@ -79,17 +79,17 @@ class Composite:
         before = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], axis=1)
         return before - left, left
 
-    def colours(self) -> Floats:
-        """Colours of the rays, [R, 3]."""
+    def colors(self) -> Floats:
+        """Colors of the rays, [R, 3]."""
         weights = self.weights()[0][..., None]
         return np.asarray((weights * self.samples[0]).sum(axis=1) + (1 - weights.sum(axis=1)) * self.background)
 
-    def backward(self, by_colours: Floats) -> tuple[Floats, Floats]:
-        """Derivatives by the raw colours and densities, from those by the colours of the rays, [R, 3]."""
-        (colours, _), (weights, left) = self.samples, self.weights()
-        part = (colours + COLOUR_PADDING) / (1 + 2 * COLOUR_PADDING)
-        by_raw = by_colours[:, None] * weights[..., None] * (1 + 2 * COLOUR_PADDING) * part * (1 - part)
-        by_weights = (by_colours[:, None] * (colours - self.background)).sum(axis=-1)
+    def backward(self, by_colors: Floats) -> tuple[Floats, Floats]:
+        """Derivatives by the raw colors and densities, from those by the colors of the rays, [R, 3]."""
+        (colors, _), (weights, left) = self.samples, self.weights()
+        part = (colors + COLOR_PADDING) / (1 + 2 * COLOR_PADDING)
+        by_raw = by_colors[:, None] * weights[..., None] * (1 + 2 * COLOR_PADDING) * part * (1 - part)
+        by_weights = (by_colors[:, None] * (colors - self.background)).sum(axis=-1)
         behind = np.cumsum((weights * by_weights)[:, ::-1], axis=1)[:, ::-1] - weights * by_weights
         slope = 1 / (1 + np.exp(-self.raw_densities - DENSITY_BIAS))
         return by_raw, (left * by_weights - behind) * self.lengths * slope

@@ -140,7 +140,7 @@ def view_direction(camera: PinholeCamera, mean: NDArray[Any]) -> tuple[NDArray[A
     return offset / distance, distance
 
 
-def unclamped_colour(gaussians: RawGaussians, n: int, camera: PinholeCamera, degree: int) -> NDArray[Any]:
+def unclamped_color(gaussians: RawGaussians, n: int, camera: PinholeCamera, degree: int) -> NDArray[Any]:
     """Σ Y_k(d) c_k + 0.5: [3]."""
     basis = sh_basis(view_direction(camera, gaussians.means[n])[0], degree)
     return basis @ gaussians.sh[n, : len(basis)] + 0.5
@@ -151,7 +151,7 @@ def vanilla_radius(mean2d: NDArray[Any], dilated: NDArray[Any], width: int, heig
     middle = (dilated[0, 0] + dilated[1, 1]) / 2
     largest = middle + np.sqrt(max(0.1, middle**2 - determinant(dilated)))
     radius = np.ceil(3 * np.sqrt(largest))
-    index = mean2d - 0.5  # the reference implementation counts pixels from their centres
+    index = mean2d - 0.5  # the reference implementation counts pixels from their centers
     grid = np.ceil(np.array([width, height]) / RADIUS_TILE)
     first = np.clip(np.trunc((index - radius) / RADIUS_TILE), 0, grid)
     last = np.clip(np.trunc((index + radius + RADIUS_TILE - 1) / RADIUS_TILE), 0, grid)
@@ -177,7 +177,7 @@ def project(
         mean2d=np.zeros((count, 2)),
         conic=np.zeros((count, 3)),
         opacity=np.zeros(count),
-        colour=np.zeros((count, 3)),
+        color=np.zeros((count, 3)),
         depth=np.zeros(count),
         radius=np.zeros(count),
         visible=np.zeros(count, bool),
@@ -204,7 +204,7 @@ def project(
         if pixel_box:
             splats.conic[n] = foot.sharp[0, 0], foot.sharp[0, 1], foot.sharp[1, 1]
         splats.opacity[n] = opacity
-        splats.colour[n] = np.maximum(0, unclamped_colour(gaussians, n, camera, degree))
+        splats.color[n] = np.maximum(0, unclamped_color(gaussians, n, camera, degree))
         splats.depth[n] = z
     return splats
 
@@ -282,7 +282,7 @@ def project_backward(
     grad_mean2d: NDArray[Any],
     grad_conic: NDArray[Any],
     grad_opacity: NDArray[Any],
-    grad_colour: NDArray[Any],
+    grad_color: NDArray[Any],
 ) -> dict[str, NDArray[Any]]:
     """Gradients of the parameters, named as in `PARAMETERS`; `filter_variance` is a constant.  Culled rows are zero."""
     grad = {name: np.zeros_like(getattr(gaussians, name)) for name in PARAMETERS}
@@ -303,10 +303,10 @@ def project_backward(
         grad_j = 2 * grad_v @ m @ foot.covariance @ camera.rotation.T
         grad_point = point_gradient(camera, foot, grad_mean2d[n], grad_j)
 
-        # Colour: SH, its direction, max(0, .)
+        # Color: SH, its direction, max(0, .)
         direction, distance = view_direction(camera, gaussians.means[n])
-        not_clamped = unclamped_colour(gaussians, n, camera, degree) > 0
-        grad_c = grad_colour[n] * not_clamped
+        not_clamped = unclamped_color(gaussians, n, camera, degree) > 0
+        grad_c = grad_color[n] * not_clamped
         basis, basis_gradient = sh_basis(direction, degree), sh_basis_gradient(direction, degree)
         used = len(basis)
         grad["sh"][n, :used] = np.outer(basis, grad_c)
@@ -383,7 +383,7 @@ def pose_gradient(
     grad_mean2d: NDArray[Any],
     grad_conic: NDArray[Any],
     grad_opacity: NDArray[Any],
-    grad_colour: NDArray[Any],
+    grad_color: NDArray[Any],
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """dL/d(shift) and dL/d(turn), each [3], and dL/d(zoom), [1], of `moved_camera` at zero."""
     shift, turn, zoom = np.zeros(3), np.zeros(3), np.zeros(1)
@@ -406,7 +406,7 @@ def pose_gradient(
 
         # The direction of view changes with the shift alone
         direction, distance = view_direction(camera, gaussians.means[n])
-        grad_c = grad_colour[n] * (unclamped_colour(gaussians, n, camera, degree) > 0)
+        grad_c = grad_color[n] * (unclamped_color(gaussians, n, camera, degree) > 0)
         basis_gradient = sh_basis_gradient(direction, degree)
         grad_d = basis_gradient.T @ (gaussians.sh[n, : len(basis_gradient)] @ grad_c)
         shift += grad_point + camera.rotation @ (grad_d - direction * (direction @ grad_d)) / distance

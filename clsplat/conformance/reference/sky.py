@@ -15,7 +15,7 @@ Entry = tuple[int, int, float]  # row and column of a texel, weight
 
 
 def rays(camera: PinholeCamera, width: int, height: int) -> NDArray[Any]:
-    """Directions through the centres of pixels."""
+    """Directions through the centers of pixels."""
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
     in_camera = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1)
@@ -32,7 +32,7 @@ def map_entries(direction: NDArray[Any], side: int) -> Iterator[Entry]:
     for j in (first_j, first_j + 1):
         for i in (first_i, first_i + 1):
             row, column = j, i
-            if column in (-1, side):  # the edge's other half is its neighbour
+            if column in (-1, side):  # the edge's other half is its neighbor
                 row, column = side - 1 - row, min(max(column, 0), side - 1)
             if row in (-1, side):
                 row, column = min(max(row, 0), side - 1), side - 1 - column
@@ -59,7 +59,7 @@ def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any
 
 
 def shows_sky(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> NDArray[Any]:
-    """Pixels whose 3 x 3 neighbourhood in the photograph shows the sky in 6 of 9 places, [H, W]; images [3, H, W]."""
+    """Pixels whose 3 x 3 neighborhood in the photograph shows the sky in 6 of 9 places, [H, W]; images [3, H, W]."""
     matches = np.pad(np.abs(sky - photograph).mean(axis=0) <= difference, 1)
     height, width = photograph.shape[1:]
     counts = sum(matches[v : v + height, u : u + width].astype(int) for v in range(3) for u in range(3))

@@ -47,8 +47,8 @@ def covariance_trace(
     """Mean of max(sum of squared scales - above, 0) by extent².  log_scales: [N, 3]; above: scene units²."""
     scale2 = np.exp(2 * log_scales)
     excess = scale2.sum(axis=1) - above
-    penalised = (excess > 0)[:, None]
-    return np.maximum(excess, 0).mean() / extent**2, 2 * scale2 * penalised / len(scale2) / extent**2
+    penalized = (excess > 0)[:, None]
+    return np.maximum(excess, 0).mean() / extent**2, 2 * scale2 * penalized / len(scale2) / extent**2
 
 
 def anisotropy(log_scales: NDArray[Any], above: float) -> tuple[float, NDArray[Any]]:
@@ -97,7 +97,7 @@ ABSGS = DensityRule(split_gradient=4e-4, dense=0.001)
 
 
 def screen_gradient(grad_mean2d: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    """‖g2d‖: pixels -> normalised device coordinates: [N,2] -> [N].  Also for `mean2d_abs`."""
+    """‖g2d‖: pixels -> normalized device coordinates: [N,2] -> [N].  Also for `mean2d_abs`."""
     return np.hypot(width / 2 * grad_mean2d[:, 0], height / 2 * grad_mean2d[:, 1])
 
 

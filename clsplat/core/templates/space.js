@@ -1,10 +1,10 @@
 for (const box of document.querySelectorAll(".space")) {
-  const {points, colours, cameras, names, shades, radius} = JSON.parse(box.querySelector("script").textContent);
+  const {points, colors, cameras, names, shades, radius} = JSON.parse(box.querySelector("script").textContent);
   const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), caption = box.querySelector("output");
   const VIEWS = {oblique: [0.6, 0.45], top: [0, Math.PI / 2], side: [0, 0]};
   let [yaw, pitch] = VIEWS.oblique, distance = 2.7 * radius, places = [], over = -1;
 
-  // Rotated about the up axis, then tilted towards the viewer; null behind the eye.
+  // Rotated about the up axis, then tilted toward the viewer; null behind the eye.
   function project(x, y, z, wide, high) {
     const a = Math.cos(yaw) * x - Math.sin(yaw) * y, b = Math.sin(yaw) * x + Math.cos(yaw) * y;
     const depth = distance + Math.cos(pitch) * b - Math.sin(pitch) * z;
@@ -30,36 +30,36 @@ for (const box of document.querySelectorAll(".space")) {
     }
     pen.setTransform(dense, 0, 0, dense, 0, 0);
     pen.clearRect(0, 0, wide, high);
-    for (let i = 0; i < colours.length; i++) {
+    for (let i = 0; i < colors.length; i++) {
       const place = project(points[3 * i], points[3 * i + 1], points[3 * i + 2], wide, high);
       if (!place) continue;
       const size = Math.min(5, Math.max(1.2, 2.3 * distance / place[2]));
-      pen.fillStyle = "#" + colours[i];
+      pen.fillStyle = "#" + colors[i];
       pen.fillRect(place[0] - size / 2, place[1] - size / 2, size, size);
     }
     places = cameras.map((camera, i) => {
       const corners = [];
       for (let k = 1; k < 16; k += 3) corners.push(project(camera[k], camera[k + 1], camera[k + 2], wide, high));
-      let centre = corners[0];
-      const outside = !centre || centre[0] < 0 || centre[0] > wide || centre[1] < 0 || centre[1] > high;
+      let center = corners[0];
+      const outside = !center || center[0] < 0 || center[0] > wide || center[1] < 0 || center[1] > high;
       pen.strokeStyle = pen.fillStyle = i === over ? "#ffffff" : shades[camera[0]];
       pen.lineWidth = i === over ? 2 : 1.2;
       if (camera[0] === 2 && outside) {
-        centre = clamped(camera, wide, high);
-        label(centre, names[i] + " (far outside)", wide);
-      } else if (camera[0] === 2) label(centre, names[i], wide);
+        center = clamped(camera, wide, high);
+        label(center, names[i] + " (far outside)", wide);
+      } else if (camera[0] === 2) label(center, names[i], wide);
       else if (corners.every(Boolean)) frustum(corners);
-      return centre;
+      return center;
     });
     if (over >= 0 && places[over]) caption.textContent = names[over];
     else caption.textContent = "";
   }
 
-  function frustum([centre, ...corners]) {
+  function frustum([center, ...corners]) {
     pen.beginPath();
     corners.forEach((corner, k) => {
       const next = corners[(k + 1) % 4];
-      pen.moveTo(centre[0], centre[1]);
+      pen.moveTo(center[0], center[1]);
       pen.lineTo(corner[0], corner[1]);
       pen.lineTo(next[0], next[1]);
     });

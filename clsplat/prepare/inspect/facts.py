@@ -20,7 +20,7 @@ from clsplat.prepare.gather import list_photographs, why_unreadable
 from clsplat.scene.camera import BORDER_POINTS, Lens
 from clsplat.scene.detect import read_scene, reader_of
 from clsplat.scene.identity import ImageFile, decode_all
-from clsplat.scene.images import CameraExposure, exposure_of, is_image, read_grey
+from clsplat.scene.images import CameraExposure, exposure_of, is_image, read_gray
 from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.quality import SIDE, both_sharpnesses, is_blurred
 from clsplat.scene.reader import Parts
@@ -32,7 +32,7 @@ from clsplat.scene.view import NO_FILE, View, camera_exposures, fits
 # What photographs look like beside each other: blurred ones, the same one twice, exposures that jump.
 
 THUMBNAIL = 32  # px, of each side
-SAME = 1.0  # grey levels between thumbnails: frames of a video are 9 apart, two codings of one photograph 0.3
+SAME = 1.0  # gray levels between thumbnails: frames of a video are 9 apart, two codings of one photograph 0.3
 JUMP = 1.0  # stops from one photograph to the next
 STEP = 2.0  # brightness of a photograph by that of the one before: at most 1.4 in five captures with one exposure
 
@@ -42,8 +42,8 @@ class PhotographMeasures:
     """What is measured of one photograph."""
 
     sharpness: NDArray[np.float64]  # both
-    brightness: NDArray[np.float64]  # mean and median, grey levels
-    thumbnail: NDArray[np.float32]  # [THUMBNAIL²], grey levels
+    brightness: NDArray[np.float64]  # mean and median, gray levels
+    thumbnail: NDArray[np.float32]  # [THUMBNAIL²], gray levels
 
 
 @dataclass(frozen=True)
@@ -95,16 +95,16 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
 def _look(file: Path) -> PhotographMeasures | DataError:
     """Measure a photograph; or return why it cannot be read."""
     try:
-        grey = read_grey(file, SIDE)[0]
+        gray = read_gray(file, SIDE)[0]
     except DataError as error:
         return error
-    small = cv2.resize(grey, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
-    brightness = np.maximum([grey.mean(), np.median(grey)], 1.0)
-    return PhotographMeasures(both_sharpnesses(grey), brightness, small.astype(np.float32).ravel())
+    small = cv2.resize(gray, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
+    brightness = np.maximum([gray.mean(), np.median(gray)], 1.0)
+    return PhotographMeasures(both_sharpnesses(gray), brightness, small.astype(np.float32).ravel())
 
 
 def _steps(brightness: Mapping[str, NDArray[np.float64]], told: Container[str]) -> list[tuple[str, str, float]]:
-    """Neighbours of which mean and median both differ by more than STEP times: one of them follows what is shown.
+    """Neighbors of which mean and median both differ by more than STEP times: one of them follows what is shown.
 
     told: photographs whose exposures are known; two of them make no step.
     """
@@ -149,14 +149,14 @@ class PointFacts:
     behind: float | None  # share that lies behind all cameras
 
 
-def points_of(parts: Parts, extent: float | None, centres: NDArray[np.floating]) -> PointFacts:
-    """Measure the points of a dataset that has some.  extent: of its cameras; centres: of these, [N, 3]."""
+def points_of(parts: Parts, extent: float | None, centers: NDArray[np.floating]) -> PointFacts:
+    """Measure the points of a dataset that has some.  extent: of its cameras; centers: of these, [N, 3]."""
     assert parts.points is not None
     positions = parts.points.positions
     finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
     known = _errors(parts, np.asarray(finite))
     good = positions[finite].astype(np.float64)
-    distance = np.linalg.norm(good - np.median(centres, axis=0), axis=1) if len(centres) else np.empty(0)
+    distance = np.linalg.norm(good - np.median(centers, axis=0), axis=1) if len(centers) else np.empty(0)
     sample = good[:: max(1, -(-len(good) // SAMPLE_SIZE))]
     in_two, behind = _coverage(sample, parts.views) if len(sample) and parts.views else (None, None)
     return PointFacts(
@@ -209,7 +209,7 @@ class CameraFacts:
     focal: tuple[float, float]  # px
     distortion: float | None  # px: the largest displacement by the lens at the border; None where it overflows
     kept: float  # share of the photograph that is left when it is undistorted
-    centred: bool  # whether the principal point lies in the photograph
+    centered: bool  # whether the principal point lies in the photograph
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ class Facts:
     strayed: list[str]
     moments: int  # different times of the views; 0 where the scene does not move
     stations: int  # different cameras that took the views, where the scene moves
-    one_place: bool  # all cameras have the same centre
+    one_place: bool  # all cameras have the same center
     same_pose: list[list[str]]
     same_but_case: list[list[str]]
     same_base: int  # names that several folders hold
@@ -268,7 +268,7 @@ def survey(parts: Parts) -> Facts:
     missing = [file for file in expected if not os.path.exists(file)]  # never raises
     known = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
     names = [view.name for view in views]
-    centres = np.stack([view.position for view in views]) if views else np.empty((0, 3))
+    centers = np.stack([view.position for view in views]) if views else np.empty((0, 3))
     extent = parts.scene.extent if parts.scene else camera_extent(views) if views else None
     return Facts(
         path=str(parts.path),
@@ -284,13 +284,13 @@ def survey(parts: Parts) -> Facts:
         cameras=_cameras(parts),
         photos=_photographs(views, set(missing)),
         looks=looks_of(parts, set(missing)),
-        points=points_of(parts, extent, centres) if parts.points else None,
+        points=points_of(parts, extent, centers) if parts.points else None,
         seen=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
         strayed=[view.name for view, far in zip(views, strayed(views), strict=True) if far] if views else [],
         moments=len(moments_of(views)),
         stations=len(by_camera(views)) if moments_of(views) else 0,
-        one_place=len(views) > 1 and bool(np.allclose(centres, centres[0], rtol=0, atol=1e-9)),
+        one_place=len(views) > 1 and bool(np.allclose(centers, centers[0], rtol=0, atol=1e-9)),
         same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         same_base=sum(count > 1 for count in Counter(file.name for file in set(expected)).values()),
@@ -334,9 +334,9 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
         original = lens.camera if lens else camera
         model = parts.models.get(views[0].name) or (lens.model if lens else "PINHOLE")
         kept = camera.width * camera.height / (original.width * original.height)
-        centred = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
+        centered = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
         size, focal = (original.width, original.height), (original.fx, original.fy)
-        found.append(CameraFacts(len(views), model, *size, focal, distortion(lens) if lens else 0.0, kept, centred))
+        found.append(CameraFacts(len(views), model, *size, focal, distortion(lens) if lens else 0.0, kept, centered))
     return sorted(found, key=lambda facts: -facts.views)
 
 

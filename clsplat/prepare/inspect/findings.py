@@ -182,7 +182,7 @@ def _cameras(facts: Facts) -> Iterator[Finding]:
         if not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
             fault = f"{name} has a focal length of {camera.focal[0]:.4g} px, which is not plausible"
             yield Finding("warning", fault, "calibrate it again, or find the poses with the right focal length")
-        if not camera.centred:
+        if not camera.centered:
             yield Finding("warning", f"{name} has its principal point outside the image", "calibrate it again")
         if camera.kept < MIN_SHARE_KEPT:
             fault = f"undistorting {name} keeps only {100 * camera.kept:.0f} % of each photograph"

@@ -32,7 +32,7 @@ def space(inspection: Inspection) -> tuple[list[tuple[str, str]], dict[str, Any]
     if not views:
         return None
     far = set(inspection.facts.strayed)
-    points, colours = _points(inspection)
+    points, colors = _points(inspection)
     near = np.stack([view.position for view in views if view.name not in far])
     origin, radius = _frame(near, points)
     axes = _axes(views) * (RADIUS / radius)
@@ -42,9 +42,9 @@ def space(inspection: Inspection) -> tuple[list[tuple[str, str]], dict[str, Any]
     size = 0.12 * float(np.median(np.linalg.norm(near - np.median(near, axis=0), axis=1))) or 0.1 * radius
     data = {
         "points": _integers(points[drawn]),
-        "colours": ["".join(f"{byte:02x}" for byte in rgb) for rgb in colours[drawn].astype(int).tolist()],
+        "colors": ["".join(f"{byte:02x}" for byte in rgb) for rgb in colors[drawn].astype(int).tolist()],
         "cameras": [[kinds[view.name], *_integers((_frustum(view, size) - origin) @ axes.T)] for view in views],
-        "shades": [colour for colour, _ in KINDS],
+        "shades": [color for color, _ in KINDS],
         "names": [view.name for view in views],
         "radius": RADIUS,
     }
@@ -63,7 +63,7 @@ def _integers(coordinates: NDArray[np.floating]) -> list[int]:
 
 
 def _points(inspection: Inspection) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions and colours of at most MAX_POINTS points, evenly spaced in the file."""
+    """Positions and colors of at most MAX_POINTS points, evenly spaced in the file."""
     table = inspection.parts.points
     if table is None or not len(table.positions):
         return np.empty((0, 3)), np.empty((0, 3))
@@ -72,14 +72,14 @@ def _points(inspection: Inspection) -> tuple[NDArray[np.float64], NDArray[np.flo
     return table.positions[chosen].astype(np.float64), table.rgb[chosen].astype(np.float64)
 
 
-def _frame(centres: NDArray[np.floating], points: NDArray[np.float64]) -> tuple[NDArray[np.floating], float]:
+def _frame(centers: NDArray[np.floating], points: NDArray[np.float64]) -> tuple[NDArray[np.floating], float]:
     """The middle of what is drawn, [3], and its radius: all cameras, and most points unless they are far away."""
-    middle = np.median(centres, axis=0)
-    reach = float(np.linalg.norm(centres - middle, axis=1).max()) or 1.0
+    middle = np.median(centers, axis=0)
+    reach = float(np.linalg.norm(centers - middle, axis=1).max()) or 1.0
     close = points[np.linalg.norm(points - middle, axis=1) < 5 * reach]
     if len(close):
         middle = (middle + np.median(close, axis=0)) / 2
-    distances = np.linalg.norm(centres - middle, axis=1).max()
+    distances = np.linalg.norm(centers - middle, axis=1).max()
     if len(close):
         distances = max(distances, np.quantile(np.linalg.norm(close - middle, axis=1), 0.7))
     return middle, float(distances) or 1.0
@@ -100,7 +100,7 @@ def _axes(views: list[View]) -> NDArray[np.float64]:
 
 
 def _frustum(view: View, size: float) -> NDArray[np.float64]:
-    """Centre and corners of the image at a depth of `size`, [5, 3], in world coordinates."""
+    """Center and corners of the image at a depth of `size`, [5, 3], in world coordinates."""
     camera = view.camera
     corners = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
     rays = [((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0) for x, y in corners]

@@ -20,7 +20,7 @@ from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs.results import RunFolder, read_settings
 from clsplat.scene.scene import scene_name
 from clsplat.training.settings_diff import differences
-from clsplat.viewer.charts import COLOURS
+from clsplat.viewer.charts import COLORS
 
 # The settings in which resolved pipelines differ.
 
@@ -81,11 +81,11 @@ MAX_SETTINGS = 3  # differing ones in a variant's name
 
 @dataclass(frozen=True)
 class Variant:
-    """Settings with a letter and a colour, which are the same on the whole page."""
+    """Settings with a letter and a color, which are the same on the whole page."""
 
     letter: str
     name: str
-    colour: str
+    color: str
     settings: dict[str, str]  # place -> value, without scene and seed; with the device
 
 
@@ -145,7 +145,7 @@ class RunComparison:
             if (settings := _settings(run)) not in distinct:
                 distinct.append(settings)
         return [
-            Variant(_letter(i), _name(settings, distinct), COLOURS[i % len(COLOURS)], settings)
+            Variant(_letter(i), _name(settings, distinct), COLORS[i % len(COLORS)], settings)
             for i, settings in enumerate(distinct)
         ]
 

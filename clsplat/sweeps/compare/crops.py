@@ -30,7 +30,7 @@ class ImageCrop:
     x: int
     y: int
     side: int
-    difference: float  # mean over the square, in grey levels
+    difference: float  # mean over the square, in gray levels
 
     @property
     def photograph(self) -> Image:

@@ -19,14 +19,14 @@ from clsplat.runs.results import Points, RunFolder, RunMetrics
 from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing
 from clsplat.sweeps.compare.crops import ImageCrop, find_crops
 from clsplat.training.records import VIEWS, over_views
-from clsplat.viewer.charts import COLOURS, Line, curve
+from clsplat.viewer.charts import COLORS, Line, curve
 
 # The tables of a comparison: metrics and costs, means over scenes, differing settings.
 
 METRICS = {  # name -> heading, digits, function that returns the better one
     "psnr": ("PSNR ↑", 2, max),
-    "psnr_colour": ("PSNR in the photographs' colours ↑", 2, max),
-    "psnr_affine": ("PSNR, colours fitted ↑", 2, max),
+    "psnr_color": ("PSNR in the photographs' colors ↑", 2, max),
+    "psnr_affine": ("PSNR, colors fitted ↑", 2, max),
     "psnr_held_out_moments": ("PSNR, held-out moments ↑", 2, max),
     "psnr_other_moments": ("PSNR, other moments ↑", 2, max),
     "psnr_static": ("PSNR, static pixels ↑", 2, max),
@@ -137,9 +137,9 @@ def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
             yield f"The {name} is not the same in all runs ({', '.join(sorted(values))})."
     for split, downscale in _measured(rows):
         found = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
-        counts = {one.colour_views for one in found if one is not None and one.figure("psnr_colour") is not None}
+        counts = {one.color_views for one in found if one is not None and one.figure("psnr_color") is not None}
         if len(counts) > 1:
-            name = f"number of {_title(rows, split, downscale)} with a PSNR in the photographs' colours"
+            name = f"number of {_title(rows, split, downscale)} with a PSNR in the photographs' colors"
             yield f"The {name} is not the same in all runs ({', '.join(map(str, sorted(counts)))})."
 
 
@@ -194,7 +194,7 @@ def _cell(values: list[float], mean: float | None, digits: int, best: bool) -> T
 
 # The charts of a comparison: quality and Gaussians over steps and CPU seconds, and quality over image sizes.
 
-MOST_LINES = len(COLOURS)  # that are told apart one by one
+MOST_LINES = len(COLORS)  # that are told apart one by one
 
 
 def curves(rows: Sequence[VariantRow]) -> list[Markup]:
@@ -207,12 +207,12 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
         if are_many:
             of_rows = [_mean([points_of(run) for run in row.runs]) for row in rows]
             return [
-                Line(points, row.variant.letter, row.variant.colour, i // len(COLOURS))
+                Line(points, row.variant.letter, row.variant.color, i // len(COLORS))
                 for i, (row, points) in enumerate(zip(rows, of_rows, strict=True))
                 if len(dict(points)) > 1
             ]
         return [
-            Line(points, name, row.variant.colour, i)
+            Line(points, name, row.variant.color, i)
             for row in rows
             for i, (run, name) in enumerate(zip(row.runs, _names(row), strict=True))
             if len(dict(points := points_of(run))) > 1  # steps: one is no line
@@ -264,7 +264,7 @@ def _size_charts(rows: Sequence[VariantRow], split: str) -> list[str]:
         lines = []
         for row in rows:
             found = [(float(i), row.figures(split, size, metric)) for i, size in enumerate(sizes)]
-            lines.append(Line([(i, fmean(values)) for i, values in found if values], colour=row.variant.colour))
+            lines.append(Line([(i, fmean(values)) for i, values in found if values], color=row.variant.color))
         drawings.append(curve(title, lines, ticks=ticks))
     return drawings
 

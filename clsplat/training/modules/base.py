@@ -129,7 +129,7 @@ class ModuleState:
 
     @property
     def measured_as(self) -> Fitted | None:
-        """What images are fitted with to be measured in the colours of their photographs; None: they are not."""
+        """What images are fitted with to be measured in the colors of their photographs; None: they are not."""
         return None
 
     def scene(self, scene: Scene) -> Scene:
@@ -323,7 +323,7 @@ def kind_of(name: str) -> type[TrainingModule]:
 
 
 def measured_as(run: Run) -> Fitted | None:
-    """Return what images are fitted with to be measured in the colours of their photographs; None: they are not."""
+    """Return what images are fitted with to be measured in the colors of their photographs; None: they are not."""
     return next((fitted for state in run.modules.values() if (fitted := state.measured_as)), None)
 
 

@@ -1,4 +1,4 @@
-"""Colours of each photograph by place and luminance: bilateral grids (cl_kernels/colour_grid.cl)."""
+"""Colors of each photograph by place and luminance: bilateral grids (cl_kernels/color_grid.cl)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,20 +18,20 @@ from clsplat.scene.view import View
 from clsplat.training.modules.base import Numbers, Tables, TrainingStep
 from clsplat.training.modules.exposure import (
     TABLE,
-    VIEW_COLOURS,
+    VIEW_COLORS,
     Appearance,
-    ColourState,
+    ColorState,
     Gain,
     RateOrAuto,
     Written,
 )
 from clsplat.training.run import Run
 
-VIEW_GRIDS = "view_colours.npy"
-ENTRIES = int(constants("colour_grid.h")["ENTRIES"])
+VIEW_GRIDS = "view_colors.npy"
+ENTRIES = int(constants("color_grid.h")["ENTRIES"])
 TABLES = ("values", "moment1", "moment2")
 WARM_UP = 1000  # steps in which the rate of grids grows from 1 % of itself (gsplat); a tenth of shorter trainings
-Nodes = Annotated[int, Field(ge=1, le=int(constants("colour_grid.h")["MOST_NODES"]))]
+Nodes = Annotated[int, Field(ge=1, le=int(constants("color_grid.h")["MOST_NODES"]))]
 GRID_MEANING = (
     f"{MEANING}; [E | b] is the trilinear mean of the matrices about a pixel; file: matrices [photographs, luminance, "
     "height, width, 3, 4], float32, the outer ones on the edges of the image, at black and at white of "
@@ -40,28 +40,28 @@ GRID_MEANING = (
 
 
 class BilateralGrid(Appearance):
-    """Colours of each photograph by place and luminance: a bilateral grid of affine changes (Wang et al. 2024).
+    """Colors of each photograph by place and luminance: a bilateral grid of affine changes (Wang et al. 2024).
 
     It follows what a phone does to parts of a photograph, local tone mapping, which `exposure` cannot.  It also follows
     what the model should learn, so that held-out photographs are often worse with it: try `exposure` first.  The mean
     over photographs and places stays that of no change at each luminance.  A grid that was fitted in one place says
-    nothing of another, so that figures are in colours of `gain`.
+    nothing of another, so that figures are in colors of `gain`.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
 
     type: Literal["bilateral_grid"] = "bilateral_grid"
     cells: Annotated[list[Nodes], Field(min_length=3, max_length=3)] = Field([4, 4, 4])
-    """Matrices along the width, the height and the luminance, 1 to 16 each.  Between them colours are trilinear; the
+    """Matrices along the width, the height and the luminance, 1 to 16 each.  Between them colors are trilinear; the
     outer ones lie on the edges, at black and at white.  Published are [16, 16, 8]."""
     rate: RateOrAuto = "auto"
     """Learning rate of the matrices, by Adam, by step; auto: 2e-3 to 2e-5 (gsplat), where no tracks tell the exposures
     that of `exposure`; it grows from 1 % of itself in 1000 steps, or a tenth of fewer than 10 000.  At most 0.5."""
     weight: Annotated[float, Field(ge=0)] = 10.0
     """Factor of the loss that makes the grid of the photograph of a step smooth: the sum over the axes of the mean of
-    the squared differences of neighbours."""
+    the squared differences of neighbors."""
 
-    files: ClassVar[Mapping[str, str]] = {VIEW_COLOURS: "colours", VIEW_GRIDS: "colour grids"}
+    files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors", VIEW_GRIDS: "color grids"}
     planes: ClassVar[int] = 9  # with the gradient that passes white
 
     def state(self, run: Run) -> "GridState":
@@ -81,7 +81,7 @@ class BilateralGrid(Appearance):
             raise DataError(f"its grids are not [photographs, {ENTRIES}, nz, ny, nx]")
         named, held = sorted(row for key, row in numbers.items() if key.endswith("/row")), len(tables["values"])
         if named != list(range(held)):
-            raise DataError(f"it has grids of the colours of {held} photographs, and its numbers name other rows")
+            raise DataError(f"it has grids of the colors of {held} photographs, and its numbers name other rows")
 
     def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
         if self.rate != "auto":
@@ -98,7 +98,7 @@ class BilateralGrid(Appearance):
         return Gain()
 
 
-class GridState(ColourState):
+class GridState(ColorState):
     """The grids of all photographs on the device, with Adam's moments: each [photographs, ENTRIES, nz, ny, nx]."""
 
     settings: BilateralGrid
@@ -127,7 +127,7 @@ class GridState(ColourState):
             self.numbers |= {f"{TABLE}/{view}/row": float(row), f"{TABLE}/{view}/updates": 0.0}
         values = matrices.reshape(len(matrices), ENTRIES, 1, 1, 1).astype(np.float32)
         self.load(self.numbers, {"values": np.broadcast_to(values, self.shape)})
-        self._centre()
+        self._center()
 
     def row(self, view: int) -> int:
         """Return the row of a training view by its number."""
@@ -139,7 +139,7 @@ class GridState(ColourState):
         image = step.image
         step.image = self.changed(step.workspace, step.camera, image, step.view)
         shares = self.smoothness(step.workspace, step.view)
-        step.own_losses.append(LossValue("colours", lambda: float(shares.get().sum(dtype=np.float64))))
+        step.own_losses.append(LossValue("colors", lambda: float(shares.get().sum(dtype=np.float64))))
         step.keep(self, (image, []))
 
     def backward(self, step: TrainingStep) -> None:
@@ -166,9 +166,9 @@ class GridState(ColourState):
         return Written(means, facts, {VIEW_GRIDS: np.ascontiguousarray(grids, np.float32)})
 
     def changed(self, workspace: Workspace, camera: DeviceCamera, image: Array, view: int) -> Array:
-        found = workspace.array("coloured", image.shape)
-        workspace.device.program("colour_grid.cl").colour_grid_forward(
-            groups=(1, camera.rows), image=image, coloured=found, **self._arguments(camera, image, view)
+        found = workspace.array("colored", image.shape)
+        workspace.device.program("color_grid.cl").color_grid_forward(
+            groups=(1, camera.rows), image=image, colored=found, **self._arguments(camera, image, view)
         )
         return found
 
@@ -179,7 +179,7 @@ class GridState(ColourState):
         by_smoothness, shares = (workspace.array(f"grid {name}", row) for name in ("smoothness", "shares"))
         differences = {axis: row // n * (n - 1) for axis, n in nodes.items()}
         sizes |= {f"weight_{axis}": self.settings.weight / max(number, 1) for axis, number in differences.items()}
-        workspace.device.program("colour_grid_table.cl").colour_grid_smoothness(
+        workspace.device.program("color_grid_table.cl").color_grid_smoothness(
             items=row,
             values=self.arrays["values"],
             by_smoothness=by_smoothness,
@@ -195,18 +195,18 @@ class GridState(ColourState):
     ) -> tuple[Array, Array]:
         """Return the gradient by an image from that by what `changed` made of it, and that by the grid, [row]."""
         (nx, _, nz), row = self.settings.cells, row_length(self.settings.cells)
-        found = workspace.array("grad_coloured", image.shape)
+        found = workspace.array("grad_colored", image.shape)
         passed = workspace.array("grid passed", (3, *image.shape[1:]))
         sums, by_grid = (
             workspace.array("grid row sums", (ENTRIES * nz * nx, camera.rows)),
             workspace.array("by grid", row),
         )
-        program, arguments = workspace.device.program("colour_grid.cl"), self._arguments(camera, image, view)
-        program.colour_grid_backward(
+        program, arguments = workspace.device.program("color_grid.cl"), self._arguments(camera, image, view)
+        program.color_grid_backward(
             groups=(1, camera.rows), image=image, gradient=gradient, grad_image=found, passed=passed, **arguments
         )
         of_rows = ("nx", "nz", "per_column", "width", "rows", "stride")
-        program.colour_grid_row_sums(
+        program.color_grid_row_sums(
             groups=(nx, camera.rows),
             image=image,
             passed=passed,
@@ -214,7 +214,7 @@ class GridState(ColourState):
             **{name: arguments[name] for name in of_rows},
         )
         of_nodes = ("nx", "ny", "per_row", "height", "rows")
-        program.colour_grid_gather(
+        program.color_grid_gather(
             items=row, row_sums=sums, by_grid=by_grid, count=row, **{name: arguments[name] for name in of_nodes}
         )
         return found, by_grid
@@ -231,14 +231,14 @@ class GridState(ColourState):
         }
 
     def learn(self, workspace: Workspace, view: int, by_grid: Array, step: int) -> None:
-        """Change the grid of a view by Adam, with a count of updates of its own, then centre all.
+        """Change the grid of a view by Adam, with a count of updates of its own, then center all.
 
         by_grid: derivatives of the losses of the image, [row]; those of the smoothness are as `smoothness` left them.
         """
         key, row = f"{TABLE}/{self.views[view]}/updates", row_length(self.settings.cells)
         self.numbers[key] = updates = self.numbers.get(key, 0.0) + 1
         arguments: dict[str, Any] = dict(self.arrays)
-        workspace.device.program("colour_grid_table.cl").colour_grid_update(
+        workspace.device.program("color_grid_table.cl").color_grid_update(
             items=row,
             by_grid=by_grid,
             by_smoothness=workspace.array("grid smoothness", row),
@@ -248,12 +248,12 @@ class GridState(ColourState):
             correction2=1 / (1 - ADAM["BETA2"] ** updates),
             count=row,
         )
-        self._centre()
+        self._center()
 
-    def _centre(self) -> None:
+    def _center(self) -> None:
         """Subtract the mean over photographs and places at each level of luminance."""
         photographs, _, levels, rows, columns = self.shape
-        self.device.program("colour_grid_table.cl").colour_grid_centre(
+        self.device.program("color_grid_table.cl").color_grid_center(
             groups=ENTRIES * levels,
             values=self.arrays["values"],
             places=rows * columns,

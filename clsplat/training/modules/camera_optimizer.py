@@ -128,7 +128,7 @@ class CameraOptimizer(TrainingModule):
 class Move:
     """A rotation vector and a shift, each [3], of a camera in the axes of the world.
 
-    The camera turns about the point of its axis at a depth, where photographs show the scene: about its own centre a
+    The camera turns about the point of its axis at a depth, where photographs show the scene: about its own center a
     turn is in the image nearly what a shift is, and Adam, number by number, does not tell them apart.
     """
 
@@ -246,14 +246,14 @@ class CameraState(ModuleState):
         """Return a scene with the learned cameras.
 
         Views that were not trained on have the focal lengths of their camera; they are moved as those of the training
-        views are as a whole: about their mean, by the scale between the centres before and after.  Their rotations
+        views are as a whole: about their mean, by the scale between the centers before and after.  Their rotations
         stay, as the mean of the learned ones does.
         """
         if not self.views:
             return scene
         learned = {view.name: self.pose(number) for number, view in enumerate(self.views)}
         before = np.array([view.position for view in self.views])
-        after = np.array([_centre(learned[view.name]) for view in self.views])
+        after = np.array([_center(learned[view.name]) for view in self.views])
         middle, moved_middle = before.mean(axis=0), after.mean(axis=0)
         around = before - middle
         spread = float((around**2).sum())
@@ -342,7 +342,7 @@ def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_
     return lambda: np.cumsum(copied(), axis=1, dtype=np.float64)[:, -1]
 
 
-def _centre(pose: Floats) -> Floats:
+def _center(pose: Floats) -> Floats:
     return np.asarray(-pose[:, :3].T @ pose[:, 3])
 
 

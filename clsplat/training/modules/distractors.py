@@ -45,7 +45,7 @@ class Distractors(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
-    place: ClassVar[int] = 20  # in the colours of the scene
+    place: ClassVar[int] = 20  # in the colors of the scene
     planes: ClassVar[int] = 12  # which rendering and comparing them take, at most
 
     type: Literal["distractors"] = "distractors"
@@ -119,7 +119,7 @@ class DistractorsState(ModuleState):
         if not (kept := step.kept(self)):
             return
         layer, sums = kept
-        frame = replace(layer.frame, image=layer.image)  # blending is differentiated from the colours of all
+        frame = replace(layer.frame, image=layer.image)  # blending is differentiated from the colors of all
         sums += [frame, self.rasterizer.pixel_sums(frame.drawn, frame, step.gradient, behind=layer.behind)]
         look_behind(step.workspace, frame, step.gradient)
 
@@ -131,7 +131,7 @@ class DistractorsState(ModuleState):
 
 def first_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint8]]]) -> Tables:
     """Return the first Gaussians of photographs, [height, width, 3] with their views: spread evenly over each, with its
-    colours, nearly clear."""
+    colors, nearly clear."""
     parts = [_spread(count, view, pixels) for view, pixels in photographs]
     found = {name: np.concatenate([part[name] for part in parts]).astype(np.float32) for name in WIDTHS}
     moments = {moment: np.zeros_like(values) for name, values in found.items() for moment in moment_tables(name)}
@@ -142,14 +142,14 @@ def _spread(count: int, view: View, pixels: NDArray[np.uint8]) -> dict[str, NDAr
     """Gaussians at the places of a Fibonacci lattice, one unit of length before a camera."""
     camera, places = view.camera, np.arange(count) + 0.5
     x, y = camera.width * places / count, camera.height * ((places * GOLDEN) % 1)
-    colours = pixels[y.astype(int), x.astype(int)] / 255
+    colors = pixels[y.astype(int), x.astype(int)] / 255
     size = SIZE * np.sqrt(camera.width * camera.height / count / (camera.fx * camera.fy))
     return {
         "means": np.column_stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(count)]),
         "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
         "log_scales": np.full((count, 3), np.log(size)),
         "logit_opacity": np.full((count, 1), np.log(OPACITY / (1 - OPACITY))),
-        "sh_base": (colours - 0.5) / SH_C0,
+        "sh_base": (colors - 0.5) / SH_C0,
     }
 
 

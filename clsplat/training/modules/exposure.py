@@ -1,7 +1,7 @@
-"""Colours of each photograph, where exposures differ: between the rendered image and the losses.
+"""Colors of each photograph, where exposures differ: between the rendered image and the losses.
 
-A photograph has its numbers, all 0 where its colours are the scene's.  They make a matrix [E | b], and a pixel c of the
-rendered image becomes min(1, E c + b) before every loss (cl_kernels/colours.cl).
+A photograph has its numbers, all 0 where its colors are the scene's.  They make a matrix [E | b], and a pixel c of the
+rendered image becomes min(1, E c + b) before every loss (cl_kernels/colors.cl).
 """
 
 import json
@@ -36,9 +36,9 @@ from clsplat.training.modules.base import ModuleState, Numbers, Tables, Training
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-VIEW_COLOURS = "view_colours.json"
-TABLE, KNOWN = "colours", "known exposures"  # KNOWN: whether the numbers began with exposures that were measured
-SUMS = int(constants("colours.cl")["SUMS"])
+VIEW_COLORS = "view_colors.json"
+TABLE, KNOWN = "colors", "known exposures"  # KNOWN: whether the numbers began with exposures that were measured
+SUMS = int(constants("colors.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
 FEW_VISITS = 400  # of a photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
 MOST = 5e-2  # learning rate
@@ -51,7 +51,7 @@ EXPLAINED = 1 / 3
 
 @dataclass(frozen=True)
 class Written:
-    """What a training leaves of the colours of its photographs."""
+    """What a training leaves of the colors of its photographs."""
 
     matrices: dict[str, Floats]  # of each photograph, the mean where it has several, [3, 4]
     facts: dict[str, Any]  # for JSON: at least `meaning` and `type`, the name of the kind
@@ -62,7 +62,7 @@ class Appearance(TrainingModule):
     """Numbers of each photograph, which are learned with the Gaussians; their mean over the photographs stays 0.
 
     Without that, a change of all of them and the opposite one of the Gaussians would be the same to every loss, and the
-    colours of the model would drift.
+    colors of the model would drift.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
@@ -71,7 +71,7 @@ class Appearance(TrainingModule):
     family: ClassVar[str] = "appearance"
     outlasts: ClassVar[Literal["numbers"]] = "numbers"
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
-    files: ClassVar[Mapping[str, str]] = {VIEW_COLOURS: "colours"}
+    files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors"}
     planes: ClassVar[int] = 6  # the image in the colors of its photograph, and its gradient
 
     rate: RateOrAuto = "auto"
@@ -95,8 +95,8 @@ class Appearance(TrainingModule):
 
     @property
     @abstractmethod
-    def fit(self) -> "ColourModel":
-        """What images are measured with: colours that are fitted to a photograph."""
+    def fit(self) -> "ColorModel":
+        """What images are measured with: colors that are fitted to a photograph."""
 
     def is_active(self, scene: Scene | None = None) -> bool:
         return self.when == "always" or self.chosen == "on"
@@ -137,21 +137,21 @@ class Appearance(TrainingModule):
         return self.model_copy(update={"chosen": chosen, "reason": reason})
 
     @classmethod
-    def measured_beside(cls, model: Path) -> "ColourModel | None":
-        path = model.with_name(VIEW_COLOURS)
+    def measured_beside(cls, model: Path) -> "ColorModel | None":
+        path = model.with_name(VIEW_COLORS)
         if not path.is_file():
             return None
-        data, known = read_json(path, "colours of photographs"), variants(Appearance)
+        data, known = read_json(path, "colors of photographs"), variants(Appearance)
         name = data.get("type") if isinstance(data, dict) else None
         if not isinstance(name, str) or name not in known:
             names = ", ".join(known)
-            raise DataError(f"{path}: the type of colours is {quoted(name)}; expected one of {names}: write it again")
+            raise DataError(f"{path}: the type of colors is {quoted(name)}; expected one of {names}: write it again")
         facts = {key: data[key] for key in ("model",) if key in data}
         return known[name].model_validate(facts).fit if known[name] is cls else None
 
 
-class ColourModel(Settings):
-    """What makes the colours of a scene those of one photograph: one matrix for all its pixels, of a few numbers."""
+class ColorModel(Settings):
+    """What makes the colors of a scene those of one photograph: one matrix for all its pixels, of a few numbers."""
 
     columns: ClassVar[tuple[str, ...]] = ()  # names of the numbers of a photograph
     fitted_to_a_channel: ClassVar[int] = 1  # numbers that `fitted` finds for each of red, green and blue
@@ -180,7 +180,7 @@ class ColourModel(Settings):
         return 0.0, np.zeros_like(row)
 
 
-class Gain(Gains, ColourModel):
+class Gain(Gains, ColorModel):
     """An exposure and a white balance of each photograph.
 
     Channels are multiplied by exp(exposure + (red, green, blue)); green follows from red and blue, so that the
@@ -206,11 +206,11 @@ class Gain(Gains, ColourModel):
         return np.array([exposure, log_gains[0] - exposure, log_gains[2] - exposure])
 
 
-class Affine(ColourModel):
-    """An affine change of the colours of each photograph, twelve numbers (Kerbl et al. 2024).
+class Affine(ColorModel):
+    """An affine change of the colors of each photograph, twelve numbers (Kerbl et al. 2024).
 
-    It follows white balance, contrast and haze, and also what is none of these: colours that change with the direction
-    of view, which it takes from the Gaussians; `weight` holds it back.  `gain` generalises better.
+    It follows white balance, contrast and haze, and also what is none of these: colors that change with the direction
+    of view, which it takes from the Gaussians; `weight` holds it back.  `gain` generalizes better.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
@@ -245,22 +245,22 @@ class Affine(ColourModel):
 
 
 class Exposure(Appearance):
-    """Colours of each photograph, where exposures differ: one matrix for all its pixels."""
+    """Colors of each photograph, where exposures differ: one matrix for all its pixels."""
 
     type: Literal["exposure"] = "exposure"
-    model: OneOf[ColourModel] = Gain()
+    model: OneOf[ColorModel] = Gain()
     """What a photograph has: `gain`, an exposure and a white balance, or `affine`."""
 
     @property
-    def fit(self) -> ColourModel:
+    def fit(self) -> ColorModel:
         return self.model
 
     def state(self, run: Run) -> "ExposureState":
         return ExposureState(self, [view.name for view in run.scene.split("train")])
 
 
-class ColourState(ModuleState):
-    """What a training has of the colours of its photographs, of whichever kind."""
+class ColorState(ModuleState):
+    """What a training has of the colors of its photographs, of whichever kind."""
 
     def __init__(self, settings: Appearance, views: Sequence[str]) -> None:
         """views: the names of the training views, by number; one of several sizes has one row."""
@@ -272,7 +272,7 @@ class ColourState(ModuleState):
         exposures = exposures_of(run)
         self.begin_with(exposures.log_gains)
         self.numbers[KNOWN] = float(bool(exposures.log_gains))
-        LOG.info("colours of photographs: %s", exposures.text)
+        LOG.info("colors of photographs: %s", exposures.text)
 
     def prepare(self, run: Run, last: int, trained: bool = True) -> None:
         self.rate = self.settings.rate_of(last, len(self.names), self.numbers.get(KNOWN, 1.0) > 0)
@@ -281,7 +281,7 @@ class ColourState(ModuleState):
         """Set the first numbers.  log_gains: of red, green and blue by view, where known, [3]."""
 
     @property
-    def measured_as(self) -> ColourModel:
+    def measured_as(self) -> ColorModel:
         return self.settings.fit
 
     @abstractmethod
@@ -289,24 +289,24 @@ class ColourState(ModuleState):
         """Return what the run folder gets."""
 
     def write(self, run: Run) -> None:
-        """Write the colours of each training photograph; log a line.  Raises NumericError where they are not finite."""
+        """Write the colors of each training photograph; log a line.  Raises NumericError where they are not finite."""
         found = self.written()
         if wrong := next((view for view, matrix in found.matrices.items() if not np.isfinite(matrix).all()), None):
             raise NumericError(
-                f"the colours of {quoted(wrong)} are not finite; lower optimize.modules.{self.settings.type}.rate"
+                f"the colors of {quoted(wrong)} are not finite; lower optimize.modules.{self.settings.type}.rate"
             )
-        write_text(run.out / VIEW_COLOURS, json.dumps(found.facts, indent=1) + "\n")
+        write_text(run.out / VIEW_COLORS, json.dumps(found.facts, indent=1) + "\n")
         for name, array in found.arrays.items():
             with atomic(run.out / name) as file:
                 np.save(file, array, allow_pickle=False)
         greens = [matrix[1, 1] for matrix in found.matrices.values()]
         LOG.info(
-            "colours of %d photographs in %s: green is multiplied by %.2f to %.2f",
-            *(len(greens), VIEW_COLOURS, min(greens), max(greens)),
+            "colors of %d photographs in %s: green is multiplied by %.2f to %.2f",
+            *(len(greens), VIEW_COLORS, min(greens), max(greens)),
         )
 
 
-class ExposureState(ColourState):
+class ExposureState(ColorState):
     """The numbers of one matrix for each photograph."""
 
     settings: Exposure
@@ -328,8 +328,8 @@ class ExposureState(ColourState):
         row = self.table.row(self.numbers, self.views[step.view])
         penalty, matrix, image = self.settings.model.penalty(row)[0], self.settings.model.matrix(row), step.image
         step.keep(self, (image, matrix, []))
-        step.image = change_colours(step.workspace, step.camera, image, matrix)
-        step.own_losses.append(LossValue("colours", lambda: penalty))
+        step.image = change_colors(step.workspace, step.camera, image, matrix)
+        step.own_losses.append(LossValue("colors", lambda: penalty))
 
     def backward(self, step: TrainingStep) -> None:
         if kept := step.kept(self):
@@ -382,11 +382,11 @@ def exposures_of(run: Run) -> Exposures:
     return run.exposures[names]
 
 
-def change_colours(workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats) -> Array:
-    """Return an image, [3 or 4, rows, stride], with the colours that a matrix [3, 4] makes of its own."""
-    found = workspace.array("coloured", image.shape)
-    workspace.device.program("colours.cl").colours_forward(
-        groups=(1, camera.rows), image=image, coloured=found, **_arguments(camera, image, matrix)
+def change_colors(workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats) -> Array:
+    """Return an image, [3 or 4, rows, stride], with the colors that a matrix [3, 4] makes of its own."""
+    found = workspace.array("colored", image.shape)
+    workspace.device.program("colors.cl").colors_forward(
+        groups=(1, camera.rows), image=image, colored=found, **_arguments(camera, image, matrix)
     )
     return found
 
@@ -394,12 +394,12 @@ def change_colours(workspace: Workspace, camera: DeviceCamera, image: Array, mat
 def change_back(
     workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats, gradient: Array
 ) -> tuple[Array, Callable[[], Floats]]:
-    """Return the gradient by an image from that by what `change_colours` made of it, and a wait for that by the matrix.
+    """Return the gradient by an image from that by what `change_colors` made of it, and a wait for that by the matrix.
 
     The sums of each row are added in double, in the order of rows.
     """
-    found, sums = workspace.array("grad_coloured", image.shape), workspace.array("colour sums", (SUMS, camera.rows))
-    workspace.device.program("colours.cl").colours_backward(
+    found, sums = workspace.array("grad_colored", image.shape), workspace.array("color sums", (SUMS, camera.rows))
+    workspace.device.program("colors.cl").colors_backward(
         groups=(1, camera.rows),
         image=image,
         gradient=gradient,

@@ -1,4 +1,4 @@
-"""The colour behind everything, where each step draws its own."""
+"""The color behind everything, where each step draws its own."""
 
 import logging
 from collections.abc import Mapping
@@ -16,9 +16,9 @@ LOG = logging.getLogger("clsplat")
 
 
 class RandomBackground(TrainingModule):
-    """Draw the colour behind everything in each step: uniform, by the seed and the step alone."""
+    """Draw the color behind everything in each step: uniform, by the seed and the step alone."""
 
-    conflicts: ClassVar[Mapping[str, str]] = {"sky": "it is behind everything, and drawn colours would be too"}
+    conflicts: ClassVar[Mapping[str, str]] = {"sky": "it is behind everything, and drawn colors would be too"}
     joins: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"where"})
 
@@ -46,5 +46,5 @@ class _Drawing(ModuleState):
 
 
 def drawn_background(device: Device, seed: int, step: int) -> Array:
-    """Return the colour of a global step, [3] in [0, 1)."""
+    """Return the color of a global step, [3] in [0, 1)."""
     return device.upload(np.random.default_rng([seed, step]).random(3, np.float32))

@@ -75,7 +75,7 @@ class SkyModule(TrainingModule):
     @classmethod
     def begin_model(cls, run: Run, source: Model | None) -> None:
         """Give the run's new model its first sky, where it is to have one: that of the source, or, without it and at
-        another size of the map, the colours of the sky that the photographs show."""
+        another size of the map, the colors of the sky that the photographs show."""
         own, settings = source and source.sky, cls.settled_model(run, run.model_settings, ())
         if (background := _in_use(settings.background)) is None:
             run.modules.pop(SKY, None)
@@ -85,12 +85,12 @@ class SkyModule(TrainingModule):
         if is_transparent(run.scene):
             LOG.warning(
                 "model.background: the photographs have transparency: what is learned and exported as a sky is the "
-                "colour that clsplat puts behind them; leave model.background out"
+                "color that clsplat puts behind them; leave model.background out"
             )
         texels, free = _first(run, background.side)
         sky = own if own and own.side == background.side else Sky(texels)
         run.modules[SKY] = LearnedSky(background, sky.upload(run.device), free)
-        LOG.info("sky: %d of %d x %d colours by direction are learned", free.sum(), background.side, background.side)
+        LOG.info("sky: %d of %d x %d colors by direction are learned", free.sum(), background.side, background.side)
 
     @classmethod
     def advice(cls, run: Run) -> Iterator[str]:
@@ -158,7 +158,7 @@ def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
 
 
 def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """The first colours of the map and which are learned; all, from the mean of the upper thirds of photographs, where
+    """The first colors of the map and which are learned; all, from the mean of the upper thirds of photographs, where
     none shows a sky."""
     seen = _seen(run, run.scene)
     if found := panorama(seen, side):

@@ -81,7 +81,7 @@ class TransientsState(ModuleState):
 
     def after_render(self, step: TrainingStep) -> None:
         workspace, camera, planes = step.workspace, step.camera, step.planes
-        residuals, counts = measure_residuals(workspace, camera, step.image, planes.colours, planes.mask)
+        residuals, counts = measure_residuals(workspace, camera, step.image, planes.colors, planes.mask)
         if (threshold := self.settings.threshold(self.numbers, step.number)) is not None:
             reach = max(1, round(self.settings.box * camera.width / 2))
             step.planes = replace(planes, mask=mask_transients(workspace, camera, residuals, threshold, reach))

@@ -22,7 +22,7 @@ from clsplat.core.reading import read_json
 from clsplat.formats.splats import is_moment
 from clsplat.scene import camera_files
 from clsplat.scene.camera import Camera
-from clsplat.scene.camera_files import centre_lost, width_lost
+from clsplat.scene.camera_files import center_lost, width_lost
 from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
 from clsplat.scene.transforms_json import JsonFrame, opengl_matrix, pose_of
 from clsplat.scene.view import View
@@ -121,7 +121,7 @@ def write(path: Path, views: Sequence[View], fps: float) -> None:
         "camera_path": frames,
     }
     write_text(path, json.dumps(table, indent=1) + "\n")
-    for warn in (centre_lost, width_lost):
+    for warn in (center_lost, width_lost):
         warn(path, [view.camera for view in views], "its readers")
 
 
@@ -140,7 +140,7 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
         np.arange(len(views)), scipy.spatial.transform.Rotation.from_matrix(poses[:, :, :3])
     )(places).as_matrix()
     lenses = np.array([[c.fx, c.fy, c.cx, c.cy] for c in (view.camera for view in views)])
-    centres, lenses = (
+    centers, lenses = (
         np.stack([np.interp(places, np.arange(len(views)), column) for column in columns.T], axis=1)
         for columns in (np.stack([view.position for view in views]), lenses)
     )
@@ -152,10 +152,10 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
         View(
             f"frame_{i:05d}",
             Camera(first.width, first.height, *lens),
-            np.column_stack([turn, -turn @ centre]),
+            np.column_stack([turn, -turn @ center]),
             time=time,
         )
-        for i, (turn, centre, lens, time) in enumerate(zip(turns, centres, lenses.tolist(), times, strict=True), 1)
+        for i, (turn, center, lens, time) in enumerate(zip(turns, centers, lenses.tolist(), times, strict=True), 1)
     ]
 
 
@@ -206,9 +206,9 @@ def _world(path: Path, scene: Path | None, known: bool) -> Any:
     @np.errstate(all="ignore")  # a pose that is not finite is refused
     def move(pose: Floats) -> Floats:
         """x' = scale · (rotation x + shift) is nerfstudio's world."""
-        centre = -pose[:, :3].T @ pose[:, 3]
+        center = -pose[:, :3].T @ pose[:, 3]
         turned = pose[:, :3] @ rotation @ before[:, :3].T
-        place = before[:, :3] @ (rotation.T @ (centre / scale - shift)) + before[:, 3]
+        place = before[:, :3] @ (rotation.T @ (center / scale - shift)) + before[:, 3]
         return np.column_stack([turned, -turned @ place])
 
     return move

@@ -62,7 +62,7 @@ Write = Callable[[Image], None]  # one picture, RGB, [height, width, 3]
 CODEC = "VP80"  # as OpenCV sets them, VP9 has the same size and PSNR, and takes 4.5 times as long
 QUALITY = "18"  # of H.264, a constant rate factor: hardly a loss to see
 WITHOUT_TREE = "0"  # with x264's macroblock tree the bits differ from run to run where a processor has AVX-512
-BT709 = 1  # of colours, as FFmpeg numbers it
+BT709 = 1  # of colors, as FFmpeg numbers it
 WITHOUT = "or write pictures alone, into --out DIR, which any encoder reads"
 
 

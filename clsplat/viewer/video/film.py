@@ -167,7 +167,7 @@ def _path(wish: Wish, scene: Scene | None, points: Floats) -> Film:
 
 
 def files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
-    """Return the file of each layer: that of the colours, and others beside it.  Raises ConfigError for their names."""
+    """Return the file of each layer: that of the colors, and others beside it.  Raises ConfigError for their names."""
     found = {
         layer: video if layer == LAYERS[0] else video.with_name(f"{video.stem}_{layer}{video.suffix}")
         for layer in layers
@@ -178,7 +178,7 @@ def files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
 
 
 def shoot(canvas: Canvas, film: Film, videos: Mapping[str, Path], side: Side | None, through: Through) -> None:
-    """Render the views into videos, one a layer.  side: what stands on the right of the colours."""
+    """Render the views into videos, one a layer.  side: what stands on the right of the colors."""
     wide = film.size[0] * (1 if side is None else 2)
     checked_size((wide, film.size[1]))
     depths = canvas.depth_range(film.views) if "depth" in videos else (0.0, 0.0)

@@ -52,7 +52,7 @@ class Rig:
 
     @cached_property
     def positions(self) -> Floats:
-        """Camera centres, [V, 3]."""
+        """Camera centers, [V, 3]."""
         return np.stack([view.position for view in self.views])
 
     @cached_property
@@ -127,20 +127,20 @@ def unit(vectors: Floats) -> Floats:
 
 Indices = NDArray[np.intp]
 DEGREE = 5  # of the B-spline
-LOOSENESS = 0.25  # of the median step between neighbours: how far the curve may pass from a view
+LOOSENESS = 0.25  # of the median step between neighbors: how far the curve may pass from a view
 UP_WEIGHT = 0.1  # of the upward axes beside positions, times the distance
 MOST_VIEWS = 1000  # of those, evenly by name, that a walk visits
 ROUNDS = 20  # of shortening
 
 
 def order(rig: Rig) -> Indices:
-    """Return the indices of the views by name, or from neighbour to neighbour where that way is shorter, [V]."""
+    """Return the indices of the views by name, or from neighbor to neighbor where that way is shorter, [V]."""
     spread = float(np.median(np.linalg.norm(rig.positions - np.median(rig.positions, axis=0), axis=1))) or 1.0
     places = np.hstack([rig.positions / spread, rig.forwards])
     by_name = np.array(sorted(range(len(rig.views)), key=lambda i: rig.views[i].name))
     by_name = by_name[:: -(-len(by_name) // MOST_VIEWS)]
     between = scipy.spatial.distance.cdist(places[by_name], places[by_name])
-    ways = np.arange(len(by_name)), _shortened(_neighbours(between), between)
+    ways = np.arange(len(by_name)), _shortened(_neighbors(between), between)
     return np.asarray(by_name[min(ways, key=lambda way: _length(between, way))])
 
 
@@ -163,7 +163,7 @@ def smooth(places: Floats, frames: int, distance: float) -> Floats:
     return np.asarray(np.stack(scipy.interpolate.splev(np.linspace(0, 1, frames), curve), axis=1) / weights)
 
 
-def _neighbours(between: Floats) -> Indices:
+def _neighbors(between: Floats) -> Indices:
     """From the first view always on to the nearest that is left."""
     way, left = [0], set(range(1, len(between)))
     while left:
@@ -276,7 +276,7 @@ def fit(camera: Camera, size: Size) -> float:
 
 
 LOG = logging.getLogger("clsplat")
-WIDEST_GAP = math.radians(100)  # between neighbours on a ring about the focus: a wider one was never photographed
+WIDEST_GAP = math.radians(100)  # between neighbors on a ring about the focus: a wider one was never photographed
 SHARE = 90  # percentile of the cameras' distances that an ellipse and a spiral reach (Barron et al. 2022)
 FARNESS = 0.75  # of the focus of a spiral, between near (0) and far (1), by inverse depth (Mildenhall et al. 2019)
 TURNS = 2  # of a spiral
@@ -340,7 +340,7 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
 
 
 def through(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Fly along the views, by name or from neighbour to neighbour, whichever way is shorter, on a smooth curve."""
+    """Fly along the views, by name or from neighbor to neighbor, whichever way is shorter, on a smooth curve."""
     chosen = order(rig)
     distance = float(np.median(rig.depths))
     places = np.hstack([rig.positions, rig.positions + distance * rig.forwards, rig.ups])[chosen]

@@ -14,8 +14,8 @@ from clsplat.render.painter import Layers, Painter
 from clsplat.scene.view import View
 
 Image = NDArray[np.uint8]
-LAYERS = ("colour", "depth", "alpha")
-PROBES = 8  # views whose depths set the range of colours
+LAYERS = ("color", "depth", "alpha")
+PROBES = 8  # views whose depths set the range of colors
 PROBE_SIDE = 240  # px
 OPAQUE = 0.5  # alpha of pixels that have a depth
 SHARES = 0.02, 0.98  # of these pixels lie before near, and before far
@@ -57,7 +57,7 @@ class Canvas:
 
 def shown(found: Layers, layer: str, depths: tuple[float, float]) -> Image:
     """Return one of LAYERS as 8 bits, RGB, [height, width, 3]."""
-    if layer == "colour":
+    if layer == "color":
         return to_8_bits(found.image)
     if layer == "alpha":
         return np.repeat(to_8_bits(found.alpha)[:, :, None], 3, axis=2)
@@ -67,22 +67,22 @@ def shown(found: Layers, layer: str, depths: tuple[float, float]) -> Image:
 
 def values(found: Layers, layer: str) -> NDArray[np.float32]:
     """Return one of LAYERS as floats, [height, width] or [height, width, 3]."""
-    array = {"colour": found.image, "depth": found.depth, "alpha": found.alpha}[layer]
+    array = {"color": found.image, "depth": found.depth, "alpha": found.alpha}[layer]
     assert array is not None
     return array
 
 
 def depth_picture(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: tuple[float, float]) -> Image:
-    """Return depths, [height, width], as colours from red (near) to blue (far), black where nothing is.
+    """Return depths, [height, width], as colors from red (near) to blue (far), black where nothing is.
 
-    The colours are even in inverse depth: what is near is told apart finely, as by the eye.
+    The colors are even in inverse depth: what is near is told apart finely, as by the eye.
     """
     near, far = depths
     with np.errstate(divide="ignore"):
         place = (1 / np.maximum(depth, 1e-30) - 1 / far) / (1 / near - 1 / far)
-    colours = cv2.applyColorMap(to_8_bits(place.astype(np.float32)), cv2.COLORMAP_TURBO)[:, :, ::-1]
+    colors = cv2.applyColorMap(to_8_bits(place.astype(np.float32)), cv2.COLORMAP_TURBO)[:, :, ::-1]
     cover = np.where(depth > 0, alpha, 0)[:, :, None]
-    return to_8_bits((colours / np.float32(255) * cover).astype(np.float32))
+    return to_8_bits((colors / np.float32(255) * cover).astype(np.float32))
 
 
 def beside(image: Image, other: Image) -> Image:

@@ -1,4 +1,4 @@
-/* The colours of one photograph: y = min(1, E c + b) of every pixel c, with a matrix [E | b] of its own, and back.
+/* The colors of one photograph: y = min(1, E c + b) of every pixel c, with a matrix [E | b] of its own, and back.
  *
  * White is cut, since a photograph has no more; black is not, or a pixel below it would have no gradient.  What is cut
  * passes no gradient.  A fourth plane of the image is copied.  Planes are [channels,H',W'] with H', W' whole tiles,
@@ -7,11 +7,11 @@
 
 #define SUMS 12  // derivatives by the matrix [E | b], row by row
 
-/* Change the colours.  No local memory. */
+/* Change the colors.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
-void colours_forward(
+void colors_forward(
     __global const float *restrict image,  // [channels,H',stride] 3 or 4 channels
-    __global float *restrict coloured,     // [channels,H',stride]
+    __global float *restrict colored,     // [channels,H',stride]
     const float rr, const float rg, const float rb, const float r1,  // the matrix: y_red = rr red + rg green + ...
     const float gr, const float gg, const float gb, const float g1,
     const float br, const float bg, const float bb, const float b1,
@@ -27,18 +27,18 @@ void colours_forward(
         const uint at = y * stride + x;
         const VF inside = inside_row(x, columns);
         const VF r = VLOAD(image + at), g = VLOAD(image + plane + at), b = VLOAD(image + 2 * plane + at);
-        VSTORE(inside * smaller(rr * r + rg * g + rb * b + r1, one), coloured + at);
-        VSTORE(inside * smaller(gr * r + gg * g + gb * b + g1, one), coloured + plane + at);
-        VSTORE(inside * smaller(br * r + bg * g + bb * b + b1, one), coloured + 2 * plane + at);
+        VSTORE(inside * smaller(rr * r + rg * g + rb * b + r1, one), colored + at);
+        VSTORE(inside * smaller(gr * r + gg * g + gb * b + g1, one), colored + plane + at);
+        VSTORE(inside * smaller(br * r + bg * g + bb * b + b1, one), colored + 2 * plane + at);
         if (channels > 3)
-            VSTORE(VLOAD(image + 3 * plane + at), coloured + 3 * plane + at);
+            VSTORE(VLOAD(image + 3 * plane + at), colored + 3 * plane + at);
     }
 }
 
 /* Gradient by the image, and the sums of a row that give the derivatives by the matrix.
  * Local memory: TEAM * SUMS * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
-void colours_backward(
+void colors_backward(
     __global const float *restrict image,     // [channels,H',stride] before the change
     __global const float *restrict gradient,  // [channels,H',stride] by the changed image, zero outside the image
     __global float *restrict grad_image,      // [channels,H',stride]

@@ -1,4 +1,4 @@
-/* The colours of one photograph by place and luminance: a bilateral grid (Chen et al. 2007; Wang et al. 2024).
+/* The colors of one photograph by place and luminance: a bilateral grid (Chen et al. 2007; Wang et al. 2024).
  *
  * At each of nx ny nz nodes over the width, the height and the luminance of an image stands what a matrix [E | b] has
  * beside that of no change.  A pixel c lies at X = (x + 1/2) / width (nx - 1), Y likewise, and Z = clamp(l . c, 0, 1)
@@ -9,7 +9,7 @@
  * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image.  A grid is [ENTRIES,nz,ny,nx].  The
  * derivative by it is summed over the pixels of a row for each of its columns of nodes, then over the rows about each
  * node in their order: each sum has one place and is written once.  Deterministic. */
-#include "colour_grid.h"
+#include "color_grid.h"
 #include "planes.h"
 
 #define LUMINANCE_RED 0.299f    // BT.601
@@ -98,12 +98,12 @@ static inline void matrices_of(
         }
 }
 
-/* Change the colours.  One group of TEAM items = one row.  Local memory: ENTRIES * MOST_NODES^2 * 4 bytes. */
+/* Change the colors.  One group of TEAM items = one row.  Local memory: ENTRIES * MOST_NODES^2 * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
-void colour_grid_forward(
+void color_grid_forward(
     __global const float *restrict image,   // [channels,H',stride] 3 or 4 channels
     __global const float *restrict values,  // [photographs,ENTRIES,nz,ny,nx]
-    __global float *restrict coloured,      // [channels,H',stride]
+    __global float *restrict colored,      // [channels,H',stride]
     const uint first,                       // value of the photograph
     const uint nx,
     const uint ny,
@@ -125,18 +125,18 @@ void colour_grid_forward(
         const VF inside = inside_row(x, columns), level = level_of(luminance_of(r, g, b), nz), one = (VF)(1.0f);
         VF a[ENTRIES];
         matrices_of(grid, nx, nz, x, per_column, level, a, 0);
-        VSTORE(inside * smaller(r + (a[0] * r + a[1] * g + a[2] * b + a[3]), one), coloured + at);
-        VSTORE(inside * smaller(g + (a[4] * r + a[5] * g + a[6] * b + a[7]), one), coloured + plane + at);
-        VSTORE(inside * smaller(b + (a[8] * r + a[9] * g + a[10] * b + a[11]), one), coloured + 2 * plane + at);
+        VSTORE(inside * smaller(r + (a[0] * r + a[1] * g + a[2] * b + a[3]), one), colored + at);
+        VSTORE(inside * smaller(g + (a[4] * r + a[5] * g + a[6] * b + a[7]), one), colored + plane + at);
+        VSTORE(inside * smaller(b + (a[8] * r + a[9] * g + a[10] * b + a[11]), one), colored + 2 * plane + at);
         if (channels > 3)
-            VSTORE(VLOAD(image + 3 * plane + at), coloured + 3 * plane + at);
+            VSTORE(VLOAD(image + 3 * plane + at), colored + 3 * plane + at);
     }
 }
 
 /* Gradient by the image, through the matrix and through the luminance at which it is read, and what passed the cut.
- * As colour_grid_forward. */
+ * As color_grid_forward. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
-void colour_grid_backward(
+void color_grid_backward(
     __global const float *restrict image,     // [channels,H',stride] before the change
     __global const float *restrict values,    // [photographs,ENTRIES,nz,ny,nx]
     __global const float *restrict gradient,  // [channels,H',stride] by the changed image, zero outside the image
@@ -187,9 +187,9 @@ void colour_grid_backward(
 /* Sums of w p [c; 1] over the pixels of a row about a column of nodes, w the weight of its place and level.
  * One group of TEAM items = one column of nodes in one row of pixels.  Local memory: ENTRIES * TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
-void colour_grid_row_sums(
+void color_grid_row_sums(
     __global const float *restrict image,   // [3 or 4,H',stride] before the change
-    __global const float *restrict passed,  // [3,H',stride] of colour_grid_backward
+    __global const float *restrict passed,  // [3,H',stride] of color_grid_backward
     __global float *restrict row_sums,      // [ENTRIES,nz,nx,H']
     const uint nx,
     const uint nz,
@@ -229,7 +229,7 @@ void colour_grid_row_sums(
 
 /* Derivatives by the grid: the rows of pixels about each row of nodes, in their order.  One item = one value. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void colour_grid_gather(
+void color_grid_gather(
     __global const float *restrict row_sums,  // [ENTRIES,nz,nx,H']
     __global float *restrict by_grid,         // [ENTRIES,nz,ny,nx]
     const uint nx,
