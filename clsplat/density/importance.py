@@ -27,19 +27,19 @@ class Weights:
 
 
 def weights(
-    looks: Iterable[SurveyView], count: int, of_view: float | None = None, dtype: DTypeLike = np.float64
+    looks: Iterable[SurveyView], count: int, weight_per_view: float | None = None, dtype: DTypeLike = np.float64
 ) -> Weights:
     """Return the weights of N = `count` Gaussians, added in the order of the views.
 
-    of_view: the share of a view's weight that is made by what is useful in it, the largest first; None: not counted.
-    dtype: of the total.
+    weight_per_view: the share of a view's weight that its useful Gaussians, the heaviest first, add up to; None: do
+    not count views.  dtype: of the total.
     """
     total, views = np.zeros(count, dtype), np.zeros(count, np.int64)
     for look in looks:
         weight = look.sum(WEIGHT)
         total += weight
-        if of_view is not None:
-            views += largest_of(weight.astype(np.float64), of_view)
+        if weight_per_view is not None:
+            views += largest_of(weight.astype(np.float64), weight_per_view)
     return Weights(total, views)
 
 

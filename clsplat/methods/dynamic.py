@@ -64,10 +64,10 @@ class SplitInTime(Grow):
             edit.set_children(name, rows, np.stack([end[name] for end in ends], axis=1))
 
 
-class PruneAbsent(Rule):
+class PruneInvisible(Rule):
     """Remove Gaussians that are almost transparent at each moment of the training views."""
 
-    type: Literal["prune_absent"] = "prune_absent"
+    type: Literal["prune_invisible"] = "prune_invisible"
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"opacity_below"})
 

@@ -53,14 +53,14 @@ def most(allowed: Callable[[int], bool], count: int) -> int:
     return low
 
 
-class PruneSpare(Rule):
+class PruneRedundant(Rule):
     """Remove the Gaussians with the least weight in the training views: as many as raise the views' squared error by
     at most a share of it.
 
     How many that are is found by rendering some of the views without them.  Training goes on to make up for the rise.
     """
 
-    type: Literal["prune_spare"] = "prune_spare"
+    type: Literal["prune_redundant"] = "prune_redundant"
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"error_rise", "views"})
 

@@ -53,10 +53,10 @@ class ByWrongPixels(Rule):
         return edit.survey.once(wrong_pixels, self.views, self.error_above)
 
 
-class UngrowAccurate(ByWrongPixels):
+class RevertGrowth(ByWrongPixels):
     """Undo the growth, by the rules before this one, of Gaussians that take part in few wrong pixels."""
 
-    type: Literal["ungrow_accurate"] = "ungrow_accurate"
+    type: Literal["revert_growth"] = "revert_growth"
     training_keys: ClassVar[frozenset[str]] = frozenset({"pixels_above"})
 
     pixels_above: NonNegative = 5

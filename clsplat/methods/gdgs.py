@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 CENTRAL = (0.01, 0.99)  # quantiles of the means between which the grid lies, along each axis
 
 
-class CloneCrowded(Rule):
+class CloneDense(Rule):
     """Copy small Gaussians with a large gradient twice where such Gaussians crowd: in place, and moved at random.
 
     A grid of `cells`³ covers the central 98 % of the means.  The rule acts where the fullest `extremes` cells hold
@@ -22,7 +22,7 @@ class CloneCrowded(Rule):
     before `clone`, which then takes the others.
     """
 
-    type: Literal["clone_crowded"] = "clone_crowded"
+    type: Literal["clone_dense"] = "clone_dense"
     training_keys: ClassVar[frozenset[str]] = frozenset(
         {"gradient_above", "size_below", "ratio_above", "jitter", "cells", "extremes"}
     )

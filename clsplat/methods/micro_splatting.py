@@ -50,13 +50,13 @@ class RenderedTexture(Statistic):
 class Subdivide(Rule):
     """Base of rules that replace Gaussians by smaller ones, a limited share of them at a time."""
 
-    training_keys: ClassVar[frozenset[str]] = frozenset({"children", "beta", "at_most", "radius_above"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"children", "beta", "max_fraction", "radius_above"})
 
     children: Annotated[int, Field(ge=2, le=8)] = 2
     """Number of Gaussians that replace one."""
     beta: Annotated[float, Field(gt=0, le=1)] = BETA
     """A child's covariance divided by its parent's."""
-    at_most: Share = 0.05
+    max_fraction: Share = 0.05
     """Largest share of all Gaussians that one edit splits; those with the largest score come first."""
     radius_above: Annotated[float, Field(ge=0)] = 2.0
     """Smallest mean radius on the screen, three standard deviations, px."""
@@ -68,7 +68,7 @@ class Subdivide(Rule):
     def subdivide(self, edit: Edit, candidates: NDArray[np.bool_], score: NDArray[np.float32]) -> None:
         """Split the candidates, [N], with the largest scores; those of earlier rules and small ones are left out."""
         candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
-        chosen = largest(score, int(self.at_most * len(candidates)), candidates)
+        chosen = largest(score, int(self.max_fraction * len(candidates)), candidates)
         edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
 
 

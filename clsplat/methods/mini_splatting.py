@@ -31,18 +31,23 @@ LOG = logging.getLogger("clsplat")
 Floats = NDArray[np.float64]
 
 
-def drawn_weights(survey: Survey, of_view: float | None = None, drawn: int | None = None) -> Weights:
-    """Return the weights in training views.  drawn: the number of views; None: all; of_view: as in `weights`."""
+def drawn_weights(survey: Survey, weight_per_view: float | None = None, drawn: int | None = None) -> Weights:
+    """Return the weights in training views.
+
+    weight_per_view: as in `weights`.  drawn: the number of views; None: all.
+    """
     views = survey.views if drawn is None else survey.drawn(drawn)
-    return weights(survey.looks(views), survey.count, of_view)
+    return weights(survey.looks(views), survey.count, weight_per_view)
 
 
-def useless(survey: Survey, of_view: float) -> NDArray[np.bool_]:
-    """Return for each view, [V, N], which Gaussians it sees that are not of the largest that make `of_view` of its
-    weight."""
+def useless(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
+    """Return for each view the Gaussians that it sees but does not need, [V, N].
+
+    It needs the heaviest, which add up to the share `weight_per_view` of its weight.
+    """
     found = np.zeros((len(survey.views), survey.count), bool)
     for here, look in zip(found, survey.looks(survey.views), strict=True):
-        here[:] = (look.radius() > 0) & ~largest_of(look.sum(WEIGHT).astype(np.float64), of_view)
+        here[:] = (look.radius() > 0) & ~largest_of(look.sum(WEIGHT).astype(np.float64), weight_per_view)
     return found
 
 
@@ -54,20 +59,20 @@ class PruneUseless(Rule):
 
     type: Literal["prune_useless"] = "prune_useless"
     grows: ClassVar[bool] = False
-    training_keys: ClassVar[frozenset[str]] = frozenset({"of_view", "of_all", "views", "views_below"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"weight_per_view", "weight_total", "views", "views_below"})
 
-    of_view: Share = 0.99
+    weight_per_view: Share = 0.99
     """Share of a view's weight that is made by what is useful in it."""
     views: Annotated[int, Field(ge=1)] | None = None
     """Number of training views, drawn by seed and step; all of them without a number, or where there are no more."""
     views_below: Annotated[int, Field(ge=0)] = 2
     """Number of views below which a Gaussian is removed."""
-    of_all: Share = 0.999
+    weight_total: Share = 0.999
     """Share of the weight in all views that stays; the smallest weights go."""
 
     def mark(self, edit: Edit) -> None:
-        found = edit.survey.once(drawn_weights, self.of_view, self.views)
-        kept = largest_of(found.total, self.of_all) & (found.views >= self.views_below)
+        found = edit.survey.once(drawn_weights, self.weight_per_view, self.views)
+        kept = largest_of(found.total, self.weight_total) & (found.views >= self.views_below)
         edit.choose(~kept, copies=0, kept=0)
 
 
@@ -81,10 +86,10 @@ class HideUseless(Scheduled):
 
     stage: Literal["hide_useless"] = "hide_useless"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"of_view"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"weight_per_view"})
     edits: ClassVar[bool] = True
 
-    of_view: Share = 0.99
+    weight_per_view: Share = 0.99
     """Share of a view's weight that is made by what it shows."""
 
     def attach(self, run: Run) -> None:
@@ -92,7 +97,7 @@ class HideUseless(Scheduled):
             run.model.gaussians.add(HIDDEN, -(-len(run.scene.split("train")) // HIDDEN_VIEWS))
 
     def run(self, run: Run) -> None:
-        hide(run.model.gaussians, useless(run.survey(), self.of_view))
+        hide(run.model.gaussians, useless(run.survey(), self.weight_per_view))
 
 
 # New Gaussians on the surfaces that a model shows (Mini-Splatting2).

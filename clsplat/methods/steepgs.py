@@ -44,7 +44,7 @@ class Splitting(Statistic):
         )
 
 
-class SplitSaddle(Rule):
+class SplitSteepest(Rule):
     """Replace a Gaussian by two, moved apart in the direction in which that lowers the loss most.
 
     It is split where the least eigenvalue of its splitting matrix, the mean over views, is low enough; the children
@@ -52,7 +52,7 @@ class SplitSaddle(Rule):
     (`max_gaussians`, `budget`, memory).
     """
 
-    type: Literal["split_saddle"] = "split_saddle"
+    type: Literal["split_steepest"] = "split_steepest"
     training_keys: ClassVar[frozenset[str]] = frozenset(
         {"eigenvalue_below", "gradient_above", "distance", "shrink", "opacity"}
     )

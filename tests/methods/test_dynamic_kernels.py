@@ -17,7 +17,7 @@ from clsplat.formats.splats import MOTION, PARAMETERS, width_of
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.motion import presence
-from clsplat.methods.dynamic import PruneAbsent, SplitInTime
+from clsplat.methods.dynamic import PruneInvisible, SplitInTime
 from clsplat.photos.photographs import Photographs
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
@@ -90,12 +90,12 @@ def test_what_no_view_shows_is_removed(device, rng):
     views = [replace(case.view, time=time) for time in (0.0, 0.375, 0.625, 1.0)]
     survey = Survey(Rasterizer(device, "radix"), model, Photographs(device, "black"), views, 0, 700)
     edit = Edit(model.gaussians, statistics_of(model.gaussians, np.zeros(65)), SceneScale(2.0), 700, 4, survey)
-    densify(edit, [PruneAbsent()], Rasterizer(device, "radix").tiler)
+    densify(edit, [PruneInvisible()], Rasterizer(device, "radix").tiler)
     assert model.gaussians.count == 45
 
 
 @on_one_setting
-@pytest.mark.parametrize("rule", [SplitInTime(), PruneAbsent()])
+@pytest.mark.parametrize("rule", [SplitInTime(), PruneInvisible()])
 def test_rules_of_motion_need_one(device, rng, rule):
     gaussians = random_case(rng, 17).model(device).gaussians
     edit = Edit(gaussians, statistics_of(gaussians, np.zeros(17)), SceneScale(2.0), step=700, seed=4)

@@ -14,7 +14,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
 from clsplat.formats.splats import SH_C0
-from clsplat.methods.error_pruning import PruneSpare, most, squared_error
+from clsplat.methods.error_pruning import PruneRedundant, most, squared_error
 from clsplat.methods.mini_splatting import drawn_weights
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photograph
@@ -56,7 +56,7 @@ def error_of(case: Case, rows: np.ndarray, photographs: list, masks: list) -> fl
     return total
 
 
-def pruned(survey: Survey, rule: PruneSpare) -> np.ndarray:
+def pruned(survey: Survey, rule: PruneRedundant) -> np.ndarray:
     """The rows that a rule removes; nothing is changed before the edit is applied."""
     gaussians = survey._model.gaussians
     before = {name: gaussians.get(name) for name in gaussians.tables}
@@ -81,7 +81,7 @@ def test_as_many_go_as_the_views_allow(device, rng, count, width, height):
     before = error_of(case, np.arange(count), photographs, masks)
     assert squared_error(survey, survey.views) == pytest.approx(before, rel=1e-3)
     for rise in (0.02, 0.3, 3.0):
-        gone = pruned(survey, PruneSpare(error_rise=rise))
+        gone = pruned(survey, PruneRedundant(error_rise=rise))
         number = len(gone)
         assert set(gone) == set(order[:number])
         assert error_of(case, order[number:], photographs, masks) <= (1 + rise) * before * 1.002
@@ -97,10 +97,12 @@ def test_half_the_exposure_gives_the_same_choice(device, rng):
     dim.parameters["sh_base"][:] = 0.5 * case.parameters["sh_base"] - 0.25 / SH_C0
     dim.parameters["sh_rest"][:] *= 0.5
     masks = [None, None]
-    bright = pruned(survey_of(device, case, photographs, masks), PruneSpare(error_rise=0.1))
+    bright = pruned(survey_of(device, case, photographs, masks), PruneRedundant(error_rise=0.1))
     half = [colors // 2 for colors in photographs]
     assert 0 < len(bright) < 40
-    np.testing.assert_array_equal(pruned(survey_of(device, dim, half, masks, 0.5), PruneSpare(error_rise=0.1)), bright)
+    np.testing.assert_array_equal(
+        pruned(survey_of(device, dim, half, masks, 0.5), PruneRedundant(error_rise=0.1)), bright
+    )
 
 
 @on_one_setting
@@ -112,7 +114,7 @@ def test_a_picture_without_error_keeps_what_is_seen(device, rng):
     survey = survey_of(device, case, photographs, [None])
     unseen = np.flatnonzero(drawn_weights(survey).total == 0)
     assert 5 <= len(unseen) < 20
-    assert set(unseen) <= set(pruned(survey, PruneSpare(error_rise=1e-12)))
+    assert set(unseen) <= set(pruned(survey, PruneRedundant(error_rise=1e-12)))
 
 
 @pytest.mark.parametrize(("count", "limit"), [(0, 0), (1, 0), (1, 1), (7, 3), (255, 255), (1000, 600), (10**6, 123456)])

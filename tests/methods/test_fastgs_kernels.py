@@ -16,7 +16,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey, scaled
 from clsplat.density.thresholds import SceneScale
 from clsplat.methods.adc import Clone, SplitLarge
-from clsplat.methods.fastgs import PruneInaccurate, PruneSampled, UngrowAccurate, Wrong, wrong_pixels
+from clsplat.methods.fastgs import PruneInaccurate, PruneSampled, RevertGrowth, Wrong, wrong_pixels
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
@@ -135,10 +135,10 @@ def edit_of(device: Device, rng, count: int, wrong: Wrong, sizes=0.01, opacity=0
 def test_growth_needs_wrong_pixels(device, rng):
     wrong = Wrong(np.array([0, 5, 6, 100, 5, 6]), np.zeros(6))
     edit = edit_of(device, rng, 6, wrong, sizes=np.repeat([0.001, 0.1], 3))
-    rules = [Clone(size_below=0.01, opacity="shared"), SplitLarge(size_above=0.01), UngrowAccurate(pixels_above=5)]
+    rules = [Clone(size_below=0.01, opacity="shared"), SplitLarge(size_above=0.01), RevertGrowth(pixels_above=5)]
     logits, scales = edit.gaussians.get("logit_opacity"), edit.gaussians.get("log_scales")
     change = densify(edit, rules, Rasterizer(device, "radix").tiler)
-    assert (change.after, change.causes) == (9, {"clone": 1, "split": 2, "ungrow_accurate": 0})
+    assert (change.after, change.causes) == (9, {"clone": 1, "split": 2, "revert_growth": 0})
     kept = [0, 1, 6]  # rows of the Gaussians 0, 1 and 4, which stay to the bit
     np.testing.assert_array_equal(edit.gaussians.get("logit_opacity")[kept], logits[[0, 1, 4]])
     np.testing.assert_array_equal(edit.gaussians.get("log_scales")[kept], scales[[0, 1, 4]])
@@ -149,7 +149,7 @@ def test_ungrown_gaussians_keep_their_size_for_later_rules(device, rng):
     """Split and undone: its own size counts for the removal of large ones, not that of its children."""
     edit = edit_of(device, rng, 2, Wrong(np.array([0, 9]), np.zeros(2)), sizes=0.12)
     prune = PruneSampled(share=1.0, size_above=0.1)
-    densify(edit, [SplitLarge(size_above=0.01), UngrowAccurate(), prune], Rasterizer(device, "radix").tiler)
+    densify(edit, [SplitLarge(size_above=0.01), RevertGrowth(), prune], Rasterizer(device, "radix").tiler)
     assert edit.gaussians.count == 2, "of 0.12, which goes, and of 0.12 / 1.6, twice"
 
 
@@ -192,7 +192,7 @@ def test_a_large_score_is_removed_late(device, rng):
     assert edit.rows().tolist() == [1, 1, 0, 0]
 
 
-@on_devices("rule", [UngrowAccurate(), PruneSampled(), PruneInaccurate()])
+@on_devices("rule", [RevertGrowth(), PruneSampled(), PruneInaccurate()])
 def test_rules_without_photographs_say_so(device, rng, rule: Rule):
     gaussians = random_case(rng, 4).model(device).gaussians
     with pytest.raises(ConfigError, match="needs training photographs; expected"):

@@ -10,7 +10,7 @@ from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.methods.adc import Clone
-from clsplat.methods.gdgs import CloneCrowded, cells_of
+from clsplat.methods.gdgs import CloneDense, cells_of
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
@@ -59,10 +59,10 @@ def test_gaussians_in_the_fullest_cells_are_copied_and_moved(device, rng, count)
     gaussians = crowded(device, rng, count)
     before = {name: gaussians.get(name) for name in gaussians.tables}
     chosen, _ = expected(before, 4, 20)
-    change = apply(gaussians, CloneCrowded(ratio_above=0.0), Clone())
+    change = apply(gaussians, CloneDense(ratio_above=0.0), Clone())
     small = np.exp(before["log_scales"]).max(axis=1) <= 0.01 * EXTENT
     steep = small & (before["stats/screen_grad"][:, 0] / 2 >= 2e-4)
-    assert change.grown == {"clone_crowded": len(chosen), "clone": steep.sum() - len(chosen)}
+    assert change.grown == {"clone_dense": len(chosen), "clone": steep.sum() - len(chosen)}
     assert count < 600 or (len(chosen) > 50 and change.grown["clone"] > 3)
     rows = np.where(steep, 2, 1)
     rows[chosen] = 3
@@ -91,11 +91,11 @@ def test_it_acts_from_its_ratio_on(device, rng):
     chosen, ratio = expected(before, 3, 5)
     assert ratio > 2
     rule = {"cells": 3, "extremes": 5}
-    assert apply(crowded(device, np.random.default_rng(0), 0), CloneCrowded(**rule)).after == 0
-    assert apply(gaussians, CloneCrowded(ratio_above=ratio * 1.001, **rule)).after == 600
+    assert apply(crowded(device, np.random.default_rng(0), 0), CloneDense(**rule)).after == 0
+    assert apply(gaussians, CloneDense(ratio_above=ratio * 1.001, **rule)).after == 600
     for name in (SEEN, "stats/screen_grad"):  # an edit clears them
         gaussians.set(name, before[name])
-    assert apply(gaussians, CloneCrowded(ratio_above=ratio * 0.999, **rule)).after == 600 + 2 * len(chosen)
+    assert apply(gaussians, CloneDense(ratio_above=ratio * 0.999, **rule)).after == 600 + 2 * len(chosen)
 
 
 @on_one_setting
@@ -104,7 +104,7 @@ def test_moves_depend_on_the_step_alone(device, rng):
     for step in (700, 700, 800):
         rng.bit_generator.state = state
         gaussians = crowded(device, rng, 100)
-        apply(gaussians, CloneCrowded(ratio_above=0.0), step=step)
+        apply(gaussians, CloneDense(ratio_above=0.0), step=step)
         found.append(gaussians.get("means"))
     np.testing.assert_array_equal(found[0], found[1])
     assert (found[0] != found[2]).any()
@@ -114,7 +114,7 @@ def test_moves_depend_on_the_step_alone(device, rng):
 def test_growth_stops_at_the_limit(device, rng):
     gaussians = crowded(device, rng, 300)
     means = gaussians.get("means")
-    assert apply(gaussians, CloneCrowded(ratio_above=0.0), limit=301).after == 300, "none has room for two more"
+    assert apply(gaussians, CloneDense(ratio_above=0.0), limit=301).after == 300, "none has room for two more"
     np.testing.assert_array_equal(gaussians.get("means"), means)
 
 

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 PRUNE = "{type: prune_faint, opacity_below: 0.005}"
 GAINFUL = "{type: clone, statistic: gain, gradient_above: 0.1, size_below: 0.1}"
-SPARE = "{type: prune_spare, error_rise: 0.1, views: 3}"
+SPARE = "{type: prune_redundant, error_rise: 0.1, views: 3}"
 ENTROPY = "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: weight_entropy, weight: 0.05}]"
 
 
@@ -25,7 +25,7 @@ def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, tmp_path):
     first = train(tiny_scene, tmp_path / "first", *settings)
     whole = (first.out / "point_cloud.ply").read_bytes()
     edits = first.records.read("densify")
-    assert all(sum(edit["causes"][name] for edit in edits) > 20 for name in ("clone", "prune_spare"))
+    assert all(sum(edit["causes"][name] for edit in edits) > 20 for name in ("clone", "prune_redundant"))
     again = shutil.copytree(first.out, tmp_path / "again")
     for step in (30, 40, 50):
         (again / "checkpoints" / f"step_{step:06d}.npz").unlink()

@@ -24,7 +24,7 @@ stages:
       losses: [l1]
       during:
         - densify: {{every: 7, stop: 15, rules: [{{type: clone, gradient_above: 1.0e-9, size_below: 1}}]}}
-        - hide_useless: {{every: 5, stop: 11, of_view: 0.6}}
+        - hide_useless: {{every: 5, stop: 11, weight_per_view: 0.6}}
         - checkpoint: {{every: 1, keep: 99}}
   - export: {{file: point_cloud.ply}}
 """

@@ -51,7 +51,7 @@ class Edited:
 def test_texture_splits_and_children_are_half_as_large(device, rng):
     texture = np.tile([0.01, 0.3], 20)
     case = Edited(device, rng, 40, texture=texture, screen_grad=1.0)
-    change = case.apply(SplitTextured(texture_above=0.1, gradient_above=0.0, at_most=1.0))
+    change = case.apply(SplitTextured(texture_above=0.1, gradient_above=0.0, max_fraction=1.0))
     assert (change.before, change.after, change.causes) == (40, 60, {"split_textured": 20})
     for source in range(40):
         rows = case.rows_of(source)
@@ -78,7 +78,7 @@ def test_strict_and_lowered(device, rng):
     }
     for gradient_above, expected in ((0.0, [2, 2, 1, 1]), (1e-4, [2, 1, 1, 1])):
         case = Edited(device, rng, 4, **columns)
-        case.apply(SplitTextured(texture_above=0.1, gradient_above=gradient_above, at_most=1.0))
+        case.apply(SplitTextured(texture_above=0.1, gradient_above=gradient_above, max_fraction=1.0))
         assert [len(case.rows_of(n)) for n in range(4)] == expected
 
 
@@ -86,7 +86,7 @@ def test_strict_and_lowered(device, rng):
 def test_only_the_most_textured_share_splits(device, rng):
     texture = rng.permutation(np.linspace(0.2, 0.9, 100))
     case = Edited(device, rng, 100, texture=texture)
-    change = case.apply(SplitTextured(texture_above=0.0, gradient_above=0.0, at_most=0.07))
+    change = case.apply(SplitTextured(texture_above=0.0, gradient_above=0.0, max_fraction=0.07))
     assert change.after == 107
     assert {n for n in range(100) if len(case.rows_of(n)) == 2} == set(np.argsort(-texture)[:7])
 
@@ -102,7 +102,7 @@ def test_quantiles_are_of_pixels_or_of_gaussians(device, rng):
     of_pixels = PixelQuantile(quantile=0.5, of="pixels")
     for above, expected in ((of_pixels, (texture >= 0.05).sum()), (Quantile(quantile=0.5), 25)):
         case = Edited(device, rng, 50, texture=texture)
-        rule = SplitTextured(texture_above=above, gradient_above=0.0, at_most=1.0)
+        rule = SplitTextured(texture_above=above, gradient_above=0.0, max_fraction=1.0)
         assert case.apply(rule).after == 50 + expected
 
 
@@ -111,7 +111,7 @@ def test_quantiles_are_of_those_that_were_seen(device, rng):
     texture = np.where(np.arange(50) < 10, np.linspace(0.01, 0.1, 50), 0.0)
     case = Edited(device, rng, 50, texture=texture)
     case.gaussians.set(SEEN, 2.0 * (texture > 0)[:, None])
-    rule = SplitTextured(texture_above=Quantile(quantile=0.8), gradient_above=0.0, at_most=1.0)
+    rule = SplitTextured(texture_above=Quantile(quantile=0.8), gradient_above=0.0, max_fraction=1.0)
     assert case.apply(rule).after == 52
     unseen = Edited(device, rng, 50)
     unseen.gaussians.set(SEEN, np.zeros((50, 1)))
@@ -126,7 +126,7 @@ def test_oversized_ones_split(device, rng, rms_above, pixels):
     case.gaussians.set("log_scales", log_scales)
     case.gaussians.add(INTERVAL2, 1)
     case.gaussians.set(INTERVAL2, interval[:, None] ** 2)
-    case.apply(SplitOversized(rms_above=rms_above, pixels=pixels, at_most=1.0))
+    case.apply(SplitOversized(rms_above=rms_above, pixels=pixels, max_fraction=1.0))
     trace = np.exp(2.0 * log_scales).sum(axis=1)
     bound = pixels * interval if pixels else 0.01 * EXTENT
     if isinstance(rms_above, Quantile):
@@ -141,7 +141,7 @@ def test_first_growing_rule_takes_it_and_pruning_overrides(device, rng):
     case = Edited(device, rng, 30, texture=1.0, screen_grad=1.0)
     logits = np.where(np.arange(30) % 3 == 0, -7.0, 2.0).astype(np.float32)
     case.gaussians.set("logit_opacity", logits[:, None])
-    rules = [Clone(size_below=1e9), SplitTextured(texture_above=0.1, at_most=1.0), PruneFaint()]
+    rules = [Clone(size_below=1e9), SplitTextured(texture_above=0.1, max_fraction=1.0), PruneFaint()]
     change = case.apply(*rules)
     assert change.causes == {"clone": 20, "split_textured": 0, "prune_faint": 10}
     assert [len(case.rows_of(n)) for n in range(30)] == np.where(logits < 0, 0, 2).tolist()
@@ -164,7 +164,9 @@ def test_the_limit_ranks_by_gradient_whatever_else_is_measured(device, rng):
     case = Edited(device, rng, 50, ("rendered_texture", "screen_grad", "screen_radius"))
     case.gaussians.set("stats/screen_grad", 2 * gradient[:, None])
     case.gaussians.set("stats/rendered_texture", 2 * (1 - gradient[:, None]))
-    case.apply(SplitTextured(texture="rendered_texture", texture_above=0.0, gradient_above=0.0, at_most=1.0), limit=58)
+    case.apply(
+        SplitTextured(texture="rendered_texture", texture_above=0.0, gradient_above=0.0, max_fraction=1.0), limit=58
+    )
     assert {n for n in range(50) if len(case.rows_of(n)) == 2} == set(np.argsort(-gradient)[:8])
 
 

@@ -95,5 +95,5 @@ def test_what_few_views_need_and_what_has_little_weight_goes(device, rng):
     survey = SimpleNamespace(once=lambda function, *arguments: found)
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3, survey=survey)
     edit.mark(copies=2, kept=1)
-    PruneUseless(views_below=2, of_all=0.999).mark(edit)
+    PruneUseless(views_below=2, weight_total=0.999).mark(edit)
     assert edit.rows().tolist() == [2, 0, 2, 0, 0]

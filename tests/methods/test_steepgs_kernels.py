@@ -16,7 +16,7 @@ from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.methods.adc import Clone, PruneFaint
-from clsplat.methods.steepgs import UPPER, SplitSaddle, divided_logits, least_axes
+from clsplat.methods.steepgs import UPPER, SplitSteepest, divided_logits, least_axes
 from clsplat.opencl.device import Array, Device
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace
@@ -241,9 +241,9 @@ def test_children_lie_along_the_axis_and_share_the_opacity(device, rng):
     matrices = rng.permuted(np.stack([least, np.full(65, 4e-6), np.full(65, 5e-6)], axis=1), axis=1)
     axis = np.eye(3)[(matrices == least[:, None]).argmax(axis=1)]
     case = Edited(device, rng, diagonal(matrices))
-    change = case.apply(SplitSaddle(distance=0.7, shrink=1.5, eigenvalue_below=-1e-6))
+    change = case.apply(SplitSteepest(distance=0.7, shrink=1.5, eigenvalue_below=-1e-6))
     chosen = least < -1e-6
-    assert (change.before, change.after, change.grown) == (65, 65 + chosen.sum(), {"split_saddle": chosen.sum()})
+    assert (change.before, change.after, change.grown) == (65, 65 + chosen.sum(), {"split_steepest": chosen.sum()})
     own = covariance_of(*(case.before[name].astype(np.float64) for name in ("quats", "log_scales")))
     way = 0.7 * np.sqrt(np.einsum("ni,nij,nj->n", axis, own, axis))[:, None] * axis
     opacity = 1 / (1 + np.exp(-case.before["logit_opacity"].astype(np.float64)))
@@ -269,17 +269,17 @@ def test_children_lie_along_the_axis_and_share_the_opacity(device, rng):
 
 @on_one_setting
 def test_without_gaussians_nothing_happens(device, rng):
-    assert Edited(device, rng, np.zeros((0, 6))).apply(SplitSaddle()).after == 0
+    assert Edited(device, rng, np.zeros((0, 6))).apply(SplitSteepest()).after == 0
 
 
 @on_one_setting
 def test_candidates_reach_the_gradient_and_are_not_yet_taken(device, rng):
     case = Edited(device, rng, diagonal(np.full((40, 3), -1.0)), screen_grad=np.tile([1e-4, 3e-4], 20))
-    case.apply(SplitSaddle(gradient_above=2e-4))
+    case.apply(SplitSteepest(gradient_above=2e-4))
     assert [len(case.rows_of(n)) for n in range(40)] == [1, 2] * 20
     case = Edited(device, rng, diagonal(np.full((40, 3), -1.0)))
-    change = case.apply(Clone(size_below=1e9), SplitSaddle())
-    assert change.grown == {"clone": 40, "split_saddle": 0}
+    change = case.apply(Clone(size_below=1e9), SplitSteepest())
+    assert change.grown == {"clone": 40, "split_steepest": 0}
     np.testing.assert_array_equal(case.gaussians.get("logit_opacity")[::2], case.before["logit_opacity"])
 
 
@@ -287,11 +287,11 @@ def test_candidates_reach_the_gradient_and_are_not_yet_taken(device, rng):
 def test_the_lowest_eigenvalues_come_first_below_the_limit(device, rng):
     least = -rng.permutation(np.linspace(1e-3, 1, 50))
     case = Edited(device, rng, diagonal(least[:, None] * [1, 0.1, 0]))
-    assert case.apply(SplitSaddle(), limit=57).after == 57
+    assert case.apply(SplitSteepest(), limit=57).after == 57
     assert {n for n in range(50) if len(case.rows_of(n)) == 2} == set(np.argsort(least)[:7])
     for limit in (50, 10):
         case = Edited(device, rng, diagonal(least[:, None] * [1, 0.1, 0]))
-        assert case.apply(SplitSaddle(), limit=limit).after == 50
+        assert case.apply(SplitSteepest(), limit=limit).after == 50
         np.testing.assert_array_equal(case.gaussians.get("logit_opacity"), case.before["logit_opacity"])
 
 
@@ -303,7 +303,7 @@ def test_undone_or_pruned_split_leaves_the_others_as_they_are(device, rng):
     case = Edited(device, rng, columns, screen_grad=np.linspace(1e-3, 1, count))
     logits = np.where(np.arange(count) < 5, -7.0, 1.0)[:, None]
     case.gaussians.set("logit_opacity", logits)
-    change = case.apply(SplitSaddle(), Clone(size_below=1e9), PruneFaint(), limit=50)
+    change = case.apply(SplitSteepest(), Clone(size_below=1e9), PruneFaint(), limit=50)
     assert change.after == 50
     for n in range(count):
         rows = case.rows_of(n)
@@ -384,10 +384,8 @@ def test_a_gaussian_between_two_blobs_escapes_its_saddle(device):
     scale = SceneScale(1.0)
     assert densify(Edit(model.gaussians, stats, scale, 700, 4), [Clone(size_below=9.0)], rasterizer.tiler).after == 1
     stats.add(view_of(frame, pixel_sums), mean2d)
-    assert (
-        densify(Edit(model.gaussians, stats, scale, 700, 4), [SplitSaddle(gradient_above=0.0)], rasterizer.tiler).after
-        == 2
-    )
+    edit = Edit(model.gaussians, stats, scale, 700, 4)
+    assert densify(edit, [SplitSteepest(gradient_above=0.0)], rasterizer.tiler).after == 2
     apart = camera.rotation @ np.diff(model.gaussians.get("means"), axis=0)[0]
     assert abs(apart[0]) > 20 * abs(apart[1])
     assert loss(model.gaussians)[0] < before

@@ -64,7 +64,7 @@ def test_numbers_that_no_training_survives_are_refused(pipeline, override, bound
 
 
 def test_filters_and_rules_that_read_no_positions_allow_motion():
-    load("dynamic_7k", ["model.screen_filter=mip", "densify.rules=[clone, split_saddle, prune_unimportant]"])
+    load("dynamic_7k", ["model.screen_filter=mip", "densify.rules=[clone, split_steepest, prune_unimportant]"])
 
 
 def test_a_class_of_a_plugin_declares_a_conflict_in_its_stage(tmp_path, without_plugins):

@@ -114,7 +114,7 @@ MATCHING = {
     for rule, size in (("clone", (".size_below",)), ("split", (".size_above", ".children", ".shrink")))
     for key in ("", ".start", ".statistic", ".as_many_as", ".gradient_above", ".opacity", *size)
 }
-SUBDIVIDE = (".start", ".at_most", ".beta", ".children", ".radius_above")
+SUBDIVIDE = (".start", ".max_fraction", ".beta", ".children", ".radius_above")
 STAGE = ("budget", "every", "grow_until", "inside", "max_gaussians", "patience", "per_pixel", "start", "stop")
 THINNING = {
     *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
@@ -140,7 +140,7 @@ def rules(stage: str, **keys: str) -> set[str]:
 WRONG = " views error_above start"
 FASTGS = {
     *rules("densify", prune_faint="opacity_below start", prune_large="size_above start"),
-    *rules("densify", ungrow_accurate="pixels_above" + WRONG),
+    *rules("densify", revert_growth="pixels_above" + WRONG),
     *rules("densify", prune_sampled="opacity_below share size_above.between size_above.points" + WRONG),
     *rules("densify~2", prune_faint="opacity_below start", prune_inaccurate="score_above" + WRONG),
     *(f"densify~2.{key}" for key in STAGE),
@@ -153,10 +153,10 @@ MINI = {
     *(
         place
         for n in ("", "~2", "~3")
-        for place in rules(f"densify{n}", prune_useless="of_all of_view start views views_below")
+        for place in rules(f"densify{n}", prune_useless="weight_total weight_per_view start views views_below")
     ),
     *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
-    *(f"hide_useless{n}.{key}" for n in ("", "~2") for key in ("every", "of_view", "start", "stop")),
+    *(f"hide_useless{n}.{key}" for n in ("", "~2") for key in ("every", "weight_per_view", "start", "stop")),
     *("densify.every", "densify.start", "densify.stop"),
     *(f"reset_opacity.{key}" for key in ("every", "stop", "when_background")),
     *(f"reset_opacity~2.{key}" for key in ("every", "start", "stop", "to", "when_background")),
@@ -177,19 +177,19 @@ SADDLE = {
     *(f"densify.rules.{rule}{key}" for rule in ("clone", "split") for key in (".as_many_as", ".gradient_above")),
     *("densify.rules.clone.size_below", "densify.rules.split.size_above"),
     *("densify.rules.split.children", "densify.rules.split.shrink"),
-    *(f"densify.rules.split_saddle{key}" for key in ("", ".start", ".eigenvalue_below", ".gradient_above")),
-    *(f"densify.rules.split_saddle{key}" for key in (".distance", ".shrink", ".opacity")),
+    *(f"densify.rules.split_steepest{key}" for key in ("", ".start", ".eigenvalue_below", ".gradient_above")),
+    *(f"densify.rules.split_steepest{key}" for key in (".distance", ".shrink", ".opacity")),
 }
 CROWDED = {
-    *(f"densify.rules.clone_crowded{key}" for key in ("", ".start", ".gradient_above", ".size_below")),
-    *(f"densify.rules.clone_crowded{key}" for key in (".ratio_above", ".jitter", ".cells", ".extremes")),
+    *(f"densify.rules.clone_dense{key}" for key in ("", ".start", ".gradient_above", ".size_below")),
+    *(f"densify.rules.clone_dense{key}" for key in (".ratio_above", ".jitter", ".cells", ".extremes")),
 }
 DIFFERENCES = {
     ("splat", "auto"): {
         f"densify.rules.{rule}.{key}" for rule in ("clone", "split") for key in ("gradient_above", "statistic")
     }
     | {f"densify~2.{key}" for key in STAGE}
-    | {f"densify~2.rules.prune_spare{key}" for key in ("", ".start", ".error_rise", ".views")},
+    | {f"densify~2.rules.prune_redundant{key}" for key in ("", ".start", ".error_rise", ".views")},
     ("splat", "steep"): SADDLE,
     ("splat", "gdgs"): CROWDED,
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
@@ -216,7 +216,7 @@ DIFFERENCES = {
     ("splat", "opti3dgs"): MEAN_FILTER,
     ("splat", "dash"): DASH | {"reset_opacity.stop", "rates.logit_opacity"},
     ("splat_7k", "fast"): {
-        *rules("densify~2", prune_useless="of_all of_view start views views_below"),
+        *rules("densify~2", prune_useless="weight_total weight_per_view start views views_below"),
         *(f"densify~2.{key}" for key in STAGE),
         *(f"densify.rules.prune_large{key}" for key in ("", ".size_above", ".start")),
         *(f"rates.{key}" for key in ("log_scales", "logit_opacity", "quats", "sh_base", "sh_rest")),
@@ -240,7 +240,7 @@ DIFFERENCES = {
         *(f"rates.{key}" for key in ("log_scales", "logit_opacity", "quats", "sh_base", "sh_rest")),
         *(f"rates.means.{key}" for key in ("over", "start", "until")),
         *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),
-        *(f"densify~2.rules.prune_useless.{key}" for key in ("of_all", "of_view")),
+        *(f"densify~2.rules.prune_useless.{key}" for key in ("weight_total", "weight_per_view")),
         *("densify.rules.clone.size_below", "views.resolution.until", "steps"),
         *("losses.l1.weight", "losses.l2", "losses.l2.weight"),
     },

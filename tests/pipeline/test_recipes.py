@@ -27,10 +27,10 @@ RECIPES = (  # each has a rule, loss, filter or transform that no other one of t
 )  # fmt: skip
 LOOKS_AT_VIEWS = {"fastgs_7k", "speedy_7k", "mini_7k", "taming_7k"}
 ACTS = {  # what decides in a family of recipes; `clone` in all others
-    "auto": "clone split prune_spare", "fast": "clone prune_useless",
-    "fastgs": "split prune_inaccurate", "gdgs": "clone_crowded", "mcmc": "relocate",
+    "auto": "clone split prune_redundant", "fast": "clone prune_useless",
+    "fastgs": "split prune_inaccurate", "gdgs": "clone_dense", "mcmc": "relocate",
     "micro_splatting_v2": "split_textured merge_neighbors prune_unimportant",
-    "mini": "clone prune_useless", "speedy": "prune_least", "steep": "split_saddle",
+    "mini": "clone prune_useless", "speedy": "prune_least", "steep": "split_steepest",
 }  # fmt: skip
 LEARNS = {"auto_opti3dgs_7k"}
 ALONE = """

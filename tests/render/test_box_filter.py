@@ -44,7 +44,7 @@ def test_the_resolved_file_says_it_again(tmp_path):
     assert load_pipeline(tmp_path / "again.yaml").settings.model == pipeline.settings.model
 
 
-@pytest.mark.parametrize(("name", "rule"), [("steep_7k", "split_saddle"), ("auto_7k", "clone")])
+@pytest.mark.parametrize(("name", "rule"), [("steep_7k", "split_steepest"), ("auto_7k", "clone")])
 def test_a_rule_that_reads_conics_is_refused(name, rule):
     words = rf"stages\[1\]\.optimize\..*: '{rule}' does not go .* box \(model.screen_filter\): .*another screen filter"
     with pytest.raises(ConfigError, match=words):

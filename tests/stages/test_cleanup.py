@@ -36,7 +36,8 @@ model: {sh_degree: 0}
 stages:
   - init: {source: random, count: 600, opacity: 0.3}
   - optimize: {steps: 4, losses: [l1], during: [{add_to_average: {every: 1}}, {checkpoint: {every: 1}}]}
-  - cleanup: {rules: [{type: prune_faint, opacity_below: 0.29}, {type: prune_useless, views_below: 2, of_all: 0.95}]}
+  - cleanup:
+      rules: [{type: prune_faint, opacity_below: 0.29}, {type: prune_useless, views_below: 2, weight_total: 0.95}]
   - optimize: {steps: 4, losses: [l1], during: [{checkpoint: {every: 1}}]}
   - take_average
   - export
