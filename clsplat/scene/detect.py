@@ -6,13 +6,14 @@ from clsplat.core.errors import ConfigError, DataError, in_shell
 from clsplat.formats.table import detect as model_format
 from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.images import is_image
+from clsplat.scene.llff import LlffReader
 from clsplat.scene.multicamera import MulticameraReader
 from clsplat.scene.reader import Reader, reader_classes
 from clsplat.scene.scene import HOLDOUT, Scene
 from clsplat.scene.transforms_json import BlenderReader, MultiscaleReader, NerfstudioReader
 from clsplat.scene.view_selection import Split
 
-PRECEDENCE = (MulticameraReader, ColmapReader, BlenderReader, MultiscaleReader, NerfstudioReader)
+PRECEDENCE = (MulticameraReader, ColmapReader, BlenderReader, MultiscaleReader, NerfstudioReader, LlffReader)
 
 
 def readers() -> list[Reader]:

@@ -14,7 +14,7 @@ from clsplat.scene.detect import format_names, holds_scene, read_scene, readers
 from tests.support.orbit_scene import orbit, photograph, write
 from tests.support.refusals import refusal
 
-SHIPPED = ["multi-camera video", "COLMAP", "Blender", "multi-scale Blender", "nerfstudio"]
+SHIPPED = ["multi-camera video", "COLMAP", "Blender", "multi-scale Blender", "nerfstudio", "LLFF"]
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +33,7 @@ class OneFile(Reader):
 
 def test_shipped_readers_come_in_order_of_precedence():
     assert [reader.name for reader in readers()] == SHIPPED
-    assert format_names() == "multi-camera video, COLMAP, Blender, multi-scale Blender or nerfstudio"
+    assert format_names() == "multi-camera video, COLMAP, Blender, multi-scale Blender, nerfstudio or LLFF"
 
 
 def test_readers_of_plugins_follow_in_order_of_definition():

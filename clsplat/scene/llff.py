@@ -1,0 +1,98 @@
+"""Read LLFF datasets: `poses_bounds.npy` next to a folder of photographs (Mildenhall et al. 2019)."""
+
+import logging
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import DataError
+from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera
+from clsplat.scene.images import is_image, read_header
+from clsplat.scene.reader import Parts, Reader
+from clsplat.scene.scene import Scene, every_nth, make_scene
+from clsplat.scene.view import View
+
+POSES_FILE = "poses_bounds.npy"
+MAX_BYTES = 1 << 24  # 136 bytes per image: 120 000 images
+LLFF_TO_OPENCV = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.float64)  # from axes (down, right, back)
+logger = logging.getLogger("clsplat")
+
+
+class LlffReader(Reader):
+    """An LLFF scene: the i-th row of `poses_bounds.npy` belongs to the i-th image by name.
+
+    The file holds a focal length and no distortion, and no points.  Every `holdout`-th view is for testing.
+    """
+
+    name = "LLFF"
+    expects = POSES_FILE
+
+    def matches(self, path: Path) -> bool:
+        return (path / POSES_FILE).is_file()
+
+    def read(self, path: Path, holdout: int) -> Scene:
+        file = path / POSES_FILE
+        rows, images = read_poses(file), image_files(path)
+        if len(rows) != len(images):
+            raise DataError(
+                f"{file}: holds {len(rows)} poses for {len(images)} images in {images[0].parent if images else path}; "
+                "expected one pose per image, in order of name: add the missing images or remove the others"
+            )
+        views = [view_from_row(file, row, image) for row, image in zip(rows, images, strict=True)]
+        logger.info("%s: one focal length per image and no distortion; undistorted photographs are expected", file)
+        return make_scene(path, views, every_nth([view.name for view in views], holdout), None)
+
+    def list_parts(self, parts: Parts) -> None:
+        super().list_parts(parts)
+        parts.on_disk = image_files(parts.path)
+
+
+def read_poses(path: Path) -> NDArray[np.float64]:
+    """Return the rows of a `poses_bounds.npy`, [N, 17]: a matrix [3, 5] and the nearest and farthest depths.
+
+    Raises DataError for a damaged file and for numbers that are not finite.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES} bytes")
+        with path.open("rb") as file:
+            rows = np.load(file, allow_pickle=False)
+        if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+            raise ValueError(f"it has shape {rows.shape}, {rows.dtype}")
+        if not np.isfinite(rows).all():
+            raise ValueError("it has numbers that are not finite")
+    except (ValueError, EOFError, MemoryError, OSError) as error:
+        raise DataError(f"{path}: {error}; expected finite numbers [N, 17]: export it again") from error
+    return np.asarray(rows, np.float64)
+
+
+def image_files(path: Path) -> list[Path]:
+    """Return the images of the dataset by name: of `images`, else of the largest `images_N`, else of its folder."""
+    smaller = [folder for folder in path.glob("images_*") if re.fullmatch(r"images_\d+", folder.name)]
+    for folder in (path / "images", *sorted(smaller, key=lambda folder: int(folder.name[7:])), path):
+        files = sorted(file for file in folder.iterdir() if is_image(file)) if folder.is_dir() else []
+        if files:
+            return files
+    return []
+
+
+def view_from_row(path: Path, row: NDArray[np.float64], image: Path) -> View:
+    """Return the view of one row; the focal length follows the size of the image file.  Raises DataError."""
+    matrix, header = row[:15].reshape(3, 5), read_header(image)
+    height, width, focal = matrix[:, 4]
+    scale = header.width / width if width > 0 else 0.0
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and focal * scale >= MIN_FOCAL):
+        raise DataError(f"{path}: {image.name} has a camera of {width:g} x {height:g} px with focal length {focal:g}")
+    if abs(header.height - height * scale) > 1.5:  # a resized image is rounded to whole pixels
+        raise DataError(
+            f"{path}: {image.name} is {header.width} x {header.height} px, its camera {width:g} x {height:g}; "
+            "expected the same aspect ratio: use the images that the poses were made from"
+        )
+    rotation = matrix[:, :3] @ LLFF_TO_OPENCV  # camera to world
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise DataError(f"{path}: the pose of {image.name} has no rotation; export the file again")
+    pose = np.hstack([rotation.T, -rotation.T @ matrix[:, 3:4]])
+    camera = Camera(header.width, header.height, focal * scale, focal * scale, header.width / 2, header.height / 2)
+    return View(image.name, camera, pose, image)
