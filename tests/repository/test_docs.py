@@ -26,13 +26,14 @@ sys.path.insert(0, str(ROOT / "docs"))
 
 from families import families, tag, undescribed  # noqa: E402
 from other_pages import other_pages  # noqa: E402
+from python_pages import FOLDER  # noqa: E402
 from reference_pages import key_table, reference_pages  # noqa: E402
 from schedule_page import EXAMPLES, SAMPLES  # noqa: E402
 from yaml_examples import example, fields_of  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAMED = [(base, kind) for base, kinds in families().items() for kind in kinds]
 
 
@@ -107,9 +108,16 @@ def test_examples_of_numbers_by_step_are_valid():
 
 def test_every_page_is_in_the_navigation():
     shown = re.findall(r": (\S+\.md)$", text_of(ROOT / "mkdocs.yml"), re.M)
-    written = {page.name for page in (ROOT / "docs").glob("*.md")}
+    assert f"{FOLDER}/\n" in text_of(ROOT / "mkdocs.yml")
+    listed = re.findall(r"\((\w+\.md)\)", other_pages()[f"{FOLDER}/SUMMARY.md"])
+    shown += [f"{FOLDER}/{name}" for name in ("SUMMARY.md", *listed)]
+    written = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
     assert set(shown) == written | reference_pages().keys() | other_pages().keys()
     assert len(shown) == len(set(shown))
+
+
+def test_the_navigation_has_at_most_seven_groups():
+    assert len(re.findall(r"^  - (.+):$", text_of(ROOT / "mkdocs.yml").partition("\nnav:")[2], re.M)) <= 7
 
 
 def test_every_included_file_exists():
@@ -176,11 +184,12 @@ def options(command) -> set[str]:
 
 
 def test_links_between_files_of_the_repository_hold():
+    generated = reference_pages() | other_pages()
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text_of(page)):
-            made = (ROOT / "docs" / target).relative_to(ROOT / "docs").as_posix() in reference_pages()
-            made |= target in other_pages()
-            assert made or (page.parent / target).exists(), f"{page.name}: {target}"
+            path = (page.parent / target).resolve()
+            made = path.is_relative_to(ROOT / "docs") and path.relative_to(ROOT / "docs").as_posix() in generated
+            assert made or path.exists(), f"{page.name}: {target}"
 
 
 def test_the_front_page_is_short():
