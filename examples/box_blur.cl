@@ -1,9 +1,9 @@
-/* The mean of a window of pixels, [2 reach + 1, 2 reach + 1], as far as it lies inside the image.
+/* The mean of a window of pixels, [2 reach + 1, 2 reach + 1], limited to the image.
  *
  * One item = one pixel of one channel; dimensions x, y, channel.  No local memory.  Deterministic. */
 #include "common.h"
 
-/* Write the means; 0 beside the image. */
+/* Write the means; 0 outside the image. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void box_blur(
     __global const float *restrict image, __global float *restrict blurred,  // [3,H',stride]

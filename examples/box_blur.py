@@ -1,4 +1,4 @@
-"""Blur the photographs, and less so by step: `views: {transforms: [{type: box_blur, reach: [[0, 4], [500, 0]]}]}`."""
+"""Blur the photos, less over training: `views: {transforms: [{type: box_blur, reach: [[0, 4], [500, 0]]}]}`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,11 +8,11 @@ from clsplat.plugin import NonNegative, PhotographTransform, Planes, at_step
 
 
 class BoxBlur(PhotographTransform):
-    """Replace each pixel by the mean of the window around it."""
+    """Replace each pixel with the mean of the window around it."""
 
     type: Literal["box_blur"] = "box_blur"
     reach: NonNegative
-    """Pixels on each side of the window's middle, rounded; by step."""
+    """Pixels on each side of the center of the window, rounded; number by step."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
         camera, reach = planes.camera, round(at_step(self.reach, step))

@@ -1,6 +1,6 @@
 """Train on cameras.csv: `clsplat --plugin csv_reader.py run splat_7k --scene DIR`.
 
-A line for each photograph: its path below DIR, pose (world to camera, translation in scene units) and camera in px.
+One line per photo: its path below DIR, its pose (world to camera, translation in scene units), and its camera in px.
 """
 
 import csv

@@ -1,4 +1,4 @@
-"""What each camera makes of light: the falloff of its lens, and a response curve of each channel."""
+"""Learn how each camera records light: the falloff of its lens, and a response curve per channel."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,33 +19,32 @@ TABLE = ViewTable("responses", (), ("center_x", "center_y", "a", "b", "c", *CURV
 
 
 class CameraResponse(TrainingModule):
-    """Vignetting and response curves of each camera, learned with the Gaussians; all its photographs share them.
+    """Learn vignetting and response curves with the Gaussians, one set per camera.
 
-    A pixel x of the scene becomes f(v x) before the losses.  v = 1 + a q + b q² + c q³ is the falloff of the lens
+    A pixel x of the render becomes f(v x) before the losses.  v = 1 + a q + b q² + c q³ is the falloff of the lens
     (Goldman and Chen 2005): q is the squared distance from a center, in half diagonals of the image; center_x and
     center_y lead to it from the principal point.  f is a monotone spline of each channel (Ramsay 1988), f(0) = 0 and
     f(1) = 1.  Its slope is piecewise linear; red_0, 1, 3 and 4 are its logarithms at 0, 1/4, 3/4 and 1, less that at
-    1/2.  PPISP (Deutsch et al. 2026) has such a falloff, and a curve of powers.  All numbers begin at 0, which
-    changes nothing.
+    1/2.  PPISP (Deutsch et al. 2026) has such a falloff, and a curve of powers.  All parameters start at 0, the
+    identity.
 
-    Views have one camera where the dataset gives them the same lens, or the same pinhole camera.  Test views are
-    measured as their camera takes them; a camera without a photograph in the training changes nothing.  The model, and
-    all pictures of it, stay as the scene shows them.
+    Views with the same lens or the same pinhole camera in the dataset share a set.  Test views are measured through
+    their camera's set; a camera without training photos has the identity.  The model and its renders do not change.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
-    place: ClassVar[int] = 25  # before the colors of a photograph, which cut white
-    planes: ClassVar[int] = 8  # the image as the camera takes it, and its gradient, each with a fourth plane
+    place: ClassVar[int] = 25  # before modules for colors, which clip white
+    planes: ClassVar[int] = 8  # the image after the response, and its gradient, four channels each
     outlasts: ClassVar[Literal["numbers"]] = "numbers"
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
     files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
 
     type: Literal["lens_and_curves"] = "lens_and_curves"
     rate: NonNegative = 1e-3
-    """Learning rate of the numbers of a camera, by Adam, by step; a training of a few hundred steps needs 5e-3."""
+    """Learning rate (Adam) of the parameters; number by step. Trainings of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared numbers of the step's camera among the losses, by step: what all photographs
-    have in common the Gaussians can show as well."""
+    """Weight of the sum of the squared parameters of the step's camera; number by step. It leaves to the Gaussians
+    what all photos have in common."""
 
     def state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)
@@ -56,7 +55,7 @@ class CameraResponse(TrainingModule):
 
 
 class CameraResponseState(ModuleState):
-    """The numbers of each camera, by the name of the first view that has it."""
+    """Parameters of each camera, keyed by the first view that uses it."""
 
     def __init__(self, settings: CameraResponse, views: Sequence[str], cameras: dict[str, str]) -> None:
         """views: the names of the training views, by number; cameras: of each view, by name."""

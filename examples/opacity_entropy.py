@@ -1,4 +1,4 @@
-"""A penalty that pulls opacities to 0 or 1: `losses: [..., {type: opacity_entropy, weight: 0.01}]`."""
+"""Penalize opacities that are neither 0 nor 1: `losses: [..., {type: opacity_entropy, weight: 0.01}]`."""
 
 from pathlib import Path
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Train with a loss in NumPy in addition to those of a pipeline: `python own_loss.py SCENE [PIPELINE]`."""
+"""Train with a loss written in NumPy, in addition to those of a pipeline: `python own_loss.py SCENE [PIPELINE]`."""
 
 import sys
 
@@ -8,7 +8,7 @@ import clsplat
 
 
 def edges(image, photograph):
-    """Mean absolute difference between the slopes of two images, and its derivative by the first.
+    """Return the mean absolute difference of the image slopes, and its derivative with respect to the first image.
 
     image, photograph: [height, width, 3] float32.
     """

@@ -8,13 +8,13 @@ from clsplat.plugin import Edit, Positive, Rule, Run, Scheduled, at_step
 
 
 class PruneAtRandom(Rule):
-    """Remove a random share of the faint Gaussians."""
+    """Remove a random fraction of the faint Gaussians."""
 
     type: Literal["prune_at_random"] = "prune_at_random"
     share: Positive = 0.5
-    """Share of the faint Gaussians that is removed; by step."""
+    """Fraction of the faint Gaussians to remove; number by step."""
     opacity_below: Positive = 0.1
-    """Opacity of faint Gaussians; by step."""
+    """Opacity below which a Gaussian is faint; number by step."""
 
     def mark(self, edit: Edit) -> None:
         opacity = 1 / (1 + np.exp(-edit.gaussians.get("logit_opacity")[:, 0]))
@@ -23,14 +23,14 @@ class PruneAtRandom(Rule):
 
 
 class CapSize(Scheduled):
-    """Shrink Gaussians that are larger than a share of the scene's extent."""
+    """Shrink Gaussians that are larger than a fraction of the scene extent."""
 
     stage: Literal["cap_size"] = "cap_size"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
 
     to: Positive = 0.1
-    """Largest standard deviation along an axis, as a share of the extent; by step."""
+    """Largest standard deviation along an axis, as a fraction of the extent; number by step."""
 
     def run(self, run: Run) -> None:
         log_scales = run.model.gaussians.get("log_scales")

@@ -1,4 +1,4 @@
-"""Serve pictures of a model: `python render_service.py MODEL SCENE [PORT]`; then GET /?view=NAME or /?x=3&y=0&z=1."""
+"""Serve renders of a model: `python render_service.py MODEL SCENE [PORT]`; then GET /?view=NAME or /?x=3&y=0&z=1."""
 
 import sys
 from http.server import BaseHTTPRequestHandler, HTTPServer
