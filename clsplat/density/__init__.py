@@ -1,4 +1,4 @@
-"""Density control: statistics of Gaussians, edits, budgets, and what rules share.  Each module defines variants."""
+"""Density control: statistics of Gaussians, edits, budgets, and scores that rules share."""
 
 from clsplat.core.settings import import_modules
 

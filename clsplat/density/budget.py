@@ -1,4 +1,4 @@
-"""How many Gaussians an edit may leave, from what the training has seen so far."""
+"""Limit the number of Gaussians that an edit may leave, by the progress of training."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -8,12 +8,12 @@ from clsplat.density.edit import Edit
 
 
 @dataclass(frozen=True)
-class Moment:
-    """The time of an edit."""
+class BudgetContext:
+    """The progress of training at an edit."""
 
-    share: float  # of the steps up to the end of edits
-    edits: int  # that are left, with this one
-    divisor: float  # of the photographs' size
+    share: float  # of the steps until the last edit that are done, 0 to 1
+    edits: int  # still to come, this one included
+    divisor: float  # downscale factor of the photographs
 
 
 class Budget(Settings):
@@ -21,9 +21,9 @@ class Budget(Settings):
 
     @property
     def statistics(self) -> set[str]:
-        """Columns that it reads."""
+        """Names of the statistics that it reads."""
         return set()
 
     @abstractmethod
-    def limit(self, edit: Edit, moment: Moment, numbers: dict[str, float]) -> int:
-        """Return the number; `numbers` are kept from edit to edit, by name."""
+    def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
+        """Return the number; `numbers` persist from edit to edit, by name, and are in the checkpoint."""

@@ -1,8 +1,8 @@
-"""Apply density rules, as one edit; reset opacities (Kerbl et al. 2023, section 5)."""
+"""Apply density rules as one edit, and reset opacities (Kerbl et al. 2023, section 5)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,11 @@ from clsplat.gaussians.gaussians import Gaussians
 from clsplat.opencl.device import Array
 from clsplat.render.tiles import Tiler
 
-# The rows that an edit leaves: all tables rearranged, and the children of Gaussians in their places.
-
 
 def apply_edit(edit: Edit, tiler: Tiler) -> None:
-    """Rearrange all tables and place the children of split Gaussians.
+    """Rearrange all tables and move the children of split Gaussians to their positions.
 
-    Raises MemoryLimitError where these are more rows than memory holds; all tables stay as they are.
+    Raises MemoryLimitError if these are more rows than an index can hold; all tables stay as they are.
     """
     gaussians, device, count = edit.gaussians, edit.gaussians.device, edit.gaussians.count
     program = device.program("density.cl")
@@ -29,18 +27,19 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
     rows = int(row_offset.get_item(count))
     if rows > MAX_ROWS:
         raise MemoryLimitError(
-            f"step {edit.step}: the rules ask for more than {MAX_ROWS:,} Gaussians; use densify.max_gaussians, or "
-            "rules that make fewer copies"
+            f"step {edit.step}: the rules would make more than {MAX_ROWS:,} Gaussians; set densify.max_gaussians, or "
+            "use rules that make fewer copies"
         )
     source, fresh = device.empty(rows, np.uint32), device.empty(rows, np.uint32)
-    places: dict[str, Any] = {
-        "copies": edit.copies,
-        "kept": edit.kept,
-        "row_offset": row_offset,
-        "source": source,
-        "fresh": fresh,
-    }
-    program.list_rows(items=count, **places, count=count)
+    program.list_rows(
+        items=count,
+        copies=edit.copies,
+        kept=edit.kept,
+        row_offset=row_offset,
+        source=source,
+        fresh=fresh,
+        count=count,
+    )
     gaussians.rearrange(source, fresh, rows)
     program.spawn_children(
         items=rows,
@@ -55,14 +54,20 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
         stride=gaussians.capacity,
         count=rows,
     )
-    sharing: dict[str, Any] = {"source": source, "copies": edit.copies, "shared": edit.shared}
-    program.share_opacity(items=rows, **sharing, logit_opacity=gaussians["logit_opacity"], count=rows)
+    program.share_opacity(
+        items=rows,
+        source=source,
+        copies=edit.copies,
+        shared=edit.shared,
+        logit_opacity=gaussians["logit_opacity"],
+        count=rows,
+    )
     if edit.children:
         _set_children(edit, row_offset)
 
 
 def _set_children(edit: Edit, row_offset: Array) -> None:
-    """Write what rules said of the children of some Gaussians, where these became as many rows as they said."""
+    """Write the values that rules set for children, unless a later rule or limit changed their number."""
     copies, first = edit.rows(), row_offset.get()
     for name, sources, values in edit.children:
         whole = copies[sources] == values.shape[1]
@@ -70,18 +75,16 @@ def _set_children(edit: Edit, row_offset: Array) -> None:
         edit.gaussians.set_rows(name, rows.ravel(), values[whole].reshape(-1, values.shape[2]))
 
 
-# A part of space, such as the one in which Gaussians grow.
-
 Corner = Annotated[list[float | None], Field(min_length=3, max_length=3)]
 
 
 class Box(Settings):
-    """A box with its lower faces and without its upper ones, so that boxes side by side share no point."""
+    """An axis-aligned box; adjacent boxes share no point, since it includes only its lower faces."""
 
     low: Corner = Field(default=[None, None, None])
-    """Lowest x, y and z, scene units; null: none."""
+    """Smallest x, y and z, scene units, inclusive; null: no bound."""
     high: Corner = Field(default=[None, None, None])
-    """First x, y and z beyond it, scene units; null: none."""
+    """Largest x, y and z, scene units, exclusive; null: no bound."""
 
     @model_validator(mode="after")
     def _with_room(self) -> "Box":
@@ -91,21 +94,21 @@ class Box(Settings):
         return self
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return which points, [N, 3] scene units, lie in it, [N]; one that is not a number lies nowhere."""
-        found = ~np.isnan(points).any(axis=1)
+        """Return which points, [N, 3] scene units, are inside, [N]; NaN never is."""
+        is_inside = ~np.isnan(points).any(axis=1)
         for axis, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             values = points[:, axis].astype(np.float64)
-            found &= (True if low is None else values >= low) & (True if high is None else values < high)
-        return np.asarray(found)
+            is_inside &= (True if low is None else values >= low) & (True if high is None else values < high)
+        return np.asarray(is_inside)
 
 
 @dataclass(frozen=True)
 class Change:
-    """Numbers of Gaussians before and after an edit."""
+    """The number of Gaussians before and after an edit."""
 
     before: int
     after: int
-    causes: dict[str, int]  # Gaussians whose final outcome a rule decided, by the rule's name
+    causes: dict[str, int]  # Gaussians whose outcome a rule decided, by the rule's name
     grown: dict[str, int]  # of these, the ones that became several
 
 
@@ -117,9 +120,9 @@ def densify(
     inside: Box | None = None,
     make_room: Callable[[int], None] = lambda count: None,
 ) -> Change:
-    """Apply the rules in their order, as one rearrangement of all tables, and set the statistics to zero.
+    """Apply the rules in order, as one rearrangement of all tables, and set the statistics to zero.
 
-    limit, inside: as for `mark`.  make_room: is told how many there will be, before any is added.
+    limit, inside: as for `mark`.  make_room: called with the new number of Gaussians before the tables grow.
     """
     change = mark(edit, rules, limit, inside)
     make_room(change.after)
@@ -128,23 +131,23 @@ def densify(
 
 
 def apply_marks(edit: Edit, tiler: Tiler) -> None:
-    """Rearrange all tables as an edit was marked, and set the statistics to zero."""
+    """Rearrange all tables as the rules marked them, and set the statistics to zero."""
     apply_edit(edit, tiler)
     edit.stats.clear()
 
 
 def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Box | None = None) -> Change:
-    """Let the rules mark an edit, in their order; return what it will change.
+    """Let the rules mark an edit, in order; return what it will change.
 
-    inside: the part of space in which Gaussians grow.  Growth stops at `limit` Gaussians: those with the largest mean
-    of the first column grow first.  Rules read in `edit.room` how many they may add.
+    inside: the region in which Gaussians grow.  Growth stops at `limit` Gaussians; those with the largest mean of the
+    first statistic grow first.  Rules read the number that they may add from `edit.room`.
     """
     edit.max_rows = limit
     gaussians = edit.gaussians
     before = gaussians.count
-    acting = [(number, rule) for number, rule in enumerate(rules) if edit.step > rule.start]
+    active = [(number, rule) for number, rule in enumerate(rules) if edit.step > rule.start]
     decided_by = np.full(before, -1)
-    for edit.rule, rule in acting:
+    for edit.rule, rule in active:
         rows = edit.rows()
         rule.mark(edit)
         decided_by[edit.rows() != rows] = edit.rule
@@ -156,7 +159,7 @@ def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Bo
     decided_by[rows == 1] = -1
     causes: dict[str, int] = {}
     grown: dict[str, int] = {}
-    for number, rule in acting:
+    for number, rule in active:
         name = getattr(rule, "type", "rule")
         causes[name] = causes.get(name, 0) + int((decided_by == number).sum())
         grown[name] = grown.get(name, 0) + int(((decided_by == number) & (rows > 1)).sum())
@@ -164,7 +167,7 @@ def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Bo
 
 
 def cap_opacity(gaussians: Gaussians, limit: float) -> None:
-    """Lower opacities to `limit`, which holds for the opacity after the world filter (the opacity reset)."""
+    """Lower opacities, as they are after the 3D filter, to `limit` at most (the opacity reset)."""
     gaussians.device.program("density.cl").cap_opacity(
         items=gaussians.count,
         log_scales=gaussians["log_scales"],
@@ -176,8 +179,8 @@ def cap_opacity(gaussians: Gaussians, limit: float) -> None:
     )
 
 
-def keep(gaussians: Gaussians, kept: NDArray[np.int64], cause: str) -> Change:
-    """Remove all Gaussians but those in some rows, ascending.  cause: a name of what chose them."""
+def keep_rows(gaussians: Gaussians, kept: NDArray[np.int64], cause: str) -> Change:
+    """Remove all Gaussians except the rows `kept`, [n], ascending.  cause: the name in `Change.causes`."""
     before = gaussians.count
     source = gaussians.device.upload(kept.astype(np.uint32))
     gaussians.rearrange(source, gaussians.device.zeros(len(kept), np.uint32), len(kept))

@@ -1,9 +1,9 @@
-"""An edit of the Gaussians, and the base of the rules that mark it (Kerbl et al. 2023, section 5).
+"""Represent an edit of the Gaussians, and the base of the rules that mark it (Kerbl et al. 2023, section 5).
 
-A rule gives Gaussians an outcome: the number of rows that each becomes.  Most rules are a box in (mean of a statistic,
-size, opacity), and one kernel applies them all; others choose on the host.  Sizes are the largest standard deviation
-as a share of the scene's extent.  The first growing rule whose box holds a Gaussian decides; pruning rules override
-growth and compare the size of the children after a split.
+A rule gives Gaussians an outcome: the number of rows that each becomes.  Most rules are a range of statistic, size and
+opacity, and one kernel applies them; others choose Gaussians on the host.  A size is the largest standard deviation
+as a share of the scene's extent.  The first growing rule that matches a Gaussian decides.  Pruning rules override
+growth, and compare the size of the children after a split.
 """
 
 import math
@@ -24,23 +24,21 @@ from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale, Thre
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import checked_rows, moment_tables
 
-# What a rule may ask an edit for: numbers of rows that can be, for the Gaussians of a mask.
-
-MAX_ROWS = 2**32 - 2  # sums of 32 bits stay at one more, whatever more there is (cl_kernels/scan.cl)
+MAX_ROWS = 2**32 - 2  # cl_kernels/scan.cl saturates at 2**32 - 1, which marks an overflow
 
 
 def require_rows(copies: int, kept: int) -> None:
-    """Raise ValueError for numbers of rows that cannot be."""
+    """Raise ValueError for numbers of rows that are negative or too large."""
     for name, number in (("copies", copies), ("kept", kept)):
         if not 0 <= number <= MAX_ROWS:
             bound = "0 or more" if number < 0 else f"at most {MAX_ROWS}"
             raise ValueError(f"{name}: expected a number of rows, {bound}, got {number}")
 
 
-def outcomes_of(
+def encode_outcomes(
     chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], kept: int, count: int
 ) -> NDArray[np.uint32]:
-    """Return copies + 1 for the Gaussians that are chosen, 0 for the others, [N]; ValueError as `Edit.choose`."""
+    """Return copies + 1 for the chosen Gaussians, 0 for the others, [N].  Raises ValueError as `Edit.choose` does."""
     numbers = np.asarray(copies)
     if chosen.dtype != np.bool_ or chosen.shape != (count,):
         raise ValueError(f"chosen: expected a mask, bool [{count}], got {chosen.dtype} {list(chosen.shape)}")
@@ -54,13 +52,14 @@ def outcomes_of(
 
 
 MAX_BOUND = 3.0e38  # a bound above all values
-MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that all values but zero reach
+MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that every value except zero reaches
 
 
 class Edit:
-    """The outcome of each Gaussian: its rows, those that are the old one, the factor of fresh scales, a shared opacity.
+    """The outcome of each Gaussian: how many rows it becomes, how many of them are the old row, the factor on the
+    scales of fresh rows, and whether they share its opacity.
 
-    Random numbers depend on `seed`, `step` and the rule alone.
+    Random numbers depend only on `seed`, `step` and the rule.
     """
 
     def __init__(
@@ -79,10 +78,10 @@ class Edit:
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
         self.shared = device.empty(count, np.uint32)
-        self.rule = 0  # number of the rule that acts
-        self.may_rewrite = True  # rows of tables, before they are rearranged
+        self.rule = 0  # index of the rule that is marking
+        self.may_rewrite = True  # whether rules may change rows of tables as they mark
         self.max_rows: int | None = None  # rows at which growth stops; None: no limit
-        self.children: list[tuple[str, NDArray[np.integer], NDArray[np.floating]]] = []  # what set_children was given
+        self.children: list[tuple[str, NDArray[np.integer], NDArray[np.floating]]] = []  # arguments of set_children
         self._program = device.program("density.cl")
         self._program.start_edit(items=count, **self._outcome, count=count)
 
@@ -92,9 +91,9 @@ class Edit:
 
     @property
     def survey(self) -> Survey:
-        """The training views, in which the rules see the Gaussians before the edit.  Raises ConfigError without any."""
+        """The training views, which show the Gaussians as they are before the edit.  Raises ConfigError without any."""
         if self._survey is None:
-            raise ConfigError("a rule needs training photographs; expected an edit with a survey of them")
+            raise ConfigError("a rule needs training photographs, and there are none; leave the rule out")
         return self._survey
 
     def at(self, schedule: Schedule) -> float:
@@ -102,7 +101,7 @@ class Edit:
         return at_step(schedule, self.step)
 
     def random(self) -> np.random.Generator:
-        """Return random numbers that depend on the seed, the step and the acting rule alone."""
+        """Return a generator that depends only on the seed, the step and the rule."""
         return np.random.default_rng([self.seed, self.step, self.rule])
 
     def mark(
@@ -117,9 +116,10 @@ class Edit:
         opacity_below: float = math.inf,
         shared: bool = False,
     ) -> None:
-        """Give an outcome to every Gaussian in the box; sizes are shares of the extent.
+        """Give an outcome to every Gaussian within the bounds; sizes are shares of the extent.
 
-        shared: its rows are together as opaque as it was.  Raises ValueError for numbers of rows that cannot be.
+        copies, kept, shrink: as for `choose`.  shared: the rows together are as opaque as the Gaussian was.  Raises
+        ValueError for numbers of rows that are negative or too large.
         """
         require_rows(copies, kept)
         gaussians = self.gaussians
@@ -143,14 +143,15 @@ class Edit:
         )
 
     def matching(self, statistic: str, other: str, gradient_above: float) -> float:
-        """Return the threshold of `statistic` that as many Gaussians reach as reach `gradient_above` in `other`."""
+        """Return the threshold of `statistic` that is reached by as many Gaussians as reach `gradient_above` in
+        `other`."""
         if self.gaussians.count == 0:
             return MIN_BOUND
         share = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
         return max(float(np.quantile(self.stats.mean(statistic), 1 - share)), MIN_BOUND)
 
     def threshold(self, statistic: str, threshold: Threshold) -> float:
-        """Return the number of a threshold on a statistic, at the step of the edit."""
+        """Return a threshold on a statistic as a number, at the step of the edit."""
         if isinstance(threshold, PixelQuantile):
             return self.scene_scale.texture_quantile(threshold.quantile)
         if not isinstance(threshold, Quantile):
@@ -161,16 +162,16 @@ class Edit:
     def choose(
         self, chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], kept: int, shrink: float = 1.0
     ) -> None:
-        """Give an outcome to the Gaussians that are `chosen`, [N].
+        """Give an outcome to the Gaussians of a mask, [N].
 
-        copies: rows that each becomes, one number or [N]; kept: how many of them are the old row, with its moments and
-        statistics; the others are fresh.  Raises ValueError for another shape or type, and for numbers of rows below 0
-        or beyond MAX_ROWS.
+        copies: rows that each becomes, one number or [N].  kept: how many of them are the old row, with its moments
+        and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.  Raises ValueError for a
+        wrong shape or type, and for numbers of rows below 0 or above MAX_ROWS.
         """
         count = self.gaussians.count
         self._program.mark_chosen(
             items=count,
-            outcome=self.gaussians.device.upload(outcomes_of(chosen, copies, kept, count)),
+            outcome=self.gaussians.device.upload(encode_outcomes(chosen, copies, kept, count)),
             copies=self.copies,
             kept=self.kept,
             shrink=self.shrink,
@@ -180,20 +181,19 @@ class Edit:
         )
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Write values [n, components] into different rows, [n], of a table; fresh rows copy them.
+        """Write values, [n, components], into distinct rows, [n], of a table; fresh rows copy them.
 
         Raises ConfigError in an edit that may only remove.
         """
         if not self.may_rewrite:
-            remedy = "expected rules that remove: use this one in densify"
-            raise ConfigError(f"a rule writes {name} of Gaussians that stay; {remedy}")
+            raise ConfigError(f"a rule changes {name} of Gaussians that stay; use it in densify instead")
         self.gaussians.set_rows(name, rows, values)
 
     def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Write values [n, copies, components] into the rows that different Gaussians, [n], become, of a table.
+        """Write values, [n, copies, components], of a table into the rows that distinct Gaussians, [n], become.
 
-        Rows of Gaussians that become another number of them in the end, as where growth is undone, stay as they are.
-        Raises ValueError for other rows than in `checked_rows` and for values of another shape.
+        Gaussians that end with another number of rows, because growth was undone, stay as they are.  Raises
+        ValueError for invalid rows (`checked_rows`) and for values of a wrong shape.
         """
         components = self.gaussians.tables[name].components
         if values.ndim != 3 or len(values) != len(rows) or values.shape[2] != components:
@@ -201,7 +201,7 @@ class Edit:
         self.children.append((name, checked_rows(rows, self.gaussians.count), values))
 
     def zero_moments(self, rows: NDArray[np.integer], parameters: Collection[str] | None = None) -> None:
-        """Set Adam's moments of different rows, [n], to zero; of all that is trained, or of some parameters."""
+        """Set Adam's moments of distinct rows, [n], to zero, for some parameters or for all that are trained."""
         trained = self.gaussians.trained if parameters is None else parameters
         names = [table for parameter in trained for table in moment_tables(parameter)]
         self.gaussians.zero_rows([name for name in names if name in self.gaussians.tables], rows)
@@ -212,21 +212,21 @@ class Edit:
 
     @property
     def room(self) -> int | None:
-        """Rows that may still be added to the outcomes so far; negative: too many already; None: no limit."""
+        """Rows that rules may still add; negative: too many already; None: no limit."""
         return None if self.max_rows is None else self.max_rows - int(self.rows().sum(dtype=np.int64))
 
     def undo_growth(self, refused: NDArray[np.bool_]) -> None:
-        """Let the Gaussians of a mask, [N], that were to become several stay as they are."""
+        """Leave the Gaussians of a mask, [N], as they are if they were to become several."""
         refused = refused & (self.rows() > 1)
-        for array, alone in zip(self._outcome.values(), (1, 1, 1, 0), strict=True):
-            array.set(np.where(refused, alone, array.get()))
+        for array, unchanged in zip(self._outcome.values(), (1, 1, 1, 0), strict=True):
+            array.set(np.where(refused, unchanged, array.get()))
 
     def limit(self, limit: int) -> None:
-        """Undo growth until at most `limit` rows remain; the smallest means of the first single column come first."""
+        """Undo growth until at most `limit` rows remain; the smallest means of the first scalar statistic go first."""
         rows = self.rows().astype(np.int64)
         growing = np.flatnonzero(rows > 1)
-        single = [name for name, column in self.stats.columns.items() if column.components == 1]
-        score = self.stats.mean(single[0]) if single else np.zeros(len(rows), np.float32)
+        scalars = [name for name, column in self.stats.columns.items() if column.components == 1]
+        score = self.stats.mean(scalars[0]) if scalars else np.zeros(len(rows), np.float32)
         order = growing[np.argsort(-score[growing], kind="stable")]
         total = int(np.minimum(rows, 1).sum()) + np.cumsum(rows[order] - 1)
         refused = np.zeros(len(rows), bool)
@@ -235,38 +235,38 @@ class Edit:
 
 
 class Rule(Settings):
-    """A condition on Gaussians, and the outcome of those that meet it."""
+    """A condition on Gaussians, and the outcome for Gaussians that meet it."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     grows: ClassVar[bool] = True  # whether it may add Gaussians
-    rewrites: ClassVar[bool] = False  # changes tables as it marks, with edit.set_rows: later rules see that
+    rewrites: ClassVar[bool] = False  # whether it changes tables as it marks (edit.set_rows), which later rules see
 
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the rule acts."""
 
     @property
     def statistics(self) -> set[str]:
-        """Columns that the rule reads."""
+        """Names of the statistics that the rule reads."""
         return set()
 
     @property
     def tables(self) -> set[str]:
-        """Tables of the Gaussians that the rule reads beside the parameters."""
+        """Tables of the Gaussians that the rule reads in addition to the parameters."""
         return set()
 
     @property
     def columns(self) -> list[type[Statistic]]:
-        """The classes of its statistics, and of the columns that divide them."""
+        """The classes of its statistics, and of the statistics that divide them."""
         known = variants(Statistic)
         read = [known[name] for name in self.statistics if name in known]
         return [*read, *(known[kind.divisor] for kind in read if kind.divisor in known)]
 
     def excluded(self) -> Mapping[str, str]:
-        found = dict(self.conflicts)
+        conflicts = dict(self.conflicts)
         for kind in self.columns:
-            found |= kind.conflicts
-        return found
+            conflicts |= kind.conflicts
+        return conflicts
 
     @abstractmethod
     def mark(self, edit: Edit) -> None:

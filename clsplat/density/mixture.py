@@ -1,4 +1,4 @@
-"""Two Gaussians as one: the mean and covariance of their mixture, the mean of their colors, and their mass."""
+"""Merge pairs of Gaussians: the mean and covariance of their mixture, the mean of their colors, and their mass."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ from clsplat.formats.splats import inverse_opacities
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
-Size = Callable[[Floats], Floats]  # of Gaussians, from their log scales [N, 3]: [N], up to a constant
-THOMSEN = 1.6075  # exponent of Knud Thomsen's formula for the surface of an ellipsoid (2004), within 1.1 %
-LEAST, MOST = 1e-6, 0.99  # opacities of mixtures; beyond 0.99 no renderer of 3DGS draws more
+Size = Callable[[Floats], Floats]  # log scales, [N, 3] -> size, [N], up to a constant factor
+THOMSEN = 1.6075  # exponent of Knud Thomsen's formula for the surface of an ellipsoid (2004), error at most 1.1 %
+MIN_OPACITY, MAX_OPACITY = 1e-6, 0.99  # renderers of 3DGS clamp alpha at 0.99
 
 
 def volume(log_scales: Floats) -> Floats:
-    """Return the volumes of ellipsoids over 4π/3, [N] scene units³."""
+    """Return the volumes of ellipsoids divided by 4π/3, [N] scene units³."""
     found: Floats = np.exp(log_scales.sum(axis=1))
     return found
 
 
 def surface(log_scales: Floats) -> Floats:
-    """Return the surfaces of ellipsoids over 4π, [N] scene units², by Thomsen's formula."""
+    """Return the surface areas of ellipsoids divided by 4π, [N] scene units², by Thomsen's formula."""
     products = (log_scales.sum(axis=1, keepdims=True) - log_scales) * THOMSEN
     found: Floats = np.exp(products).mean(axis=1) ** (1 / THOMSEN)
     return found
@@ -37,34 +37,37 @@ def mass_of(tables: dict[str, Floats], size: Size = volume) -> Floats:
 
 @dataclass(frozen=True)
 class Mixtures:
-    """The moments of pairs of Gaussians, each weighted by its mass."""
+    """The moments of mixtures of two Gaussians, each weighted by its mass."""
 
-    mass: Floats  # [pairs], of both
-    share: Floats  # [pairs, 1], of the second
+    mass: Floats  # [pairs] of both together
+    share: Floats  # [pairs, 1] share of the second in the mass
     means: Floats  # [pairs, 3] scene units
     covariance: Floats  # [pairs, 3, 3] scene units²
 
     @classmethod
-    def of(cls, tables: dict[str, Floats], mass: Floats, first: Rows, second: Rows) -> "Mixtures":
-        """Return those of rows `first` and `second`, [pairs]; mass: of all rows, as `mass_of` returns it."""
+    def from_pairs(cls, tables: dict[str, Floats], mass: Floats, first: Rows, second: Rows) -> "Mixtures":
+        """Compute the mixtures of rows `first` and `second`, [pairs].  mass: of all rows, from `mass_of`."""
         total = mass[first] + mass[second]
         share = (mass[second] / total)[:, None]
         means = (1 - share) * tables["means"][first] + share * tables["means"][second]
         covariance = np.zeros((len(first), 3, 3))
         for rows, weight in ((first, 1 - share), (second, share)):
             offset = tables["means"][rows] - means
-            own = covariance_of(tables["quats"][rows], tables["log_scales"][rows])
-            covariance += weight[:, :, None] * (own + offset[:, :, None] * offset[:, None, :])
+            within = covariance_of(tables["quats"][rows], tables["log_scales"][rows])
+            covariance += weight[:, :, None] * (within + offset[:, :, None] * offset[:, None, :])
         return cls(total, share, means, covariance)
 
     def opacity(self, log_scales: Floats, size: Size = volume) -> Floats:
-        """Return the opacities that keep the mass, [pairs], within what is drawn."""
-        return np.clip(self.mass / size(log_scales), LEAST, MOST)
+        """Return the opacities that preserve the mass, [pairs], clamped to the range that renderers use."""
+        return np.clip(self.mass / size(log_scales), MIN_OPACITY, MAX_OPACITY)
 
 
-def merged(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = volume) -> dict[str, Floats]:
-    """Return Gaussians with mean and covariance of mixtures of `first` and `second`, by parameter, [pairs, ...]."""
-    mixtures = Mixtures.of(tables, mass_of(tables, size), first, second)
+def merge(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = volume) -> dict[str, Floats]:
+    """Return Gaussians with the mean and covariance of the mixtures of rows `first` and `second`, by parameter.
+
+    Each table has the shape [pairs, components].
+    """
+    mixtures = Mixtures.from_pairs(tables, mass_of(tables, size), first, second)
     share = mixtures.share
     variances, axes = np.linalg.eigh(mixtures.covariance)  # scene units²
     log_scales = log_scales_of(variances)
@@ -81,7 +84,7 @@ def merged(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = vo
 
 
 def log_scales_of(variances: Floats) -> Floats:
-    """Return log scales of variances along the axes, scene units²."""
+    """Return the log scales for variances along the axes, [N, 3] scene units²."""
     return np.asarray(0.5 * np.log(np.maximum(variances, 1e-30)))
 
 

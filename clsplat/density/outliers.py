@@ -1,4 +1,4 @@
-"""Rules for Gaussians that training photographs hardly hold: far outside of the scene, or wide on the screen."""
+"""Define rules that remove Gaussians far outside the scene, or wide on the screen (floaters)."""
 
 from typing import ClassVar, Literal
 
@@ -10,14 +10,14 @@ from clsplat.density.edit import Edit, Rule
 from clsplat.density.survey import WEIGHT, Survey
 from clsplat.render.filters import AT_REST
 
-DEVIATIONS = 3  # of a radius in pixels, cl_kernels/project.cl
+DEVIATIONS = 3  # standard deviations in a radius in pixels (cl_kernels/project.cl)
 
 
 class PruneFar(Rule):
-    """Remove Gaussians that are far outside of the scene.
+    """Remove Gaussians that are far outside the scene.
 
-    The middle of the scene is the median of the means on each axis; its size is the median distance from there.  Brush
-    has the number of sizes, and another size: a side of a box around most of the means.
+    The center of the scene is the median of the means on each axis; its size is the median distance from there.  Brush
+    uses the same factor, but takes as size a side of the box around most means.
     """
 
     type: Literal["prune_far"] = "prune_far"
@@ -26,7 +26,7 @@ class PruneFar(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"distance_above"})
 
     distance_above: Positive = 100
-    """Distance from the middle, by the scene's size, above which a Gaussian is removed; by step."""
+    """Distance from the center, as a multiple of the scene's size, above which a Gaussian is removed; by step."""
 
     def mark(self, edit: Edit) -> None:
         means = edit.gaussians.get("means").astype(np.float64)
@@ -37,21 +37,22 @@ class PruneFar(Rule):
 
 
 def largest_on_screen(survey: Survey) -> NDArray[np.float64]:
-    """Return the largest size of each Gaussian on the screen, its largest standard deviation as a share of the
-    photograph's width, over the training photographs in which it has weight, [N]; 0 where it has none."""
-    found = np.zeros(survey.count)
-    for look in survey.looks(survey.views):
-        size = look.radius().astype(np.float64) / DEVIATIONS / look.photograph.camera.width
-        np.maximum(found, size, out=found, where=look.sum(WEIGHT) > 0)
-    return found
+    """Return the largest size of each Gaussian on the screen over the training views that show it, [N]; 0 if none does.
+
+    The size is its largest standard deviation as a share of the image width.
+    """
+    largest = np.zeros(survey.count)
+    for view in survey.render(survey.views):
+        size = view.radius().astype(np.float64) / DEVIATIONS / view.photograph.camera.width
+        np.maximum(largest, size, out=largest, where=view.sum(WEIGHT) > 0)
+    return largest
 
 
 class PruneWide(Rule):
-    """Remove Gaussians that are large on the screen, in one training photograph or more: some are haze before its
-    camera.
+    """Remove Gaussians that are large on the screen in a training view: some are haze in front of its camera.
 
-    Half the photograph is the limit of on-the-fly-nvs (Meuleman et al. 2025).  Plain walls and skies may be made of
-    large ones, too: it belongs before steps that close the holes.
+    The default, half the image, is the limit of on-the-fly-nvs (Meuleman et al. 2025).  Plain walls and skies may
+    consist of large Gaussians, too: let steps follow that close the holes.
     """
 
     type: Literal["prune_wide"] = "prune_wide"
@@ -59,8 +60,8 @@ class PruneWide(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_above"})
 
     size_above: Positive = 0.5
-    """Size on the screen above which a Gaussian is removed: largest standard deviation as a share of the photograph's
-    width; by step."""
+    """Size on the screen above which a Gaussian is removed: largest standard deviation as a share of the image width;
+    by step."""
 
     def mark(self, edit: Edit) -> None:
-        edit.choose(edit.survey.once(largest_on_screen) > edit.at(self.size_above), copies=0, kept=0)
+        edit.choose(edit.survey.cached(largest_on_screen) > edit.at(self.size_above), copies=0, kept=0)

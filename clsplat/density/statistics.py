@@ -1,8 +1,8 @@
-"""Statistics of each Gaussian over the views since the last edit, in named columns that density rules read.
+"""Accumulate statistics of each Gaussian over the views since the last edit, for density rules to read.
 
-A column is a table `stats/<name>`: the sum of one number per view, or of several, over the views that see the
-Gaussian.  Its mean is the sum divided by the number of those views, or by another column.  Only columns that a rule
-reads are summed.
+A statistic is a table `stats/<name>`: a sum over the views that see the Gaussian, of one number per view or of several.
+Its mean is the sum divided by the number of these views, or by another statistic.  Only statistics that a rule reads
+are summed.
 """
 
 from abc import abstractmethod
@@ -18,34 +18,34 @@ from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array, constants
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame
 
-FOLDER = "stats/"
+PREFIX = "stats/"
 SEEN = "stats/seen"
 ABS_X = int(constants("splat.h")["SUM_ABS_X"])
 WEIGHT = int(constants("splat.h")["SUM_WEIGHT"])
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
 
-OF_CONICS = {  # records and sums have others for the pixel's box (cl_kernels/splat.h)
-    "box": "it reads the inverse covariance of splats, which a box does not have; choose another screen filter (mip is "
-    "the nearest), or another rule"
+NEEDS_CONIC = {  # with the box filter, splats and sums have other values (cl_kernels/splat.h)
+    "box": "it reads the inverse covariance of splats, which the box filter does not compute; choose another screen "
+    "filter (mip is the most similar), or another rule"
 }
 
 
 class Statistic(Settings):
-    """A column, and how a view adds to it."""
+    """A sum over views for each Gaussian."""
 
-    components: ClassVar[int] = 1  # numbers of each Gaussian; rules that compare a mean with a threshold need 1
+    components: ClassVar[int] = 1  # numbers per Gaussian; rules that compare a mean with a threshold need 1
     pixel_sums: ClassVar[int] = PIXEL_SUMS  # number of sums over pixels that the backward pass must compute
-    divisor: ClassVar[str] = "seen"  # column that divides the sum: views that see the Gaussian, or another column
-    of_all_views: ClassVar[bool] = False  # the mean is multiplied by the number of training views
+    divisor: ClassVar[str] = "seen"  # what divides the sum: the number of views that see it, or another statistic
+    is_total: ClassVar[bool] = False  # whether the mean is multiplied by the number of training views
 
     @abstractmethod
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
-        """Add a view to `total`, [components, S].  grad_mean2d: [2, S] px⁻¹."""
+        """Add a view to `total`, [components, capacity].  grad_mean2d: [2, capacity] px⁻¹."""
 
 
 class ScreenGrad(Statistic):
-    """Length of the gradient by the projected mean, in normalized device coordinates (Kerbl et al. 2023).
+    """Norm of the gradient with respect to the projected mean, in normalized device coordinates (Kerbl et al. 2023).
 
     Published thresholds have the same unit.
     """
@@ -71,7 +71,7 @@ class ScreenGradAbs(Statistic):
 
 
 class ScreenGradAbsSum(Statistic):
-    """The absolute sums of `screen_grad_abs` in x and in y, added (Gaussian Opacity Fields, Yu et al. 2024)."""
+    """The absolute sums of `screen_grad_abs`, x plus y (Gaussian Opacity Fields, Yu et al. 2024)."""
 
     type: Literal["screen_grad_abs_sum"] = "screen_grad_abs_sum"
     pixel_sums = ABS_X + 2
@@ -83,9 +83,9 @@ class ScreenGradAbsSum(Statistic):
 
 
 class Texture(Statistic):
-    """The photograph's gradient magnitude under the splat, per px: Σ α T |∇I| / Σ α T over pixels of all views.
+    """Mean gradient magnitude of the photographs under the splat, per px: Σ α T |∇I| / Σ α T over all pixels and views.
 
-    Both sums leave out masked pixels.
+    Masked pixels do not count.
     """
 
     type: Literal["texture"] = "texture"
@@ -108,7 +108,7 @@ class ScreenRadius(Statistic):
 
 
 class BlendWeight(Statistic):
-    """Weight of a splat in the image: α T, summed over pixels whose texture is known."""
+    """Weight of a splat in the image: α T, summed over the pixels that are not masked."""
 
     type: Literal["blend_weight"] = "blend_weight"
     pixel_sums = TEXTURE + 1
@@ -121,18 +121,21 @@ StatisticName = Annotated[str, VariantName(Statistic, lambda kind: kind.componen
 
 
 class SplatStats:
-    """The columns of a model, and the number of views that see each Gaussian."""
+    """The statistics of a model, and the number of views that see each Gaussian.
+
+    S is the capacity of the tables.
+    """
 
     def __init__(
         self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",), training_views: int = 1
     ) -> None:
-        """Attach the columns `names` and their divisors, drop all others; existing columns keep their sums."""
+        """Add the tables for `names` and their divisors, and drop all others; existing tables keep their sums."""
         self.gaussians, self.training_views = gaussians, training_views
         known = variants(Statistic)
         needed = {*names, *(known[name].divisor for name in names)}
         self.columns = {name: kind() for name, kind in known.items() if name in needed}
-        tables = {SEEN: 1} | {FOLDER + name: column.components for name, column in self.columns.items()}
-        for name in [name for name in gaussians.tables if name.startswith(FOLDER) and name not in tables]:
+        tables = {SEEN: 1} | {PREFIX + name: column.components for name, column in self.columns.items()}
+        for name in [name for name in gaussians.tables if name.startswith(PREFIX) and name not in tables]:
             del gaussians.tables[name]
         for name, components in tables.items():
             if name not in gaussians.tables:
@@ -140,25 +143,25 @@ class SplatStats:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The columns, in the order in which their classes are defined."""
+        """Names of the statistics, in the order in which their classes are defined."""
         return tuple(self.columns)
 
     @property
     def pixel_sums(self) -> int:
-        """Number of sums over pixels that the backward pass must compute for these columns."""
+        """Number of sums over pixels that the backward pass must compute for these statistics."""
         return max((column.pixel_sums for column in self.columns.values()), default=PIXEL_SUMS)
 
     def total(self, name: str) -> Array:
-        """Return a column's sums over views, [components, S]."""
-        return self.gaussians[FOLDER + name]
+        """Return the sums of a statistic over views, [components, S]."""
+        return self.gaussians[PREFIX + name]
 
     def divisor(self, name: str) -> Array:
-        """Return the sums that divide a column, [S]."""
-        return self.gaussians[FOLDER + self.columns[name].divisor]
+        """Return the sums that divide a statistic, [S]."""
+        return self.gaussians[PREFIX + self.columns[name].divisor]
 
     def factor(self, name: str) -> int:
-        """Return what a column's sum by its divisor is multiplied by."""
-        return self.training_views if self.columns[name].of_all_views else 1
+        """Return the factor on the quotient of a statistic and its divisor."""
+        return self.training_views if self.columns[name].is_total else 1
 
     @property
     def seen(self) -> Array:
@@ -175,18 +178,18 @@ class SplatStats:
             column.add(gaussians, view, grad_mean2d, self.total(name))
 
     def mean(self, name: str) -> NDArray[np.float32]:
-        """Return a column's mean for each Gaussian, on the host, [N]; 0 where the divisor is 0."""
+        """Return the mean of a scalar statistic, on the host, [N]; 0 where the divisor is 0."""
         return self.means(name)[:, 0]
 
     def means(self, name: str) -> NDArray[np.float32]:
-        """Return the means of a column of several components, as `mean` does, [N, components]."""
-        total, divisor = (self.gaussians.get(FOLDER + table) for table in (name, self.columns[name].divisor))
+        """Return the means of all components of a statistic, as `mean` does, [N, components]."""
+        total, divisor = (self.gaussians.get(PREFIX + table) for table in (name, self.columns[name].divisor))
         return np.divide(total, divisor, out=np.zeros_like(total), where=divisor > 0) * np.float32(self.factor(name))
 
     def clear(self) -> None:
-        """Set all columns to zero."""
+        """Set all sums to zero."""
         for name in self.gaussians.tables:
-            if name.startswith(FOLDER):
+            if name.startswith(PREFIX):
                 self.gaussians[name].fill(0)
 
 

@@ -1,4 +1,4 @@
-"""Passes over training views between two steps: what each Gaussian does in their pixels.
+"""Render training views between two steps, and sum what each Gaussian contributes to their pixels.
 
 The sums are those of the backward pass, in a fixed order: the same bits on the same device.
 """
@@ -20,14 +20,14 @@ from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.scene.view import View
 
 WEIGHT, BLENDED, SQUARE = (int(constants("splat.h")[f"SUM_{name}"]) for name in ("WEIGHT", "BLENDED", "SQUARE"))
-LOSSES = L1(weight=0.8), Dssim(weight=0.2)  # of a view in published scores
+LOSSES = L1(weight=0.8), Dssim(weight=0.2)  # the loss of a view in published scores (Kerbl et al. 2023)
 Floats = NDArray[np.float32]
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class SurveyView:
-    """One view as the Gaussians show it; valid until the next.  Pixels that a mask leaves out do not count."""
+class RenderedView:
+    """One view, rendered; valid until the next one is.  Masked pixels do not count."""
 
     rasterizer: Rasterizer
     model: DeviceModel
@@ -35,14 +35,16 @@ class SurveyView:
     frame: Frame
 
     @classmethod
-    def at(cls, rasterizer: Rasterizer, model: DeviceModel, photograph: Photograph, background: Array) -> "SurveyView":
+    def at(
+        cls, rasterizer: Rasterizer, model: DeviceModel, photograph: Photograph, background: Array
+    ) -> "RenderedView":
         """Render the view of a photograph.  background: [3]."""
         return cls(rasterizer, model, photograph, rasterizer.forward(model, photograph.camera, background))
 
     @classmethod
     def each(
         cls, rasterizer: Rasterizer, model: DeviceModel, photographs: Iterable[Photograph], background: Array
-    ) -> Iterator["SurveyView"]:
+    ) -> Iterator["RenderedView"]:
         """Render the views of photographs, one after another.  background: [3]."""
         return (cls.at(rasterizer, model, photograph, background) for photograph in photographs)
 
@@ -52,13 +54,13 @@ class SurveyView:
         return np.ones((camera.height, camera.width), bool) if mask is None else mask
 
     def error(self) -> Floats:
-        """Return the absolute difference of image and photograph, the mean over channels, [height, width]."""
+        """Return the absolute difference of render and photograph, averaged over channels, [height, width]."""
         image = inside(self.frame, self.frame.image.get())
-        found: Floats = np.abs(image - self.photograph.image() / np.float32(255)).mean(axis=2)
-        return found
+        error: Floats = np.abs(image - self.photograph.image() / np.float32(255)).mean(axis=2)
+        return error
 
     def loss(self, losses: Sequence[ImageLoss]) -> float:
-        """Return the sum of losses; pixels that do not count are black afterwards."""
+        """Return the sum of losses; masked pixels of the render are black afterwards."""
         workspace, camera, planes = self._workspace, self.photograph.camera, self.photograph.planes(self._workspace)
         if planes.mask is not None:
             apply_mask(workspace, camera, self.frame.image, planes.mask)
@@ -67,17 +69,17 @@ class SurveyView:
         return sum(loss.add(comparison).value() for loss in losses)
 
     def radius(self) -> Floats:
-        """Return the radius of each splat, three standard deviations, [N] px; 0: not seen."""
+        """Return the radius of each splat, three standard deviations, [N] px; 0: not visible."""
         return np.asarray(self.frame.radius.get()[: self.model.gaussians.count])
 
     def sum(self, number: int, plane: NDArray[Any] | None = None, channel: int | None = None) -> Floats:
-        """Return one of the sums over pixels of cl_kernels/splat.h for each Gaussian, [N]; 0 where it is not seen.
+        """Return a sum over pixels (`SUM_*` in cl_kernels/splat.h) for each Gaussian, [N]; 0 if it is not visible.
 
-        plane: the texture, [height, width], 0 or more; None: 0.  channel: the one whose sum over the image is the loss
-        of the gradients; None: there is no loss.
+        plane: the texture, [height, width], 0 or more; None: 0.  channel: the loss that is differentiated is the sum
+        of this channel over the image; None: no loss.
         """
         camera, counted = self.photograph.camera, self.counted()
-        texture = np.full((camera.rows, camera.stride), -1, np.float32)  # not known
+        texture = np.full((camera.rows, camera.stride), -1, np.float32)  # -1: the pixel does not count
         texture[: camera.height, : camera.width] = np.where(counted, 0 if plane is None else plane, -1)
         uploaded = self._workspace.array("surveyed texture", texture.shape)
         uploaded.set(texture)
@@ -99,12 +101,12 @@ class SurveyView:
 
 
 def _computed(number: int) -> int:
-    """Sums that a backward pass computes so that one of them is there: up to the texture's, or all."""
+    """Return how many sums the backward pass must compute to include this one: up to the texture's, or all."""
     return SQUARE + 1 if number >= BLENDED else BLENDED
 
 
 class Survey:
-    """The training views for the rules of one edit, which see the Gaussians as they are before it."""
+    """The training views for the rules of one edit, rendered with the Gaussians as they are before it."""
 
     def __init__(
         self,
@@ -118,36 +120,35 @@ class Survey:
         self.views = views
         self._rasterizer, self._model, self._photographs = rasterizer, model, photographs
         self._seed, self._step = seed, step
-        self._found: dict[Any, Any] = {}
+        self._cache: dict[Any, Any] = {}
 
-    def looks(self, views: Iterable[View]) -> Iterator[SurveyView]:
+    def render(self, views: Iterable[View]) -> Iterator[RenderedView]:
         """Render views, one after another."""
         photographs = (self._photographs.get(view) for view in views)
-        return SurveyView.each(self._rasterizer, self._model, photographs, self._photographs.background)
+        return RenderedView.each(self._rasterizer, self._model, photographs, self._photographs.background)
 
     @property
     def count(self) -> int:
         """Number of Gaussians, N."""
         return self._model.gaussians.count
 
-    def drawn(self, number: int) -> list[View]:
-        """Return that many of the views, drawn by seed and step, in their order; all where there are no more."""
+    def sample_views(self, number: int) -> list[View]:
+        """Return a random sample of the views, by seed and step, in their order; all if there are no more."""
         count = len(self.views)
-        places = np.random.default_rng([self._seed, self._step, count, number]).permutation(count)[:number]
-        return [self.views[place] for place in np.sort(places)]
+        indices = np.random.default_rng([self._seed, self._step, count, number]).permutation(count)[:number]
+        return [self.views[index] for index in np.sort(indices)]
 
-    def once(self, function: Callable[..., Found], *arguments: Any) -> Found:
-        """Return function(survey, *arguments); rules that ask for the same share it."""
+    def cached(self, function: Callable[..., Result], *arguments: Any) -> Result:
+        """Return function(survey, *arguments), computed once for all rules of the edit."""
         key = function, arguments
-        if key not in self._found:
-            self._found[key] = function(self, *arguments)
-        found: Found = self._found[key]
-        return found
+        if key not in self._cache:
+            self._cache[key] = function(self, *arguments)
+        result: Result = self._cache[key]
+        return result
 
 
-def scaled(values: NDArray[np.float64], counted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return values between 0 for the least of those that count and 1 for the largest; all 0 where these are equal."""
-    least, most = (
-        float(bound(values[counted], initial=start)) for bound, start in ((np.min, np.inf), (np.max, -np.inf))
-    )
+def normalize(values: NDArray[np.float64], counted: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Map values linearly so that the smallest that counts is 0 and the largest 1; all 0 if these are equal."""
+    least = float(np.min(values[counted], initial=np.inf))
+    most = float(np.max(values[counted], initial=-np.inf))
     return (values - least) / (most - least) if most > least else np.zeros_like(values)

@@ -1,4 +1,4 @@
-"""Thresholds of density rules, a number by step or a quantile of the scene's own values, and their units."""
+"""Define thresholds of density rules, a number by step or a quantile of the scene's values, and their units."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ class Quantile(Settings):
     """The quantile of a statistic over the Gaussians."""
 
     quantile: Share
-    """Share of the Gaussians that stay below the threshold."""
+    """Share of the Gaussians that are below the threshold."""
     of: Literal["gaussians"] = "gaussians"
-    """The Gaussians' own values."""
+    """Take the quantile over the Gaussians."""
 
 
 class PixelQuantile(Settings):
     """The quantile of the texture, per px, over the pixels of the training photographs."""
 
     quantile: Share
-    """Share of the pixels that stay below the threshold."""
+    """Share of the pixels that are below the threshold."""
     of: Literal["pixels"]
-    """The photographs' pixels."""
+    """Take the quantile over the photographs' pixels."""
 
 
 Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explained(", or {quantile, of}")]
@@ -40,7 +40,7 @@ def _no_photographs(share: float) -> float:
 
 @dataclass(frozen=True)
 class SceneScale:
-    """Units of rules: the scene's extent, scene units, and quantiles of the photographs' texture, per px."""
+    """The units of rules: the scene's extent, scene units, and quantiles of the photographs' texture, per px."""
 
     extent: float
     texture_quantile: Callable[[float], float] = _no_photographs

@@ -32,7 +32,7 @@ class Grow(Rule):
     @model_validator(mode="after")
     def _with_a_threshold_of_its_unit(self) -> "Grow":
         name = self.as_many_as or self.statistic
-        if variants(Statistic)[name].of_all_views and "gradient_above" not in self.model_fields_set:
+        if variants(Statistic)[name].is_total and "gradient_above" not in self.model_fields_set:
             raise ValueError(f"'gradient_above' is needed with '{name}', whose unit is another; try 200")
         return self
 

@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from clsplat.core.schedule import Positive
-from clsplat.density.budget import Budget, Moment
+from clsplat.density.budget import Budget, BudgetContext
 from clsplat.density.edit import Edit
 
 
@@ -41,12 +41,12 @@ class Momentum(Budget):
     def statistics(self) -> set[str]:
         return {"screen_grad"}
 
-    def limit(self, edit: Edit, moment: Moment, numbers: dict[str, float]) -> int:
+    def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
         count = edit.gaussians.count
         begin = numbers.setdefault("momentum/start", count)
         momentum = numbers.setdefault("momentum/sum", self.begin * begin)
         end = self.gaussians or begin + momentum
-        target = end if moment.edits == 1 else begin + (end - begin) / moment.divisor ** (2 - moment.share)
+        target = end if context.edits == 1 else begin + (end - begin) / context.divisor ** (2 - context.share)
         eager = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
         numbers["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.most, eager))))
         return min(max(count, int(target)), int(count * (1 + self.growth)))

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from clsplat.core.schedule import Positive
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.statistics import OF_CONICS, Statistic
+from clsplat.density.statistics import NEEDS_CONIC, Statistic
 from clsplat.density.survey import Survey
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import ViewGradients
@@ -26,7 +26,7 @@ FRACTION = 256  # the number is found to one part in so many
 def squared_error(survey: Survey, views: list[View]) -> float:
     """Return the squared differences of images and photographs, summed over the pixels that count."""
     total = 0.0
-    for look in survey.looks(views):
+    for look in survey.render(views):
         difference = inside(look.frame, look.frame.image.get()) - look.photograph.image() / np.float32(255)
         total += float((difference[look.counted()].astype(np.float64) ** 2).sum())
     return total
@@ -71,8 +71,8 @@ class PruneRedundant(Rule):
 
     def mark(self, edit: Edit) -> None:
         survey, gaussians = edit.survey, edit.gaussians
-        order = np.argsort(survey.once(drawn_weights).total, kind="stable")
-        views = survey.drawn(self.views)
+        order = np.argsort(survey.cached(drawn_weights).total, kind="stable")
+        views = survey.sample_views(self.views)
         limit = (1 + edit.at(self.error_rise)) * squared_error(survey, views)
 
         def allowed(number: int) -> bool:
@@ -95,8 +95,8 @@ class ErrorGain(Statistic):
 
     type: Literal["gain"] = "gain"
     divisor: ClassVar[str] = "view_error"
-    conflicts = OF_CONICS
-    of_all_views: ClassVar[bool] = True
+    conflicts = NEEDS_CONIC
+    is_total: ClassVar[bool] = True
 
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_gain(

@@ -11,7 +11,7 @@ from pydantic import Field
 from clsplat.core.schedule import NonNegative
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import SampledPruning
-from clsplat.density.survey import BLENDED, LOSSES, Survey, scaled
+from clsplat.density.survey import BLENDED, LOSSES, Survey, normalize
 from clsplat.density.thresholds import Share
 
 Floats = NDArray[np.float64]
@@ -27,15 +27,15 @@ class Wrong:
 
 def wrong_pixels(survey: Survey, views: int, error_above: float) -> Wrong:
     """Count the wrong pixels in which each Gaussian is blended, over `views` training views."""
-    drawn = survey.drawn(views)
+    drawn = survey.sample_views(views)
     total, weighted = np.zeros(survey.count, np.int64), np.zeros(survey.count)
-    for look in survey.looks(drawn):
+    for look in survey.render(drawn):
         error, counted = look.error().astype(np.float64), look.counted()
-        wrong = counted & (scaled(error, counted) > error_above)
+        wrong = counted & (normalize(error, counted) > error_above)
         pixels = look.sum(BLENDED, wrong).astype(np.int64)  # whole numbers below 2^24: exact
         total += pixels
         weighted += look.loss(LOSSES) * pixels
-    return Wrong(total // max(len(drawn), 1), scaled(weighted, np.ones(len(weighted), bool)))
+    return Wrong(total // max(len(drawn), 1), normalize(weighted, np.ones(len(weighted), bool)))
 
 
 class ByWrongPixels(Rule):
@@ -50,7 +50,7 @@ class ByWrongPixels(Rule):
 
     def wrong(self, edit: Edit) -> Wrong:
         """Return what is asked for, of the Gaussians before the edit."""
-        return edit.survey.once(wrong_pixels, self.views, self.error_above)
+        return edit.survey.cached(wrong_pixels, self.views, self.error_above)
 
 
 class RevertGrowth(ByWrongPixels):

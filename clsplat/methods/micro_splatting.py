@@ -14,7 +14,7 @@ from pydantic import Field
 from clsplat.core.schedule import NonNegative, Positive, explained
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import largest
-from clsplat.density.mixture import mass_of, merged
+from clsplat.density.mixture import mass_of, merge
 from clsplat.density.statistics import SEEN, Statistic, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
 from clsplat.formats.splats import SH_C0, inverse_opacities
@@ -187,7 +187,7 @@ class MergeNeighbors(Rule):
         first, second = first[usable], second[usable]
         if not len(first):
             return
-        for name, values in merged(tables, first, second).items():
+        for name, values in merge(tables, first, second).items():
             edit.set_rows(name, first, values)
         edit.zero_moments(first, ("log_scales", "quats"))  # which belong to other axes
         absorbed = np.zeros(gaussians.count, bool)

@@ -13,7 +13,7 @@ from pydantic import Field
 from clsplat.core.errors import NumericError
 from clsplat.density.control import Change
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.importance import Weights, drawn_order, largest_of, weights
+from clsplat.density.importance import Weights, heaviest, sampling_order, weights
 from clsplat.density.survey import WEIGHT, Survey
 from clsplat.density.thresholds import Share
 from clsplat.gaussians.conversion import from_points
@@ -36,8 +36,8 @@ def drawn_weights(survey: Survey, weight_per_view: float | None = None, drawn: i
 
     weight_per_view: as in `weights`.  drawn: the number of views; None: all.
     """
-    views = survey.views if drawn is None else survey.drawn(drawn)
-    return weights(survey.looks(views), survey.count, weight_per_view)
+    views = survey.views if drawn is None else survey.sample_views(drawn)
+    return weights(survey.render(views), survey.count, weight_per_view)
 
 
 def useless(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
@@ -46,8 +46,8 @@ def useless(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
     It needs the heaviest, which add up to the share `weight_per_view` of its weight.
     """
     found = np.zeros((len(survey.views), survey.count), bool)
-    for here, look in zip(found, survey.looks(survey.views), strict=True):
-        here[:] = (look.radius() > 0) & ~largest_of(look.sum(WEIGHT).astype(np.float64), weight_per_view)
+    for here, look in zip(found, survey.render(survey.views), strict=True):
+        here[:] = (look.radius() > 0) & ~heaviest(look.sum(WEIGHT).astype(np.float64), weight_per_view)
     return found
 
 
@@ -71,8 +71,8 @@ class PruneUseless(Rule):
     """Share of the weight in all views that stays; the smallest weights go."""
 
     def mark(self, edit: Edit) -> None:
-        found = edit.survey.once(drawn_weights, self.weight_per_view, self.views)
-        kept = largest_of(found.total, self.weight_total) & (found.views >= self.views_below)
+        found = edit.survey.cached(drawn_weights, self.weight_per_view, self.views)
+        kept = heaviest(found.total, self.weight_total) & (found.views >= self.views_below)
         edit.choose(~kept, copies=0, kept=0)
 
 
@@ -197,7 +197,7 @@ def drawn_of(
     alpha, depth: [height, width], in [0, 1] and in scene units along the axis; image: [height, width, 3].
     """
     chances = alpha.astype(np.float64).ravel()
-    places = np.sort(drawn_order(chances > 0, chances, random)[:count])
+    places = np.sort(sampling_order(chances > 0, chances, random)[:count])
     camera, (rows, columns) = view.camera, np.divmod(places, alpha.shape[1])
     z = depth[rows, columns].astype(np.float64)
     rays = np.stack(

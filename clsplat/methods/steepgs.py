@@ -15,7 +15,7 @@ from clsplat.core.schedule import NonNegative, Positive, Schedule
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import largest
 from clsplat.density.mixture import covariance_of
-from clsplat.density.statistics import OF_CONICS, Statistic
+from clsplat.density.statistics import NEEDS_CONIC, Statistic
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array
@@ -29,7 +29,7 @@ class Splitting(Statistic):
 
     type: Literal["splitting"] = "splitting"
     components = 6
-    conflicts = OF_CONICS
+    conflicts = NEEDS_CONIC
 
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("saddle.cl").accumulate_splitting(

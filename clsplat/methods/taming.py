@@ -8,10 +8,10 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.density.budget import Budget, Moment
+from clsplat.density.budget import Budget, BudgetContext
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.importance import SampledPruning, drawn_order
-from clsplat.density.survey import BLENDED, LOSSES, WEIGHT, Survey, SurveyView, scaled
+from clsplat.density.importance import SampledPruning, sampling_order
+from clsplat.density.survey import BLENDED, LOSSES, WEIGHT, RenderedView, Survey, normalize
 from clsplat.formats.splats import inverse_opacities
 
 Floats = NDArray[np.float64]
@@ -23,11 +23,11 @@ def by_median(values: NDArray[np.floating]) -> Floats:
     return np.asarray(values / np.median(positive), np.float64) if len(positive) else np.zeros(len(values))
 
 
-def pixel_weights(look: SurveyView) -> Floats:
+def pixel_weights(look: RenderedView) -> Floats:
     """Return the error of a view's pixels and the edges of its photograph, each from 0 to 1, added, [height, width]."""
     counted = look.counted()
     edges = np.abs(scipy.ndimage.laplace(look.photograph.image().mean(axis=2), mode="nearest"))
-    return scaled(look.error().astype(np.float64), counted) + scaled(edges, counted)
+    return normalize(look.error().astype(np.float64), counted) + normalize(edges, counted)
 
 
 def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
@@ -36,8 +36,8 @@ def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
     The terms: depth, radius, and over the pixels where it is blended their weights, their number and its own weight.
     """
     losses, terms = np.zeros(survey.count), np.zeros(survey.count)
-    drawn = survey.drawn(views)
-    for view, look in zip(drawn, survey.looks(drawn), strict=True):
+    drawn = survey.sample_views(views)
+    for view, look in zip(drawn, survey.render(drawn), strict=True):
         radius = look.radius()
         row = view.world_to_camera[2]
         depth = (look.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # no BLAS: bits of any thread count
@@ -63,7 +63,7 @@ class ByScore(Rule):
 
     def score(self, edit: Edit) -> Floats:
         """Return the scores, [N], 0 or more."""
-        gaussians, (losses, terms) = edit.gaussians, edit.survey.once(view_scores, self.views)
+        gaussians, (losses, terms) = edit.gaussians, edit.survey.cached(view_scores, self.views)
         opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         volume = np.exp(gaussians.get("log_scales").astype(np.float64).sum(axis=1))
         values = (25, edit.stats.mean("screen_grad")), (100, opacity), (25, volume)
@@ -90,7 +90,7 @@ class GrowScored(ByScore):
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
         score, random = self.score(edit), edit.random()
         for kind, part in ((kept, (refused & kept).sum() / refused.sum()), (~kept, 1.0)):
-            order = drawn_order((rows > 1) & kind, score, random)
+            order = sampling_order((rows > 1) & kind, score, random)
             added = np.cumsum(rows[order] - 1)
             grown = added <= round(part * room)
             refused[order[grown]] = False
@@ -122,7 +122,7 @@ class Parabola(Budget):
     gaussians: Annotated[int, Field(ge=1)]
     """The number B, to which the last edit may grow."""
 
-    def limit(self, edit: Edit, moment: Moment, numbers: dict[str, float]) -> int:
+    def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
         missing = self.gaussians - edit.gaussians.count
-        left = (moment.edits - 1) / moment.edits
+        left = (context.edits - 1) / context.edits
         return self.gaussians - int(missing * left**2) if missing > 0 else self.gaussians

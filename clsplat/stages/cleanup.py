@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from clsplat.core.errors import NoneInsideError, NumericError
 from clsplat.core.settings import OneOf
-from clsplat.density.control import Box, apply_marks, keep, mark
+from clsplat.density.control import Box, apply_marks, keep_rows, mark
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import SCORES, Score, largest
 from clsplat.density.outliers import PruneFar
@@ -100,7 +100,7 @@ class Crop(Stage):
         kept = np.flatnonzero(self.inside.holds(gaussians.get("means")))
         if not len(kept):
             raise NoneInsideError(f"crop: none of {gaussians.count:,} Gaussians lies inside; expected a larger box")
-        change = keep(gaussians, kept, self.stage)
+        change = keep_rows(gaussians, kept, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
         LOG.info("%s Gaussians kept, which lie inside", f"{change.after:,} of {change.before:,}")
@@ -115,7 +115,7 @@ def scores(run: Run, score: Score = "weight") -> NDArray[np.float64]:
     """Return what each Gaussian does to the training views, [N], summed over their pixels: its blend weight, or the
     squares of the image's derivatives by its value."""
     views = run.scene.split("train")
-    looks = run.survey().looks(run.status.counted(views, "views", len(views)))
+    looks = run.survey().render(run.status.counted(views, "views", len(views)))
     return SCORES[score](looks, run.model.gaussians.count).astype(np.float64)
 
 
@@ -150,7 +150,7 @@ class PruneLeast(Scheduled):
         gaussians, score = run.model.gaussians, scores(run, self.score)
         share = 1 - (self.remove or 0) if self.keep is None else self.keep
         kept = np.flatnonzero(largest(score, max(1, round(share * len(score)))))
-        change = keep(gaussians, kept, self.stage)
+        change = keep_rows(gaussians, kept, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
         lost = 100 * (1 - score[kept].sum() / (score.sum() or 1))

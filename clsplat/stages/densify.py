@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from clsplat.core.errors import NumericError, amount
 from clsplat.core.schedule import AtLeastOne, places
 from clsplat.core.settings import OneOf, variants
-from clsplat.density.budget import Budget, Moment
+from clsplat.density.budget import Budget, BudgetContext
 from clsplat.density.control import Box, densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import Statistic
@@ -143,5 +143,5 @@ class Densify(Scheduled):
             yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._outside(edit)
         if self.budget and self.every and self.stop:
             left = len(places(self.every, run.step - 1, self.stop))
-            moment = Moment(run.step / self.stop, left, run.divisor)
-            yield self.budget.limit(edit, moment, run.numbers)
+            context = BudgetContext(run.step / self.stop, left, run.divisor)
+            yield self.budget.limit(edit, context, run.numbers)

@@ -31,7 +31,7 @@ from clsplat.core.errors import (
 from clsplat.core.files import CHECKPOINTS, PIPELINE, atomic
 from clsplat.core.resources import full_version
 from clsplat.core.schedule import at_step
-from clsplat.density.statistics import FOLDER as STATS_FOLDER
+from clsplat.density.statistics import PREFIX as STATS_PREFIX
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients
 from clsplat.gaussians.gaussians import Gaussians
@@ -219,8 +219,8 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
         make_room(run, gaussians.count)
         run.adam = Adam(gaussians)
         run.adam.updates = state.updates
-        columns = [name for name in tables if name.startswith(STATS_FOLDER) and name != SEEN]
-        run.stats = SplatStats(gaussians, [name.removeprefix(STATS_FOLDER) for name in columns])
+        columns = [name for name in tables if name.startswith(STATS_PREFIX) and name != SEEN]
+        run.stats = SplatStats(gaussians, [name.removeprefix(STATS_PREFIX) for name in columns])
     for key, table in tables.items():  # those of rules, penalties and plug-ins too
         name = key.removeprefix("gaussians/")
         if name not in gaussians.tables:

@@ -72,7 +72,7 @@ def _seen(run: Run) -> float:
     """The largest share of the blocks of rows that one of some training views sees, with room for more."""
     survey, gaussians = run.survey(), run.model.gaussians
     lanes, most = int(run.device.tuning["LANES"]), 0.0
-    for look in survey.looks(survey.drawn(VIEWS)):
+    for look in survey.render(survey.sample_views(VIEWS)):
         keys = look.frame.depth_key.get()[: gaussians.count // lanes * lanes]
         most = max(most, float((keys != NO_SLOT).reshape(-1, lanes).any(axis=1).mean()))
     return GROWTH * most

@@ -14,7 +14,7 @@ from clsplat.core.errors import ConfigError, DataError, amount
 from clsplat.core.files import new_folder, require_free
 from clsplat.core.reading import sha256
 from clsplat.core.text_table import text_table
-from clsplat.density.mixture import Floats, Mixtures, Rows, log_scales_of, mass_of, merged, surface
+from clsplat.density.mixture import Floats, Mixtures, Rows, log_scales_of, mass_of, merge, surface
 from clsplat.formats.splats import not_finite, require_moderate, require_still, unit
 from clsplat.formats.streamed_sog import LOD_META, write_lod
 from clsplat.formats.table import bytes_of, located
@@ -152,7 +152,7 @@ def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
 
 
 def _block_cost(tables: Tables, mass: Floats, size: Floats, first: Rows, second: Rows) -> Floats:
-    mixtures = Mixtures.of(tables, mass, first, second)
+    mixtures = Mixtures.from_pairs(tables, mass, first, second)
     share = mixtures.share[:, 0]
     variances = np.linalg.eigvalsh(mixtures.covariance).astype(np.float64)
     cost: Floats = log_scales_of(variances).sum(axis=1) - (1 - share) * size[first] - share * size[second]
@@ -191,7 +191,7 @@ def _joined(tables: Tables, first: Rows, second: Rows) -> Tables:
     """The tables with mixtures at the rows `first`, and without the rows `second`."""
     kept = np.ones(len(tables["means"]), bool)
     kept[second] = False
-    mixtures = merged(tables, first, second, surface)
+    mixtures = merge(tables, first, second, surface)
     for name, values in mixtures.items():
         tables[name][first] = values
     return {name: table[kept] for name, table in tables.items()}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, amount
 from clsplat.core.files import write_text
 from clsplat.density.control import Box
-from clsplat.density.survey import WEIGHT, SurveyView
+from clsplat.density.survey import WEIGHT, RenderedView
 from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import BUDGET_SHARE, Photographs
@@ -143,7 +143,7 @@ class Membership:
         return "sight" if self.share[view, block] > self.sight else "best"
 
 
-def pairs_of(looks: Iterable[SurveyView], count: int, tile: int) -> Floats:
+def pairs_of(looks: Iterable[RenderedView], count: int, tile: int) -> Floats:
     """Return the (tile, Gaussian) pairs of N = `count` Gaussians over views, [N]: what their training costs.
 
     It is an estimate by the radius of a splat, which an image's sides bound.
@@ -156,7 +156,7 @@ def pairs_of(looks: Iterable[SurveyView], count: int, tile: int) -> Floats:
     return total
 
 
-def share_of(look: SurveyView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
+def share_of(look: RenderedView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the share of a view's pixels that the Gaussians of each block make, [B], and which are seen, [N].
 
     owner: the block of each Gaussian, [N].  Pixels that a mask leaves out do not count.
@@ -274,9 +274,9 @@ class Partitioner:
             seen[block] |= share_of(look, owner, len(found))[1]
         return members, seen | ~seen.any(axis=0)  # what is hidden from all views may come to light in any
 
-    def _looks(self, views: Sequence[View]) -> Iterator[SurveyView]:
+    def _looks(self, views: Sequence[View]) -> Iterator[RenderedView]:
         photographs = (self.photographs.get(view) for view in views)
-        return SurveyView.each(self._rasterizer, self._uploaded, photographs, self.photographs.background)
+        return RenderedView.each(self._rasterizer, self._uploaded, photographs, self.photographs.background)
 
     def _listed(self, members: Membership, block: int) -> list[dict[str, Any]]:
         """The views of a block, in the order of the scene, with reasons."""

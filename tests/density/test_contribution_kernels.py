@@ -7,15 +7,15 @@ from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.checks.density import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.importance import contributions
-from clsplat.density.survey import SurveyView
+from clsplat.density.survey import RenderedView
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer, RenderLimits
 from tests.support.devices import on_devices, on_one_setting
 
 
 def weights(rasterizer, model, photographs):
-    looks = SurveyView.each(rasterizer, model, photographs, rasterizer.device.zeros(3))
-    return contributions(looks, model.gaussians.count)
+    views = RenderedView.each(rasterizer, model, photographs, rasterizer.device.zeros(3))
+    return contributions(views, model.gaussians.count)
 
 
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 24, 24)])

@@ -9,7 +9,7 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.density.importance import sensitivities
-from clsplat.density.survey import BLENDED, SQUARE, WEIGHT, Survey, SurveyView
+from clsplat.density.survey import BLENDED, SQUARE, WEIGHT, RenderedView, Survey
 from clsplat.losses.image import L1, Dssim
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Mask, Photograph
@@ -22,13 +22,15 @@ SIZES = [(0, 16, 16), (1, 16, 16), (1, 1, 1), (16, 17, 15), (17, 33, 31), (65, 2
 
 def look_at(
     device: Device, case: Case, rng=None, mask: Mask | None = None, budget: RenderLimits | None = None
-) -> SurveyView:
+) -> RenderedView:
     """The view of a case, with a random photograph."""
     camera, (width, height) = case.device_camera(device), case.size
     colors = np.zeros((3, height, width)) if rng is None else rng.integers(0, 256, (3, height, width))
     uploaded = None if mask is None else device.upload(mask[None].astype(np.uint8))
     photograph = Photograph(camera, device.upload(colors.astype(np.uint8)), uploaded)
-    return SurveyView.at(Rasterizer(device, "radix", budget), case.model(device), photograph, device.upload(BACKGROUND))
+    return RenderedView.at(
+        Rasterizer(device, "radix", budget), case.model(device), photograph, device.upload(BACKGROUND)
+    )
 
 
 def squares(case: Case) -> np.ndarray:
@@ -54,8 +56,8 @@ def test_numbers_of_flagged_pixels_are_exact(device, rng, count, width, height):
 def test_squares_are_those_of_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     look = look_at(device, case)
-    looks = SurveyView.each(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
-    found = sensitivities(looks, look.model.gaussians.count)
+    views = RenderedView.each(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
+    found = sensitivities(views, look.model.gaussians.count)
     assert found.shape == (count,)
     expected = 2 * squares(case)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * expected.max(initial=0))
@@ -97,9 +99,9 @@ def test_other_sums_do_not_change(device, rng):
 def test_bands_and_repetitions_have_the_same_bits(device, rng):
     case = random_case(rng, 60, 70, 50)
     flags = rng.random((50, 70)) < 0.5
-    looks = [look_at(device, case), look_at(device, case, budget=RenderLimits(60, 3)), look_at(device, case)]
+    views = [look_at(device, case), look_at(device, case, budget=RenderLimits(60, 3)), look_at(device, case)]
     for number, plane, channel in ((BLENDED, flags, None), (WEIGHT, None, None), (SQUARE, None, 1)):
-        found = [look.sum(number, plane, channel) for look in looks]
+        found = [look.sum(number, plane, channel) for look in views]
         assert found[0].any()
         np.testing.assert_array_equal(found[0], found[1])
         np.testing.assert_array_equal(found[0], found[2])
@@ -148,7 +150,7 @@ def test_views_are_drawn_by_seed_and_step():
     views = list(range(25))
 
     def drawn(number: int, seed: int, step: int) -> list[int]:
-        return Survey(None, None, None, views, seed, step).drawn(number)
+        return Survey(None, None, None, views, seed, step).sample_views(number)
 
     one = drawn(10, seed=1, step=600)
     assert len(set(one)) == 10
@@ -167,5 +169,5 @@ def test_rules_share_what_they_ask_for():
         asked.append((given, number))
         return number + 1
 
-    assert [survey.once(found, number) for number in (1, 2, 1)] == [2, 3, 2]
+    assert [survey.cached(found, number) for number in (1, 2, 1)] == [2, 3, 2]
     assert asked == [(survey, 1), (survey, 2)]

@@ -11,9 +11,9 @@ from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.core.errors import ConfigError
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.importance import drawn_order
+from clsplat.density.importance import sampling_order
 from clsplat.density.statistics import SplatStats
-from clsplat.density.survey import Survey, scaled
+from clsplat.density.survey import Survey, normalize
 from clsplat.density.thresholds import SceneScale
 from clsplat.methods.adc import Clone, SplitLarge
 from clsplat.methods.fastgs import PruneInaccurate, PruneSampled, RevertGrowth, Wrong, wrong_pixels
@@ -99,12 +99,12 @@ def test_only_so_many_views_are_rendered(device, rng):
     held = survey._photographs.get
     survey._photographs.get = lambda view: (asked.append(view), held(view))[1]
     wrong_pixels(survey, 7, 0.1)
-    assert asked == survey.drawn(7)
+    assert asked == survey.sample_views(7)
 
 
 def test_draws_are_of_candidates_and_of_none_twice(rng):
     candidates = np.array([True, False, True, True, False, True, True])
-    order = drawn_order(candidates, np.array([1, np.inf, 0.0, 1, 5, 2, np.inf]), rng)
+    order = sampling_order(candidates, np.array([1, np.inf, 0.0, 1, 5, 2, np.inf]), rng)
     assert sorted(order) == [0, 2, 3, 5, 6]
     assert (order[0], order[-1]) == (6, 2), "a weight without bound comes first, one of 0 last"
 
@@ -112,7 +112,7 @@ def test_draws_are_of_candidates_and_of_none_twice(rng):
 def test_draws_are_by_weight(rng):
     """Of three with the weights 1, 2 and 3, two at a time: against the probabilities of drawing one after another."""
     weights, draws = np.array([1.0, 2.0, 3.0]), 20_000
-    last = np.bincount([drawn_order(np.ones(3, bool), weights, rng)[-1] for _ in range(draws)], minlength=3)
+    last = np.bincount([sampling_order(np.ones(3, bool), weights, rng)[-1] for _ in range(draws)], minlength=3)
     expected = [2 / 6 * 3 / 4 + 3 / 6 * 2 / 3, 1 / 6 * 3 / 5 + 3 / 6 * 1 / 3, 1 / 6 * 2 / 5 + 2 / 6 * 1 / 4]
     np.testing.assert_allclose(last / draws, expected, atol=0.015)
 
@@ -201,6 +201,6 @@ def test_rules_without_photographs_say_so(device, rng, rule: Rule):
 
 def test_values_are_scaled_between_the_valid_extremes():
     counted = np.array([True, True, False, True])
-    assert scaled(np.array([2.0, 6.0, 100.0, 3.0]), counted)[counted].tolist() == [0, 1, 0.25]
-    assert scaled(np.full(3, 7.0), np.ones(3, bool)).tolist() == [0, 0, 0]
-    assert scaled(np.zeros(3), np.zeros(3, bool)).tolist() == [0, 0, 0]
+    assert normalize(np.array([2.0, 6.0, 100.0, 3.0]), counted)[counted].tolist() == [0, 1, 0.25]
+    assert normalize(np.full(3, 7.0), np.ones(3, bool)).tolist() == [0, 0, 0]
+    assert normalize(np.zeros(3), np.zeros(3, bool)).tolist() == [0, 0, 0]

@@ -7,7 +7,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
 from clsplat.density.importance import largest
-from clsplat.density.mixture import covariance_of, mass_of, merged
+from clsplat.density.mixture import covariance_of, mass_of, merge
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale
 from clsplat.gaussians.gaussians import INTERVAL2
@@ -240,7 +240,7 @@ def test_a_merged_covariance_is_that_of_the_mixture(rng):
         "sh_base": rng.normal(size=(2 * count, 3)),
         "sh_rest": rng.normal(size=(2 * count, 45)),
     }
-    found = merged(tables, np.arange(count), np.arange(count, 2 * count))
+    found = merge(tables, np.arange(count), np.arange(count, 2 * count))
     np.testing.assert_allclose(np.linalg.norm(found["quats"], axis=1), 1, rtol=1e-9)
     assert all(np.isfinite(values).all() for values in found.values())
 

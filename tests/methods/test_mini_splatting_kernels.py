@@ -10,7 +10,7 @@ from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.checks.density import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.edit import Edit
-from clsplat.density.importance import Weights, largest_of
+from clsplat.density.importance import Weights, heaviest
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
@@ -46,7 +46,7 @@ def test_some_views_are_drawn(device, rng):
     held = [photograph_of(device, case, rng.random((31, 33)) < 0.8) for _ in range(5)]
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
     survey = Survey(Rasterizer(device, "radix"), case.model(device), source, range(5), 3, 600)
-    places = survey.drawn(2)
+    places = survey.sample_views(2)
     of_two = drawn_weights(survey, 0.9, 2)
     alone = Survey(Rasterizer(device, "radix"), case.model(device), source, places, 3, 600)
     expected = drawn_weights(alone, 0.9)
@@ -68,7 +68,7 @@ def test_a_view_has_no_use_for_the_rest_of_what_it_sees(device, rng, count, widt
         for here, mask in zip(found, masks, strict=True):
             splats = case.project()
             weight = ref.contribution(splats, width, height, mask)
-            expected = (splats.radius > 0) & ~largest_of(weight, share)
+            expected = (splats.radius > 0) & ~heaviest(weight, share)
             np.testing.assert_array_equal(here, expected)
 
 
@@ -85,7 +85,7 @@ def test_a_view_has_no_use_for_the_rest_of_what_it_sees(device, rng, count, widt
     ],
 )
 def test_the_fewest_that_make_a_share(weight, share, expected):
-    assert largest_of(np.array(weight, float), share).tolist() == expected
+    assert heaviest(np.array(weight, float), share).tolist() == expected
 
 
 @on_one_setting

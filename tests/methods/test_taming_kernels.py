@@ -9,7 +9,7 @@ from scipy.ndimage import convolve
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import random_case, safe_case
-from clsplat.density.budget import Moment
+from clsplat.density.budget import BudgetContext
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
@@ -134,7 +134,7 @@ def test_a_low_score_is_removed_sooner(device, rng):
 def limit(most: int, count: int, edits: int) -> int:
     """What the budget allows to an edit of `count` Gaussians, the first of so many."""
     edit = SimpleNamespace(gaussians=SimpleNamespace(count=count))
-    return Parabola(gaussians=most).limit(edit, Moment(share=0.5, edits=edits, divisor=1.0), {})
+    return Parabola(gaussians=most).limit(edit, BudgetContext(share=0.5, edits=edits, divisor=1.0), {})
 
 
 @pytest.mark.parametrize(("first", "most", "edits"), [(100, 1500, 28), (1000, 1001, 5), (10, 10**6, 1), (7, 8, 100)])

@@ -8,7 +8,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import Decay
-from clsplat.density.budget import Moment
+from clsplat.density.budget import BudgetContext
 from clsplat.methods.dash import Momentum
 from clsplat.photos.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, course, knots
 from clsplat.photos.sampling import ViewSettings
@@ -117,18 +117,20 @@ def edit_of(count: int, eager: int, step: int = 100) -> SimpleNamespace:
 def test_momentum_follows_its_formulas():
     budget, numbers = Momentum(), {}
     begin = 1000
-    assert budget.limit(edit_of(begin, 300), Moment(0.1, 5, 4.0), numbers) == 1200  # at most a fifth more
+    assert budget.limit(edit_of(begin, 300), BudgetContext(0.1, 5, 4.0), numbers) == 1200  # at most a fifth more
     assert numbers == {"momentum/start": begin, "momentum/sum": 5200}  # .98 * 5000 + 300
     target = begin + 5200 / 4**1.7
-    assert budget.limit(edit_of(1200, 0), Moment(0.3, 5, 4.0), numbers) == int(1200 * (1 + min(0.2, target / 1200 - 1)))
+    assert budget.limit(edit_of(1200, 0), BudgetContext(0.3, 5, 4.0), numbers) == int(
+        1200 * (1 + min(0.2, target / 1200 - 1))
+    )
     assert numbers["momentum/sum"] == 5200  # it does not fall
-    assert budget.limit(edit_of(6000, 900), Moment(0.9, 5, 1.0), numbers) == 6200
+    assert budget.limit(edit_of(6000, 900), BudgetContext(0.9, 5, 1.0), numbers) == 6200
     assert numbers["momentum/sum"] == 5996
-    assert budget.limit(edit_of(6900, 0), Moment(0.95, 1, 2.0), numbers) == 6996  # the last edit reaches it
-    assert budget.limit(edit_of(7400, 0), Moment(0.95, 1, 1.0), numbers) == 7400  # pruned ones are replaced
+    assert budget.limit(edit_of(6900, 0), BudgetContext(0.95, 1, 2.0), numbers) == 6996  # the last edit reaches it
+    assert budget.limit(edit_of(7400, 0), BudgetContext(0.95, 1, 1.0), numbers) == 7400  # pruned ones are replaced
 
 
 def test_momentum_with_a_number_of_its_own_ends_there():
     budget, numbers = Momentum(gaussians=2000), {}
     for share in (0.2, 0.5, 0.8):
-        assert budget.limit(edit_of(1950, 1900), Moment(share, 5, 1.0), numbers) == 2000
+        assert budget.limit(edit_of(1950, 1900), BudgetContext(share, 5, 1.0), numbers) == 2000

@@ -84,7 +84,7 @@ def test_the_least_gaussians_go(tiny_scene, pipeline, tmp_path):
 def test_the_score_may_be_the_change_of_the_image(tiny_scene, pipeline, tmp_path):
     run = opened(tiny_scene, pipeline, tmp_path)
     by_weight = scores(run)
-    score = sensitivities(run.survey().looks(run.scene.split("train")), run.model.gaussians.count)
+    score = sensitivities(run.survey().render(run.scene.split("train")), run.model.gaussians.count)
     before = run.model.gaussians.get("means")
     PruneLeast(stage="prune_least", remove=0.8, score="sensitivity").act(run)
     kept = np.sort(np.argsort(-score, kind="stable")[: round(0.2 * len(before))])

@@ -5,7 +5,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.density import mixture
-from clsplat.density.mixture import covariance_of, mass_of, merged, surface, volume
+from clsplat.density.mixture import covariance_of, mass_of, merge, surface, volume
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.workflows import lod
@@ -50,7 +50,7 @@ def moments(tables: dict[str, np.ndarray], row: int) -> tuple[float, np.ndarray,
 def test_a_pair_becomes_the_moments_of_its_mixture(rng):
     tables = wide(model(rng, 40))
     first, second = np.arange(0, 40, 2), np.arange(1, 40, 2)
-    found = merged(tables, first, second, surface)
+    found = merge(tables, first, second, surface)
     for pair, (i, j) in enumerate(zip(first, second, strict=True)):
         (a, mean_a, cov_a), (b, mean_b, cov_b) = moments(tables, i), moments(tables, j)
         mean = (a * mean_a + b * mean_b) / (a + b)
@@ -69,7 +69,7 @@ def test_a_pair_becomes_the_moments_of_its_mixture(rng):
 def test_a_mixture_is_symmetric_in_its_pair(rng, size):
     tables = wide(model(rng, 20))
     one, two = np.arange(10), np.arange(10, 20)
-    there, back = merged(tables, one, two, size), merged(tables, two, one, size)
+    there, back = merge(tables, one, two, size), merge(tables, two, one, size)
     for found in (there, back):
         found["covariance"] = covariance_of(found.pop("quats"), found["log_scales"])
     for name in there:

@@ -15,7 +15,7 @@ from clsplat.density.control import cap_opacity, densify
 from clsplat.density.edit import Edit
 from clsplat.density.importance import contributions, sensitivities
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
-from clsplat.density.survey import SurveyView
+from clsplat.density.survey import RenderedView
 from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
@@ -238,18 +238,20 @@ def contribution(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
         photographs = [photograph_of(device, case, mask) for mask in masks]
         expected = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
         black, background = np.zeros(3, np.float32), rng.random(3).astype(np.float32)
-        found, again = (contributions(_looks(device, case, photographs, black), count) for _ in range(2))
+        found, again = (contributions(_render_views(device, case, photographs, black), count) for _ in range(2))
         what = f"blend weights of {count} Gaussians"
         yield by_element("blend_backward", what, found, np.asarray(expected), SUM, floor=0.1)
         yield equal("blend_backward", f"{what}, a second time", again, found)
-        found = sensitivities(_looks(device, case, photographs, background), count)
+        found = sensitivities(_render_views(device, case, photographs, background), count)
         squares = np.sum([_squares(case, background, mask) for mask in masks], axis=0)
         yield by_norm("blend_backward", f"squared changes of the image by {count} Gaussians", found, squares, GRADIENT)
 
 
-def _looks(device: Device, case: Case, photographs: list[Photograph], background: NDArray[Any]) -> Iterator[SurveyView]:
+def _render_views(
+    device: Device, case: Case, photographs: list[Photograph], background: NDArray[Any]
+) -> Iterator[RenderedView]:
     """The views of photographs, by a new rasterizer and model."""
-    return SurveyView.each(Rasterizer(device, "radix"), case.model(device), photographs, device.upload(background))
+    return RenderedView.each(Rasterizer(device, "radix"), case.model(device), photographs, device.upload(background))
 
 
 def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray[Any]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.density.visible_error import FAINT, UNSEEN, VisibleError
+from clsplat.stages.palette import FAINT, UNSEEN, VisibleError
 
 POSITIONS = np.array([[3.0, 0, 1], [2, 2, 2], [0, 3, 1.5], [-1, 2.5, 0.5], [2.5, -1, 0.2]])
 
@@ -20,8 +20,8 @@ def seen(rng) -> SimpleNamespace:
 
 
 def error_of(seen: SimpleNamespace, coefficients: int) -> VisibleError:
-    looks = [SimpleNamespace(sum=lambda number, row=row: row) for row in seen.weights]
-    return VisibleError.of(zip(looks, POSITIONS, strict=True), seen.means, coefficients)
+    views = [SimpleNamespace(sum=lambda number, row=row: row) for row in seen.weights]
+    return VisibleError.from_views(zip(views, POSITIONS, strict=True), seen.means, coefficients)
 
 
 def shown(seen: SimpleNamespace, i: int, error: np.ndarray) -> float:
