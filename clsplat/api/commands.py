@@ -63,27 +63,27 @@ def resume(
     scene: PathLike | None = None,
     *,
     set: Overrides = (),
+    steps: int | None = None,
     device: "str | Device | None" = None,
     live: int | None = None,
     on: PathLike | None = None,
 ) -> Path:
-    """Go on with a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder.
+    """Continue a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder.
 
-    scene: where its photographs are, if they have moved; live, on: as for `run`.
+    scene: where its photographs are, if they have moved; steps: train to this step; set, live, on: as for `run`.
     """
+    return run_job(resume_job(folder, scene, set, steps, on), device, live)
+
+
+def resume_job(
+    folder: PathLike, scene: PathLike | None, set: Overrides, steps: int | None, on: PathLike | None
+) -> "Job":
+    """Return the job that `resume` runs, to describe it instead."""
     from clsplat.pipeline.execution import values_of
     from clsplat.sweeps.experiment import Job
 
     load_plugins()
-    return run_job(Job.resume(Path(folder), overrides(set), path_of(scene), values_of(path_of(on))), device, live)
-
-
-def steps_key(folder: Path) -> str:
-    """Return the key of the steps that a run trains, such as optimize.steps."""
-    from clsplat.runs.state import steps_key
-
-    load_plugins()
-    return steps_key(folder)
+    return Job.resume(Path(folder), overrides(set), path_of(scene), values_of(path_of(on)), steps)
 
 
 def status(folder: PathLike) -> dict[str, Any]:
@@ -206,7 +206,7 @@ def run_job(job: "Job", device: "str | Device | None", live: int | None = None, 
         )
     from clsplat.sweeps.batch import run_sweep  # and what tells devices apart, which a single run does not need
 
-    run_sweep(work, job.out, work.execution, device, job.start)
+    run_sweep(work, job.state, work.execution, device, job.start)
     return job.out
 
 

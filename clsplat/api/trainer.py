@@ -98,11 +98,12 @@ class Trainer:
             out = tempfile.mkdtemp(prefix="clsplat-")
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
         self.out = Path(out)
-        outputs.check_places(self.pipeline, RunState.read(self.out))
+        before = RunState.read(self.out)
+        outputs.check_places(self.pipeline, before)
         rasterizer = self.pipeline.settings.rasterizer
         opened = proved(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:
-            status = holding.enter_context(run_folder.opened(self.out, start, step=0))
+            status = holding.enter_context(run_folder.opened(before, start, step=0))
             with failures_recorded(status, as_raised=True):
                 scene_of_run = RunScene.of(self.pipeline.settings.scene, self.scene)
                 self._run = opening.make_run(self.pipeline, scene_of_run, opened, self.out, status)

@@ -88,12 +88,11 @@ def resume(
     on: OnOption = None,
 ) -> None:
     """Go on with a run from its newest checkpoint, or train one that is done for longer."""
-    changes = [*(set_ or ()), *([f"{commands.steps_key(folder)}={steps}"] if steps is not None else [])]
+    job = commands.resume_job(folder, scene, set_ or (), steps, on)
     if dry_run:
-        file = folder / "pipeline.yaml"
-        terminal.show(commands.describe_run(file, scene, folder, set=changes, device=device, start="resume", on=on))
+        terminal.show(job.describe(device))
     else:
-        _show_summary(commands.resume(folder, scene, set=changes, device=device, live=live, on=on))
+        _show_summary(commands.run_job(job, device, live))
 
 
 def _show_summary(folder: Path) -> None:

@@ -27,18 +27,18 @@ LOG = logging.getLogger("clsplat")
 
 def describe(
     pipeline: Pipeline,
-    out: Path,
+    state: RunState,
     device: str | Device | None,
     start: Start,
     read: ReadScene = read_run_scene,
     with_time: bool = False,
 ) -> str:
-    """Return a line for each stage of a run in `out`, which is left as it is.
+    """Return a line for each stage of a run in a folder, which is left as it is.
 
     read: reads the scene; with_time: whether lines follow that say how long a new run takes.
     Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
     """
-    state = RunState.read(out)
+    out = state.out
     begun = start_of(pipeline, state, start)
     if begun is None:
         return f"{out}: up to date"

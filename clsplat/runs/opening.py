@@ -268,14 +268,14 @@ def _adapted(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pipel
     """The pipeline with what its `adapt` decides."""
     if not pipeline.undecided:
         return pipeline
-    pipeline = adapted(pipeline, measured(run.scene, lambda: _share_with_sky(run)))
+    pipeline = adapted(pipeline, measured(run.scene, lambda name: _measured_by_module(name, run)))
     for one in pipeline.decisions:
         tell(one.text)
     return pipeline
 
 
-def _share_with_sky(run: Run) -> float | None:
-    return next((kind.measured(run) for kind in unlisted().values() if kind.measure == "sky"), None)
+def _measured_by_module(name: str, run: Run) -> float | None:
+    return next((kind.measured(run) for kind in unlisted().values() if kind.measure == name), None)
 
 
 def _taken(pipeline: Pipeline, run: Run) -> Pipeline:

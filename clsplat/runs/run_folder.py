@@ -38,20 +38,21 @@ Start = Literal["new", "resume", "restart"]
 
 
 @contextmanager
-def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
+def opened(state: RunState, start: Start, **values: Any) -> Iterator[StatusFile]:
     """Make the run folder, swept of what killed runs have left, and its status with `values`; hold it in the block.
 
     A run that ends before its first step, without a checkpoint, leaves no new folder and no run in one that was there;
     one that was done before, and is refused before it goes on, stays done.
     Raises ConfigError when it holds another run, OutputError when it is in use or cannot be written.
     """
-    check_run_folder(RunState.read(out), start)
+    check_run_folder(state, start)
+    out = state.out
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     with told_as(out):
         make_folder(out)
     try:
         with lock.held(out) as require_held:
-            state = RunState.read(out)  # again: another run may have ended since
+            state = RunState.read(out)  # again, now that it is held: another process may have run there since
             check_run_folder(state, start)
             sweep(out, border=PIPELINE)
             before = read_text(out / STATUS) if state.phase is Phase.DONE else None
@@ -145,23 +146,23 @@ def check_run_folder(state: RunState, start: Start) -> None:
 # The folder of a run that was given none, and whether a folder has what a run would make.
 
 
-def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
+def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> RunState:
     """Return the default run folder: a new run beside one that is not up to date gets the next free number."""
-    number, free = 1, folder
+    number, state = 1, RunState.read(folder)
 
-    def taken() -> bool:
-        if (free / LOCK).exists():
+    def is_taken() -> bool:
+        if LOCK in state.names:
             try:
-                if not lock.check_free(free):
+                if not lock.check_free(state.out):
                     return True
             except OutputError:  # by a run that may not have begun yet
                 return True
-        return PIPELINE in (state := RunState.read(free)).names and not (pipeline and is_same(pipeline, state))
+        return PIPELINE in state.names and not (pipeline and is_same(pipeline, state))
 
-    while start == "new" and taken():
+    while start == "new" and is_taken():
         number += 1
-        free = folder.with_name(f"{folder.name}-{number}")
-    return free
+        state = RunState.read(folder.with_name(f"{folder.name}-{number}"))
+    return state
 
 
 def start_of(pipeline: Pipeline, state: RunState, start: Start) -> Start | None:

@@ -100,6 +100,13 @@ class RunState:
         return self.phase is Phase.DONE and not self.difference(pipeline) and not self.lost
 
     @property
+    def steps_key(self) -> str:
+        """The key of the training's steps: optimize.steps, also where the pipeline cannot be read, or another."""
+        with suppress(ConfigError):  # which the resumed run raises again
+            return f"{self.pipeline.settings.training.stage}.steps"
+        return "optimize.steps"
+
+    @property
     def restart(self) -> str:
         """The command that begins the run again."""
         pipeline = "…"
@@ -146,10 +153,3 @@ def sum_of(file: Path) -> str | None:
     with suppress(DataError):
         return sha256(file)
     return None
-
-
-def steps_key(folder: Path) -> str:
-    """Return the key of the steps in a run folder, such as optimize.steps; this one too where the file tells none."""
-    with suppress(ConfigError):  # told when the run is resumed
-        return f"{RunState.read(folder).pipeline.settings.training.stage}.steps"
-    return "optimize.steps"

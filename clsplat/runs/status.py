@@ -21,14 +21,15 @@ from clsplat.training.status import status_of
 LOG = logging.getLogger("clsplat")
 
 
-def run_status(out: Path) -> dict[str, Any]:
+def run_status(state: RunState) -> dict[str, Any]:
     """Return what status.json says, the last report and the metrics of a run folder; of a matrix no step.
 
     state: as there, or killed where its process on this machine has ended; silent: seconds since the heartbeat of a run
-    that has not ended, on whatever machine it runs; ahead: seconds by which that is in the future, from a minute on.
+    that has not ended, on whatever machine it runs; ahead: seconds by which that is in the future, from a minute on;
+    advice: how to continue a run that has stopped before its end, else "".
     Raises DataError when the folder holds no run, or a damaged status.json or metrics.json.
     """
-    state = RunState.read(out)
+    out = state.out
     if not (status := dict(state.status)):
         raise DataError(f"{out}: has no readable status.json; expected the folder of a run")
     try:
@@ -50,7 +51,9 @@ def run_status(out: Path) -> dict[str, Any]:
     metrics = None
     if METRICS in state.names:
         metrics = read_metrics(out / METRICS).model_dump(exclude_unset=True)
-    return {"run": str(out), **status, "last": _last(out), "metrics": metrics}
+    has_stopped = status["state"] in ("killed", "failed", "interrupted")
+    advice = _advice(state) if has_stopped else ""
+    return {"run": str(out), **status, "last": _last(out), "metrics": metrics, "advice": advice}
 
 
 def _last(out: Path) -> dict[str, Any] | None:
@@ -72,8 +75,8 @@ def status_text(status: dict[str, Any]) -> str:
         lines.append(f"its clock is ahead by {status['ahead']} s{_place(status)}: its silence cannot be told")
     if status.get("message"):
         lines.append(status["message"])
-    if status["state"] in ("killed", "failed", "interrupted") and (advice := _advice(status)):
-        lines.append(advice)
+    if status["advice"]:
+        lines.append(status["advice"])
     if status["last"] and status["metrics"] is None:
         lines.append("last report: " + _figures(status["last"], ("step", "loss", "psnr", "gaussians")))
     if placed := photographs_text((status["metrics"] or {}).get("preparation", {})):
@@ -84,11 +87,10 @@ def status_text(status: dict[str, Any]) -> str:
     return "\n  ".join(map(one_line, lines))
 
 
-def _advice(status: dict[str, Any]) -> str:
-    """How to go on with a run that has ended before its end."""
-    out, message = Path(status["run"]), str(status.get("message"))
-    resume = f"clsplat resume {in_shell(out)}"
-    state = RunState.read(out)
+def _advice(state: RunState) -> str:
+    """How to continue a run that has stopped before its end."""
+    out, status = state.out, state.status
+    message, resume = str(status.get("message")), f"clsplat resume {in_shell(out)}"
     if PIPELINE not in state.names or resume in message or "--restart" in message:
         return ""
     if "cells" in status or state.checkpoints:

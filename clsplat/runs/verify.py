@@ -111,26 +111,32 @@ def output(expected: str | None, path: Path) -> str:
 NO_SUMS = "is missing, as in runs of a Trainer; without it the outputs are not verified"
 
 
-def verify(out: Path) -> dict[str, Any]:
+def verify(state: RunState) -> dict[str, Any]:
     """Return `whole`, the `state` of the run, and for each file in `objects` whether it is whole, and a detail.
+
+    Where a file is damaged, `remedy` says how to get it back.
 
     Files that a run declares and does not have yet are no fault while it is not done.  Raises DataError where the
     folder holds no run.
     """
-    state = RunState.read(out)
+    out = state.out
     if state.phase is Phase.EMPTY:
         raise DataError(f"{out}: holds neither pipeline.yaml nor status.json; expected the folder of a run")
-    objects = list(_objects(state))
-    return {
-        "run": str(out),
-        "state": state.state_name,
-        "whole": all(one["whole"] for one in objects),
-        "objects": objects,
-    }
+    cells: dict[str, RunState] = {}
+    objects = list(_objects(state, cells))
+    damaged = [one["file"] for one in objects if not one["whole"]]
+    verified = {"run": str(out), "state": state.state_name, "whole": not damaged, "objects": objects}
+    if damaged:
+        cell = cells.get(damaged[0].partition("/")[0])
+        verified["remedy"] = _remedy(cell if cell and cell.phase else state, verified)
+    return verified
 
 
-def _objects(state: RunState, whole: bool = False) -> Iterator[dict[str, Any]]:
-    """What is found of each file of a run, or of the cells of a matrix; `whole` expects those of one that is done."""
+def _objects(state: RunState, cells: dict[str, RunState], whole: bool = False) -> Iterator[dict[str, Any]]:
+    """What is found of each file of a run, or of the cells of a matrix; `whole` expects those of one that is done.
+
+    cells: takes the folders of the cells, by name.
+    """
     out, names, status, sums = state.out, state.names, state.status, state.sums or {}
     settings: dict[str, Any] = {}
     ended = CHECKSUMS in names and (PIPELINE in sums or not sums)  # while a run goes on it lists other files
@@ -139,8 +145,9 @@ def _objects(state: RunState, whole: bool = False) -> Iterator[dict[str, Any]]:
     yield one(PIPELINE, partial(settings_file, state, settings))
     yield one(STATUS, status_file)
     if "matrix" in settings or "cells" in status:
-        for cell in _cells(out, done):
-            yield from ({**found, "file": f"{cell.out.name}/{found['file']}"} for found in _objects(cell, done))
+        cells |= _cells(out, done)
+        for name, cell in sorted(cells.items()):
+            yield from ({**found, "file": f"{name}/{found['file']}"} for found in _objects(cell, {}, done))
         if done or COMPARISON in names:
             yield one(COMPARISON, require_end)
         return
@@ -177,13 +184,15 @@ def look_at(out: Path, name: str, look: Callable[[Path], Any]) -> dict[str, Any]
         return {"file": name, "whole": False, "detail": reason}
 
 
-def _cells(out: Path, done: bool) -> list[RunState]:
-    """The folders of a matrix's cells: those that are there, and of one that is done all of them."""
-    names = {one.name for one in out.iterdir() if one.is_dir() and not one.is_symlink() and RunState.read(one).phase}
-    with suppress(ConfigError):  # told already
-        found = load_experiment(str(out / PIPELINE)) if done else None
-        names |= {cell.name for cell in found.cells} if found else set()
-    return [RunState.read(out / name) for name in sorted(names)]
+def _cells(out: Path, done: bool) -> dict[str, RunState]:
+    """The folders of a matrix's cells, by name: those that are there, and of a finished matrix all of them."""
+    folders = [path for path in out.iterdir() if path.is_dir() and not path.is_symlink()]
+    cells = {path.name: state for path in folders if (state := RunState.read(path)).phase}
+    with suppress(ConfigError):  # which the pipeline's own line says
+        experiment = load_experiment(str(out / PIPELINE)) if done else None
+        for cell in experiment.cells if experiment else ():
+            cells.setdefault(cell.name, RunState.read(out / cell.name))
+    return cells
 
 
 # What `clsplat check RUN` says of a run folder.
@@ -199,18 +208,15 @@ def verdict(found: dict[str, Any]) -> str:
     names = ", ".join(damaged[:3]) + (", …" if len(damaged) > 3 else "")
     return (
         f"{found['run']}: {found['state']}; {len(damaged)} of {len(found['objects'])} files are damaged or missing: "
-        f"{names}; copy them again, or {found.get('remedy') or _remedy(found, damaged[0])}"
+        f"{names}; copy them again, or {found['remedy']}"
     )
 
 
-def _remedy(found: dict[str, Any], file: str) -> str:
-    """How the run of a damaged file comes back: from a checkpoint that is whole, or from the beginning."""
-    out = Path(found["run"])
-    folders = [*(one for one in (out / file).parents if out in one.parents), out]
-    state = next(one for one in map(RunState.read, folders) if one.phase or one.out == out)
+def _remedy(state: RunState, verified: dict[str, Any]) -> str:
+    """How to get the files of a run back: from a checkpoint that is whole, or from the beginning."""
     if state.phase is Phase.DONE and "cells" not in state.status and not state.lost and PIPELINE in state.names:
         return "go without them: all outputs are whole, and only training for longer needs these files"
-    whole = {out / one["file"] for one in found["objects"] if one["whole"]}
+    whole = {Path(verified["run"], one["file"]) for one in verified["objects"] if one["whole"]}
     goes_on = "cells" in state.status or any(path in whole for path in state.checkpoints)
     goes_on |= state.phase < Phase.STATELESS and not (state.checkpoints or state.status.get("checkpoint"))
     if state.out / PIPELINE not in whole:
@@ -239,13 +245,13 @@ def check(pipeline: str) -> dict[str, Any]:
     """
     if is_field(Path(pipeline)) and is_there(Path(pipeline)):
         return {"path": pipeline, "name": Path(pipeline).name, "parameters": load_field(pipeline).shape.learned}
-    phase = RunState.read(Path(pipeline)).phase
-    if not phase and pipeline not in shipped() and is_model(Path(pipeline)):
+    state = RunState.read(Path(pipeline))
+    if not state.phase and pipeline not in shipped() and is_model(Path(pipeline)):
         return examine(Path(pipeline))
     if len(Path(pipeline).parts) > 1 and not is_there(origin(Path(pipeline))):
         raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
-    if Path(pipeline).is_dir() and (phase or pipeline not in shipped()):
-        return verify(Path(pipeline))
+    if Path(pipeline).is_dir() and (state.phase or pipeline not in shipped()):
+        return verify(state)
     if found := load_experiment(pipeline):
         return {"path": str(found.path), "name": found.name, "cells": [cell.name for cell in found.cells]}
     checked = load(pipeline)

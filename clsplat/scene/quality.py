@@ -27,19 +27,20 @@ class Measures:
     """Mean distance between a point and where photographs show it, px at the size of training; None: not known."""
     scene: Scene | None = None
     """The scene as it is trained on; None: not prepared yet."""
-    look_for_sky: Callable[[], float | None] = lambda: None
+    measure: Callable[[str], float | None] = lambda name: None
+    """Returns what a training module measures; None: not known."""
 
     @cached_property
     def sky(self) -> float | None:
         """The share of the training photographs that show a sky, for which all are read; None: not known."""
-        return self.look_for_sky()
+        return self.measure("sky")
 
 
-def measured(scene: Scene, look_for_sky: Callable[[], float | None] = lambda: None) -> Measures:
+def measured(scene: Scene, measure: Callable[[str], float | None] = lambda name: None) -> Measures:
     """Return the measures of a scene, as it is trained on."""
     views = {view.name: view for view in reversed(scene.with_fold().split("train"))}  # the largest size of each
     errors = reprojection_errors(scene.tracks, views.values())
-    return Measures(len(views), None if errors is None else float(errors.mean()), scene, look_for_sky)
+    return Measures(len(views), None if errors is None else float(errors.mean()), scene, measure)
 
 
 def nearest_points(scene: Scene) -> float | None:

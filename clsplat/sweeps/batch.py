@@ -285,19 +285,21 @@ def run_one(
 
 def run_sweep(
     experiment: Experiment,
-    out: Path,
+    state: RunState,
     execution: Execution,
     device: str | None,
     start: Start,
 ) -> None:
-    """Run every cell, unless its result is in the store, and write compare.html; `out` is as after a run without store.
+    """Run every cell, unless its result is in the store, and write compare.html, as a run without a store does.
 
     device: the one of the engine inline.  A cell that fails does not stop the others; at the end a ClsplatError is
     raised with the exit code of the first one.  Raises Interrupted, Different.
     """
     store = Store(execution.keeps or Path())
-    with matrix_opened(experiment, out, start) as (status, failures):
-        sweep = _Sweep(experiment.name, experiment.text, experiment.cells, out, store, failures, start == "restart")
+    with matrix_opened(experiment, state, start) as (status, failures):
+        sweep = _Sweep(
+            experiment.name, experiment.text, experiment.cells, state.out, store, failures, start == "restart"
+        )
         sweep.status = status
         sweep.run(execution, device)
 

@@ -39,19 +39,20 @@ LOG = logging.getLogger("clsplat")
 
 def run_pipeline(
     pipeline: Pipeline,
-    out: Path,
+    state: RunState,
     device: str | Device | None,
     start: Start,
     live: Live | None = None,
     minutes: float | None = None,
 ) -> None:
-    """Run one pipeline in its folder, with a log and a progress bar.  Raises ClsplatError; status.json tells why.
+    """Run one pipeline in its folder, with a log and a progress bar.  Raises ClsplatError; status.json says why.
 
-    minutes: as for `Job.run`.
+    state: the folder before the run; minutes: as for `Job.run`.
     """
-    outputs.check_places(pipeline, RunState.read(out))
+    outputs.check_places(pipeline, state)
+    out = state.out
     with (
-        run_folder.opened(out, start, step=0) as status,
+        run_folder.opened(state, start, step=0) as status,
         stopping_on_signals(stop_at_once),
         failures_recorded(status),
         terminal.logging_to(out / LOG_FILE),
@@ -84,8 +85,13 @@ class Job:
     """A checked pipeline or matrix, and the folder that it runs in."""
 
     work: Pipeline | Experiment
-    out: Path
+    state: RunState  # the folder, as it is before the run
     start: Start
+
+    @property
+    def out(self) -> Path:
+        """The folder."""
+        return self.state.out
 
     @classmethod
     def open(
@@ -103,15 +109,32 @@ class Job:
         checkpoint, "restart" begins again in a folder that holds a run; execution: of a matrix, in the place of its
         own.
         """
+        state = None
         if out is not None:
-            is_there(out)
+            is_there(out)  # raises where no file can have that name
+            state = RunState.read(out)
+        return cls._open(pipeline, state, scene, overrides, start, execution)
+
+    @classmethod
+    def _open(
+        cls,
+        pipeline: str,
+        state: RunState | None,
+        scene: Path | None,
+        overrides: Sequence[str],
+        start: Start,
+        execution: dict[str, Any] | None,
+    ) -> "Job":
         changes = overrides_of(overrides, scene)
-        if found := load_experiment(pipeline, changes, execution):
-            return cls(found, out or free_folder(Path("runs") / found.name, None, start), start)
-        if execution is not None:
+        experiment = load_experiment(pipeline, changes, execution)
+        if experiment is None and execution is not None:
             raise ConfigError(f"{pipeline}: is a single run; --on is for a file with `matrix:`")
+        if state:
+            return cls(experiment or load(pipeline, changes), state, start)
+        if experiment:
+            return cls(experiment, free_folder(Path("runs") / experiment.name, None, start), start)
         checked = load(pipeline, changes)
-        return cls(checked, out or free_folder(Path("runs") / checked.settings.name, checked, start), start)
+        return cls(checked, free_folder(Path("runs") / checked.settings.name, checked, start), start)
 
     @classmethod
     def resume(
@@ -120,18 +143,19 @@ class Job:
         overrides: Sequence[str] = (),
         scene: Path | None = None,
         execution: dict[str, Any] | None = None,
+        steps: int | None = None,
     ) -> "Job":
-        """Take the pipeline that a run folder holds, to go on with it there.  Raises ConfigError or DataError.
+        """Take the pipeline that a run folder holds, to continue it there.  Raises ConfigError or DataError.
 
-        scene: where its photographs are; default: where they were; execution: as for `open`.
+        scene: where its photographs are; default: where they were; execution: as for `open`; steps: of its training.
         """
-        file = out / PIPELINE
-        if not file.is_file():
-            again = (
-                f"; give its `clsplat run … --out {in_shell(out)} --resume` again" if (out / STATUS).is_file() else ""
-            )
-            raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has begun{again}")
-        return cls.open(str(file), scene, out, overrides, "resume", execution)
+        state = RunState.read(out)
+        if PIPELINE not in state.names:
+            again = f"; run its `clsplat run … --out {in_shell(out)} --resume` again" if STATUS in state.names else ""
+            raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has started{again}")
+        if steps is not None:
+            overrides = [*overrides, f"{state.steps_key}={steps}"]
+        return cls._open(str(out / PIPELINE), state, scene, overrides, "resume", execution)
 
     def describe(self, device: str | Device | None = None) -> str:
         """What would run, as lines of text, of a single run with a rough range of the time that it takes.
@@ -139,8 +163,8 @@ class Job:
         Raises what `run` raises before it begins.
         """
         if isinstance(self.work, Experiment):
-            return describe_matrix(self.work, self.out, device, self.start)
-        return describe.describe(self.work, self.out, device, self.start, with_time=True)
+            return describe_matrix(self.work, self.state, device, self.start)
+        return describe.describe(self.work, self.state, device, self.start, with_time=True)
 
     def run(self, device: str | Device | None = None, live: int | None = None, minutes: float | None = None) -> None:
         """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why.
@@ -154,18 +178,17 @@ class Job:
             raise ConfigError(
                 "--minutes: expected a single run; a matrix has several: give optimize.steps in its cells"
             )
-        state = RunState.read(self.out)
-        if minutes is not None and self.start == "resume" and state.phase >= Phase.BEGUN:
+        if minutes is not None and self.start == "resume" and self.state.phase >= Phase.BEGUN:
             raise ConfigError("--minutes is for a new run, whose steps it chooses; leave it out to go on with this one")
         with previewed(live) as preview:
             if isinstance(self.work, Experiment):
-                run_matrix(self.work, self.out, device, self.start, preview)
-            elif start := start_of(self.work, state, self.start):
+                run_matrix(self.work, self.state, device, self.start, preview)
+            elif start := start_of(self.work, self.state, self.start):
                 folder = self.work.settings.scene.folder
                 if start == "resume" and not folder.exists():
                     remedy = f"`clsplat resume {in_shell(self.out)} --scene DIR` says where they are now"
                     raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
-                run_pipeline(self.work, self.out, device, start, preview, minutes)
+                run_pipeline(self.work, self.state, device, start, preview, minutes)
             else:
                 _require_same_photographs(self.work, self.out)
                 LOG.info("%s: up to date: its outputs are whole; change a setting or the folder to run again", self.out)
@@ -191,15 +214,18 @@ def previewed(port: int | None) -> Iterator[Live | None]:
 
 
 def run_matrix(
-    experiment: Experiment, out: Path, device: str | Device | None, start: Start, live: Live | None = None
+    experiment: Experiment, state: RunState, device: str | Device | None, start: Start, live: Live | None = None
 ) -> None:
-    """Run every cell in its folder below `out` and write compare.html; a resumed matrix leaves finished cells alone.
+    """Run every cell in its folder, and write compare.html; a resumed matrix leaves finished cells alone.
+
+    state: the folder before the run.
 
     A cell that fails does not stop the others; at the end a ClsplatError is raised with the exit code of the first one.
     Interrupted stops the whole.
     """
-    done = done_cells(experiment, out, start)  # before anything changes in the folder
-    with matrix_opened(experiment, out, start) as (status, failures):
+    out = state.out
+    before, done = read_cells(experiment, out, start)
+    with matrix_opened(experiment, state, start) as (status, failures):
         status.enter("running")
         for number, cell in enumerate(status.counted(experiment.cells, "cells", len(experiment.cells)), 1):
             title = f"cell {number} of {len(experiment.cells)}: {cell.name}"
@@ -208,7 +234,7 @@ def run_matrix(
             try:
                 with failures.kept(cell.name):
                     if cell.name not in done:
-                        run_pipeline(cell.pipeline, out / cell.name, device, start, live)
+                        run_pipeline(cell.pipeline, before[cell.name], device, start, live)
             except Interrupted as stopped:
                 raise Interrupted(f"stopped in {title}; `clsplat resume {in_shell(out)}` goes on with it") from stopped
             status.note(done=number, failed=failures.texts())
@@ -216,14 +242,14 @@ def run_matrix(
 
 
 @contextmanager
-def matrix_opened(experiment: Experiment, out: Path, start: Start) -> Iterator[tuple[StatusFile, Failures]]:
+def matrix_opened(experiment: Experiment, state: RunState, start: Start) -> Iterator[tuple[StatusFile, Failures]]:
     """Hold the folder of a matrix while its cells run; at the end write compare.html.
 
     Raises a ClsplatError with the exit code of the first cell that is among the failures at the end.
     """
-    check_matrix_folder(out)
-    count, failures = len(experiment.cells), Failures("cells")
-    with run_folder.opened(out, start, cells=count, done=0, failed={}) as status, failures_recorded(status):
+    check_matrix_folder(state)
+    count, failures, out = len(experiment.cells), Failures("cells"), state.out
+    with run_folder.opened(state, start, cells=count, done=0, failed={}) as status, failures_recorded(status):
         write_text(out / PIPELINE, experiment.text)
         yield status, failures
         status.require_held()
@@ -233,45 +259,48 @@ def matrix_opened(experiment: Experiment, out: Path, start: Start) -> Iterator[t
         status.end("done", exit_code=0)
 
 
-def done_cells(experiment: Experiment, out: Path, start: Start) -> list[str]:
-    """Return the names of the cells that a resumed matrix leaves alone: they are done, and whole.
+def read_cells(experiment: Experiment, out: Path, start: Start) -> tuple[dict[str, RunState], set[str]]:
+    """Return the folders of the cells, by name, and the names of the cells that a resumed matrix leaves alone.
 
     Raises ConfigError where one was run with other settings.
     """
-    states = [(cell, RunState.read(out / cell.name)) for cell in experiment.cells if start == "resume"]
-    for cell, state in states:
-        state.require_same(cell.pipeline)
-    return [cell.name for cell, state in states if state.is_whole(cell.pipeline)]
+    states = {cell.name: RunState.read(out / cell.name) for cell in experiment.cells}
+    resumed = experiment.cells if start == "resume" else []
+    for cell in resumed:
+        states[cell.name].require_same(cell.pipeline)
+    return states, {cell.name for cell in resumed if states[cell.name].is_whole(cell.pipeline)}
 
 
-def check_matrix_folder(out: Path) -> None:
+def check_matrix_folder(state: RunState) -> None:
     """Raise ConfigError when the folder holds a single run, or files of others under the names of a matrix."""
-    outputs.check_names(RunState.read(out), OF_A_MATRIX)
-    if (out / PIPELINE).exists() and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
+    outputs.check_names(state, OF_A_MATRIX)
+    out = state.out
+    if PIPELINE in state.names and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
 
 
-def describe_matrix(experiment: Experiment, out: Path, device: str | Device | None, start: Start) -> str:
+def describe_matrix(experiment: Experiment, state: RunState, device: str | Device | None, start: Start) -> str:
     """What would run, a line for each cell.
 
     Raises a ClsplatError with the exit code of the first cell that the run would refuse.
     """
-    check_matrix_folder(out)
-    run_folder.check_run_folder(RunState.read(out), start)
-    describe.tell_of_waiting(out)
-    done, lines, refusals = done_cells(experiment, out, start), [], Failures("cells")
+    check_matrix_folder(state)
+    run_folder.check_run_folder(state, start)
+    describe.tell_of_waiting(state.out)
+    cells, done = read_cells(experiment, state.out, start)
+    lines, refusals = [], Failures("cells")
     read = cache(read_run_scene)  # each distinct scene once
     for cell in experiment.cells:
-        state = "done" if cell.name in done else "unfinished" if (out / cell.name).exists() else ""
+        progress = "done" if cell.name in done else "unfinished" if (state.out / cell.name).exists() else ""
         try:
-            if state != "done":
-                describe.describe(cell.pipeline, out / cell.name, device, start, read)
+            if progress != "done":
+                describe.describe(cell.pipeline, cells[cell.name], device, start, read)
         except ClsplatError as error:
             refusals[cell.name] = error
-        lines.append(f"  {cell.name}  {state}".rstrip())
+        lines.append(f"  {cell.name}  {progress}".rstrip())
     if refusals:
         raise refusals.whole(len(lines), "would fail")
-    return f"would run {len(lines)} cells in {out}:\n" + "\n".join(lines)
+    return f"would run {len(lines)} cells in {state.out}:\n" + "\n".join(lines)
 
 
 def compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError]) -> None:

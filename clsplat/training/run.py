@@ -19,7 +19,6 @@ from clsplat.gaussians.gaussians import HIDDEN, INTERVAL2, DeviceModel
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
-from clsplat.photos.exposure_estimate import Exposures
 from clsplat.photos.photographs import Photographs, texture_quantile
 from clsplat.render.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.render.painter import Painter, SplatPainter
@@ -74,7 +73,7 @@ class Run:
     numbers: dict[str, float] = field(default_factory=dict)  # that parts of it keep from step to step, by name
     best: Best | None = None  # what validation has found in the training
     best_tables: Tables = field(default_factory=dict)  # of that model, on the host, as long as the training goes on
-    exposures: dict[tuple[str, ...], Exposures] = field(default_factory=dict)  # measured, by the names of photographs
+    measured: dict[Any, Any] = field(default_factory=dict)  # what modules have measured once, by keys of their choice
     train_seconds: float = 0.0
     cpu_seconds: float = 0.0  # of all threads of the process, in the same time
     written: dict[str, str] = field(default_factory=dict)  # models: path in the run folder -> SHA-256

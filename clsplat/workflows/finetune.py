@@ -29,7 +29,6 @@ from clsplat.runs.state import RunState
 from clsplat.scene.identity import Identity, decode_all, require_whole
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.sweeps.store import CellAttempt, whole
-from clsplat.training import checkpoint
 
 LOG = logging.getLogger("clsplat")
 RECIPE, TRAINING = "compress", "optimize"
@@ -93,14 +92,15 @@ def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL)
     What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.  Where
     all checkpoints are damaged it begins anew.
     """
-    if not is_trained(pipeline, folder):
+    state = RunState.read(folder)
+    if not state.is_whole(pipeline):
         is_whole = any(whole([CellAttempt(folder)]))
-        if checkpoint.saved(folder) and not is_whole:
+        if state.checkpoints and not is_whole:
             LOG.warning("%s: no checkpoint is whole; it is trained again from the beginning", folder)
         begun: Start = "resume" if is_whole else "restart"
         start: Start = begun if is_there(folder) else "new"
         try:
-            run_pipeline(pipeline, folder, device, start)
+            run_pipeline(pipeline, state, device, start)
         except Interrupted as error:
             raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
     return folder / file

@@ -30,7 +30,7 @@ def status_of(folder: Path) -> dict[str, Any]:
     """Return the state of what a folder holds: a scene in blocks, a store of cells, or a run.  Raises DataError."""
     if is_in_blocks(folder):
         return blocks_status(folder)
-    return store_status(folder) if is_store(folder) else run_status(folder)
+    return store_status(folder) if is_store(folder) else run_status(RunState.read(folder))
 
 
 def check(pipeline: str) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def _parts(out: Path) -> list[str]:
 
 def _status(folder: Path) -> dict[str, Any]:
     try:
-        return run_status(folder) if RunState.read(folder).phase else {"state": "waiting"}
+        return run_status(state) if (state := RunState.read(folder)).phase else {"state": "waiting"}
     except DataError as error:
         return {"state": "unknown", "message": one_line(error)}
 
@@ -95,7 +95,7 @@ def _objects(out: Path, done: bool) -> Iterator[dict[str, Any]]:
         if done or (out / name).exists():
             yield verify.look_at(out, name, look)
     for part in parts:
-        if RunState.read(out / part).phase:
-            yield from ({**one, "file": f"{part}/{one['file']}"} for one in verify.verify(out / part)["objects"])
+        if (state := RunState.read(out / part)).phase:
+            yield from ({**one, "file": f"{part}/{one['file']}"} for one in verify.verify(state)["objects"])
         elif done:
             yield {"file": part, "whole": False, "detail": "is missing"}

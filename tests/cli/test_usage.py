@@ -18,6 +18,7 @@ from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.overrides import settable
 from clsplat.pipeline.recipes import copy, manual, summaries, summary
+from clsplat.runs.state import RunState
 from clsplat.runs.status import run_status, status_text
 from clsplat.training.records import Records
 from tests.support.commands import clsplat, process
@@ -237,7 +238,7 @@ def test_status_refuses_damaged_metrics(text, tmp_path):
     write_status(tmp_path, state="done", step=7)
     (tmp_path / "metrics.json").write_text(text)
     with pytest.raises(DataError, match=r"metrics.json: .*the file is damaged: run the pipeline again"):
-        run_status(tmp_path)
+        run_status(RunState.read(tmp_path))
 
 
 @pytest.mark.parametrize("line", ["null", '{"step": null}', '{"step": 3}', '{"step": "3", "kind": "train"}'])
@@ -247,7 +248,7 @@ def test_damaged_records_are_told_with_their_line(line, tmp_path, caplog):
     fault = r"metrics.jsonl:2: damaged; .*'step' and 'kind'; remove this line"
     with pytest.raises(DataError, match=fault):
         Records(tmp_path).read()
-    found = run_status(tmp_path)
+    found = run_status(RunState.read(tmp_path))
     assert (found["state"], found["step"], found["last"]) == ("done", 7, None), "the state is told all the same"
     assert re.search(fault, caplog.text)
 
@@ -265,14 +266,16 @@ def test_status_tells_from_files(finished, tmp_path):
     gone.wait()
     write_status(tmp_path, state="running", step=7, steps=9, process=gone.pid)
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train", "loss": 0.25, "psnr": 20.0}\ncut')
-    assert status_text(run_status(tmp_path)) == (
+    assert status_text(run_status(RunState.read(tmp_path))) == (
         f"{tmp_path}: killed at step 7 of 9\n"
         f"  no checkpoint was saved; `clsplat resume {tmp_path}` begins it again\n"
         "  last report: step 5, loss 0.25, psnr 20"
     )
     matrix = {"state": "failed", "cells": 4, "done": 4, "failed": {"a": "no"}, "message": "1 of 4 cells failed"}
     write_status(tmp_path, **matrix)
-    assert "failed, 4 of 4 cells, 1 of them failed\n  1 of 4 cells failed\n" in status_text(run_status(tmp_path))
+    assert "failed, 4 of 4 cells, 1 of them failed\n  1 of 4 cells failed\n" in status_text(
+        run_status(RunState.read(tmp_path))
+    )
 
 
 def test_no_two_recipes_have_one_description():

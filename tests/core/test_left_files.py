@@ -20,6 +20,7 @@ from clsplat.core.settings import Settings
 from clsplat.prepare.cache import RECORD, STEPS, Planned, _show, prepare
 from clsplat.prepare.steps import Step
 from clsplat.runs import run_folder
+from clsplat.runs.state import RunState
 from clsplat.training import checkpoint
 from tests.support.commands import clsplat as command
 from tests.support.runs import NO_PROCESS
@@ -54,7 +55,7 @@ def test_what_a_process_still_writes_is_not_swept(tmp_path):
         path.write_text("x")
     with atomic(tmp_path / "c") as file:
         file.write(b"x")
-        with run_folder.opened(tmp_path, "new", step=0):
+        with run_folder.opened(RunState.read(tmp_path), "new", step=0):
             pass
     assert (tmp_path / "c").read_bytes() == b"x"
     assert other.exists()
@@ -130,7 +131,7 @@ def test_checkpoint_and_records_are_synced_before_old_ones_go(tiny_scene, tmp_pa
 
 @has_proc
 def test_a_run_folder_is_on_the_disk_with_the_folders_above_it(tmp_path, calls):
-    with run_folder.opened(tmp_path / "a" / "run", "new"):
+    with run_folder.opened(RunState.read(tmp_path / "a" / "run"), "new"):
         synced = [name for kind, name in calls if kind == "sync"]
     assert {tmp_path.name, "a"} <= {*synced}
 

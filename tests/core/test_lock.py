@@ -22,6 +22,7 @@ from clsplat.core.files import LOCK
 from clsplat.core.machine import Owner
 from clsplat.runs import run_folder
 from clsplat.runs.run_folder import free_folder
+from clsplat.runs.state import RunState
 from clsplat.training import status as writing
 from tests.support.commands import clsplat as command
 from tests.support.runs import ONE_CORE
@@ -193,21 +194,21 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
 
 
 def test_run_just_starting_in_the_default_folder_is_not_joined(tmp_path):
-    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
+    assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
     (tmp_path / "splat").mkdir()
     with lock.held(tmp_path / "splat"):
-        assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat-2"
-    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
+        assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat-2"
+    assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
 
 
 def test_the_lock_of_a_killed_start_gives_no_other_name(tmp_path):
     (tmp_path / "splat").mkdir()
     process = holder(tmp_path / "splat")
-    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat-2"
+    assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat-2"
     process.kill()
     process.wait()
     assert (tmp_path / "splat" / LOCK).exists()
-    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
+    assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
 
 
 def test_a_folder_that_another_thread_is_locking_is_held(tmp_path, monkeypatch):
@@ -335,7 +336,7 @@ def test_a_run_that_was_silent_and_goes_on_notices_who_took_over(tmp_path, monke
 
 def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "BEAT", 0.002)
-    with run_folder.opened(tmp_path / "run", "new") as status:
+    with run_folder.opened(RunState.read(tmp_path / "run"), "new") as status:
         pass
     (tmp_path / "run" / "status.json").write_text("of the next")
     status._thread.join(5)

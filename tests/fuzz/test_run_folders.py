@@ -15,6 +15,7 @@ from clsplat.gaussians.model import Rendering
 from clsplat.gaussians.sky import Sky, sky_beside
 from clsplat.nerf.files import FieldModel, load_field
 from clsplat.nerf.shape import FieldShape
+from clsplat.runs.state import RunState
 from clsplat.runs.verify import verify
 from clsplat.training import archive
 from clsplat.training.status import read_status
@@ -86,7 +87,7 @@ def run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", ["status.json", "checksums.json", INPUTS])
 def test_a_damaged_file_of_a_whole_run_is_read_equal_or_told(name, run: Path):
     before = (run / name).read_bytes()
-    whole = verify(run)
+    whole = verify(RunState.read(run))
     assert whole["whole"], whole
 
     @fuzzed(20, data=damaged([before]))

@@ -21,7 +21,7 @@ from clsplat.photos.sampling import ViewPool
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
 from clsplat.runs.model_file import require_model
-from clsplat.runs.state import steps_key
+from clsplat.runs.state import RunState
 from clsplat.runs.status import summary
 from clsplat.runs.time_budget import Rehearsal
 from clsplat.runs.verify import verify
@@ -77,8 +77,8 @@ def test_the_field_is_what_its_renders_show(finished, tiny_scene, pipeline):
 
 
 def test_a_field_is_trained_longer_by_its_steps(finished, tmp_path):
-    assert steps_key(finished) == "train_field.steps"
-    assert steps_key(tmp_path) == "optimize.steps"
+    assert RunState.read(finished).steps_key == "train_field.steps"
+    assert RunState.read(tmp_path).steps_key == "optimize.steps"
     told = clsplat_command("resume", finished, "--steps", "14", "--dry-run").stdout
     assert "14 steps" in told
     assert f"`clsplat resume {finished} --steps 24` trains longer" in "\n".join(summary(finished))
@@ -118,7 +118,7 @@ def test_a_field_stands_beside_gaussians_in_a_comparison(finished, few_steps, tm
 
 
 def test_the_files_of_a_run_of_a_field_are_checked(finished):
-    found = verify(finished)
+    found = verify(RunState.read(finished))
     assert found["whole"]
     details = [one["detail"] for one in found["objects"]]
     assert [text for text in details if text.startswith("step 12, ") and text.endswith(" parameters")]

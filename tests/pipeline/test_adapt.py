@@ -43,7 +43,7 @@ def plugin(tmp_path: Path, without_plugins: None) -> None:
 
 
 def decided(name: str, *overrides: str, count: int = 9, error: float | None = None, sky: float | None = None):
-    return adapted(load(name, list(overrides)), Measures(count, error, look_for_sky=lambda: sky))
+    return adapted(load(name, list(overrides)), Measures(count, error, measure=lambda name: sky))
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_other_photographs_are_decided_by_again(tmp_path):
 
 def test_a_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
     asked = [f"scene.path='{tiny_scene}'", *FEW, ADAPT]
-    text = describe(load("smoke", asked), tmp_path / "run", None, "new")
+    text = describe(load("smoke", asked), RunState.read(tmp_path / "run"), None, "new")
     assert "model.sh_degree=1, since 8 photographs" in text
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=[*FEW, ADAPT])
     assert "model.sh_degree=1, since 8 photographs" in (out / "log.txt").read_text()
@@ -145,7 +145,6 @@ def test_before_preparation_it_says_what_is_undecided():
     ("adapt", "complaint"),
     [
         ("{type: counted, key: model.sh_degre}", "adapt: counted: "),
-        ("{type: counted, key: optimize.steps}", "adapt: counted: optimize.steps: no 'optimize'"),
         ("{type: counted, key: scene.downscale}", "scene.downscale is used before photographs are measured"),
         ("{type: counted, key: optimize.steps}", r"optimize\.steps.* --set of one of its keys wins: optimize\.steps, "),
         ("photo", "no adaptation named 'photo'; did you mean 'photos'"),
@@ -161,14 +160,18 @@ def test_what_cannot_be_decided_is_refused_in_a_sentence(adapt, complaint):
 def test_a_run_looks_for_a_sky_where_it_decides(tmp_path, rng, monkeypatch, count, clear, sky):
     scene = Yard(rng, count, clear).write(tmp_path / "yard")
     if sky is None:
-        monkeypatch.setattr("clsplat.runs.opening._share_with_sky", lambda run: pytest.fail("looked for a sky"))
-    text = describe(load("photos", [f"scene.path='{scene}'", "scene.holdout=0"]), tmp_path / "run", None, "new")
+        monkeypatch.setattr(
+            "clsplat.runs.opening._measured_by_module", lambda name, run: pytest.fail("looked for a sky")
+        )
+    text = describe(
+        load("photos", [f"scene.path='{scene}'", "scene.holdout=0"]), RunState.read(tmp_path / "run"), None, "new"
+    )
     assert f"{count} training photographs; " in text
     assert sky is None or f"{sky} of them show a sky" in text
 
 
 def test_transparent_photographs_say_nothing_of_a_sky(tiny_scene, tmp_path):
-    text = describe(load("photos", [f"scene.path='{tiny_scene}'"]), tmp_path / "run", None, "new")
+    text = describe(load("photos", [f"scene.path='{tiny_scene}'"]), RunState.read(tmp_path / "run"), None, "new")
     assert "8 training photographs; the dataset does not say whether they show a sky" in text
 
 

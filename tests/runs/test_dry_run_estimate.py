@@ -14,6 +14,7 @@ from clsplat.prepare.matching import MAX_EXHAUSTIVE, most_pairs
 from clsplat.runs import estimate as module
 from clsplat.runs.describe import describe
 from clsplat.runs.opening import check_preparation, known, listed
+from clsplat.runs.state import RunState
 from clsplat.stages.optimize import Optimize
 from clsplat.sweeps.batch import wanted_cell
 from clsplat.sweeps.cell import Scenes
@@ -115,7 +116,7 @@ def as_cell(asked, out, device, start):
 def test_split_photographs_lack_is_refused_before_preparation(photos, begin, sets, complaint):
     asked = load("photos", [sets, f"scene.path='{photos}'"])
     with pytest.raises((ConfigError, DataError), match=complaint):
-        begin(asked, photos.parent / "runs" / "a", None, "new")
+        begin(asked, RunState.read(photos.parent / "runs" / "a"), None, "new")
     assert not (photos.parent / "runs" / "prepared").exists()
 
 
@@ -129,9 +130,9 @@ def test_list_is_not_refused_for_what_cameras_will_tell(photos, caplog):
     apart = "scene={train: {every: 2}, validation: {names: ['02', '05']}}"
     left_out = load("photos", [apart, f"scene.path='{photos}'"])
     check_preparation(left_out, out)
-    assert "is refused: " in (described := describe(left_out, out, None, "new"))
+    assert "is refused: " in (described := describe(left_out, RunState.read(out), None, "new"))
     assert "'02' is left out by scene.train" in described
-    told = describe(asked, out, None, "new")
+    told = describe(asked, RunState.read(out), None, "new")
     assert "if all 23 photographs are placed, the run is refused:" in told
     assert "'00.png' is held out for testing" in told
     assert "follow from the photographs: init.transparent, " in told, "what they will decide"
@@ -145,7 +146,9 @@ def test_files_that_are_left_out_are_told_once(photos, caplog):
 
 def test_dry_run_says_what_photographs_will_decide(photos):
     asked = load("photos", [f"scene.path='{photos}'", "optimize.modules.dropout={probability: 0.1}"])
-    lines = [line.strip() for line in describe(asked, photos.parent / "runs" / "a", None, "new").splitlines()]
+    lines = [
+        line.strip() for line in describe(asked, RunState.read(photos.parent / "runs" / "a"), None, "new").splitlines()
+    ]
     (found,) = [line for line in lines if line.startswith("adapt ")]
     assert "follow from the photographs: init.transparent, init.count, " in found
     assert "dropout" not in found
@@ -158,7 +161,7 @@ def test_what_is_there_already_takes_no_time(tiny_scene, tmp_path):
     assert [line.split()[0] for line in parts] == ["expected:", "optimize"]
     assert not list(tmp_path.iterdir())
     asked = load("smoke", [f"scene.path='{tiny_scene}'"])
-    assert "expected" not in describe(asked, tmp_path / "run", None, "new"), "cells of a matrix are many"
+    assert "expected" not in describe(asked, RunState.read(tmp_path / "run"), None, "new"), "cells of a matrix are many"
 
 
 @pytest.mark.parametrize("count", [2, 11, MAX_EXHAUSTIVE, MAX_EXHAUSTIVE + 1])

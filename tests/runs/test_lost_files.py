@@ -232,7 +232,7 @@ def test_run_killed_before_it_began_says_how_to_begin(tmp_path):
     """As by `kill -9` while the device is proved: there is no pipeline to go on with."""
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "status.json").write_text('{"state": "preparing", "process": 4194305}')
-    again = f"give its `clsplat run … --out {tmp_path / 'run'} --resume` again"
+    again = f"run its `clsplat run … --out {tmp_path / 'run'} --resume` again"
     assert again in command("resume", tmp_path / "run", expect=3).stderr
     assert f"give its `clsplat run … --out {tmp_path / 'run'}` again, with --resume" in (
         command("check", tmp_path / "run", expect=7).stderr

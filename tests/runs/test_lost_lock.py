@@ -11,6 +11,7 @@ from clsplat.core import lock
 from clsplat.core.errors import OutputError
 from clsplat.core.files import LOCK
 from clsplat.runs import run_folder
+from clsplat.runs.state import RunState
 from clsplat.stages.densify import Densify
 from clsplat.sweeps.experiment import Job
 from clsplat.training import checkpoint
@@ -103,7 +104,7 @@ def test_a_rescue_saves_nothing_into_a_folder_that_was_lost(tiny_scene, tmp_path
 
 def test_heartbeat_stops_in_a_lost_folder_and_the_run_learns_it(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(writing, "BEAT", 0.002)
-    with run_folder.opened(tmp_path / "run", "new") as status:
+    with run_folder.opened(RunState.read(tmp_path / "run"), "new") as status:
         before = taken(tmp_path / "run")
         while status.lost is None:
             time.sleep(0.001)
@@ -117,7 +118,7 @@ def test_run_ending_before_its_first_step_spares_the_next_one(tmp_path):
     before: dict[str, bytes] = {}
 
     def ends() -> None:
-        with run_folder.opened(tmp_path / "run", "new"):
+        with run_folder.opened(RunState.read(tmp_path / "run"), "new"):
             before.update(taken(tmp_path / "run"))
             raise ValueError("ends")
 

@@ -83,7 +83,7 @@ def test_foreign_files_with_names_of_a_matrix_are_not_replaced(tmp_path):
     for name in files.OF_A_MATRIX - {files.PIPELINE}:
         (tmp_path / name).write_text("mine")
         with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
-            experiment.check_matrix_folder(tmp_path)
+            experiment.check_matrix_folder(RunState.read(tmp_path))
         (tmp_path / name).unlink()
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.runs import status as reading
+from clsplat.runs.state import RunState
 from clsplat.training.status import Amount, StatusFile
 from tests.support.refusals import refusal
 from tests.support.runs import write_status
@@ -22,7 +23,7 @@ def put(folder: Path, **values) -> dict:
     gone.wait()
     killed = {"step": 7, "steps": 9, "state": "running", "process": gone.pid, "time": time.time() - 200}
     write_status(folder, **{**killed, **values})
-    return reading.run_status(folder)
+    return reading.run_status(RunState.read(folder))
 
 
 def test_a_process_that_is_gone_was_killed(tmp_path):
@@ -111,7 +112,7 @@ def test_a_damaged_status_is_refused(name, value, tmp_path):
     path = tmp_path / "status.json"
     status = {**json.loads(path.read_text()), name: "HERE"}
     path.write_text(json.dumps(status).replace('"HERE"', value))
-    message = refusal(reading.run_status, tmp_path)
+    message = refusal(reading.run_status, RunState.read(tmp_path))
     assert message.startswith(f"{path}: damaged ({name}: ")
 
 
@@ -119,7 +120,7 @@ def test_a_status_of_a_newer_version_is_refused(tmp_path):
     put(tmp_path)
     path = tmp_path / "status.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "format": 2}))
-    assert "of a newer clsplat" in refusal(reading.run_status, tmp_path)
+    assert "of a newer clsplat" in refusal(reading.run_status, RunState.read(tmp_path))
 
 
 def test_no_line_holds_what_a_terminal_obeys(tmp_path):

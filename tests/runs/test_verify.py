@@ -11,6 +11,7 @@ import pytest
 import clsplat
 from clsplat.core.errors import DataError
 from clsplat.opencl import device
+from clsplat.runs.state import RunState
 from clsplat.runs.verify import verify
 from tests.support.commands import clsplat as command
 
@@ -296,7 +297,7 @@ def test_a_matrix_is_checked_with_its_cells(tiny_scene, tmp_path):
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"holds neither pipeline.yaml nor status.json"):
-        verify(tmp_path)
+        verify(RunState.read(tmp_path))
     assert "expected the folder of a run" in command("check", tmp_path, expect=3).stderr
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from clsplat.pipeline.loading import load
 from clsplat.runs.describe import describe
+from clsplat.runs.state import RunState
 from clsplat.scene.detect import read_scene
 from clsplat.scene.quality import measured, nearest_points
 from clsplat.scene.scene import Tracks
@@ -47,7 +48,7 @@ def test_nearest_points_are_before_any_training_photograph(tiny_scene):
 def test_a_run_warns_where_points_lie_before_the_near_plane(tmp_path, rng, caplog, near, warned):
     Yard(rng).write(tmp_path / "yard")
     asked = load("smoke", [f"scene.path='{tmp_path / 'yard'}'", f"model.near={near}"])
-    describe(asked, tmp_path / "run", None, "new")
+    describe(asked, RunState.read(tmp_path / "run"), None, "new")
     warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
     told = [message for message in warnings if "model.near" in message]
     assert len(told) == warned

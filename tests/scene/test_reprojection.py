@@ -10,6 +10,7 @@ from clsplat.pipeline.loading import adapted, load
 from clsplat.prepare.inspect.findings import POSES, POSES_ERROR, Inspection
 from clsplat.prepare.undistort import undistort_scene
 from clsplat.runs.describe import describe
+from clsplat.runs.state import RunState
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.quality import Measures, measured
@@ -133,7 +134,7 @@ def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rn
     folder, (name, value) = missing(tmp_path / "scene", VECTOR, rng), of_step.split("=", 1)
     caplog.set_level("INFO", "clsplat")
     asked = load("smoke", [f"scene.path='{folder}'", f"{name}={value}", "model.background=auto"])
-    describe(asked, tmp_path / "run", None, "new")
+    describe(asked, RunState.read(tmp_path / "run"), None, "new")
     assert f"model.background: off, since {reason}" in caplog.text
 
 
@@ -155,7 +156,7 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
     asked = [f"scene.path='{folder}'", *FEW, "scene.validation=auto", "optimize.keep=best", "optimize.refit=true"]
     asked += ["model.background={type: auto, photographs: 0.25}", "adapt={type: photos, keep: [model.background]}"]
     asked += ["optimize.modules.random_background=null"]
-    run_pipeline(load("smoke", asked), tmp_path / "run", None, "new")
+    run_pipeline(load("smoke", asked), RunState.read(tmp_path / "run"), None, "new")
     written = load(str(tmp_path / "run" / "pipeline.yaml")).settings
     assert "camera_optimizer" in [one.type for one in written.training.modules]
     background = written.model.background
@@ -179,9 +180,9 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
 def test_what_a_run_can_know_is_refused_before_anything_changes(changes, fault, tmp_path, rng):
     folder, out = missing(tmp_path / "scene", VECTOR, rng), tmp_path / "run"
     asked = [f"scene.path='{folder}'", *FEW]
-    run_pipeline(load("smoke", asked), out, None, "new")
+    run_pipeline(load("smoke", asked), RunState.read(out), None, "new")
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name not in STATE}
     for begin in (describe, run_pipeline):
         with pytest.raises((ConfigError, DataError), match=fault):
-            begin(load("smoke", [*asked, *changes]), out, None, "restart")
+            begin(load("smoke", [*asked, *changes]), RunState.read(out), None, "restart")
     assert {path: path.read_bytes() for path in before} == before

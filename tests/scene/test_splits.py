@@ -13,6 +13,7 @@ from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load
 from clsplat.runs.describe import describe
 from clsplat.runs.opening import RunScene
+from clsplat.runs.state import RunState
 from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene, Tracks
@@ -267,7 +268,10 @@ def test_every_nth_that_takes_none_for_testing_is_refused(folder):
 def test_without_test_views_a_dry_run_has_no_lines_of_them(folder, tmp_path):
     def described(holdout: int) -> str:
         return describe(
-            load("splat_7k", [f"scene.path={folder}", f"scene.holdout={holdout}"]), tmp_path / "r", None, "new"
+            load("splat_7k", [f"scene.path={folder}", f"scene.holdout={holdout}"]),
+            RunState.read(tmp_path / "r"),
+            None,
+            "new",
         )
 
     assert "evaluate       1 test view at 1/1" in described(24)

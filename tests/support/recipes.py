@@ -6,6 +6,7 @@ from pathlib import Path
 
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.stretching import stretched
+from clsplat.runs.state import RunState
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.optimize import Optimize
 from clsplat.sweeps.experiment import run_pipeline
@@ -53,7 +54,7 @@ def often(old: Stage, loop: Optimize, saved: int) -> Optimize:
 
 def train(pipeline: Pipeline, out: Path, resume: bool = False) -> str:
     """Run it; return the hash of its model."""
-    run_pipeline(pipeline, out, os.environ.get("CLSPLAT_DEVICE"), "resume" if resume else "new")
+    run_pipeline(pipeline, RunState.read(out), os.environ.get("CLSPLAT_DEVICE"), "resume" if resume else "new")
     return digest(out)
 
 

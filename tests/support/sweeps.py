@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.pipeline.matrix import load_experiment
+from clsplat.runs.state import RunState
 from clsplat.sweeps import experiment
 from clsplat.sweeps.store import Store
 
@@ -80,7 +81,7 @@ def undisturbed(sweep: Sweep, out: Path) -> dict[str, str]:
     """The hashes of the same cells, run one after the other without a store."""
     found = load_experiment(str(sweep.file))
     assert found is not None
-    experiment.run_matrix(found, out, None, "new")
+    experiment.run_matrix(found, RunState.read(out), None, "new")
     return models(out)
 
 

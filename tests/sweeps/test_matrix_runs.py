@@ -13,6 +13,7 @@ from clsplat.core.errors import ClsplatError, ConfigError, DataError, InternalEr
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.runs import opening, runner
+from clsplat.runs.state import RunState
 from clsplat.sweeps import experiment
 from tests.support.commands import clsplat
 from tests.support.pipelines import SMALL, STAGES, names
@@ -30,7 +31,7 @@ def finished(tiny_scene, tmp_path_factory) -> tuple[str, Path]:
     found = load_experiment(str(folder / "x.yaml"))
     assert found is not None
     logging.getLogger("clsplat").setLevel(logging.INFO)
-    experiment.run_matrix(found, folder / "run", None, "new")
+    experiment.run_matrix(found, RunState.read(folder / "run"), None, "new")
     return str(folder / "x.yaml"), folder / "run"
 
 
@@ -74,7 +75,7 @@ def test_a_dry_run_reads_each_distinct_scene_once(tiny_scene, tmp_path, monkeypa
     (tmp_path / "x.yaml").write_text(f"name: sweep\nmatrix: {{{axes}}}\n{STAGES}")
     found = load_experiment(str(tmp_path / "x.yaml"))
     assert len(found.cells) == 12
-    assert "would run 12 cells" in experiment.describe_matrix(found, tmp_path / "run", None, "new")
+    assert "would run 12 cells" in experiment.describe_matrix(found, RunState.read(tmp_path / "run"), None, "new")
     assert sorted(folders) == sorted([tiny_scene.name, "other"] * 2), "at each of two sizes"
     assert not (tmp_path / "run").exists()
 
@@ -120,13 +121,13 @@ def test_a_matrix_that_has_lost_its_status_goes_on(finished, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(finished[1], out)
     (out / "status.json").unlink()
-    experiment.run_matrix(load_experiment(str(out / "pipeline.yaml")), out, None, "resume")
+    experiment.run_matrix(load_experiment(str(out / "pipeline.yaml")), RunState.read(out), None, "resume")
     assert json.loads((out / "status.json").read_text())["state"] == "done"
     mine = tmp_path / "mine"
     mine.mkdir()
     shutil.copy(finished[0], mine / "pipeline.yaml")
     with pytest.raises(ConfigError, match="is not that of a run"):
-        experiment.run_matrix(load_experiment(finished[0]), mine, None, "restart")
+        experiment.run_matrix(load_experiment(finished[0]), RunState.read(mine), None, "restart")
 
 
 def test_a_cell_that_fails_does_not_stop_the_others(finished, tmp_path, monkeypatch):
@@ -139,7 +140,7 @@ def test_a_cell_that_fails_does_not_stop_the_others(finished, tmp_path, monkeypa
 
     monkeypatch.setattr(runner, "execute", failing)
     with pytest.raises(ClsplatError, match=r"2 of 4 cells failed; the first, steps=4-.*: the loss is nan") as error:
-        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, "new")
+        experiment.run_matrix(load_experiment(finished[0]), RunState.read(tmp_path / "run"), None, "new")
     assert error.value.exit_code == NumericError.exit_code
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert (status["state"], status["exit_code"], status["done"]) == ("failed", 6, 4)
@@ -157,7 +158,7 @@ def test_a_matrix_ends_in_a_status_whatever_happens(finished, tmp_path, monkeypa
     monkeypatch.setattr(experiment, "write_comparison", broken)
     shutil.copytree(finished[1], tmp_path / "run")
     with pytest.raises(InternalError, match=r"a defect\): AssertionError; run with --debug") as error:
-        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, "resume")
+        experiment.run_matrix(load_experiment(finished[0]), RunState.read(tmp_path / "run"), None, "resume")
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert (status["state"], status["exit_code"], status["message"]) == ("failed", 1, str(error.value))
 
@@ -172,7 +173,7 @@ def test_an_interrupt_stops_the_whole(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "execute", interrupted)
     words = f"stopped in cell 1 of 4: steps=4-opacity=0.1-seed=0; `clsplat resume {tmp_path / 'run'}` goes on with it"
     with pytest.raises(Interrupted, match=re.escape(words)):
-        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, "new")
+        experiment.run_matrix(load_experiment(finished[0]), RunState.read(tmp_path / "run"), None, "new")
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"
     assert len(cells) == 1
     assert not cells[0].exists(), "it had not begun"
@@ -186,15 +187,15 @@ def test_cells_run_with_other_settings_are_not_taken_for_done(finished, tmp_path
     with pytest.raises(
         ConfigError, match=r"seed=0: was run with other settings: stages\[0\].init.count was 300, is 301"
     ):
-        experiment.run_matrix(load_experiment(str(changed)), tmp_path / "run", None, "resume")
+        experiment.run_matrix(load_experiment(str(changed)), RunState.read(tmp_path / "run"), None, "resume")
 
 
 def test_folders_are_not_mixed(finished, tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="already holds a run"):
-        experiment.run_matrix(load_experiment(finished[0]), finished[1], None, "new")
+        experiment.run_matrix(load_experiment(finished[0]), RunState.read(finished[1]), None, "new")
     (tmp_path / "pipeline.yaml").write_text("name: single\nstages: []\n")
     with pytest.raises(ConfigError, match="holds a single run"):
-        experiment.run_matrix(load_experiment(finished[0]), tmp_path, None, "resume")
+        experiment.run_matrix(load_experiment(finished[0]), RunState.read(tmp_path), None, "resume")
 
 
 def test_check_and_dry_run_list_the_cells(finished, tmp_path):

@@ -118,7 +118,7 @@ def test_the_best_model_is_left_with_the_colors_of_its_step(tiny_scene, tmp_path
 def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_path, few_steps):
     """The synthetic scene has points without tracks."""
     asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "optimize.modules.exposure.when=auto"])
-    run_pipeline(asked, tmp_path / "run", None, "new")
+    run_pipeline(asked, RunState.read(tmp_path / "run"), None, "new")
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
     assert found.chosen == "off"
     assert found.reason == "neither tracks of points nor cameras tell the exposures"
@@ -131,14 +131,14 @@ def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
     wall = Wall(rng)
     wall.write(tmp_path / "scene")
     settings = [f"scene.path='{tmp_path / 'scene'}'", "scene.holdout=0", *FEW, "optimize.modules.exposure.when=auto"]
-    run_pipeline(load("smoke", settings), tmp_path / "run", None, "new")
+    run_pipeline(load("smoke", settings), RunState.read(tmp_path / "run"), None, "new")
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
     assert found.chosen == "on"
     assert "exposures of 8 photographs differ by" in found.reason
     photographs = json.loads((tmp_path / "run" / "view_colors.json").read_text())["photographs"]
     gains = np.log([np.diag(photographs[view.name]["matrix"]) for view in wall.views])
     assert gains == pytest.approx(wall.log_gains, abs=0.06), "twelve steps do not move them far"
-    with run_folder.opened(tmp_path / "run", "resume", step=0) as status:
+    with run_folder.opened(RunState.read(tmp_path / "run"), "resume", step=0) as status:
         run = opening.open_run(load(str(tmp_path / "run" / "pipeline.yaml")), tmp_path / "run", None, "resume", status)
     assert run.settings.training.modules == [found], "who goes on takes the choice"
 

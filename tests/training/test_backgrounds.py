@@ -10,6 +10,7 @@ from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
 from clsplat.runs.describe import describe
+from clsplat.runs.state import RunState
 from clsplat.scene.detect import read_scene
 from clsplat.scene.view import load_image
 from clsplat.training.modules.random_background import drawn_background
@@ -81,4 +82,4 @@ def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
         ],
     )
     with pytest.raises(ConfigError, match="does not go together with sky"):
-        describe(asked, tmp_path / "other", None, "new")
+        describe(asked, RunState.read(tmp_path / "other"), None, "new")

@@ -18,6 +18,7 @@ from clsplat.pipeline.loading import load
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import opening, run_folder, runner
 from clsplat.runs.describe import describe
+from clsplat.runs.state import RunState
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
 from clsplat.training.memory import last_place
@@ -105,7 +106,7 @@ def test_what_makes_room_is_told_where_it_helps(more, told, tiny_scene, tmp_path
     """Where views see all Gaussians a training is refused before its first step, and the host is no remedy."""
     own = [f"scene.path='{tiny_scene}'", *FEW, *more]
     with pytest.raises(MemoryLimitError) as refused:
-        run_pipeline(load("smoke", own), tmp_path / "run", Device(small(7700)), "new")
+        run_pipeline(load("smoke", own), RunState.read(tmp_path / "run"), Device(small(7700)), "new")
     assert ("rasterizer.harmonics=auto" in str(refused.value)) == told
     assert "for 7,995 Gaussians" in str(refused.value)
 
@@ -121,14 +122,14 @@ def test_the_harmonics_move_to_the_host_where_the_device_is_full(spread, at_once
     """2,000 Gaussians become more than 3,000; a resumed run moves them where it needs to, whatever it did before."""
     out, own, device = tmp_path / "run", [f"scene.path='{tiny_scene}'", *spread], small(3150)
     with caplog.at_level("INFO", "clsplat"):
-        run_pipeline(load("smoke", own), out, Device(device), "new")
+        run_pipeline(load("smoke", own), RunState.read(out), Device(device), "new")
     (told,) = [one.message for one in caplog.records if "the harmonics lie on the host, as" in one.message]
     assert not told.startswith("step 0: ")
     assert digest(out) == digest(at_once)
     for memory in (device.memory, 8 << 30):
         for name in ("checkpoints/step_000012.npz", "checkpoints/step_000008.npz", "point_cloud.ply"):
             (out / name).unlink()
-        run_pipeline(load("smoke", own), out, Device(replace(device, memory=memory)), "resume")
+        run_pipeline(load("smoke", own), RunState.read(out), Device(replace(device, memory=memory)), "resume")
         assert digest(out) == digest(at_once)
     assert read_yaml(out / "pipeline.yaml").data["rasterizer"]["harmonics"] == "auto"
 
@@ -137,9 +138,9 @@ def test_a_run_that_sees_few_goes_on_from_every_checkpoint(few_steps, tiny_scene
     """Growth ends above what the estimate of the host allows, and below what the views that were looked at do."""
     own = [f"scene.path='{tiny_scene}'", *spread_of(few_steps, tmp_path / "few.ply", 200), "optimize.steps=16"]
     device, out = small(2050), tmp_path / "run"
-    run_pipeline(load("smoke", own), out, Device(device), "new")
+    run_pipeline(load("smoke", own), RunState.read(out), Device(device), "new")
     expected = digest(out)
-    with run_folder.opened(out, "resume", step=0) as status:
+    with run_folder.opened(RunState.read(out), "resume", step=0) as status:
         run = opening.open_run(load("smoke", own), out, Device(device), "resume", status)
         checkpoint.restore(run)
     assert run.model.gaussians.on_host is not None
@@ -149,7 +150,7 @@ def test_a_run_that_sees_few_goes_on_from_every_checkpoint(few_steps, tiny_scene
             if int(file.stem[-6:]) > step:
                 file.unlink()
         (out / "point_cloud.ply").unlink()
-        run_pipeline(load("smoke", own), out, Device(device), "resume")
+        run_pipeline(load("smoke", own), RunState.read(out), Device(device), "resume")
         assert digest(out) == expected
 
 
@@ -158,7 +159,7 @@ def test_what_the_device_does_not_hold_begins_on_the_host(spread, tiny_scene, tm
     for name, more in (("auto", ()), ("host", (HOST,))):
         with caplog.at_level("INFO", "clsplat"):
             own = [f"scene.path='{tiny_scene}'", *spread, "densify.start=99", *more]
-            run_pipeline(load("smoke", own), tmp_path / name, Device(small(1900)), "new")
+            run_pipeline(load("smoke", own), RunState.read(tmp_path / name), Device(small(1900)), "new")
     told = [one.message for one in caplog.records if "the harmonics lie on the host" in one.message]
     assert [one.startswith("step 0: ") for one in told] == [True, True]
     assert ["as the device holds 1," in one for one in told] == [True, False]
@@ -188,9 +189,9 @@ def test_harmonics_stay_where_the_host_is_no_help(tiny_scene, info):
 
 def test_a_dry_run_says_that_the_harmonics_will_lie_on_the_host(tiny_scene, tmp_path):
     own = [f"scene.path='{tiny_scene}'", HOST]
-    text = describe(load("smoke", own), tmp_path / "run", None, "new")
+    text = describe(load("smoke", own), RunState.read(tmp_path / "run"), None, "new")
     assert "harmonics on the host, in" in text
-    assert "on the host" not in describe(load("smoke", own[:1]), tmp_path / "run", None, "new")
+    assert "on the host" not in describe(load("smoke", own[:1]), RunState.read(tmp_path / "run"), None, "new")
 
 
 def test_device_holds_what_a_view_sees_of_host_harmonics(spread, tiny_scene, tmp_path):
@@ -233,7 +234,7 @@ def test_a_penalty_on_harmonics_is_refused(few_steps, tiny_scene, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(few_steps, out)
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, DEFERRED])
-    with run_folder.opened(out, "restart", step=0) as status:
+    with run_folder.opened(RunState.read(out), "restart", step=0) as status:
         run = opening.open_run(checked, out, None, "restart", status)
         run.losses.append(OnHarmonics(weight=1.0))
         with pytest.raises(ConfigError, match="a penalty on sh_rest"):

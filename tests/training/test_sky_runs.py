@@ -56,7 +56,7 @@ def learned(yard, tmp_path_factory) -> Path:
     """A run that finds out by itself that there is a sky."""
     out = tmp_path_factory.mktemp("runs") / "yard"
     asked = load("smoke", [f"scene.path='{yard[1]}'", *LONGER, "model.background=auto"])
-    run_pipeline(asked, out, None, "new")
+    run_pipeline(asked, RunState.read(out), None, "new")
     assert RunState.read(out).is_whole(asked), "the same command finds it up to date"
     return out
 
@@ -116,7 +116,7 @@ def test_a_choice_is_written_with_its_reason(learned):
 
 def test_without_visible_sky_the_bits_are_those_without_the_key(tiny_scene, tmp_path, few_steps, rng):
     asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "model.background=auto"])
-    run_pipeline(asked, tmp_path / "run", None, "new")
+    run_pipeline(asked, RunState.read(tmp_path / "run"), None, "new")
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
     assert (found.chosen, found.reason) == ("off", "the photographs have transparency")
     assert digest(tmp_path / "run") == digest(few_steps)
@@ -159,7 +159,7 @@ def test_pixels_that_count_and_are_opaque_show_a_sky(tmp_path, rng, alpha, maske
         write_model(folder / "sparse" / "0", views, yard.points, None)
     more = [f"scene.masks={masks}"] if masked else []
     settings = [f"scene.path='{folder}'", *FEW, "optimize.steps=1", "scene.holdout=4", "model.background=auto", *more]
-    run_pipeline(load("smoke", settings), tmp_path / "run", None, "new")
+    run_pipeline(load("smoke", settings), RunState.read(tmp_path / "run"), None, "new")
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
     assert (found.chosen, found.reason.startswith(why)) == (chosen, True), found.reason
 
@@ -239,7 +239,7 @@ def test_another_model_of_the_same_name_does_not_take_a_sky(learned, tmp_path, c
 def test_an_export_of_splats_shows_the_sky_without_its_file(yard, learned, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(learned, out)
-    run_pipeline(load(str(out / "pipeline.yaml"), ["export.sky=splats"]), out, None, "resume")
+    run_pipeline(load(str(out / "pipeline.yaml"), ["export.sky=splats"]), RunState.read(out), None, "resume")
     assert not (out / "point_cloud_sky.json").exists()
     model, before = clsplat.load(out), clsplat.load(learned)
     assert len(model) == len(before) + 10_000

@@ -201,7 +201,7 @@ def test_blocks_trained_in_a_store_are_those_trained_here(tiny_scene, few_steps,
     train(tiny_scene, few_steps, tmp_path / "here", blocks=2, sight=NEVER)
     on, out, here = tmp_path / "lab.yaml", tmp_path / "out", []
     run = finetune.run_pipeline
-    monkeypatch.setattr(finetune, "run_pipeline", lambda *words: here.append(words[1].name) or run(*words))
+    monkeypatch.setattr(finetune, "run_pipeline", lambda *words: here.append(words[1].out.name) or run(*words))
     on.write_text(f"engine: inline\nstore: '{tmp_path / 'store'}'\n")
     for _ in range(2):  # the second time all is done
         train(tiny_scene, few_steps, out, blocks=2, sight=NEVER, on=on)

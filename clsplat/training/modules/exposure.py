@@ -369,7 +369,8 @@ def exposures_of(run: Run) -> Exposures:
     """Return what the training photographs show of their exposures, or else what their cameras noted; measured once."""
     views = run.scene.split("train")
     names = tuple(view.name for view in views)
-    if names not in run.exposures:
+    key = TABLE, names
+    if key not in run.measured:
 
         def read(view: View) -> tuple[NDArray[np.uint8], Mask | None]:
             photograph = run.photographs.get(view)
@@ -378,8 +379,9 @@ def exposures_of(run: Run) -> Exposures:
         counted = run.status.counted(views, "photographs", len(views))
         shown = measured(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
         told = len(shown.log_gains) == len(set(names))
-        run.exposures[names] = shown if told else with_noted(shown, noted(views))
-    return run.exposures[names]
+        run.measured[key] = shown if told else with_noted(shown, noted(views))
+    exposures: Exposures = run.measured[key]
+    return exposures
 
 
 def change_colors(workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats) -> Array:
