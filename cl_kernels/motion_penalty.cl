@@ -1,19 +1,19 @@
 /* Penalties on the motion of Gaussians: value and gradient.  Planes of `motion` as in motion.cl; s is the duration.
  *
- *   travel    min(s, 1) |v|: the way in the time in which it is there, at most that of the scene; s is a constant
- *   brevity   max(log(s_0 / s), 0): how much shorter it is there than s_0
+ *   motion_l2       min(s, 1) |v|: the distance traveled during s, at most the scene's duration; s is a constant
+ *   short_duration  max(log(s_0 / s), 0): how much shorter s is than s_0
  *
  * One item = LANES Gaussians; each adds to the gradient and writes one sum.  No local memory.  Deterministic. */
 #include "motion.h"
 
 #define SPEED2_MIN 1.0e-20f  // (scene units by the scene's duration)^2, below which nothing moves
 
-/* grad_motion += weight d(travel)/d(v). */
+/* grad_motion += weight d(motion_l2)/d(v). */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void travel(
+void motion_l2(
     __global const float *restrict motion,  // [W,S]
     __global float *restrict grad_motion,   // [W,S]
-    __global float *restrict sums,          // [items] sums of the travel, scene units
+    __global float *restrict sums,          // [items] sums of min(s, 1) |v|, scene units
     const float weight,                     // scene units^-1
     const uint stride,
     const uint count)
@@ -36,12 +36,12 @@ void travel(
     sums[get_global_id(0)] = sum_lanes(moves ? time * speed : (VF)(0.0f));
 }
 
-/* grad_motion += weight d(brevity)/d(log s). */
+/* grad_motion += weight d(short_duration)/d(log s). */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void brevity(
+void short_duration(
     __global const float *restrict motion,  // [W,S]
     __global float *restrict grad_motion,   // [W,S]
-    __global float *restrict sums,          // [items] sums of the brevity
+    __global float *restrict sums,          // [items] sums of max(log(s_0 / s), 0)
     const float log_below,                  // log of s_0
     const float weight,
     const uint stride,

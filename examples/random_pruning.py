@@ -29,10 +29,10 @@ class CapSize(Scheduled):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
 
-    to: Positive = 0.1
+    max_size: Positive = 0.1
     """Largest standard deviation along an axis, as a fraction of the extent; number by step."""
 
     def run(self, run: Run) -> None:
         log_scales = run.model.gaussians.get("log_scales")
-        largest = np.log(at_step(self.to, run.step) * run.scene.extent)
+        largest = np.log(at_step(self.max_size, run.step) * run.scene.extent)
         run.model.gaussians.set("log_scales", np.minimum(log_scales, largest).astype(np.float32))

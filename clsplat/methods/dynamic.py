@@ -102,43 +102,43 @@ def require_motion(name: str, gaussians: Gaussians) -> None:
 # Penalties on the motion of Gaussians, which keep what stands still where it is, and what is there, there.
 
 
-class Travel(Penalty):
+class MotionL2(Penalty):
     """Mean over Gaussians of min(s, 1) |v|, in extents: the way of each while it is there, s its duration (ours).
 
     Meant for velocities of which the photographs say little.  On the synthetic scene it lost 0.3 to 0.5 dB, beside
-    `brevity` (docs/moving.md), and no recipe has it.
+    `short_duration` (docs/moving.md), and no recipe has it.
     """
 
-    type: Literal["travel"] = "travel"
+    type: Literal["motion_l2"] = "motion_l2"
 
     def add(self, inputs: PenaltyInputs) -> LossValue:
         require_moving(self.type, inputs)
-        sums = inputs.sums("travel")
+        sums = inputs.sums("motion_l2")
         weight = at_step(self.weight, inputs.step) / max(1, inputs.gaussians.count) / inputs.extent
-        inputs.gaussians.device.program("motion_penalty.cl").travel(
+        inputs.gaussians.device.program("motion_penalty.cl").motion_l2(
             **inputs.arguments(MOTION), sums=sums, weight=weight
         )
-        return LossValue("travel", lambda: weight * float(sums.get().sum(dtype="float64")))
+        return LossValue("motion_l2", lambda: weight * float(sums.get().sum(dtype="float64")))
 
 
-class Brevity(Penalty):
+class ShortDuration(Penalty):
     """Mean over Gaussians of max(log(s₀ / s), 0), s₀ = `below`: against durations that show one moment alone (ours).
 
-    No recipe has it: see `travel`.
+    No recipe has it: see `motion_l2`.
     """
 
-    type: Literal["brevity"] = "brevity"
+    type: Literal["short_duration"] = "short_duration"
     below: Annotated[float, Field(gt=0)] = 1.0
     """s₀, the duration from which on there is no penalty, by the scene's duration."""
 
     def add(self, inputs: PenaltyInputs) -> LossValue:
         require_moving(self.type, inputs)
-        sums = inputs.sums(f"brevity {self.below}")
+        sums = inputs.sums(f"short_duration {self.below}")
         weight = at_step(self.weight, inputs.step) / max(1, inputs.gaussians.count)
-        inputs.gaussians.device.program("motion_penalty.cl").brevity(
+        inputs.gaussians.device.program("motion_penalty.cl").short_duration(
             **inputs.arguments(MOTION), sums=sums, log_below=math.log(self.below), weight=weight
         )
-        return LossValue("brevity", lambda: weight * float(sums.get().sum(dtype="float64")))
+        return LossValue("short_duration", lambda: weight * float(sums.get().sum(dtype="float64")))
 
 
 def require_moving(name: str, inputs: PenaltyInputs) -> None:

@@ -64,21 +64,21 @@ class Uniform(Order):
         return pool.shuffled(range(len(pool.views)), step)
 
 
-class Paper(Order):
+class ShuffleOrder(Order):
     """Views of the finest size twice as often as the others: 40, 20, 20, 20 % for four sizes (Barron et al. 2021, whose
     protocol Mip-Splatting follows)."""
 
-    type: Literal["paper"] = "paper"
+    type: Literal["shuffle"] = "shuffle"
 
     def at(self, pool: ViewPool, step: int) -> View:
         return pool.shuffled([*range(len(pool.views)), *pool.finest], step)
 
 
-class Code(Order):
+class StackOrder(Order):
     """A random view of the finest size in the place of 30 % of the steps: 47.5, 17.5, 17.5, 17.5 % for four sizes (the
     released code of Mip-Splatting)."""
 
-    type: Literal["code"] = "code"
+    type: Literal["stack"] = "stack"
 
     def at(self, pool: ViewPool, step: int) -> View:
         rng = pool.random(step)

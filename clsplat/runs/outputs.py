@@ -22,7 +22,7 @@ from clsplat.core.machine import Owner
 from clsplat.core.reading import read_file, sha256
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.state import Phase, RunState, is_below, not_whole, read_sums
-from clsplat.stages.report import is_by_heart
+from clsplat.stages.report import is_overfit
 from clsplat.training.run import Run
 from clsplat.training.stage import Training
 
@@ -37,7 +37,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "train": run.metrics.get("train", {}),
         **({"validation": run.metrics["validation"]} if "validation" in run.metrics else {}),
         **({"kept": run.best.figures()} if run.best else {}),
-        **({"by_heart": True} if is_by_heart(run) else {}),
+        **({"overfit": True} if is_overfit(run) else {}),
         "gaussians": run.gaussians,
         **({"parameters": run.learned_field.parameters} if run.learned_field else {}),
         "steps": run.step,

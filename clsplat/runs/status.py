@@ -177,7 +177,7 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
         more = f"; `clsplat resume {in_shell(folder)} --steps {2 * metrics['steps']}` trains longer"
-        if metrics.get("by_heart"):
+        if metrics.get("overfit"):
             more = "; the photographs are learned by heart: more of them help most"
         elif kept and (kept["refit"] or kept["step"] < kept["last"]["step"]):  # validation has found where to end
             more = ""

@@ -40,7 +40,7 @@ class Evaluate(Scheduled):
     makes: ClassVar[frozenset[str]] = frozenset({"metrics"})
     output_keys: ClassVar[frozenset[str]] = CADENCE | {
         "split",
-        "most",
+        "max_views",
         "downscales",
         "metrics",
         "lpips",
@@ -50,7 +50,7 @@ class Evaluate(Scheduled):
 
     split: Literal["test", "train", "validation"] = "test"
     """Views that are measured."""
-    most: Annotated[int, Field(gt=0)] | None = None
+    max_views: Annotated[int, Field(gt=0)] | None = None
     """Number of views that are measured at most, evenly spaced; without it, all."""
     downscales: Annotated[list[Downscale], Field(min_length=1)] | None = None
     """Divisors of the photographs' size; without it, the smallest in training."""
@@ -90,7 +90,7 @@ class Evaluate(Scheduled):
         perceptual, painter = self._perceptual(), self._painter(run)
         for downscale in self.downscales or [run.downscale]:
             found = learned_scene(run).downscaled(downscale).split(self.split)
-            views = some_of(found, self.most or len(found))
+            views = some_of(found, self.max_views or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
             trained, colors = run.scene.split("train"), measured_as(run)

@@ -40,7 +40,7 @@ class Export(Scheduled):
     """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
     quality: Quality = "balanced"
     """Of SPZ and SOG, how finely harmonics, colors, positions and rotations are rounded."""
-    sky: Literal["beside", "splats"] = "beside"
+    sky: Literal["sidecar", "splats"] = "sidecar"
     """A sky that was learned (`model.background`): a file beside the model, or 10 000 Gaussians on a far sphere, which
     every viewer shows."""
 

@@ -32,7 +32,7 @@ from clsplat.training.stage import Stage
 # Where the first Gaussians lie: at the scene's points, on surfaces that a sweep finds, or on a hull.
 
 LOG = logging.getLogger("clsplat")
-MIN_POINTS = 100  # with fewer from a sweep or a hull, random ones are used
+MIN_USABLE = 100  # with fewer from a sweep or a hull, random ones are used
 Chance = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 
 
@@ -66,7 +66,7 @@ def points_and_sweep(run: Run, count: int, chance: Chance | None) -> PointCloud:
 def enough_swept(run: Run, count: int, chance: Chance | None) -> PointCloud | None:
     """Return the points of `swept`, or None, with a warning, where they are too few."""
     points = swept(run, count, chance)
-    if len(points) < MIN_POINTS:
+    if len(points) < MIN_USABLE:
         remedy = "photographs from places that lie closer together agree on more"
         LOG.warning("the photographs agree on %d points only; starting from random ones; %s", len(points), remedy)
         return None
@@ -76,7 +76,7 @@ def enough_swept(run: Run, count: int, chance: Chance | None) -> PointCloud | No
 def on_hull(run: Run, count: int) -> PointCloud | None:
     """Return at most `count` points on the hull of the silhouettes, or None, with a warning, where they are too few."""
     points = hull_points(_views(run), *looked_at_box(run.scene), load_rgba, count, run.seed)
-    if len(points) < MIN_POINTS:
+    if len(points) < MIN_USABLE:
         remedy = "they need transparency around what they show, and no masks; or use init: {source: sweep}"
         LOG.warning(
             "the photographs' silhouettes give %d points only; starting from random ones; %s", len(points), remedy
@@ -99,7 +99,7 @@ class Init(Stage):
     `source: auto` uses the scene's points if it has points.  Without points it uses a plane sweep over the photographs,
     or, where these have transparent pixels, what `transparent` says: random points in a box around the point
     that the cameras look at, as published, or points on the hull of the silhouettes in that box.  Where a scene has
-    fewer points than `fewest`, and its photographs are opaque, those of a sweep join them.  `source: points+sweep`
+    fewer points than `min_points`, and its photographs are opaque, those of a sweep join them.  `source: points+sweep`
     adds those of a sweep however many points the scene has, but where a pixel shows one of them or is transparent.
     """
 
@@ -112,7 +112,7 @@ class Init(Stage):
     """Source of the first Gaussians."""
     transparent: Literal["random", "hull"] = "random"
     """Source of `auto` for a scene without points whose photographs are transparent."""
-    fewest: Annotated[int, Field(ge=0)] = 0
+    min_points: Annotated[int, Field(ge=0)] = 0
     """Number of the scene's points below which `auto` adds those of a plane sweep."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first Gaussians."""
@@ -120,7 +120,7 @@ class Init(Stage):
     """Factor of the first sizes."""
     count: Annotated[int, Field(gt=0)] = 100_000
     """Number of random points; largest number of points on a hull."""
-    swept: Annotated[int, Field(gt=0)] = 20_000
+    sweep_points: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
     detail: Literal["uniform", "laplacian"] = "uniform"
     """Which pixels of a sweep become points: all with the same chance, and sizes are those of neighbors; or where the
@@ -132,7 +132,7 @@ class Init(Stage):
     duration: Annotated[float, Field(gt=0)] = 4.0
     """Standard deviation of the time around that, by the scene's duration; a long one begins as a scene that stands
     still."""
-    shortest: Annotated[float, Field(gt=0)] = 0.1
+    min_duration: Annotated[float, Field(gt=0)] = 0.1
     """Shortest duration of the Gaussians whose points moved, with `times: per_frame`, by the scene's duration."""
     file: ReadPath | None = None
     """Model file of any format, or a run folder, for `source: model`."""
@@ -173,12 +173,12 @@ class Init(Stage):
         if source == "model":
             return len(self._read()["means"])
         if source in ("points", "points+sweep"):
-            return (0 if scene.points is None else len(scene.points)) + self.swept * self._is_joined(scene)
-        return self.swept if source == "sweep" else self.count
+            return (0 if scene.points is None else len(scene.points)) + self.sweep_points * self._is_joined(scene)
+        return self.sweep_points if source == "sweep" else self.count
 
     def _is_joined(self, scene: Scene) -> bool:
         """Whether points of a sweep join those of the scene."""
-        few = scene.points is not None and len(scene.points) < self.fewest
+        few = scene.points is not None and len(scene.points) < self.min_points
         return self.source == "points+sweep" or (self.source == "auto" and few and not is_transparent(scene))
 
     def _origin(self, source: str, scene: Scene) -> str:
@@ -206,20 +206,20 @@ class Init(Stage):
             return with_motion(with_degree(self._read(), degree), run.model_settings.time, str(self.file)), source
         chance = CHANCES[self.detail]
         found: dict[str, Callable[[], PointCloud | None]] = {
-            "sweep": lambda: enough_swept(run, self.swept, chance),
+            "sweep": lambda: enough_swept(run, self.sweep_points, chance),
             "hull": lambda: on_hull(run, self.count),
             "points": lambda: own_points(run.scene),
-            "points+sweep": lambda: points_and_sweep(run, self.swept, chance),
+            "points+sweep": lambda: points_and_sweep(run, self.sweep_points, chance),
         }
         points = found[source]() if source in found else None
         if points is None:
             points, source = self._random(run), "random"
         if source == "points" and self._is_joined(run.scene):
-            points, source = points.joined(swept(run, self.swept, chance)), "points+sweep"
+            points, source = points.joined(swept(run, self.sweep_points, chance)), "points+sweep"
         self._require_memory(run, len(points))
         parameters = from_points(points, self.opacity, degree, self.scale)
         seen = points.times if self.times == "per_frame" else None
-        return moving(parameters, run.model_settings.time, seen, (self.duration, self.shortest), run.seed), source
+        return moving(parameters, run.model_settings.time, seen, (self.duration, self.min_duration), run.seed), source
 
     def _read(self) -> Parameters:
         assert self.file is not None  # as `check` requires

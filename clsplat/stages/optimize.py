@@ -78,7 +78,7 @@ class Keeping(Training):
         every = own.every if own else self.steps // parts
         start, stop = (own.start, own.stop) if own else (0, None)
         facts = {"metrics": [*PSNR_AND_SSIM], "every": every}
-        train = Evaluate.model_validate({**facts, "split": "train", "most": SHOWN, "start": start, "stop": stop})
+        train = Evaluate.model_validate({**facts, "split": "train", "max_views": SHOWN, "start": start, "stop": stop})
         return [train] if own else [train, Evaluate.model_validate({**facts, "split": "validation"})]
 
     @property

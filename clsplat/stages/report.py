@@ -274,7 +274,7 @@ def overfitting_note(run: Run) -> str:
     return f"{text} {REMEDY}" if now.is_apart else text if split == "validation" else ""
 
 
-def is_by_heart(run: Run) -> bool:
+def is_overfit(run: Run) -> bool:
     """Return whether the model of a run has learned its photographs by heart, as far as that is known."""
     now = run.best.found if run.best else _psnr_elsewhere(run)[1]
     return now is not None and now.is_apart

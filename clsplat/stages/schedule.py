@@ -26,15 +26,15 @@ class RaiseSh(Scheduled):
 class ResetOpacity(Scheduled):
     """Lower all opacities; training raises those of needed Gaussians, and pruning removes floaters (Kerbl et al. 2023).
 
-    `to` holds after the world filter (Yu et al. 2024).
+    `value` holds after the world filter (Yu et al. 2024).
     """
 
     stage: Literal["reset_opacity"] = "reset_opacity"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"to"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"value"})
 
-    to: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    value: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Largest opacity after the reset."""
     when_background: Literal["black", "white"] | None = None
     """Background on which the stage acts; without it, on both."""
@@ -45,7 +45,7 @@ class ResetOpacity(Scheduled):
     def run(self, run: Run) -> None:
         if not self._acts(run):
             return
-        cap_opacity(run.model.gaussians, self.to)
+        cap_opacity(run.model.gaussians, self.value)
         if run.adam is not None:
             run.adam.forget("logit_opacity")
 

@@ -25,7 +25,7 @@ class MotionRates(Settings):
     Times are shares of the time from the first to the last moment of the scene.
     """
 
-    training_keys: ClassVar[frozenset[str]] = frozenset({"shortest"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"min_duration"})
 
     velocity: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
     """Of velocities, as shares of the scene's extent; they fall, as in FreeTimeGS."""
@@ -39,7 +39,7 @@ class MotionRates(Settings):
     """Of the coefficients of the third power of time, as shares of the scene's extent."""
     turn: Rate = 1.0e-3
     """Of the changes of quaternions by time."""
-    shortest: Annotated[float, Field(ge=0, lt=1)] = 0.02
+    min_duration: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Shortest duration that an update leaves; what is shorter than a moment shows nothing between two of them."""
 
     def times(self, factor: float) -> "MotionRates":
@@ -48,12 +48,12 @@ class MotionRates(Settings):
 
     @property
     def _rates(self) -> list[str]:
-        return [name for name in type(self).model_fields if name != "shortest"]
+        return [name for name in type(self).model_fields if name != "min_duration"]
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates of a global step by the names of the fields, and `shortest`."""
+        """Return the rates of a global step by the names of the fields, and `min_duration`."""
         rates = {name: at_step(getattr(self, name), step) for name in self._rates}
-        return {**rates, **{name: rates[name] * extent for name in IN_EXTENTS}, "shortest": self.shortest}
+        return {**rates, **{name: rates[name] * extent for name in IN_EXTENTS}, "min_duration": self.min_duration}
 
 
 def update_motion(
@@ -70,8 +70,8 @@ def update_motion(
     """
     table, (moment1, moment2) = gaussians.tables[MOTION], moment_tables(MOTION)
     beta1, beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
-    shortest = math.log(rates["shortest"]) if rates["shortest"] else -LONGEST
-    bounds = {"log_duration": (shortest, LONGEST)}
+    min_duration = math.log(rates["min_duration"]) if rates["min_duration"] else -LONGEST
+    bounds = {"log_duration": (min_duration, LONGEST)}
     shared: dict[str, Any] = {
         "motion": table.array,
         "gradient": gradients[MOTION],

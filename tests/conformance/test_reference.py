@@ -785,7 +785,7 @@ def test_gradients_of_a_motion(rng, degree, turns):
     assert relative_error(by_logit, five_point(value, logit)) < FD_TOLERANCE
 
 
-@pytest.mark.parametrize("penalty", [lambda m: ref.travel(m, 2.5), lambda m: ref.brevity(m, 0.4)])
+@pytest.mark.parametrize("penalty", [lambda m: ref.motion_l2(m, 2.5), lambda m: ref.short_duration(m, 0.4)])
 def test_gradients_of_penalties_on_the_motion(rng, penalty):
     motion = rng.normal(0, 0.4, (7, 8))
     motion[:, 4] = rng.normal(-1, 0.5, 7)

@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.settings import OneOf, Settings, descriptions, rebuild, tag_of, variants
 from clsplat.density.edit import Edit, Rule
 from clsplat.losses.base import ImageLoss, Loss, Penalty
-from clsplat.photos.sampling import Order, Paper
+from clsplat.photos.sampling import Order, ShuffleOrder
 from clsplat.photos.transforms import PhotographTransform
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.recipes import json_schema
@@ -52,11 +52,11 @@ def own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_variants_are_the_subclasses_with_a_name():
     images = {"inverse_depth", "weight_entropy", "l1", "l2", "dssim"}
-    penalties = {"travel", "brevity", "covariance_trace", "anisotropy", "mean_scale", "mean_opacity"}
+    penalties = {"motion_l2", "short_duration", "covariance_trace", "anisotropy", "mean_scale", "mean_opacity"}
     assert variants(Loss).keys() == images | penalties
     assert variants(Loss).keys() == variants(ImageLoss).keys() | variants(Penalty).keys()
-    assert variants(Order)["paper"] is Paper
-    assert tag_of(Paper) == ("type", "paper")
+    assert variants(Order)["shuffle"] is ShuffleOrder
+    assert tag_of(ShuffleOrder) == ("type", "shuffle")
     assert tag_of(Order) is None, "a base is no variant"
     assert {"densify", "evaluate", "checkpoint"} <= variants(Scheduled).keys() < variants(Stage).keys()
 
@@ -109,22 +109,22 @@ def test_nested_variants_are_known_in_any_definition_order(tmp_path):
 @pytest.mark.usefixtures("own")
 def test_two_variants_of_one_name_are_refused():
     class Other(Order):
-        type: Literal["paper"] = "paper"
+        type: Literal["shuffle"] = "shuffle"
 
     with pytest.raises(ConfigError) as error:
         variants(Order)
     assert str(error.value) == (
-        "two variants of Order have the name 'paper': "
-        "clsplat.photos.sampling.Paper and tests.core.test_settings.Other; "
+        "two variants of Order have the name 'shuffle': "
+        "clsplat.photos.sampling.ShuffleOrder and tests.core.test_settings.Other; "
         "rename one"
     )
 
 
 def test_a_word_means_the_variant_with_its_defaults(loaded):
-    words = loaded("{order: paper}", "[l1, dssim]", "[clone, prune_faint]")
-    mappings = loaded("{order: {type: paper}}", "[{type: l1}, {type: dssim}]", "[{type: clone}, {type: prune_faint}]")
+    words = loaded("{order: shuffle}", "[l1, dssim]", "[clone, prune_faint]")
+    mappings = loaded("{order: {type: shuffle}}", "[{type: l1}, {type: dssim}]", "[{type: clone}, {type: prune_faint}]")
     assert words.resolved() == mappings.resolved()
-    assert words.resolved() != loaded("{order: code}", "[l1, dssim]", "[clone, prune_faint]").resolved()
+    assert words.resolved() != loaded("{order: stack}", "[l1, dssim]", "[clone, prune_faint]").resolved()
 
 
 @pytest.mark.parametrize(
@@ -135,18 +135,18 @@ def test_a_word_means_the_variant_with_its_defaults(loaded):
         ({"rules": "[{type: splitt}]"}, "no rule named 'splitt'; did you mean 'split'?"),
         ({"losses": "[disim]"}, "small.yaml:7: stages[1].optimize.losses[0]: no loss named 'disim'; did you mean "
          "'dssim'?"),
-        ({"losses": "[xyz]"}, "no loss named 'xyz'; there are anisotropy, brevity, covariance_trace, dssim, "
+        ({"losses": "[xyz]"}, "no loss named 'xyz'; there are anisotropy, covariance_trace, dssim, "
          "inverse_depth, l1, l2"),
-        ({"views": "{order: papr}"}, "small.yaml:6: stages[1].optimize.views.order: no order named 'papr'; did you "
-         "mean 'paper'?"),
+        ({"views": "{order: shufle}"}, "small.yaml:6: stages[1].optimize.views.order: no order named 'shufle'; did you "
+         "mean 'shuffle'?"),
         ({"views": "{transforms: [blurr]}"}, "no photograph transform named 'blurr'; did you mean 'blur'?"),
         ({"views": "{order: 3}"}, "stages[1].optimize.views.order: "),
         ({"views": "{order: {}}"}, "stages[1].optimize.views.order: expected a 'type', the name of the order"),
-        ({"views": "{order: {type: paper, share: 1}}"}, "optimize.views.order.share: unknown key 'share'"),
+        ({"views": "{order: {type: shuffle, share: 1}}"}, "optimize.views.order.share: unknown key 'share'"),
         ({"budget": "{gaussians: 1}"}, "small.yaml:9: stages[1].optimize.during[0].densify.budget: expected a "
          "'type', the name of the budget"),
         ({"budget": "parabol"}, "no budget named 'parabol'; did you mean 'parabola'?"),
-        ({"views": "{oder: paper}"}, "unknown key 'oder'; did you mean 'order'?"),
+        ({"views": "{oder: shuffle}"}, "unknown key 'oder'; did you mean 'order'?"),
         ({"views": "{transforms: [blur]}"}, "'sigma' is missing"),
         ({"rules": "[{type: clone, statistic: screen_grat}]"}, "rules[0].statistic: expected "),
     ],

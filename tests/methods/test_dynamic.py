@@ -35,7 +35,7 @@ from tests.support.recipes import short, train
 train(short("dynamic_7k", Path(sys.argv[1])), Path(sys.argv[2]))
 """
 GUARDED = (  # penalties on the motion, and the rule that divides Gaussians in time
-    "optimize.losses=[l1, {type: travel, weight: 0.1}, {type: brevity, weight: 0.1, below: 9}]",
+    "optimize.losses=[l1, {type: motion_l2, weight: 0.1}, {type: short_duration, weight: 0.1, below: 9}]",
     "optimize.during=[{densify: {every: 1, start: 0, stop: 9, rules: ["
     "{type: split_in_time, gradient_above: 1.0e-9, travel_above: 0.01}]}}]",
 )
@@ -121,12 +121,12 @@ def test_a_static_recipe_trains_on_a_scene_that_moves(scene, tmp_path):
 
 def test_moving_model_starts_only_a_training_of_the_same_motion(finished, scene, tmp_path):
     start = ("init.source='model'", f"init.file='{finished}'", "optimize.steps=2")
-    bound = "optimize.rates={motion: {shortest: 0.9}}"
+    bound = "optimize.rates={motion: {min_duration: 0.9}}"
     run = train_overridden(scene, tmp_path / "again", *start, "model.time={degree: 1}", bound, *GUARDED)
     assert run.model.gaussians.tables[MOTION].components == 5
-    shortest = [np.exp(table[:, 4].min()) for table in (load(finished).motion, run.model.gaussians.get(MOTION))]
-    assert shortest[0] < 0.5
-    assert shortest[1] == pytest.approx(0.9)
+    durations = [np.exp(table[:, 4].min()) for table in (load(finished).motion, run.model.gaussians.get(MOTION))]
+    assert durations[0] < 0.5
+    assert durations[1] == pytest.approx(0.9)
     entries = [json.loads(line) for line in (tmp_path / "again" / "metrics.jsonl").read_text().splitlines()]
     assert next(entry for entry in entries if entry["kind"] == "densify")["grown"]["split_in_time"] > 0
     logged = next(entry for entry in entries if entry["kind"] == "train")
@@ -138,8 +138,8 @@ def test_moving_model_starts_only_a_training_of_the_same_motion(finished, scene,
 
 
 def test_penalties_and_rules_of_motion_need_one(tiny_scene, tmp_path):
-    with pytest.raises(ConfigError, match=r"the loss 'travel': expected Gaussians that move"):
-        train_overridden(tiny_scene, tmp_path / "run", "optimize.losses=[l1, travel]", "optimize.steps=2")
+    with pytest.raises(ConfigError, match=r"the loss 'motion_l2': expected Gaussians that move"):
+        train_overridden(tiny_scene, tmp_path / "run", "optimize.losses=[l1, motion_l2]", "optimize.steps=2")
 
 
 def test_the_plan_of_memory_counts_the_motion(info):

@@ -10,7 +10,7 @@ import pytest
 
 from clsplat.core.errors import DataError, Interrupted
 from clsplat.core.progress import Progress
-from clsplat.photos.sampling import Paper, Sampler, ViewPool, ViewSettings
+from clsplat.photos.sampling import Sampler, ShuffleOrder, ViewPool, ViewSettings
 from clsplat.photos.transforms import Blur
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner
@@ -26,10 +26,10 @@ FRACTIONS = "optimize.views.resolution=[[1, 3.0], [40, 1.0]]"
 
 def test_sample_is_the_ordered_view_at_the_size_of_the_step(tiny_scene):
     views = read_scene(tiny_scene).downscaled(1, 2).split("train")
-    settings = ViewSettings(order=Paper(), resolution={"points": [[0, 2], [20, 1]], "between": "steps"})
+    settings = ViewSettings(order=ShuffleOrder(), resolution={"points": [[0, 2], [20, 1]], "between": "steps"})
     sampler, pool = Sampler(views, settings, seed=5), ViewPool(views, 5)
     for step in range(1, 40):
-        view, sample = Paper().at(pool, step), sampler.at(step)
+        view, sample = ShuffleOrder().at(pool, step), sampler.at(step)
         divisor = 2 if step < 20 else 1
         assert (sample.view.name, sample.view.downscale) == (view.name, view.downscale * divisor)
         assert sample.view.camera.width == 40 / (view.downscale * divisor)
@@ -68,7 +68,7 @@ def test_views_change_what_is_trained_and_their_defaults_do_not(tiny_scene, few_
     train(tiny_scene, tmp_path / "same", *FEW, f"optimize.views={same}")
     assert digest(tmp_path / "same") == digest(few_steps)
     found = {digest(few_steps)}
-    for name, setting in (("resolution", RESOLUTION), ("blur", BLUR), ("order", "optimize.views.order=paper")):
+    for name, setting in (("resolution", RESOLUTION), ("blur", BLUR), ("order", "optimize.views.order=shuffle")):
         run = train(tiny_scene, tmp_path / name, *FEW, setting)
         found.add(digest(tmp_path / name))
         assert run.metrics["test"].keys() == {"1"}, "what is measured keeps its size"

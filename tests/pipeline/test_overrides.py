@@ -136,13 +136,13 @@ def test_set_can_complete_a_file(tmp_path):
 def test_bare_names_in_a_file_can_be_changed_below(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text(
-        "name: x\nstages:\n  - init\n  - optimize:\n      steps: 3\n      losses: [l1]\n      views: {order: code}\n"
+        "name: x\nstages:\n  - init\n  - optimize:\n      steps: 3\n      losses: [l1]\n      views: {order: stack}\n"
         "      during: [{densify: {every: 2, rules: [prune_faint]}}]\n"
     )
     settings = load(str(path), ["optimize.losses[0].weight=0.5", "densify.rules.0.start=7"]).settings.training
     assert (settings.losses[0].type, settings.losses[0].weight) == ("l1", 0.5)
     assert settings.during[0].rules[0].start == 7
-    assert load(str(path), ["optimize.views.order.type=paper"]).settings.training.views.order.type == "paper"
+    assert load(str(path), ["optimize.views.order.type=shuffle"]).settings.training.views.order.type == "shuffle"
 
 
 def test_a_value_may_have_the_notation_of_files():

@@ -122,9 +122,9 @@ THINNING = {
     *(f"densify~3.rules.merge_neighbors{key}" for key in ("", ".start", ".color_below", ".distance_below")),
 }
 LIMITED = {  # a limit of the opacity, in front of the resets
-    *("reset_opacity.every", "reset_opacity.to", "reset_opacity~2.every", "reset_opacity~2.stop"),
+    *("reset_opacity.every", "reset_opacity.value", "reset_opacity~2.every", "reset_opacity~2.stop"),
     *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
-    *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
+    *("reset_opacity~3.stop", "reset_opacity~3.value", "reset_opacity~3.when_background"),
 }
 
 
@@ -159,7 +159,7 @@ MINI = {
     *(f"hide_useless{n}.{key}" for n in ("", "~2") for key in ("every", "weight_per_view", "start", "stop")),
     *("densify.every", "densify.start", "densify.stop"),
     *(f"reset_opacity.{key}" for key in ("every", "stop", "when_background")),
-    *(f"reset_opacity~2.{key}" for key in ("every", "start", "stop", "to", "when_background")),
+    *(f"reset_opacity~2.{key}" for key in ("every", "start", "stop", "value", "when_background")),
 }
 LEAST = ("prune_least", "prune_least~2")
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
@@ -223,16 +223,16 @@ DIFFERENCES = {
         *(f"rates.means.{key}" for key in ("over", "start", "until")),
         *(f"views.resolution{key}" for key in ("", ".every", ".follows", ".largest", ".start", ".until")),
         *(f"{stage}.{key}" for stage in ("add_to_average", "reset_opacity~2") for key in ("every", "start", "stop")),
-        *(f"reset_opacity{key}" for key in (".every", ".start", ".stop", ".to", ".when_background")),
+        *(f"reset_opacity{key}" for key in (".every", ".start", ".stop", ".value", ".when_background")),
         *(
-            "reset_opacity~2.to",
+            "reset_opacity~2.value",
             "reset_opacity~2.when_background",
             "raise_sh.every",
             "raise_sh.stop",
             "evaluate.every",
             "steps",
         ),
-        *("densify.start", "densify.stop", "stages.init.count", "stages.init.fewest", "stages.init.transparent"),
+        *("densify.start", "densify.stop", "stages.init.count", "stages.init.min_points", "stages.init.transparent"),
     },
     ("fast", "fast_30k"): {
         *(f"{stage}.every" for stage in ("raise_sh", "densify~2", "add_to_average", "evaluate", "checkpoint")),
@@ -255,7 +255,7 @@ DIFFERENCES = {
         *("densify.rules.clone.gradient_above", "densify.rules.split.gradient_above"),
         *(
             f"stages.evaluate~2.{key}"
-            for key in ("downscales", "file", "lpips", "lpips_input", "metrics", "most", "split")
+            for key in ("downscales", "file", "lpips", "lpips_input", "metrics", "max_views", "split")
         ),
     },
     ("micro_splatting", "micro_splatting_v2"): THINNING,
@@ -510,7 +510,7 @@ def test_the_schema_accepts_what_the_loader_accepts(own_schema):
         ("- init", "- init:"),
         ("{type: clone}", "clone"),
         ("{type: l1, weight: 0.8}", "l1"),
-        ("steps: 10", "steps: 10\n      views: {order: paper}"),
+        ("steps: 10", "steps: 10\n      views: {order: shuffle}"),
     ],
 )
 def test_schema_accepts_bare_names_and_stages_without_settings(old, new, write, own_schema):

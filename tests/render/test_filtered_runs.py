@@ -15,7 +15,7 @@ from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import read as read_ply
 from clsplat.gaussians.model import Model
 from clsplat.metrics.views import render_view
-from clsplat.photos.sampling import Code, Sampler, ViewSettings
+from clsplat.photos.sampling import Sampler, StackOrder, ViewSettings
 from clsplat.pipeline.loading import load
 from clsplat.render.painter import SplatPainter
 from clsplat.runs import opening, runner
@@ -32,7 +32,7 @@ MIP = (
     "optimize.raise_sh.every=5",
     "optimize.densify.start=5",
 )
-LEVELS = ("scene.levels=3", "optimize.views.order=code", "evaluate.downscales=[1, 2, 4]")
+LEVELS = ("scene.levels=3", "optimize.views.order=stack", "evaluate.downscales=[1, 2, 4]")
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_metrics_of_every_scale(finished):
 
 def test_training_saw_every_level(finished):
     assert finished.scene.downscales == (1, 2, 4)
-    sampler = Sampler(finished.scene.split("train"), ViewSettings(order=Code()), finished.seed)
+    sampler = Sampler(finished.scene.split("train"), ViewSettings(order=StackOrder()), finished.seed)
     assert {sampler.at(step).view.downscale for step in range(1, 51)} == {1, 2, 4}
 
 

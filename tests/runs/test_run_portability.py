@@ -98,7 +98,7 @@ def test_the_summary_names_what_there_is(done, tiny_scene):
 def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
     folder = shutil.copytree(done, tmp_path / "run")
     metrics = json.loads((folder / "metrics.json").read_text())
-    (folder / "metrics.json").write_text(json.dumps({**metrics, "by_heart": True}))
+    (folder / "metrics.json").write_text(json.dumps({**metrics, "overfit": True}))
     assert summary(folder)[-1].endswith("in a browser; the photographs are learned by heart: more of them help most")
 
 

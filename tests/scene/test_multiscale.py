@@ -142,14 +142,14 @@ def shares(views: list[View], order: str, steps: int) -> dict[float, float]:
 def test_the_shares_of_the_scales():
     views = views_of(10, 1, 2, 4, 8)
     assert shares(views, "uniform", 400) == {1: 0.25, 2: 0.25, 4: 0.25, 8: 0.25}
-    assert shares(views, "paper", 500) == {1: 0.4, 2: 0.2, 4: 0.2, 8: 0.2}
-    code = shares(views, "code", 20_000)
-    assert code[1] == pytest.approx(0.475, abs=0.015)
+    assert shares(views, "shuffle", 500) == {1: 0.4, 2: 0.2, 4: 0.2, 8: 0.2}
+    stack = shares(views, "stack", 20_000)
+    assert stack[1] == pytest.approx(0.475, abs=0.015)
     for scale in (2, 4, 8):
-        assert code[scale] == pytest.approx(0.175, abs=0.015)
+        assert stack[scale] == pytest.approx(0.175, abs=0.015)
 
 
-@pytest.mark.parametrize("order", ["uniform", "paper", "code"])
+@pytest.mark.parametrize("order", ["uniform", "shuffle", "stack"])
 def test_the_order_depends_on_seed_and_step_alone(order):
     views = views_of(7, 1, 2)
     straight = drawn(views, order, 60, seed=3)

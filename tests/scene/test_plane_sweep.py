@@ -236,7 +236,7 @@ def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, cap
     cloud = PointCloud(np.random.default_rng(0).random((found, 3), np.float32), np.zeros((found, 3), np.float32))
     monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: cloud)
     monkeypatch.setattr("clsplat.stages.init.is_transparent", lambda scene: alpha)
-    stages = f"[{{init: {{fewest: {own + more}}}}}, {{optimize: {{steps: 1, losses: [l1]}}}}, export]"
+    stages = f"[{{init: {{min_points: {own + more}}}}}, {{optimize: {{steps: 1, losses: [l1]}}}}, export]"
     file.write_text(f"name: start\nstages: {stages}\n")
     caplog.set_level("INFO", "clsplat")
     run = train(tiny_scene, tmp_path / "run", pipeline=str(file))
@@ -250,11 +250,11 @@ def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, cap
 def test_points_and_sweep(tiny_scene, tmp_path, caplog, detail):
     scene = read_scene(tiny_scene)
     caplog.set_level("INFO", "clsplat")
-    sets = ("init.source=points+sweep", f"init.detail={detail}", "init.swept=60", "optimize.steps=1")
+    sets = ("init.source=points+sweep", f"init.detail={detail}", "init.sweep_points=60", "optimize.steps=1")
     train(tiny_scene, tmp_path / "run", *sets)
     found = re.search(r"([\d,]+) Gaussians from the scene's points and a sweep", caplog.text)
     assert found
-    expected = Init(source="points+sweep", swept=60).expected_count(scene)
+    expected = Init(source="points+sweep", sweep_points=60).expected_count(scene)
     assert len(scene.points) < int(found[1].replace(",", "")) <= expected == len(scene.points) + 60
 
 

@@ -130,12 +130,12 @@ NAMED = {
     "masks": sets("scene.masks='{masks}'", scene="lens"),
     "motion_of_degree_3": sets("model.time={degree: 3, rotation: true}", recipe="dynamic_7k", scene="moving"),
     "motion_penalties": sets(
-        "optimize.losses=[l1, {type: travel, weight: 0.1}, {type: brevity, weight: 0.1, below: 9}]",
+        "optimize.losses=[l1, {type: motion_l2, weight: 0.1}, {type: short_duration, weight: 0.1, below: 9}]",
         recipe="dynamic_7k",
         scene="moving",
     ),
     "multiscale": sets("scene.levels=2", scene="multiscale"),
-    "order_of_paper": sets("optimize.views.order=paper"),
+    "shuffle_order": sets("optimize.views.order=shuffle"),
     "pair_budget": sets("rasterizer.pair_budget=1", same_as="splat_7k"),
     "plugin_blur": sets(
         "optimize.views={transforms: [{type: box_blur, reach: [[0, 3], [40, 0]]}]}", plugin="box_blur.py"
@@ -205,8 +205,8 @@ def adjust(name: str, settings: dict[str, Any]) -> None:
         settings["every"] = max(EDITS_EVERY, settings["every"])
         if "stop" in settings and settings["stop"] <= settings["every"]:
             settings["stop"] = settings["every"] + 1
-    if "to" in settings:
-        settings["to"] = max(settings["to"], OPAQUE)
+    if "value" in settings:
+        settings["value"] = max(settings["value"], OPAQUE)
     for rule in settings.get("rules", ()):
         if rule.get("statistic") == "gain":
             rule["gradient_above"] = 0.5  # so few steps promise little

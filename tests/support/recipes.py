@@ -47,7 +47,7 @@ def often(old: Stage, loop: Optimize, saved: int) -> Optimize:
         if before.every != 1 and stage.stage != "raise_sh"
         else stage
         for before, stage in zip(old.during, loop.during, strict=True)
-        if not isinstance(stage, Evaluate) and getattr(stage, "to", 1) > 0.01
+        if not isinstance(stage, Evaluate) and getattr(stage, "value", 1) > 0.01
     ]
     return loop.model_copy(update={"during": during})
 

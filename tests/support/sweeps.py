@@ -31,7 +31,7 @@ stages:
             start: 20
             stop: 300
             rules: [{type: clone, gradient_above: 1.0e-4, size_below: 0.02}, {type: prune_faint, opacity_below: 0.005}]
-        - reset_opacity: {every: 150, stop: 300, to: 0.1}
+        - reset_opacity: {every: 150, stop: 300, value: 0.1}
         - checkpoint: {every: 40}
   - evaluate
   - export

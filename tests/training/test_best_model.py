@@ -16,7 +16,7 @@ from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
 from clsplat.runs.runner import as_trained
 from clsplat.runs.status import summary
-from clsplat.stages.report import NAMES, is_by_heart, overfitting_note
+from clsplat.stages.report import NAMES, is_overfit, overfitting_note
 from clsplat.sweeps.experiment import Job
 from clsplat.training import best_model, checkpoint
 from clsplat.training.archive import split
@@ -232,7 +232,7 @@ def test_without_a_measurement_of_ones_own_there_are_twenty(pipeline):
     train_, validation, *others = training.inner
     assert others == training.during
     assert (validation.split, validation.every) == ("validation", 350)
-    assert (train_.split, train_.every, train_.most) == ("train", 350, 8)
+    assert (train_.split, train_.every, train_.max_views) == ("train", 350, 8)
     assert load("splat_7k").settings.training.inner == training.during
 
 
@@ -396,10 +396,10 @@ def test_run_without_validation_is_told_when_it_overfits(tiny_scene, tmp_path, p
     plain = ("scene.validation=0", "optimize.keep=last", "optimize.steps=8")
     run = train(tiny_scene, tmp_path / "run", *plain, pipeline=pipeline)
     assert overfitting_note(run) == ""
-    assert not is_by_heart(run)
+    assert not is_overfit(run)
     run.records.add(8, "evaluate", split="train", downscale=1, psnr=40.0, ssim=1.0)
     run.records.write()
     assert "40.0 dB at training views" in overfitting_note(run)
     assert "dB at test views, more than 6 dB apart: the photographs are learned by heart" in overfitting_note(run)
     assert "`scene.validation: auto` with `optimize.keep: best`" in overfitting_note(run)
-    assert is_by_heart(run)
+    assert is_overfit(run)

@@ -12,7 +12,7 @@ from clsplat.formats.splats import MOTION, STILL, WIDTHS, fields_of, width_of
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import PenaltyInputs
-from clsplat.methods.dynamic import Brevity, Travel
+from clsplat.methods.dynamic import MotionL2, ShortDuration
 from clsplat.opencl.device import Device
 from clsplat.render.motion import at_moment, to_centers
 from clsplat.render.rasterizer import Rasterizer
@@ -93,8 +93,8 @@ def step_figures(
 ) -> Iterator[Figure]:
     """Two updates, in which durations reach their bound.  every: as in motion_step."""
     case = moving_case(rng, count, width)
-    model, rates = case.model(device), MotionRates(log_duration=0.5, shortest=0.3).at(3, EXTENT)
-    gaussians, shortest = model.gaussians, float(np.log(0.3))
+    model, rates = case.model(device), MotionRates(log_duration=0.5, min_duration=0.3).at(3, EXTENT)
+    gaussians, min_duration = model.gaussians, float(np.log(0.3))
     Adam(gaussians)
     frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
     values, m, v = case.parameters[MOTION].astype(np.float64), np.zeros((count, width)), np.zeros((count, width))
@@ -107,7 +107,7 @@ def step_figures(
         planes[:, :count] = gradient.T
         gradients[MOTION].set(planes)
         values, m, v = ref.adam_step(values, gradient.astype(np.float64), m, v, step, each, seen=seen)
-        values[seen, 4] = np.maximum(values[seen, 4], shortest)
+        values[seen, 4] = np.maximum(values[seen, 4], min_duration)
         update_motion(gaussians, gradients, frame.depth_key, rates, step, every)
     what = f"{count} of {width} columns" + (", of seen rows alone" if every == 0 else "")
     found, before = gaussians.get(MOTION), case.parameters[MOTION]
@@ -128,14 +128,14 @@ def motion(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     yield from still_figures(device, rng)
 
 
-@CHECKS.add("travel", "brevity")
+@CHECKS.add("motion_l2", "short_duration")
 def penalties_of_motion(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for count in COUNTS:
         table = moving_case(rng, count, 8).parameters[MOTION]
         table[1::7, :3] = 0
         for penalty, (value, gradient) in (
-            (Travel(weight=3.0), ref.travel(table.astype(np.float64), EXTENT)),
-            (Brevity(weight=3.0, below=0.4), ref.brevity(table.astype(np.float64), 0.4)),
+            (MotionL2(weight=3.0), ref.motion_l2(table.astype(np.float64), EXTENT)),
+            (ShortDuration(weight=3.0, below=0.4), ref.short_duration(table.astype(np.float64), 0.4)),
         ):
             gaussians = Gaussians(device, {**random_case(rng, count).parameters, MOTION: table})
             gradients, what = GaussianGradients(gaussians), f"{count} Gaussians"

@@ -81,7 +81,7 @@ def moved_backward(
     return grad_motion, grad_center
 
 
-def travel(motion: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
+def motion_l2(motion: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
     """Mean of min(s, 1) |v| by extent, and its gradient by the motion, in which s counts as a constant."""
     time = np.minimum(np.exp(motion[:, 4]), 1)
     speed = np.linalg.norm(motion[:, :3], axis=1)
@@ -90,7 +90,7 @@ def travel(motion: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
     return float((time * speed).mean()) / extent, gradient
 
 
-def brevity(motion: NDArray[Any], below: float) -> tuple[float, NDArray[Any]]:
+def short_duration(motion: NDArray[Any], below: float) -> tuple[float, NDArray[Any]]:
     """Mean of max(log(below / s), 0), and its gradient by the motion."""
     shorter = np.log(below) - motion[:, 4]
     gradient = np.zeros_like(motion)
