@@ -35,7 +35,7 @@ Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explained(", or {q
 
 
 def _no_photographs(share: float) -> float:
-    raise ConfigError("a quantile of pixels needs training photographs")
+    raise ConfigError("a quantile of pixels needs training photographs, and there are none; give a number")
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ def test_undeclared_rewriting_rule_leaves_the_model_as_it_was(tiny_scene, spoilt
     monkeypatch.setattr(MergeNeighbors, "rewrites", False)
     run = opened(tiny_scene, spoilt, tmp_path / "run")
     before = {name: run.model.gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
-    with pytest.raises(ConfigError, match=r"a rule writes .* of Gaussians that stay; expected rules that remove"):
+    with pytest.raises(ConfigError, match=r"a rule changes .* of Gaussians that stay; use it in densify"):
         Cleanup(stage="cleanup", rules=[MergeNeighbors()]).act(run)
     for name, table in before.items():
         np.testing.assert_array_equal(run.model.gaussians.get(name), table)
