@@ -38,7 +38,7 @@ from clsplat.scene.reader import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.view import View
 from clsplat.stages.optimize import Optimize
-from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
+from clsplat.training.modules.base import ModuleState, Scalars, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage, path_in_run
 
@@ -67,7 +67,6 @@ __all__ = [
     "MemoryLimitError",
     "ModuleState",
     "NonNegative",
-    "Numbers",
     "NumericError",
     "OneOf",
     "Optimize",
@@ -82,6 +81,7 @@ __all__ = [
     "Reader",
     "Rule",
     "Run",
+    "Scalars",
     "Scene",
     "Schedule",
     "Scheduled",

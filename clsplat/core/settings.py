@@ -41,7 +41,7 @@ class Settings(BaseModel):
     output_keys: ClassVar[frozenset[str]] = frozenset()  # the model does not depend on them: they may change on resume
     training_keys: ClassVar[frozenset[str]] = frozenset()  # they may change on resume; bits then no longer compare
     step_keys: ClassVar[frozenset[str]] = frozenset()  # steps that grow with the length of the training
-    by_type: ClassVar[bool] = False  # in a list each type is there once, and addressed by it
+    keyed_by_type: ClassVar[bool] = False  # in a list each type is there once, and addressed by it
     rate_keys: ClassVar[frozenset[str]] = frozenset()  # schedules by step whose values fall as much, so that sums stay
     family: ClassVar[str] = ""  # by which `conflicts` of others may name it, next to its type
     conflicts: ClassVar[Mapping[str, str]] = {}

@@ -22,7 +22,7 @@ from clsplat.metrics.images import to_8_bits
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View
 from clsplat.training.memory import first_tables, last_place
-from clsplat.training.modules.base import learned_scene, measured_as
+from clsplat.training.modules.base import color_model, learned_scene
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room
 from clsplat.training.stage import Scheduled, Stage
@@ -171,7 +171,7 @@ class ReinitFromDepth(Stage):
     def _drawn(run: Run, count: int) -> list[Drawn]:
         """What is drawn of each training photograph; random numbers are of the seed, the step and its place."""
         views = learned_scene(run).downscaled(run.downscale).split("train")
-        painter, found, own_colors = run.painter(), list[Drawn](), measured_as(run) is not None
+        painter, found, own_colors = run.painter(), list[Drawn](), color_model(run) is not None
         for number, view in enumerate(run.status.counted(views, "photographs", len(views))):
             photograph = run.photographs.get(view)
             layers = painter.layers(photograph.camera, depth=True)

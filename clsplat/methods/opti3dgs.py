@@ -13,7 +13,7 @@ from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import ByNumber, adam_step
 from clsplat.photos.photographs import apply_mask
 from clsplat.photos.transforms import Planes
-from clsplat.training.modules.base import ModuleState, Numbers, TrainingModule, TrainingStep
+from clsplat.training.modules.base import ModuleState, Scalars, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 STRIP = int(constants("haar.cl")["STRIP"])
@@ -33,9 +33,8 @@ class Haar(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
     rate_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
-    place: ClassVar[int] = 10  # before what compares the photograph with the image
-    planes: ClassVar[int] = 6  # the photograph that is changed, and its gradient
-    outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "numbers"
+    order: ClassVar[int] = 10  # before what compares the photograph with the image
+    device_planes: ClassVar[int] = 6  # the photograph that is changed, and its gradient
 
     type: Literal["haar"] = "haar"
     learn: Literal["filter", "scale"] = "filter"
@@ -45,7 +44,7 @@ class Haar(TrainingModule):
     weight: NonNegative = 0.05
     """Factor of the loss that pulls the filter to Haar's; by step."""
 
-    def state(self, run: Run) -> "HaarState":
+    def create_state(self, run: Run) -> "HaarState":
         return HaarState(self)
 
     def check_losses(self, losses: Sequence[Loss]) -> None:
@@ -57,16 +56,18 @@ class Haar(TrainingModule):
                     "photograph exchanged, such as l1, l2 and dssim; the class of one says `symmetric = True`"
                 )
 
-    def penalty(self, numbers: Numbers, step: int) -> tuple[float, ByNumber]:
+    def penalty(self, scalars: Scalars, step: int) -> tuple[float, ByNumber]:
         """Return the loss of the filter alone, and its derivatives."""
         weight = at_step(self.weight, step)
-        away = {name: value - (name == "haar/scale") for name, value in numbers.items()}
+        away = {name: value - (name == "haar/scale") for name, value in scalars.items()}
         value = weight * 2 * sum(one**2 for one in away.values())
         return value, {name: 4 * weight * one for name, one in away.items()}
 
 
 class HaarState(ModuleState):
     """The filter, and its Adam."""
+
+    after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
     def __init__(self, settings: Haar) -> None:
         super().__init__()
@@ -75,34 +76,34 @@ class HaarState(ModuleState):
     @property
     def filter(self) -> ByNumber:
         """What is learned, by name."""
-        return {name: self.numbers.get(name, 0.0) for name in NAMES[self.settings.learn]}
+        return {name: self.scalars.get(name, 0.0) for name in NAMES[self.settings.learn]}
 
     def after_render(self, step: TrainingStep) -> None:
-        step.keep(self, step.planes)
+        step.save(self, step.planes)
         step.planes = apply_filter(step.planes, self.filter)
 
     def before_losses(self, step: TrainingStep) -> None:
         """A loss keeps the sums of its last call, so that the gradient by the photograph comes before its value."""
-        self.settings.check_losses(step.losses_asked)
-        gradient = gradient_by_photograph(step.losses_asked, step.comparison)
+        self.settings.check_losses(step.loss_settings)
+        gradient = gradient_by_photograph(step.loss_settings, step.comparison)
         if step.planes.mask is not None:
             apply_mask(step.workspace, step.camera, gradient, step.planes.mask)
-        of_images = filter_gradients(step.kept(self), self.filter, gradient)
+        of_images = filter_gradients(step.saved(self), self.filter, gradient)
         value, of_filter = self.settings.penalty(self.filter, step.number)
-        step.own_losses.append(LossValue(self.settings.type, lambda: value))
-        step.keep(self, (of_images, of_filter))
+        step.module_losses.append(LossValue(self.settings.type, lambda: value))
+        step.save(self, (of_images, of_filter))
 
     def update(self, step: TrainingStep) -> None:
-        of_images, of_filter = step.kept(self)
+        of_images, of_filter = step.saved(self)
         by_images = of_images()
         self.learn({name: by_images[name] + own for name, own in of_filter.items()}, step.number)
 
     def learn(self, gradients: ByNumber, step: int) -> None:
         """Change the filter by Adam."""
-        adam_step(self.numbers, self.filter, gradients, at_step(self.settings.rate, step))
+        adam_step(self.scalars, self.filter, gradients, at_step(self.settings.rate, step))
 
 
-def apply_filter(planes: Planes, numbers: ByNumber) -> Planes:
+def apply_filter(planes: Planes, scalars: ByNumber) -> Planes:
     """Return a photograph after the transform; the colors of `planes` stay as they are."""
     camera, workspace = planes.camera, planes.workspace
     found = workspace.array("haar", planes.colors.shape)
@@ -110,12 +111,12 @@ def apply_filter(planes: Planes, numbers: ByNumber) -> Planes:
         items=(camera.stride // 2, camera.rows // 2),
         image=planes.colors,
         found=found,
-        **_arguments(planes, numbers, found),
+        **_arguments(planes, scalars, found),
     )
     return replace(planes, colors=found)
 
 
-def filter_gradients(planes: Planes, numbers: ByNumber, gradient: Array) -> Callable[[], ByNumber]:
+def filter_gradients(planes: Planes, scalars: ByNumber, gradient: Array) -> Callable[[], ByNumber]:
     """Begin the derivatives by scale and leak of what `apply_filter` returned of `planes`; the result waits for them.
 
     gradient: by those colors, [3, rows, stride], zero outside the image and where the mask is.
@@ -127,7 +128,7 @@ def filter_gradients(planes: Planes, numbers: ByNumber, gradient: Array) -> Call
         image=planes.colors,
         gradient=gradient,
         sums=sums,
-        **_arguments(planes, numbers, sums),
+        **_arguments(planes, scalars, sums),
     )
     copied = sums.get_later()
 
@@ -138,9 +139,9 @@ def filter_gradients(planes: Planes, numbers: ByNumber, gradient: Array) -> Call
     return derivatives
 
 
-def _arguments(planes: Planes, numbers: ByNumber, unread: Array) -> dict[str, Any]:
+def _arguments(planes: Planes, scalars: ByNumber, unread: Array) -> dict[str, Any]:
     """Arguments of both kernels; `unread` stands in the place of a mask."""
-    scale, leak = numbers["haar/scale"], numbers.get("haar/leak", 0.0)
+    scale, leak = scalars["haar/scale"], scalars.get("haar/leak", 0.0)
     masked, sizes = int(planes.mask is not None), planes.camera.plane_arguments()
     return {"mask": planes.mask or unread, "masked": masked, "u": leak + scale, "v": leak - scale, **sizes}
 

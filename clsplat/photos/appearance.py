@@ -25,7 +25,7 @@ ADAM = constants("adam.h")
 ByNumber = dict[str, float]
 
 
-def adam_step(numbers: dict[str, float], values: Mapping[str, float], gradients: ByNumber, rate: float) -> None:
+def adam_step(scalars: dict[str, float], values: Mapping[str, float], gradients: ByNumber, rate: float) -> None:
     """Change some numbers by Adam (Kingma and Ba 2015), as the parameters of the Gaussians are changed.
 
     values: the numbers now, by name; beside each, `numbers` keeps NAME/updates, NAME/moment1 and NAME/moment2.
@@ -33,13 +33,13 @@ def adam_step(numbers: dict[str, float], values: Mapping[str, float], gradients:
     beta1, beta2 = ADAM["BETA1"], ADAM["BETA2"]
     for name, value in values.items():
         names = [f"{name}/{kept}" for kept in ("updates", "moment1", "moment2")]
-        updates, moment1, moment2 = (numbers.get(kept, 0.0) for kept in names)
+        updates, moment1, moment2 = (scalars.get(kept, 0.0) for kept in names)
         updates, gradient = updates + 1, gradients[name]
         moment1 = beta1 * moment1 + (1 - beta1) * gradient
         moment2 = beta2 * moment2 + (1 - beta2) * gradient**2
         root = math.sqrt(moment2 / (1 - beta2**updates)) + ADAM["EPSILON"]
-        numbers[name] = value - rate * moment1 / (1 - beta1**updates) / root
-        numbers |= dict(zip(names, (updates, moment1, moment2), strict=True))
+        scalars[name] = value - rate * moment1 / (1 - beta1**updates) / root
+        scalars |= dict(zip(names, (updates, moment1, moment2), strict=True))
 
 
 # A table of numbers with a row for each photograph, and Adam of its own: a step changes the row of its photograph.
@@ -58,34 +58,34 @@ class ViewTable:
         """Return the names of a row's numbers."""
         return [f"{self.name}/{view}/{column}" for column in self.columns]
 
-    def row(self, numbers: Mapping[str, float], view: str) -> Floats:
+    def row(self, scalars: Mapping[str, float], view: str) -> Floats:
         """Return a row, [columns]."""
-        return np.array([numbers.get(key, 0.0) for key in self.keys(view)])
+        return np.array([scalars.get(key, 0.0) for key in self.keys(view)])
 
-    def begun(self, numbers: Mapping[str, float]) -> bool:
+    def begun(self, scalars: Mapping[str, float]) -> bool:
         """Whether the dictionary holds the table."""
-        return self.keys(self.views[0])[0] in numbers
+        return self.keys(self.views[0])[0] in scalars
 
-    def begin(self, numbers: dict[str, float], rows: Mapping[str, Floats]) -> None:
+    def begin(self, scalars: dict[str, float], rows: Mapping[str, Floats]) -> None:
         """Set every row, to 0 where none is given, then `center`."""
         for view in self.views:
             values = rows.get(view, np.zeros(len(self.columns)))
-            numbers.update(zip(self.keys(view), map(float, values), strict=True))
-        self.center(numbers)
+            scalars.update(zip(self.keys(view), map(float, values), strict=True))
+        self.center(scalars)
 
-    def update(self, numbers: dict[str, float], view: str, gradient: Floats, rate: float) -> None:
+    def update(self, scalars: dict[str, float], view: str, gradient: Floats, rate: float) -> None:
         """Change the row of a view by Adam, with a count of updates of its own, then `center` where it is centered."""
-        values = {key: numbers.get(key, 0.0) for key in self.keys(view)}
-        adam_step(numbers, values, dict(zip(values, map(float, gradient), strict=True)), rate)
+        values = {key: scalars.get(key, 0.0) for key in self.keys(view)}
+        adam_step(scalars, values, dict(zip(values, map(float, gradient), strict=True)), rate)
         if self.is_centered:
-            self.center(numbers)
+            self.center(scalars)
 
-    def center(self, numbers: dict[str, float]) -> None:
+    def center(self, scalars: dict[str, float]) -> None:
         """Subtract from each column its mean over the views; the sum is exact, so that no order matters."""
         for column in zip(*map(self.keys, self.views), strict=True):
-            mean = math.fsum(numbers[key] for key in column) / len(column)
+            mean = math.fsum(scalars[key] for key in column) / len(column)
             for key in column:
-                numbers[key] -= mean
+                scalars[key] -= mean
 
     def write(self, path: Path, rows: Mapping[str, Floats]) -> None:
         """Write rows by the name of a view as a side file."""

@@ -62,7 +62,7 @@ class SkyEvidence:
         return np.asarray(x[None, :, None] * turn[0] + (y[:, None, None] * turn[1] + turn[2]))
 
 
-def looked_at(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -> Iterator[SkyEvidence]:
+def detect_sky(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -> Iterator[SkyEvidence]:
     """Yield what photographs, [height, width, 3], show of the sky in pixels that count, [height, width]; None: all."""
     up = upward(scene.split("train"))
     for view, image, counted in views:

@@ -107,8 +107,8 @@ class _Node:
 
     def is_by_type(self, name: str) -> bool:
         """Whether the name is a type of items that are addressed by it, and not a number."""
-        by_type = any(base.by_type for base in bases(self.inside))
-        return by_type and not name.isdigit() and all(isinstance(one, dict) and "type" in one for one in self.data)
+        is_keyed = any(base.keyed_by_type for base in bases(self.inside))
+        return is_keyed and not name.isdigit() and all(isinstance(one, dict) and "type" in one for one in self.data)
 
     def put(self, name: str, value: Any, text: str) -> None:
         """Put an item of a type at its place in a list, or in place of the one that is there; None removes that.
@@ -129,7 +129,7 @@ class _Node:
         if value is None:
             return
         if at is None:
-            at = sum(getattr(kinds.get(one), "place", 0) <= kinds[name].place for one in places)
+            at = sum(getattr(kinds.get(one), "order", 0) <= kinds[name].order for one in places)
         item = {"type": name, **{key: one for key, one in value.items() if key != "type"}}
         self.data.insert(at, with_tags(item, self.inside))
 
@@ -241,7 +241,7 @@ def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[
             yield from _keys(value, f"{prefix}{name}.", addresses)
         elif items is not None:
             for i, item in enumerate(items):
-                own = item.type if getattr(item, "by_type", False) else i
+                own = item.type if getattr(item, "keyed_by_type", False) else i
                 yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{own}") + ".", addresses)
         else:
             yield Key(prefix + name, plain.get(name), texts.get(name, ""))

@@ -1,4 +1,4 @@
-"""What is behind the Gaussians, as `model.background` in a pipeline file says."""
+"""Settings of `model.background`: what is rendered behind the Gaussians."""
 
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -10,59 +10,66 @@ from clsplat.gaussians.sky import SIDES
 
 
 class Backdrop(Settings):
-    """What a key `background` of `model` takes."""
+    """What is behind the Gaussians."""
+
+    @property
+    def sky(self) -> "EnvironmentMap | None":
+        """The settings of the learned sky; None without one."""
+        return None
 
 
-class Directions(Backdrop):
-    """A color for each direction, learned with the Gaussians: the sky, which no point is near.
+class EnvironmentMap(Backdrop):
+    """Learn a color for each direction together with the Gaussians: a sky, infinitely far away.
 
-    A pixel has the color C + T b: b in the direction of its ray, T what the Gaussians leave.  Colors are those of an
-    octahedral map, bilinear, with Adam of its own; in directions in which photographs show no sky they stay
-    as they begin.
-    Where a photograph shows the map's color, Gaussians have a loss of what they cover there (splatfacto-w, Xu et al.
-    2024), so that they leave the sky.
+    A pixel has the color C + T b, where C is the blended color of the Gaussians, T their transmittance, and b the map's
+    color in the direction of the pixel's ray.  The map is octahedral with bilinear interpolation, and has its own Adam.
+    Texels in directions without sky in any photograph keep their initial color.  Where a photograph shows the map's
+    color, a loss on alpha removes Gaussians in front of the sky (splatfacto-w, Xu et al. 2024).
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "cover", "difference"})
     family: ClassVar[str] = "sky"
 
-    type: Literal["directions"] = "directions"
+    type: Literal["envmap"] = "envmap"
     side: Annotated[int, Field(ge=SIDES[0], le=SIDES[1])] = 64
-    """Texels in a row of the map, which is square; 64 are 3 degrees from one to the next."""
+    """Texels along a side of the square map; at 64 they are 3 degrees apart."""
     rate: NonNegative = 5.0e-3
-    """Learning rate of the colors, by Adam, by step."""
+    """Learning rate of the colors; by step."""
     cover: NonNegative = 0.05
-    """Factor of the loss of what covers the sky: the mean over the image of alpha in pixels that show it; by step."""
+    """Weight of the loss on Gaussians in front of the sky: mean over the image of alpha in pixels of sky; by step."""
     difference: NonNegative = 0.05
-    """Difference of the colors, the mean of the channels, up to which a pixel of a photograph shows the map."""
+    """Largest difference between pixel and map, mean over channels, at which a pixel shows the sky; by step."""
+
+    @property
+    def sky(self) -> "EnvironmentMap":
+        return self
 
 
 class Auto(Backdrop):
-    """A sky where photographs have one, by what their upper part shows.
+    """Learn a sky if the photographs show one.
 
-    Before training the photographs are looked at: pixels show the sky that are bright or blue, far from all points of
-    the dataset, even, and joined to the upper edge.  A photograph with more than a quarter of them below the horizon
-    shows none.  Elsewhere the bits are those without this key.
+    Before training, the photographs are searched for sky: smooth, bright or blue regions that touch the upper edge and
+    are far from all points of the dataset.  A photograph with more than a quarter of such pixels below the horizon
+    counts as one without sky.  If no sky is chosen, the model is bit-identical to one without this key.
     """
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
 
     type: Literal["auto"] = "auto"
-    model: Directions = Directions()
-    """What is behind the Gaussians, where photographs show a sky."""
+    model: EnvironmentMap = EnvironmentMap()
+    """The sky to learn."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.15
-    """Share of the upper third of a photograph from which on it shows one."""
+    """Share of the upper third of a photograph that must be sky for the photograph to count."""
     photographs: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Share of the photographs that must."""
+    """Share of the photographs that must count."""
     chosen: Literal["on", "off"] | None = None
-    """Written by a run: whether there is a sky."""
+    """Written by a run: whether a sky is learned."""
     reason: str = ""
     """Written by a run: why."""
 
     def parts(self) -> dict[str, Any]:
-        return {}  # a run leaves the sky out where something excludes it
+        return {}  # no conflict is an error: a run chooses no sky instead
 
     @property
-    def in_use(self) -> Directions | None:
-        """What is behind the Gaussians, once it is chosen."""
+    def sky(self) -> EnvironmentMap | None:
         return self.model if self.chosen == "on" else None

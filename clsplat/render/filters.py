@@ -17,7 +17,7 @@ from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import MAX_DEGREE, width_of
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.opencl.device import Array, Device
-from clsplat.render.backdrops import Backdrop
+from clsplat.render.backdrops import Backdrop, EnvironmentMap
 from clsplat.render.camera import camera_values
 from clsplat.scene.view import View
 
@@ -185,10 +185,14 @@ class ModelSettings(Settings):
     screen_filter: OneOf[ScreenFilter] = Dilation()
     """Blur of splats in the image."""
     background: OneOf[Backdrop] | None = None
-    """What is behind the Gaussians: `directions`, a sky that is learned, or `auto`; without it, `scene.background`."""
-
+    """What is behind the Gaussians: `envmap`, a learned sky, or `auto`; by default `scene.background`."""
     time: Motion | None = None
     """How Gaussians move, in a scene whose views have times; without it, they stand still."""
+
+    @property
+    def sky(self) -> EnvironmentMap | None:
+        """The settings of the learned sky; None without one, or while `auto` has not chosen."""
+        return self.background.sky if self.background else None
 
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""

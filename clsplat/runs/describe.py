@@ -12,7 +12,7 @@ from clsplat.runs.estimate import expected
 from clsplat.runs.opening import ReadScene, check_start, known, listed, open_run, read_run_scene, settle
 from clsplat.runs.outputs import check_places
 from clsplat.runs.run_folder import Start, check_run_folder, start_of
-from clsplat.runs.runner import check_in, restore
+from clsplat.runs.runner import check_run, restore
 from clsplat.runs.state import RunState
 from clsplat.scene.quality import Measures
 from clsplat.stages.evaluate import Evaluate
@@ -58,7 +58,7 @@ def describe(
         if start == "resume":
             resumed = restore(pipeline, run)
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
-        check_in(pipeline, run)
+        check_run(pipeline, run)
     names = listed(pipeline, planned, out) if run is None else []
     measures, refusal = _known(pipeline, names)
     lines += [*refusal, *(f"  {one.text}" for one in pipeline.decisions)]

@@ -44,7 +44,7 @@ from clsplat.scene.view import Alpha, View
 from clsplat.stages.export import Export
 from clsplat.stages.render import image_paths
 from clsplat.stages.train_field import ExportField
-from clsplat.training.modules.base import measured_beside, scene_beside
+from clsplat.training.modules.base import apply_side_files, read_color_model
 from clsplat.viewer.video.film import require_motion, times_of
 from clsplat.viewer.video.pictures import LAYERS, Canvas, shown, values
 
@@ -336,11 +336,11 @@ class ModelFile:
         self.loaded = read(self.source.file)
         self.device = open_correct(device)
         found = self.source.scene(self.loaded)
-        self.photographs = scene_beside(self.source.file, found) if scene is None else found
+        self.photographs = apply_side_files(self.source.file, found) if scene is None else found
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)
         self.background = self.loaded.rendering.background or self.scene.background
-        self.colors = measured_beside(self.source.file)
+        self.colors = read_color_model(self.source.file)
 
     @property
     def gaussians(self) -> Model:
@@ -437,7 +437,7 @@ def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "n
         raise ConfigError(f"{out}: expected a folder to write into")
     if isinstance(scene, Path) and has_pipeline(scene):
         source = ModelSource.of(scene, None)
-        found = scene_beside(source.file, read_scene(source.folder, source.settings.split))
+        found = apply_side_files(source.file, read_scene(source.folder, source.settings.split))
     else:
         found = scene if isinstance(scene, Scene) else read_scene(scene, HOLDOUT)
     return camera_files.write_cameras(found, out, format_, images)

@@ -31,7 +31,7 @@ from clsplat.scene.scene import SPLITS, Background, Scene, every_nth, make_scene
 from clsplat.scene.view import View
 from clsplat.scene.view_selection import OfPlaced
 from clsplat.stages.optimize import Optimize
-from clsplat.training.modules.base import unlisted
+from clsplat.training.modules.sky_choice import choose_sky, sky_share
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
@@ -268,14 +268,10 @@ def _adapted(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pipel
     """The pipeline with what its `adapt` decides."""
     if not pipeline.undecided:
         return pipeline
-    pipeline = adapted(pipeline, measured(run.scene, lambda name: _measured_by_module(name, run)))
+    pipeline = adapted(pipeline, measured(run.scene, lambda: sky_share(run)))
     for one in pipeline.decisions:
         tell(one.text)
     return pipeline
-
-
-def _measured_by_module(name: str, run: Run) -> float | None:
-    return next((kind.measured(run) for kind in unlisted().values() if kind.measure == name), None)
 
 
 def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
@@ -289,13 +285,10 @@ def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
     """The pipeline with what its modules choose."""
 
     def chosen(training: Optimize) -> Optimize:
-        modules = [module.settled(run) for module in training.modules]
+        modules = [module.resolve_auto(run) for module in training.modules]
         return training if modules == training.modules else training.model_copy(update={"modules": modules})
 
     settings = of_trainings(pipeline.settings, Optimize, chosen)
     modules = [one for stage in settings.stages if isinstance(stage, Optimize) for one in stage.modules]
-    model = settings.model
-    for kind in unlisted().values():
-        model = kind.settled_model(run, model, modules)
-    settings = settings.model_copy(update={"model": model})
+    settings = settings.model_copy(update={"model": choose_sky(run, settings.model, modules)})
     return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)

@@ -160,7 +160,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
     Return the checksums of files that an earlier end of the run has written, and that its coming stages do not.
     """
     taken = restore(pipeline, run) if start == "resume" else None
-    check_in(pipeline, run)
+    check_run(pipeline, run)
     if start == "restart":
         clear(run.status)
     if start == "resume":
@@ -177,10 +177,10 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
     return before
 
 
-def check_in(pipeline: Pipeline, run: Run) -> None:
+def check_run(pipeline: Pipeline, run: Run) -> None:
     """Raise what stages that are still to run can know of the run before any of them; nothing is written."""
     for stage in pipeline.stages[run.cursor :]:
-        stage.check_in(run)
+        stage.check_run(run)
 
 
 def write_pipeline(pipeline: Pipeline, run: Run) -> None:

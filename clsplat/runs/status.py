@@ -164,7 +164,7 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"  {name:<8} {kept['step']:,} {what}, by a validation PSNR of {kept['validation']:.2f} dB"
     yield f"  scene    {metrics['scene']}" + (f"; {placed}" if placed else "")
     files = {stage: folder / name for stage, name in metrics["files"].items()}
-    of_modules = {file: what for kind in variants(TrainingModule).values() for file, what in kind.files.items()}
+    of_modules = {file: what for kind in variants(TrainingModule).values() for file, what in kind.side_files.items()}
     told = {
         of_modules.get(file.name) or TITLES.get(stage, stage): file for stage, file in files.items() if file.exists()
     }

@@ -22,7 +22,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import fewest_steps, last_edit, of_trainings, stretched, with_steps
 from clsplat.runs.run_folder import Start
-from clsplat.runs.runner import check_in, run_stages, write_pipeline
+from clsplat.runs.runner import check_run, run_stages, write_pipeline
 from clsplat.stages.optimize import Keeping
 from clsplat.training.run import Run
 from clsplat.training.stage import Training
@@ -73,7 +73,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
     """
     until = time.perf_counter() + 60 * minutes
     _require_one_training(pipeline)
-    check_in(pipeline, run)
+    check_run(pipeline, run)
     found = rehearse_enough(pipeline, run, minutes, until)
     steps, planned = pipeline.settings.training.steps, found.steps_in(until - time.perf_counter())
     if planned < fewest(pipeline):

@@ -27,20 +27,19 @@ class Measures:
     """Mean distance between a point and where photographs show it, px at the size of training; None: not known."""
     scene: Scene | None = None
     """The scene as it is trained on; None: not prepared yet."""
-    measure: Callable[[str], float | None] = lambda name: None
-    """Returns what a training module measures; None: not known."""
+    measure_sky: Callable[[], float | None] = lambda: None
 
     @cached_property
     def sky(self) -> float | None:
         """The share of the training photographs that show a sky, for which all are read; None: not known."""
-        return self.measure("sky")
+        return self.measure_sky()
 
 
-def measured(scene: Scene, measure: Callable[[str], float | None] = lambda name: None) -> Measures:
+def measured(scene: Scene, measure_sky: Callable[[], float | None] = lambda: None) -> Measures:
     """Return the measures of a scene, as it is trained on."""
     views = {view.name: view for view in reversed(scene.with_fold().split("train"))}  # the largest size of each
     errors = reprojection_errors(scene.tracks, views.values())
-    return Measures(len(views), None if errors is None else float(errors.mean()), scene, measure)
+    return Measures(len(views), None if errors is None else float(errors.mean()), scene, measure_sky)
 
 
 def nearest_points(scene: Scene) -> float | None:

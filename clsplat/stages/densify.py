@@ -144,4 +144,4 @@ class Densify(Scheduled):
         if self.budget and self.every and self.stop:
             left = len(places(self.every, run.step - 1, self.stop))
             context = BudgetContext(run.step / self.stop, left, run.divisor)
-            yield self.budget.limit(edit, context, run.numbers)
+            yield self.budget.limit(edit, context, run.scalars)

@@ -13,7 +13,7 @@ from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
 from clsplat.metrics.views import mean, measure, tell_of_colors
 from clsplat.render.painter import Painter, SplatPainter
 from clsplat.scene.view import some_of
-from clsplat.training.modules.base import learned_scene, measured_as
+from clsplat.training.modules.base import color_model, learned_scene
 from clsplat.training.run import Run
 from clsplat.training.stage import CADENCE, Scheduled
 
@@ -93,7 +93,7 @@ class Evaluate(Scheduled):
             views = some_of(found, self.max_views or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            trained, colors = run.scene.split("train"), measured_as(run)
+            trained, colors = run.scene.split("train"), color_model(run)
             results = measure(painter, views, photographs, perceptual, colors=colors, counted=counted, trained=trained)
             if not results:
                 continue

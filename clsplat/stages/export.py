@@ -104,7 +104,7 @@ class Cameras(Stage):
     folder: Annotated[str, path_in_run()] = "cameras"
     """Path inside the run folder."""
 
-    def check_in(self, run: Run) -> None:
+    def check_run(self, run: Run) -> None:
         for name in self.formats:
             checked(run.original, name)
 

@@ -24,7 +24,7 @@ from clsplat.scene.viewpoint import center_of, looked_at_box, random_points
 from clsplat.scene.visual_hull import hull_points
 from clsplat.stages.init_motion import moving, require_times, with_motion
 from clsplat.training.memory import first_tables, last_place
-from clsplat.training.modules.base import unlisted
+from clsplat.training.modules.sky_choice import start_sky
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room
 from clsplat.training.stage import Stage
@@ -141,7 +141,7 @@ class Init(Stage):
         if self.source == "model" and self.file is None:
             raise ConfigError(f"init.file: source '{self.source}' needs a model file, or the folder of a run; give one")
 
-    def check_in(self, run: Run) -> None:
+    def check_run(self, run: Run) -> None:
         require_times(run.scene, run.model_settings.time)
         source = self._source(run.scene)
         if source == "model":
@@ -159,9 +159,7 @@ class Init(Stage):
         run.adam, run.stats, run.metrics = None, None, {}  # which were of an earlier model
         run.model = run.model_settings.model(gaussians, degree if self.source == "model" else 0)
         run.refresh_filter()
-        source_model = load(Path(self.file)) if source == "model" and self.file else None
-        for kind in unlisted().values():
-            kind.begin_model(run, source_model)
+        start_sky(run, load(Path(self.file)) if source == "model" and self.file else None)
         LOG.info("%s Gaussians from %s", f"{run.model.gaussians.count:,}", self._origin(source, run.scene))
 
     def expected_count(self, scene: Scene) -> int:

@@ -22,7 +22,7 @@ from clsplat.stages.evaluate import Evaluate
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.best_model import Best, Measured
 from clsplat.training.checkpoint import copied_of, finite_values, put_back
-from clsplat.training.modules.base import ModuleState, TrainingModule, attached, brought, check_list
+from clsplat.training.modules.base import ModuleState, TrainingModule, attach_modules, check_list, implied_modules
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import more_room, place_harmonics
@@ -149,8 +149,8 @@ class Keeping(Training):
             found=now,
             degree=run.model.degree,
             metrics=copied,
-            numbers=dict(run.numbers),
-            modules={name: dict(one.numbers) for name, one in run.modules.items() if one.outlasts != "no"},
+            scalars=dict(run.scalars),
+            modules={name: dict(one.scalars) for name, one in run.modules.items() if one.after_training != "dropped"},
             evaluations=evaluations,
             since=0,
             apart=apart,
@@ -174,7 +174,7 @@ class Keeping(Training):
             if best.found.step != run.step:
                 put_back(run, run.best_tables, best)
                 run.adam = run.stats = None
-                run.numbers.update(best.numbers)
+                run.scalars.update(best.scalars)
             run.metrics.update(best.metrics)
             run.best = best.model_copy(update={"taken": run.step, "refit": "due" if self.refit else "none"})
             run.best_tables = {}
@@ -271,17 +271,17 @@ class Optimize(Keeping):
         super().check()
 
     def outputs(self, out: Path) -> list[Path]:
-        files = [name for module in self.modules for name in module.files]
+        files = [name for module in self.modules for name in module.side_files]
         return [*super().outputs(out), *(out / name for name in dict.fromkeys(files))]
 
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
             pass
 
-    def check_in(self, run: Run) -> None:
-        super().check_in(run)
-        for module in (*brought(run, self), *self.modules):
-            module.check_in(run)
+    def check_run(self, run: Run) -> None:
+        super().check_run(run)
+        for module in (*implied_modules(run, self), *self.modules):
+            module.check_run(run)
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
@@ -343,7 +343,7 @@ class Optimize(Keeping):
         run.adam = run.adam or Adam(gaussians)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates = self.rates.settled(views.full_size(last))
-        states: list[ModuleState] = attached(self.modules, run, last)
+        states: list[ModuleState] = attach_modules(self.modules, run, last)
         trained = self.losses, rates, run.scene.extent, self.update
         return StepTrainer(*parts, *trained, modules=states)
 

@@ -24,7 +24,8 @@ from clsplat.scene.scene import SPLITS
 from clsplat.scene.view import View, some_of
 from clsplat.scene.viewpoint import across, closest_point, upward
 from clsplat.training.best_model import Measured
-from clsplat.training.modules.base import learned_scene, measured_as, unlisted
+from clsplat.training.modules.base import color_model, learned_scene
+from clsplat.training.modules.sky_choice import sky_advice
 from clsplat.training.records import VIEWS, over_views
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
@@ -53,10 +54,10 @@ def advice(run: Run) -> list[str]:
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
     return [
-        *of_training_views(found, has_colors=measured_as(run) is not None),
+        *of_training_views(found, has_colors=color_model(run) is not None),
         *of_test_views(test),
         *of_capture(views, run.original.views),
-        *(sentence for kind in unlisted().values() for sentence in kind.advice(run)),
+        *sky_advice(run),
     ]
 
 

@@ -70,17 +70,17 @@ class TrainField(Training):
             raise ValueError("expected stages in 'during' that edit no Gaussians: a field has none")
         return self
 
-    def check_in(self, run: Run) -> None:
+    def check_run(self, run: Run) -> None:
         """Raise ConfigError for a grid that the scene does not touch, MemoryLimitError for a field that does not fit,
         before it is made, and what stages of `during` raise."""
-        super().check_in(run)
+        super().check_run(run)
         require_seen(self.field, run.scene)
         views = run.scene.split("train")
         held = min(run.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
         field_plan(self.field, held).check(run.device.info)
 
     def run(self, run: Run) -> None:
-        self.check_in(run)
+        self.check_run(run)
         field = run.learned_field = self._begun(run)
         last = run.step - run.stage_step + self.steps
         pool, forecast = ViewPool(run.scene.split("train"), run.seed), Forecast.of(run.step, last, [])

@@ -52,7 +52,7 @@ class Snapshot(Scheduled):
     def _of_a_video(cls, size: str | None) -> str | None:
         return None if size is None else size_of(size)
 
-    def check_in(self, run: Run) -> None:
+    def check_run(self, run: Run) -> None:
         self._view(run)
 
     def _view(self, run: Run) -> View:

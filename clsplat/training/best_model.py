@@ -53,7 +53,7 @@ class Best(BaseModel):
     """Active degree of its spherical harmonics."""
     metrics: dict[str, dict[str, Any]]
     """Its averages, by split and downscale."""
-    numbers: dict[str, float] = {}
+    scalars: dict[str, float] = {}
     """What parts of the run kept at its step."""
     modules: dict[str, dict[str, float]] = {}
     """The numbers of its modules, by name."""

@@ -43,7 +43,7 @@ from clsplat.training import archive, best_model, field
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.archive import Arrays, split
 from clsplat.training.best_model import Best, Tables, model_tables
-from clsplat.training.modules.base import Numbers, kind_of, modules_of, restored
+from clsplat.training.modules.base import Scalars, class_of, modules_so_far, restore_modules
 from clsplat.training.run import Run
 from clsplat.training.settings_diff import differences
 from clsplat.training.sh_offload import make_room
@@ -69,7 +69,7 @@ class State(BaseModel):
     degree: Annotated[int, Field(ge=0, le=3)]
     zero_fresh: list[str]
     updates: dict[str, Count]
-    numbers: dict[str, float]  # that parts of the run keep
+    scalars: dict[str, float]  # that parts of the run keep
     modules: dict[str, dict[str, float]]  # the same of its modules, by name
     best: Best | None  # what validation has found
     train_seconds: float
@@ -122,23 +122,23 @@ MODULES = "modules/"  # before the names of modules, before those of their table
 def module_tables(run: Run, whole: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
     """Yield the tables by their keys in the file.  whole: with what only training needs."""
     for module, state in run.modules.items():
-        if whole or state.outlasts != "no":
+        if whole or state.after_training != "dropped":
             yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(whole).items())
 
 
-def check_modules(numbers: Mapping[str, Numbers], tables: Arrays) -> None:
+def check_modules(scalars: Mapping[str, Scalars], tables: Arrays) -> None:
     """Raise DataError for tables that are not those of modules.  tables: without MODULES."""
-    for name in numbers:
+    for name in scalars:
         own, tables = split(tables, f"{name}/")
-        kind_of(name).check_saved(numbers[name], own)
+        class_of(name).check_saved(scalars[name], own)
     if tables:
         raise DataError(f"it has tables of modules that it says nothing of: {', '.join(tables)}")
 
 
-def put_back_modules(run: Run, numbers: Mapping[str, Numbers], tables: Arrays) -> None:
+def put_back_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -> None:
     """Give the modules of a run what was copied of them at another step."""
-    for name, own in numbers.items():
-        if name in run.modules and name in modules_of(run):
+    for name, own in scalars.items():
+        if name in run.modules and name in modules_so_far(run):
             run.modules[name].load(own, split(tables, f"{name}/")[0])
 
 
@@ -185,7 +185,7 @@ def check_run_tables(state: State, tables: Arrays) -> None:
     if state.field:
         if state.updates.keys() != {UPDATES}:
             raise DataError("it counts updates of other parameters than those of its field")
-        kind = field.kind_of(state.field)
+        kind = field.class_of(state.field)
         kind.check_tables(state.field["shape"], *split(tables, field.FOLDER))
         return
     best, own = split(tables, best_model.FOLDER)
@@ -194,7 +194,7 @@ def check_run_tables(state: State, tables: Arrays) -> None:
     check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
 
 
-def _gaussians(modules: Mapping[str, Numbers], tables: Arrays) -> Arrays:
+def _gaussians(modules: Mapping[str, Scalars], tables: Arrays) -> Arrays:
     """Check the tables of modules; return the others."""
     of_modules, own = split(tables, MODULES)
     check_modules(modules, of_modules)
@@ -205,14 +205,14 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
     """Put the tables of a state into a run."""
     if state.field:
         own, _ = split(tables, field.FOLDER)
-        kind = field.kind_of(state.field)
+        kind = field.class_of(state.field)
         run.learned_field = kind.of_tables(state.field["shape"], own, run.photographs.background)
         run.learned_field.updates = state.updates[UPDATES]
         return
     run.best_tables, tables = split(tables, best_model.FOLDER)
     of_modules, tables = split(tables, MODULES)
     saved = {name: (own, split(of_modules, f"{name}/")[0]) for name, own in state.modules.items()}
-    run.modules = restored(run, saved)
+    run.modules = restore_modules(run, saved)
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
     run.model = run.model_settings.model(gaussians, state.degree)
     if state.updates:
@@ -401,8 +401,8 @@ def _write(run: Run, kind: str) -> Path:
         degree=0 if run.learned_field else run.model.degree,
         zero_fresh=[] if run.learned_field else run.model.gaussians.zero_fresh,
         updates=updates_of(run),
-        numbers=run.numbers,
-        modules={name: one.numbers for name, one in run.modules.items()},
+        scalars=run.scalars,
+        modules={name: one.scalars for name, one in run.modules.items()},
         best=run.best,
         train_seconds=run.train_seconds,
         cpu_seconds=run.cpu_seconds,
@@ -452,7 +452,7 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
 
 def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
-    run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
+    run.acted, run.edited, run.whole, run.scalars = state.acted, state.edited, True, state.scalars
     run.best = state.best
     if run.is_refit:
         run.divide(run.original.with_fold())

@@ -59,7 +59,7 @@ class TrainedField(ABC):
         """Return the field of a checkpoint, by what `tables` has returned."""
 
 
-def kind_of(written: Mapping[str, Any]) -> type[TrainedField]:
+def class_of(written: Mapping[str, Any]) -> type[TrainedField]:
     """Return the class of a field in a checkpoint.  Raises DataError where no module defines it."""
     kind = TrainedField.kinds.get(str(written.get("kind")))
     if kind is None or not isinstance(written.get("shape"), dict):

@@ -70,7 +70,7 @@ class Run:
     changes: list[str] = field(default_factory=list)  # of settings, with which the run went on
     divisor: float = 1.0  # of the photographs' size at the step before an edit
     inputs_before: str = ""  # `inputs` of the checkpoint that the run goes on from
-    numbers: dict[str, float] = field(default_factory=dict)  # that parts of it keep from step to step, by name
+    scalars: dict[str, float] = field(default_factory=dict)  # that parts of it keep from step to step, by name
     best: Best | None = None  # what validation has found in the training
     best_tables: Tables = field(default_factory=dict)  # of that model, on the host, as long as the training goes on
     measured: dict[Any, Any] = field(default_factory=dict)  # what modules have measured once, by keys of their choice
@@ -94,7 +94,7 @@ class Run:
         if self._model is None:
             raise ConfigError("no model yet: an init stage must come first")
         for state in self.modules.values():
-            state.complete(self._model)
+            state.attach_to(self._model)
         return self._model
 
     @model.setter
@@ -120,7 +120,7 @@ class Run:
         """Come to the beginning of a stage."""
         self.cursor, self.stage_step, self.acted, self.edited = cursor, 0, 0, False
         self.records.settled = self.records.lines
-        self.modules = {name: one for name, one in self.modules.items() if one.outlasts != "no"}
+        self.modules = {name: one for name, one in self.modules.items() if one.after_training != "dropped"}
         if self._model is not None:
             self.model.gaussians.tables.pop(HIDDEN, None)  # which a training has for itself
 
@@ -140,7 +140,7 @@ class Run:
         self._model = None
         self.adam = self.stats = None
         self.modules = {}
-        self.numbers = {}
+        self.scalars = {}
         self.metrics = {}
         self.written = {}
         self.whole = True

@@ -47,7 +47,9 @@ def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind:
         before, after = ({one["type"]: one for one in items} for items in (old, new))
         now = {one.type: one for one in settings or ()}
         for name in dict.fromkeys([*before, *after]):
-            own = kind or ("training" if kinds[name].joins and not {name} <= before.keys() & after.keys() else None)
+            own = kind or (
+                "training" if kinds[name].optional_on_resume and not {name} <= before.keys() & after.keys() else None
+            )
             yield from differences(before.get(name), after.get(name), now.get(name), f"{place}.{name}", own)
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for i, (before, after) in enumerate(zip(old, new, strict=True)):
@@ -59,7 +61,7 @@ def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind:
 
 def _kinds(items: list[Any]) -> dict[str, Any]:
     """The classes of a list's items by their types, where each is addressed by its type."""
-    known = {tag[1]: kind for kind in Settings.defined if kind.by_type and (tag := tag_of(kind))}
+    known = {tag[1]: kind for kind in Settings.defined if kind.keyed_by_type and (tag := tag_of(kind))}
     named = [str(one.get("type")) if isinstance(one, dict) else "" for one in items]
     return {name: known[name] for name in named} if all(name in known for name in named) else {}
 

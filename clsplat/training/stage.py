@@ -62,7 +62,7 @@ class Stage(Settings):
     def check(self) -> None:
         """Raise errors that do not depend on the run, such as a missing file, before the run starts."""
 
-    def check_in(self, run: Run) -> None:
+    def check_run(self, run: Run) -> None:
         """Raise errors of a run that can be known before its first stage, for one that is only described."""
 
     @abstractmethod
@@ -184,10 +184,10 @@ class Training(Stage):
         for stage in self.during:
             stage.check()
 
-    def check_in(self, run: Run) -> None:
+    def check_run(self, run: Run) -> None:
         for stage in self.during:
             if stage.stop is None or stage.stop > run.step + 1:  # else its time has passed
-                stage.check_in(run)
+                stage.check_run(run)
 
     def outputs(self, out: Path) -> list[Path]:
         return [path for stage in self.during for path in stage.outputs(out)]

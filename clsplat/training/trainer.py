@@ -119,7 +119,7 @@ class StepTrainer:
         for module in now.modules:
             module.before_losses(now)
         now.losses += [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
-        now.losses += now.own_losses
+        now.losses += now.module_losses
         for module in now.modules:
             module.after_losses(now)
         return ViewLosses(now.frame, comparison, now.losses, step=now)
@@ -134,7 +134,9 @@ class StepTrainer:
             module.backward(now)
         self.rasterizer.device.timings.section = "statistics"
         texture = known_gradient(workspace, now.camera, now.planes.colors, mask) if count > TEXTURE else None
-        now.pixel_sums = self.rasterizer.pixel_sums(now.model, now.frame, now.gradient, count, texture, now.behind)
+        now.pixel_sums = self.rasterizer.pixel_sums(
+            now.model, now.frame, now.gradient, count, texture, now.transmittance_gradient
+        )
         for module in reversed(now.modules):
             module.after_backward(now)
         return ViewGradients(now.frame, now.comparison, now.losses, now.pixel_sums, step=now)

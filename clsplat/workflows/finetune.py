@@ -77,7 +77,7 @@ class Tuning:
         screen = {"type": "dilation", "variance": numbers.screen_variance, "compensate": int(numbers.compensate)}
         if numbers.pixel_box:
             screen = {"type": "box"}
-        sky = self.model.sky and {"type": "directions", "side": self.model.sky.side}
+        sky = self.model.sky and {"type": "envmap", "side": self.model.sky.side}
         return {
             "model.sh_degree": self.model.sh_degree,
             "model.near": numbers.near,

@@ -31,18 +31,18 @@ LEAK = np.array([1.0, 1.0]) / np.sqrt(2)
 COURSE = {1000: 0.10, 3000: 0.28, 5000: 0.46, 7000: 0.63, 10000: 0.85, 15000: 1.0}  # published
 
 
-def taps_of(numbers: dict[str, float]) -> np.ndarray:
+def taps_of(scalars: dict[str, float]) -> np.ndarray:
     """The filter, h0 and h1."""
-    return numbers["haar/scale"] * HAAR + numbers.get("haar/leak", 0.0) * LEAK
+    return scalars["haar/scale"] * HAAR + scalars.get("haar/leak", 0.0) * LEAK
 
 
 def through(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> np.ndarray:
     """The photograph [3, H, W] after the transform."""
     camera = camera_of(device, image.shape[2], image.shape[1])
     counted = None if mask is None else planes_of(device, camera, mask[None])
-    numbers = {"haar/scale": HAAR @ taps, "haar/leak": LEAK @ taps}
+    scalars = {"haar/scale": HAAR @ taps, "haar/leak": LEAK @ taps}
     planes = Planes(Workspace(device), camera, planes_of(device, camera, image), counted)
-    return apply_filter(planes, numbers).colors.get()[:, : camera.height, : camera.width]
+    return apply_filter(planes, scalars).colors.get()[:, : camera.height, : camera.width]
 
 
 @on_devices("width, height, share", each_once(SIZES, [None, 0.7, 0.1]))
@@ -91,8 +91,8 @@ def course_of(haar: Haar, steps: int) -> list[float]:
     state, course = HaarState(haar), [0.0]
     for step in range(1, steps + 1):
         state.learn(haar.penalty(state.filter, step)[1], step)
-        course.append(state.numbers["haar/scale"])
-    assert state.numbers.get("haar/leak", 0.0) == 0
+        course.append(state.scalars["haar/scale"])
+    assert state.scalars.get("haar/leak", 0.0) == 0
     return course
 
 
@@ -134,14 +134,14 @@ def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked)
     """Finite differences of the float64 losses of the rendered image, by each number."""
     losses = [L1(weight=0.8), Dssim(weight=0.2), L2(weight=3.0), Anisotropy(above=1.0)]
     trainer, haar, photograph = trainer_of(device, rng, losses, masked, learn=learn, weight=0.01)
-    haar.numbers = {name: 0.31 + 0.4 * i for i, name in enumerate(NAMES[learn])}
-    before, counted = dict(haar.numbers), photograph.counted()
+    haar.scalars = {name: 0.31 + 0.4 * i for i, name in enumerate(NAMES[learn])}
+    before, counted = dict(haar.scalars), photograph.counted()
     view = trainer.differentiate(photograph, 1)
     image = view.comparison.image.get()[:, :30, :41].astype(np.float64)
     colors = photograph.image().transpose(2, 0, 1) / 255
 
-    def total(numbers: dict[str, float]) -> float:
-        taps = taps_of(numbers)
+    def total(scalars: dict[str, float]) -> float:
+        taps = taps_of(scalars)
         found = ref.haar_filtered(colors, taps, counted) * (1 if counted is None else counted)
         parts = ((0.8, ref.l1), (0.2, ref.dssim), (3.0, ref.l2))
         images = sum(weight * loss(image, found)[0] for weight, loss in parts)
@@ -153,9 +153,9 @@ def test_the_gradient_is_that_of_all_losses_together(device, rng, learn, masked)
         expected[name] = (up - down) / 2e-6
     trainer.update(view)
     for name, gradient in expected.items():
-        assert haar.numbers[f"{name}/moment1"] / 0.1 == pytest.approx(gradient, rel=2e-3, abs=1e-5)
-        assert haar.numbers[name] == pytest.approx(before[name] - 1e-4 * np.sign(gradient), abs=1e-9)
-        assert haar.numbers[f"{name}/updates"] == 1
+        assert haar.scalars[f"{name}/moment1"] / 0.1 == pytest.approx(gradient, rel=2e-3, abs=1e-5)
+        assert haar.scalars[name] == pytest.approx(before[name] - 1e-4 * np.sign(gradient), abs=1e-9)
+        assert haar.scalars[f"{name}/updates"] == 1
     own = next(loss.value() for loss in view.losses if loss.name == "haar")
     assert view.loss - view.losses[-1].value() == pytest.approx(total(before), rel=1e-4)
     assert own == pytest.approx(0.01 * 2 * ((taps_of(before) - HAAR) ** 2).sum())
@@ -179,9 +179,9 @@ def test_what_the_filter_needs_changes_no_loss_and_no_gradient(device, rng, mask
 def test_differentiating_changes_no_number(device, rng):
     trainer, haar, photograph = trainer_of(device, rng, [L1()])
     trainer.differentiate(photograph, 1)
-    assert haar.numbers == {}
+    assert haar.scalars == {}
     trainer.step(photograph, 1)
-    assert haar.numbers.keys() > {*NAMES["filter"]}
+    assert haar.scalars.keys() > {*NAMES["filter"]}
 
 
 @on_devices("masked", [False, True])
@@ -191,15 +191,15 @@ def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
     for losses in (of_colors, [WeightEntropy(weight=0.3), *of_colors]):
         trainer, haar, photograph = trainer_of(device, np.random.default_rng(5), losses, masked)
         view = trainer.step(photograph, 1)
-        moments.append({name: value for name, value in haar.numbers.items() if name.endswith("moment1")})
+        moments.append({name: value for name, value in haar.scalars.items() if name.endswith("moment1")})
     assert moments[0] == pytest.approx(moments[1], rel=1e-6)
     assert all(moments[0].values())
     entropy = next(loss.value() for loss in view.losses if loss.name == "weight_entropy")
     sums = view.comparison.image.get()[3].sum(dtype=np.float64)
     assert entropy == pytest.approx(0.3 * sums / (30 * 41), rel=1e-5)
-    trainer.losses, haar.numbers = [WeightEntropy()], {}
+    trainer.losses, haar.scalars = [WeightEntropy()], {}
     trainer.step(photograph, 2)
-    assert haar.numbers["haar/scale/moment1"] / 0.1 == pytest.approx(-0.2), "its own loss alone"
+    assert haar.scalars["haar/scale/moment1"] / 0.1 == pytest.approx(-0.2), "its own loss alone"
 
 
 @on_one_setting
@@ -246,9 +246,9 @@ def test_the_recipe_trains(tiny_scene, tmp_path):
     """The filter leaves zero at its rate, and measured is what photographs are."""
     short = ("optimize.steps=30", "optimize.evaluate.every=30", "checkpoint.every=30", "optimize.log_every=10")
     run = train(tiny_scene, tmp_path / "run", *short, pipeline="auto_opti3dgs_7k")
-    numbers = run.modules["haar"].numbers
-    assert numbers["haar/scale"] == pytest.approx(30 * 4.3e-4, rel=0.1)
-    assert abs(numbers["haar/leak"]) < 30 * 4.3e-4
+    scalars = run.modules["haar"].scalars
+    assert scalars["haar/scale"] == pytest.approx(30 * 4.3e-4, rel=0.1)
+    assert abs(scalars["haar/leak"]) < 30 * 4.3e-4
     plain = train(tiny_scene, tmp_path / "plain", *short, pipeline="splat_7k")
     psnr = [one.metrics["test"]["1"]["psnr"] for one in (run, plain)]
     assert psnr[0] == pytest.approx(psnr[1], abs=1.5)

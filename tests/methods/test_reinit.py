@@ -101,8 +101,8 @@ def test_they_lie_where_the_cameras_were_learned_to_be(tiny_scene, tmp_path):
     """All cameras were learned to be a shift beside their places; the depths that they see are those of the model."""
     run, moved = opened(tiny_scene, plane(), tmp_path / "run"), opened(tiny_scene, plane(), tmp_path / "moved")
     poses = CameraState(CameraOptimizer(), moved.scene.split("train"), moved.original.views)
-    poses.numbers |= {f"{DEPTHS}/{view.name}": 1.0 for view in poses.views}
-    poses.numbers |= {f"{SHIFTS}/{view.name}/z": 0.3 for view in poses.views}
+    poses.scalars |= {f"{DEPTHS}/{view.name}": 1.0 for view in poses.views}
+    poses.scalars |= {f"{SHIFTS}/{view.name}/z": 0.3 for view in poses.views}
     moved.modules = {"camera_optimizer": poses}
     expected = [view.position for view in learned_scene(moved).split("train")]
     assert np.abs(np.array(expected) - [view.position for view in run.scene.split("train")]).max() > 0.1

@@ -99,8 +99,8 @@ def test_a_field_that_does_not_fit_is_refused_before_it_is_made(tiny_scene, pipe
         device=SimpleNamespace(info=limits),
     )
     with pytest.raises(MemoryLimitError, match=r"4 tables of 1,024 MiB.*take fewer levels or entries of the grid"):
-        load(pipeline, changes).stages[0].check_in(run)
-    load(pipeline).stages[0].check_in(run)
+        load(pipeline, changes).stages[0].check_run(run)
+    load(pipeline).stages[0].check_run(run)
 
 
 def test_cube_no_photograph_shows_is_refused_before_allocation(tiny_scene, pipeline):
@@ -114,7 +114,7 @@ def test_cube_no_photograph_shows_is_refused_before_allocation(tiny_scene, pipel
     ):
         stage = load(pipeline, [f"train_field.field.grid.{change}" for change in changes]).stages[0]
         with pytest.raises(ConfigError, match=rf"{fault} \(.*tiny\); expected one about .*: set `corner` and `side`"):
-            stage.check_in(SimpleNamespace(scene=scene))
+            stage.check_run(SimpleNamespace(scene=scene))
 
 
 def test_the_plan_of_a_field_is_near_what_it_takes(finished):

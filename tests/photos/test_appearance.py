@@ -53,26 +53,26 @@ def test_the_fitted_matrix_is_the_one_that_made_a_photograph(rng, model):
 
 
 def test_table_changes_its_views_row_and_keeps_means_at_zero(rng):
-    table, numbers = ViewTable("t", ("a", "b/c", "d"), ("x", "y")), {"other": 1.0}
-    assert not table.begun(numbers)
-    table.begin(numbers, {"a": np.array([0.3, 0.0]), "d": np.array([0.0, 0.6])})
-    assert table.begun(numbers)
-    assert table.row(numbers, "a") == pytest.approx([0.2, -0.2])
-    before = {view: table.row(numbers, view) for view in table.views}
-    table.update(numbers, "b/c", np.array([2.0, -5.0]), rate=0.03)
-    after = {view: table.row(numbers, view) for view in table.views}
+    table, scalars = ViewTable("t", ("a", "b/c", "d"), ("x", "y")), {"other": 1.0}
+    assert not table.begun(scalars)
+    table.begin(scalars, {"a": np.array([0.3, 0.0]), "d": np.array([0.0, 0.6])})
+    assert table.begun(scalars)
+    assert table.row(scalars, "a") == pytest.approx([0.2, -0.2])
+    before = {view: table.row(scalars, view) for view in table.views}
+    table.update(scalars, "b/c", np.array([2.0, -5.0]), rate=0.03)
+    after = {view: table.row(scalars, view) for view in table.views}
     assert sum(after.values()) == pytest.approx([0, 0], abs=1e-15)
     moved = {view: after[view] - before[view] for view in table.views}
     assert moved["b/c"] == pytest.approx([-0.02, 0.02]), "by the rate, less the mean"
     assert moved["a"] == pytest.approx([0.01, -0.01])
-    assert {key for key in numbers if key.endswith("updates")} == {"t/b/c/x/updates", "t/b/c/y/updates"}
-    assert numbers["other"] == 1
+    assert {key for key in scalars if key.endswith("updates")} == {"t/b/c/x/updates", "t/b/c/y/updates"}
+    assert scalars["other"] == 1
 
 
 def test_a_view_has_one_row_at_all_its_sizes():
     colors = ExposureState(Exposure(), ("a", "b", "a"))
     colors.rate = 0.01
-    colors.begin_with({})
+    colors.start_from({})
     colors.learn(2, -IDENTITY, step=1)
     assert colors.matrix(0)[0, 0] == colors.matrix(2)[0, 0] > 1 > colors.matrix(1)[0, 0]
 

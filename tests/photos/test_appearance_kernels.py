@@ -42,7 +42,7 @@ class Case:
     """A trainer of a random scene; its photograph is the second of two, which have colors of their own."""
 
     def __init__(self, device, rng, colors=None, losses=SMOOTH, share=None) -> None:
-        case, self.numbers = random_case(rng, 40, 50, 36), {}
+        case, self.scalars = random_case(rng, 40, 50, 36), {}
         model, pixels = case.model(device), rng.integers(0, 256, (3, 36, 50)).astype(np.uint8)
         mask = None if share is None else device.upload((rng.random((1, 36, 50)) < share).astype(np.uint8))
         camera = replace(case.device_camera(device), view=1)
@@ -51,13 +51,13 @@ class Case:
         self.trainer = StepTrainer(*parts, device.upload(BACKGROUND), losses, Rates())
         if colors:
             state, gains = ExposureState(Exposure(model=colors), ("a", "b")), np.array([0.3, 0.1, -0.2])
-            state.rate, state.numbers = 0.01, self.numbers
-            state.begin_with({"a": -gains, "b": gains})
+            state.rate, state.scalars = 0.01, self.scalars
+            state.start_from({"a": -gains, "b": gains})
             self.trainer.modules = [state]
 
     def loss(self, key: str, change: float) -> float:
         """The loss with one number changed."""
-        self.trainer.modules[0].numbers = {**self.numbers, key: self.numbers[key] + change}
+        self.trainer.modules[0].scalars = {**self.scalars, key: self.scalars[key] + change}
         return self.trainer.compare(self.photograph, 1).loss
 
 
@@ -67,8 +67,8 @@ def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, monkeypatch, 
     case, found = Case(device, rng, colors, share=share), []
     table, step = case.trainer.modules[0].table, 2e-3
     numeric = [(case.loss(key, step) - case.loss(key, -step)) / (2 * step) for key in table.keys("b")]
-    case.trainer.modules[0].numbers = case.numbers
-    monkeypatch.setattr(ViewTable, "update", lambda self, numbers, view, gradient, rate: found.append((view, gradient)))
+    case.trainer.modules[0].scalars = case.scalars
+    monkeypatch.setattr(ViewTable, "update", lambda self, scalars, view, gradient, rate: found.append((view, gradient)))
     case.trainer.step(case.photograph, 1)
     ((view, gradient),) = found
     assert view == "b"
@@ -102,7 +102,7 @@ def test_numbers_of_no_change_give_the_gradients_of_none(device, rng, monkeypatc
 def test_a_mask_hides_pixels_whatever_their_colors_become(device, rng):
     """An offset makes black pixels bright."""
     case = Case(device, rng, Affine(), share=0.5)
-    case.numbers.update({key: 0.2 for key in case.trainer.modules[0].table.keys("b") if key.endswith("1")})
+    case.scalars.update({key: 0.2 for key in case.trainer.modules[0].table.keys("b") if key.endswith("1")})
     image = case.trainer.compare(case.photograph, 1).comparison.image.get()[:, :36, :50]
     hidden = ~case.photograph.counted()
     assert (image[:, hidden] == 0).all()

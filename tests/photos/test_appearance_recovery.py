@@ -71,7 +71,7 @@ class Capture:
         gaussians = self.model.gaussians
         gaussians.set("sh_base", self.colors + rng.normal(0, 0.3, self.colors.shape).astype(np.float32))
         state.rate = state.settings.rate_of(STEPS, VIEWS, False)
-        state.begin_with({})
+        state.start_from({})
         parts = self.rasterizer, self.model, Adam(gaussians), SplatStats(gaussians, []), self.background
         trainer = StepTrainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), RATES, modules=[state])
         for step in range(1, STEPS + 1):

@@ -43,7 +43,7 @@ def plugin(tmp_path: Path, without_plugins: None) -> None:
 
 
 def decided(name: str, *overrides: str, count: int = 9, error: float | None = None, sky: float | None = None):
-    return adapted(load(name, list(overrides)), Measures(count, error, measure=lambda name: sky))
+    return adapted(load(name, list(overrides)), Measures(count, error, measure_sky=lambda: sky))
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_a_run_looks_for_a_sky_where_it_decides(tmp_path, rng, monkeypatch, coun
     scene = Yard(rng, count, clear).write(tmp_path / "yard")
     if sky is None:
         monkeypatch.setattr(
-            "clsplat.runs.opening._measured_by_module", lambda name, run: pytest.fail("looked for a sky")
+            "clsplat.runs.opening.sky_share", lambda run: pytest.fail("looked for a sky")
         )
     text = describe(
         load("photos", [f"scene.path='{scene}'", "scene.holdout=0"]), RunState.read(tmp_path / "run"), None, "new"

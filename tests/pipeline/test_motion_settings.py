@@ -80,7 +80,7 @@ def test_a_class_of_a_plugin_declares_a_conflict_in_its_stage(tmp_path, without_
     with pytest.raises(
         ConfigError, match=r"losses\[1\]: 'wave' .* with sky \(model.background\): it has .*; leave one"
     ):
-        load("smoke", [losses, "model.background=directions"])
+        load("smoke", [losses, "model.background=envmap"])
     stage = "  - optimize: {steps: 1, losses: [%s]}\n"
     path = tmp_path / "x.yaml"
     path.write_text("name: x\nstages:\n  - init\n" + stage % "l1, wave" + stage % "l1, l2")

@@ -11,7 +11,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.sky import Sky
 from clsplat.losses.image import L2
 from clsplat.photos.photographs import Photograph
-from clsplat.render.backdrops import Directions
+from clsplat.render.backdrops import EnvironmentMap
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.sky import Skies
 from clsplat.training.adam import Adam, Rates
@@ -68,7 +68,7 @@ def numeric(scene: Scene, array, place: tuple[int, int], step: float) -> float:
 
 @on_devices("share", [None, 0.7])
 def test_the_gradient_by_the_sky_is_that_of_the_losses(device, rng, share):
-    scene = Scene(device, rng, Directions(side=8, cover=0), share)
+    scene = Scene(device, rng, EnvironmentMap(side=8, cover=0), share)
     view = scene.trainer.compare(scene.photograph, 1)
     view = scene.trainer.backward(view)
     skies, sky = scene.trainer.rasterizer.skies, scene.model.sky
@@ -82,9 +82,9 @@ def test_the_gradient_by_the_sky_is_that_of_the_losses(device, rng, share):
 
 @on_one_setting
 def test_masked_pixels_are_not_asked_to_show_the_sky(device, rng):
-    scene = Scene(device, rng, Directions(side=8, cover=0.5, difference=0.5), 0.7)
+    scene = Scene(device, rng, EnvironmentMap(side=8, cover=0.5, difference=0.5), 0.7)
     view = scene.trainer.compare(scene.photograph, 1)
-    behind, mask = view.step.behind.get(), view.comparison.mask.get()
+    behind, mask = view.step.transmittance_gradient.get(), view.comparison.mask.get()
     assert behind.shape == mask.shape
     assert np.abs(behind[mask > 0]).max() > 0
     assert np.abs(behind[mask == 0]).max() == 0
@@ -92,7 +92,7 @@ def test_masked_pixels_are_not_asked_to_show_the_sky(device, rng):
 
 def test_the_gradient_by_opacities_has_that_of_the_cover(device, rng):
     """By finite differences, with the pixels that show the sky and those that do not left as they are."""
-    scene = Scene(device, rng, Directions(side=8, cover=0.5, difference=0.5))
+    scene = Scene(device, rng, EnvironmentMap(side=8, cover=0.5, difference=0.5))
     gaussians, rasterizer = scene.model.gaussians, scene.trainer.rasterizer
     view = scene.trainer.backward(scene.trainer.compare(scene.photograph, 1))
     assert {value.name for value in view.losses} == {"l2", "sky"}
@@ -107,7 +107,7 @@ def test_the_gradient_by_opacities_has_that_of_the_cover(device, rng):
 
 @on_one_setting
 def test_runs_of_pixels_are_kept_within_a_budget(device, rng):
-    scene = Scene(device, rng, Directions(side=8))
+    scene = Scene(device, rng, EnvironmentMap(side=8))
     camera, workspace = scene.photograph.camera, scene.trainer.rasterizer.workspace
     skies = Skies(device, workspace, kept=1)
     first = skies.runs(camera, 8)

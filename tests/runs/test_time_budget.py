@@ -60,7 +60,7 @@ def test_it_takes_the_time_that_was_given(monkeypatch, minutes, growth, until_sh
     monkeypatch.setattr(time_budget, "rehearse", rehearse)
     monkeypatch.setattr(time_budget, "new_run", lambda *given: SimpleNamespace(interrupted=False))
     monkeypatch.setattr(time_budget, "write_pipeline", lambda *given: None)
-    monkeypatch.setattr(time_budget, "check_in", lambda *given: None)
+    monkeypatch.setattr(time_budget, "check_run", lambda *given: None)
     time_budget.execute_within(minutes, load("splat_7k"), SimpleNamespace(), "new", lambda progress: None, execute)
     assert clock[0] == pytest.approx(60 * minutes, rel=0.05)
     assert len(planned) == 1 + len(time_budget.CORRECTED)

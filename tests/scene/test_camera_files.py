@@ -114,8 +114,8 @@ def test_a_lens_that_nerfstudio_does_not_know_is_refused(model, scene_of, tmp_pa
     assert not (tmp_path / "out").exists()
     stage = SimpleNamespace(original=scene_of(model))
     with pytest.raises(DataError, match="no camera model"):
-        Cameras(formats=["nerfstudio"]).check_in(stage)
-    Cameras(formats=["inria", "colmap"]).check_in(stage)
+        Cameras(formats=["nerfstudio"]).check_run(stage)
+    Cameras(formats=["inria", "colmap"]).check_run(stage)
 
 
 def test_nerfstudio_finds_its_validation_views_and_one_model(scene_of, tmp_path):

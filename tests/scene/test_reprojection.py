@@ -141,10 +141,10 @@ def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rn
 def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
     for recipe in ("smoke", "photos"):  # which may decide either
         with pytest.raises(ConfigError, match="not learned together with poses"):
-            load(recipe, ["optimize.modules.camera_optimizer={start: 1}", "model.background=directions"])
+            load(recipe, ["optimize.modules.camera_optimizer={start: 1}", "model.background=envmap"])
         with pytest.raises(ConfigError, match="'random_background' does not go together with sky"):
-            load(recipe, ["optimize.modules.random_background={}", "model.background=directions"])
-    asked = load("photos", ["model.background=directions"])  # which may learn poses
+            load(recipe, ["optimize.modules.random_background={}", "model.background=envmap"])
+    asked = load("photos", ["model.background=envmap"])  # which may learn poses
     with pytest.raises(ConfigError, match=r"adapt: photos: .*not learned together with poses.*; --set of one"):
         adapted(asked, Measures(60, 1.0))
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from clsplat.metrics.views import ViewMetrics
-from clsplat.render.backdrops import Auto, Backdrop, Directions
+from clsplat.render.backdrops import Auto, Backdrop, EnvironmentMap
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.stages.report import FEW, far_below, of_capture, of_test_views, of_training_views, widest_gap
-from clsplat.training.modules.sky import SkyModule
+from clsplat.training.modules.sky_choice import sky_advice
 
 CAMERA = Camera(40, 30, 40.0, 40.0, 20.0, 15.0)
 
@@ -68,10 +68,10 @@ def run_with(background: Backdrop | None) -> SimpleNamespace:
 
 def test_a_sky_that_was_added_is_said_with_its_reason():
     added = Auto(chosen="on", reason="25 of 25 photographs show one; 25% of them")
-    (text,) = SkyModule.advice(run_with(added))
+    (text,) = sky_advice(run_with(added))
     assert text.startswith("a sky was added, since 25 of 25 photographs show one; ")
-    others = None, Directions(), Auto(), Auto(chosen="off")
-    assert not [text for other in others for text in SkyModule.advice(run_with(other))]
+    others = None, EnvironmentMap(), Auto(), Auto(chosen="off")
+    assert not [text for other in others for text in sky_advice(run_with(other))]
 
 
 def test_few_photographs_are_said():

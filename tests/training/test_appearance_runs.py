@@ -17,7 +17,7 @@ from clsplat.sweeps.compare.comparison import RunComparison
 from clsplat.sweeps.compare.page import main_table
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.training import checkpoint
-from clsplat.training.modules.base import measured_beside
+from clsplat.training.modules.base import read_color_model
 from clsplat.training.modules.exposure import Exposure
 from tests.support.exposed_wall import Wall
 from tests.support.runs import FEW, digest, train
@@ -37,12 +37,12 @@ def with_gains(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *GAIN)
     names = [view.name for view in run.scene.split("train")]
-    numbers = run.modules["exposure"].numbers
-    updates = [numbers.get(f"colors/{name}/exposure/updates", 0) for name in names]
+    scalars = run.modules["exposure"].scalars
+    updates = [scalars.get(f"colors/{name}/exposure/updates", 0) for name in names]
     assert sum(updates) == 12
     assert len(set(updates)) > 1, "eight photographs, twelve steps"
     for column in ("exposure", "red", "blue"):
-        values = [numbers[f"colors/{name}/{column}"] for name in names]
+        values = [scalars[f"colors/{name}/{column}"] for name in names]
         assert sum(values) == pytest.approx(0, abs=1e-12)
         assert max(map(abs, values)) > 1e-3
     assert digest(tmp_path / "run") != digest(few_steps)
@@ -80,7 +80,7 @@ def test_a_run_folder_is_measured_in_the_photographs_colors_too(with_gains, few_
     for damage in ("[]", '{"type": "lens"}'):
         (tmp_path / "view_colors.json").write_text(damage)
         with pytest.raises(DataError, match=r"the type of colors is .* expected one of \w+"):
-            measured_beside(tmp_path / "point_cloud.ply")
+            read_color_model(tmp_path / "point_cloud.ply")
 
 
 def test_where_colors_began_is_kept_with_them(rng, tmp_path):
@@ -96,7 +96,7 @@ def test_where_colors_began_is_kept_with_them(rng, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("clsplat.training.modules.exposure.exposures_of", lambda run: UNKNOWN)
         again = train(tmp_path / "scene", tmp_path / "run", *gain, resume=True)
-    assert again.modules["exposure"].numbers == run.modules["exposure"].numbers
+    assert again.modules["exposure"].scalars == run.modules["exposure"].scalars
 
 
 def test_the_best_model_is_left_with_the_colors_of_its_step(tiny_scene, tmp_path):
@@ -110,7 +110,7 @@ def test_the_best_model_is_left_with_the_colors_of_its_step(tiny_scene, tmp_path
     run = train(tiny_scene, tmp_path / "run", *GAIN, *kept, wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     then, _ = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    assert run.modules["exposure"].numbers == then.modules["exposure"]
+    assert run.modules["exposure"].scalars == then.modules["exposure"]
     (row, *_) = json.loads((tmp_path / "run" / "view_colors.json").read_text())["photographs"].items()
     assert row[1]["exposure"] == then.modules["exposure"][f"colors/{row[0]}/exposure"]
 
@@ -155,7 +155,7 @@ def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
 def test_the_reason_says_which_bound_decided(spread, explained, chosen, said):
     exposures = Exposures({"a": np.full(3, spread), "b": np.full(3, -spread)}, "at 9 points", explained)
     run = SimpleNamespace(scene=SimpleNamespace(split=lambda _: []), exposures={(): exposures})
-    found = Exposure(when="auto").settled(run)
+    found = Exposure(when="auto").resolve_auto(run)
     assert (found.chosen, found.reason) == (chosen, exposures.text + said)
 
 

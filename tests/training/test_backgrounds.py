@@ -72,13 +72,13 @@ def test_a_run_repeats_to_the_bit(tiny_scene, tmp_path):
 @pytest.mark.slow
 def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="does not go together with sky"):
-        train(tiny_scene, tmp_path / "run", RANDOM, "model.background=directions", "optimize.steps=2")
+        train(tiny_scene, tmp_path / "run", RANDOM, "model.background=envmap", "optimize.steps=2")
     asked = load(
         "smoke",
         [
             f"scene.path='{tiny_scene}'",
             "optimize.modules.random_background.where=transparent",
-            "model.background=directions",
+            "model.background=envmap",
         ],
     )
     with pytest.raises(ConfigError, match="does not go together with sky"):

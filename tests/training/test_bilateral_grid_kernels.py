@@ -64,7 +64,7 @@ class Case:
     """A trainer of a random scene; its photograph is the second of two, which have grids of their own."""
 
     def __init__(self, device, rng, nodes=(3, 2, 4), share=None) -> None:
-        case, self.numbers = random_case(rng, 40, WIDTH, HEIGHT), {}
+        case, self.scalars = random_case(rng, 40, WIDTH, HEIGHT), {}
         model, pixels = case.model(device), rng.integers(0, 256, (3, HEIGHT, WIDTH)).astype(np.uint8)
         mask = None if share is None else device.upload((rng.random((1, HEIGHT, WIDTH)) < share).astype(np.uint8))
         self.photograph = Photograph(replace(case.device_camera(device), view=1), device.upload(pixels), mask)
@@ -73,14 +73,14 @@ class Case:
         self.trainer = StepTrainer(*parts, behind, (L2(),), Rates())
         self.state = GridState(BilateralGrid(cells=list(nodes), weight=0.1), ("a", "b"), device)
         self.state.rate, self.trainer.modules = 0.01, [self.state]
-        self.state.begin_with({"b": np.array([0.3, 0.1, -0.2])})
+        self.state.start_from({"b": np.array([0.3, 0.1, -0.2])})
         self.values = self.state.tables()["values"]
 
     def loss(self, at: int, change: float) -> float:
         """The loss with one value of the grid changed."""
         values = self.values.copy()
         values[1].reshape(-1)[at] += change
-        self.state.load(self.state.numbers, {"values": values})
+        self.state.load(self.state.scalars, {"values": values})
         return self.trainer.compare(self.photograph, 1).loss
 
 
@@ -90,12 +90,12 @@ def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, share):
     case, step = Case(device, rng, share=share), 2e-3
     places = rng.choice(case.values[1].size, 24, replace=False)
     numeric = [(case.loss(at, step) - case.loss(at, -step)) / (2 * step) for at in places]
-    case.state.load(case.state.numbers, {"values": case.values})
+    case.state.load(case.state.scalars, {"values": case.values})
     case.trainer.step(case.photograph, 1)
     found = case.state.tables()
     assert found["moment1"][1].ravel()[places] == pytest.approx(0.1 * np.array(numeric), rel=0.02, abs=2e-6)
     assert not found["moment1"][0].any(), "the other photograph has no update"
-    assert case.state.numbers["colors/b/updates"] == 1
+    assert case.state.scalars["colors/b/updates"] == 1
 
 
 @on_one_setting
@@ -121,7 +121,7 @@ def test_one_matrix_is_the_affine_kind(device, rng):
     grids = GridState(BilateralGrid(cells=[1, 1, 1]), ("a", "b"), device)
     grids.load({}, {"values": values})
     affine = ExposureState(Exposure(model=Affine(weight=0)), ("a", "b"))
-    affine.numbers.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
+    affine.scalars.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
     image, gradient = (planes_of(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))
     found = grids.changed(workspace, camera, image, 1).get()

@@ -23,7 +23,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.status import summary
 from clsplat.training import archive, checkpoint, memory
-from clsplat.training.modules.base import attached, measured_beside
+from clsplat.training.modules.base import attach_modules, read_color_model
 from clsplat.training.modules.bilateral_grid import BilateralGrid, bytes_of
 from clsplat.training.modules.exposure import Exposure, Gain
 from clsplat.training.run import Run
@@ -39,7 +39,7 @@ class Plain(Appearance):
 
     type: Literal["plain"] = "plain"
 
-    def state(self, run):
+    def create_state(self, run):
         return Views(self, [view.name for view in run.scene.split("train")])
 
     @property
@@ -48,15 +48,15 @@ class Plain(Appearance):
 
 
 class Views(ColorState):
-    def begin_with(self, log_gains):
-        self.numbers |= {f"colors/{view}/steps": 0.0 for view in self.views}
+    def start_from(self, log_gains):
+        self.scalars |= {f"colors/{view}/steps": 0.0 for view in self.views}
 
     def written(self):
-        steps = {view: self.numbers[f"colors/{view}/steps"] for view in self.views}
+        steps = {view: self.scalars[f"colors/{view}/steps"] for view in self.views}
         return Written(dict.fromkeys(self.views, IDENTITY), {"meaning": "none", "type": "plain", "photographs": steps})
 
     def update(self, step):
-        self.numbers[f"colors/{self.views[step.view]}/steps"] += 1
+        self.scalars[f"colors/{self.views[step.view]}/steps"] += 1
 '''
 GRID = (*FEW, "optimize.modules.bilateral_grid={cells: [3, 2, 4]}")
 
@@ -142,7 +142,7 @@ def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps,
     assert {"view_colors.json", "view_colors.npy"} < json.loads((with_grids / "checksums.json").read_text()).keys()
     measured = json.loads((with_grids / "metrics.json").read_text())["test"]["1"]
     assert measured["psnr_color"] == pytest.approx(evaluate(with_grids)["test"]["1"]["psnr_color"], abs=1e-6)
-    assert measured_beside(with_grids / "point_cloud.ply") == Gain()
+    assert read_color_model(with_grids / "point_cloud.ply") == Gain()
     assert digest(with_grids) != digest(few_steps)
     assert f"  colors  {with_grids}/view_colors.json" in summary(with_grids)
 
@@ -166,13 +166,13 @@ def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
     """Also with as many of them."""
     run, before = copy(ended), ended.modules["bilateral_grid"]
     run.modules = dict(ended.modules)
-    (same,) = attached(ended.settings.training.modules, run, 24)
-    assert same.numbers == before.numbers
+    (same,) = attach_modules(ended.settings.training.modules, run, 24)
+    assert same.scalars == before.scalars
     assert all((table == before.tables()[name]).all() for name, table in same.tables().items())
-    (other,) = attached([BilateralGrid(cells=cells)], run, 24)
+    (other,) = attach_modules([BilateralGrid(cells=cells)], run, 24)
     assert other is run.modules["bilateral_grid"] is not before
     assert not other.tables()["values"].any()
-    assert other.numbers[f"colors/{other.names[0]}/updates"] == 0 < before.numbers[f"colors/{other.names[0]}/updates"]
+    assert other.scalars[f"colors/{other.names[0]}/updates"] == 0 < before.scalars[f"colors/{other.names[0]}/updates"]
 
 
 @pytest.mark.slow
@@ -220,7 +220,7 @@ def test_damaged_tables_are_refused():
         {**good, "moment1": good["values"] + np.float32(np.nan)},
         {},
     ):
-        with pytest.raises(DataError, match=r"its grids are not|of its BilateralGrid is not"):
+        with pytest.raises(DataError, match=r"its grids are not|of its BilateralGrid has"):
             BilateralGrid.check_saved(rows, damaged)
     for damage in ({"colors/b/row": 6.0}, {"colors/a/row": 0.5}, {"colors/c/row": 2.0}):
         with pytest.raises(DataError, match="grids of the colors of 2 photographs"):

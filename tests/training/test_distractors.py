@@ -113,7 +113,7 @@ def test_what_covers_more_than_it_explains_fades(device, rng):
     before = pair.tables["logit_opacity"][:20]
     for _ in range(3):
         step = pair.layer(0)
-        assert 0 < step.own_losses[0].value() < 1
+        assert 0 < step.module_losses[0].value() < 1
         step.gradient = device.zeros(step.image.shape)
         pair.own.backward(step)
         pair.own.update(step)
@@ -157,7 +157,7 @@ def test_they_are_in_no_output_and_bits_repeat(tiny_scene, tmp_path, few_steps):
             "optimize.modules.exposure={}",
             "optimize.modules.camera_optimizer={start: 4}",
         ),
-        ("model.background=directions", "optimize.update=deferred", "model.screen_filter=box", "scene.levels=2"),
+        ("model.background=envmap", "optimize.update=deferred", "model.screen_filter=box", "scene.levels=2"),
         ("scene.validation=auto", "optimize.keep=best", "optimize.refit=true", "rasterizer.harmonics=host"),
     ],
 )
@@ -176,7 +176,7 @@ def test_tables_that_are_not_theirs_are_refused(device, rng):
         ({"means": tables["means"][:-1]}, "as many for each photograph"),
         ({"updates": tables["updates"][:0]}, "as many for each photograph"),
         ({"sh_base": tables["sh_base"][:, :2]}, "as many for each photograph"),
-        ({"quats": np.full_like(tables["quats"], np.nan)}, "quats of its Distractors is not of finite"),
+        ({"quats": np.full_like(tables["quats"], np.nan)}, "quats of its Distractors has values that are not finite"),
         ({"sh_rest": tables["means"]}, "as many for each photograph"),
     ]
     for change, message in damaged:

@@ -17,7 +17,7 @@ from clsplat.scene.camera_files import posed
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import DEGREES, View, zoomed
-from clsplat.training.modules.base import attached, learned_scene
+from clsplat.training.modules.base import attach_modules, learned_scene
 from clsplat.training.modules.camera_optimizer import (
     CameraOptimizer,
     CameraState,
@@ -123,13 +123,13 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_focals, tiny_
     run = train(tiny_scene, out, *ON, resume=True)
     assert digest(out) == digest(with_focals)
     state = run.modules["camera_optimizer"]
-    (key,) = [name for name in state.numbers if name.startswith("focal_lengths/") and name.endswith("/log")]
-    assert state.numbers[f"{key}/updates"] == 12 - 2
-    assert abs(state.numbers[key]) > 1e-4
+    (key,) = [name for name in state.scalars if name.startswith("focal_lengths/") and name.endswith("/log")]
+    assert state.scalars[f"{key}/updates"] == 12 - 2
+    assert abs(state.scalars[key]) > 1e-4
     found = learned_scene(run)
     factors = [after.camera.fx / view.camera.fx for view, after in zip(run.original.views, found.views, strict=True)]
-    assert factors == pytest.approx([np.exp(state.numbers[key])] * len(factors)), "also those of test views"
-    (later,) = attached([], run, 24)
+    assert factors == pytest.approx([np.exp(state.scalars[key])] * len(factors)), "also those of test views"
+    (later,) = attach_modules([], run, 24)
     assert later.factor(run.original.views[0].name) != 1, "it stays"
 
 
@@ -141,7 +141,7 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
     (lengths,) = {tuple(row["focal_lengths"]) for row in rows.values()}
     scene = read_scene(tiny_scene, 5)
     assert lengths[0] != scene.views[0].camera.fx
-    assert CameraOptimizer.beside(with_focals / "point_cloud.ply", scene).views[0].camera.fx == lengths[0]
+    assert CameraOptimizer.apply_side_files(with_focals / "point_cloud.ply", scene).views[0].camera.fx == lengths[0]
     write_cameras(with_focals, tmp_path / "cameras", "nerfstudio", "copy")
     for view in read_scene(tmp_path / "cameras", 5).views:
         assert (view.camera.fx, view.camera.fy) == pytest.approx(lengths)
@@ -149,7 +149,7 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
         broken = {name: row for name in rows}
         (tmp_path / "view_poses.json").write_text(json.dumps({"photographs": broken}))
         with pytest.raises(DataError, match=r"view_poses.json: .*no two focal lengths within 10 times"):
-            CameraOptimizer.beside(tmp_path / "point_cloud.ply", scene)
+            CameraOptimizer.apply_side_files(tmp_path / "point_cloud.ply", scene)
 
 
 @pytest.mark.slow

@@ -31,9 +31,9 @@ class Case:
         run = SimpleNamespace(
             scene=SimpleNamespace(split=lambda name: [view]), original=SimpleNamespace(cameras={"a": "b"})
         )
-        self.state = kind(weight=0.1).state(run)
+        self.state = kind(weight=0.1).create_state(run)
         self.keys, self.trainer.modules = self.example.TABLE.keys("b"), [self.state]
-        self.state.numbers = dict(zip(self.keys, rng.normal(0, 0.2, 17), strict=True))
+        self.state.scalars = dict(zip(self.keys, rng.normal(0, 0.2, 17), strict=True))
 
     def loss(self) -> float:
         return self.trainer.compare(self.photograph, 1).loss
@@ -44,15 +44,15 @@ class Case:
 def test_the_gradients_of_a_step_are_those_of_its_losses(device, rng, seed):
     case, change = Case(device, rng), 2e-3
     view = case.trainer.differentiate(case.photograph, 1)
-    _, row, of_weight, (wait,) = view.step.kept(case.state)
+    _, row, of_weight, (wait,) = view.step.saved(case.state)
     found, numeric = case.example.by_numbers(row, wait()) + of_weight, []
     gradients = case.trainer.rasterizer.gradients(case.trainer.model, view.frame, view.pixel_sums)["sh_base"].get()
     for key in case.keys:
-        ends, value = [], case.state.numbers[key]
+        ends, value = [], case.state.scalars[key]
         for end in (value + change, value - change):
-            case.state.numbers[key] = end
+            case.state.scalars[key] = end
             ends.append(case.loss())
-        case.state.numbers[key] = value
+        case.state.scalars[key] = value
         numeric.append((ends[0] - ends[1]) / (2 * change))
     assert found == pytest.approx(np.array(numeric), rel=0.02, abs=2e-4)
     gaussians, ends = case.trainer.model.gaussians, []
@@ -68,13 +68,13 @@ def test_the_gradients_of_a_step_are_those_of_its_losses(device, rng, seed):
 @pytest.mark.usefixtures("without_plugins")
 def test_it_begins_with_no_change_and_learns(device, rng, seed):
     case, images = Case(device, rng), []
-    case.state.numbers = {}
+    case.state.scalars = {}
     for modules in ([], [case.state]):
         case.trainer.modules = modules
         images.append(case.trainer.compare(case.photograph, 1).comparison.image.get())
     np.testing.assert_allclose(*images, atol=1e-6)
     case.trainer.step(case.photograph, 1)
-    changed = [key for key in case.keys if case.state.numbers[key]]
+    changed = [key for key in case.keys if case.state.scalars[key]]
     assert len(changed) == 15, "without a falloff its center has no gradient"
 
 

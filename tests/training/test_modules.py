@@ -12,7 +12,7 @@ from clsplat.losses.base import LossValue
 from clsplat.losses.image import L1, L2
 from clsplat.pipeline.loading import load
 from clsplat.training import checkpoint
-from clsplat.training.modules.base import ModuleState, TrainingModule, check_list, kind_of, unlisted
+from clsplat.training.modules.base import ModuleState, TrainingModule, check_list, class_of, implicit_modules
 from tests.support.device_images import trainer_of
 from tests.support.runs import FEW, killed, train
 from tests.support.sources import PATHS, own_imports, room
@@ -29,7 +29,7 @@ def types(*settings: str) -> list[str]:
 def test_nothing_but_its_check_knows_a_module_by_name():
     """Trainer, checkpoint, memory plan, evaluation, writer and reader of side files go through the base."""
     listed = variants(TrainingModule)
-    homes = {kind.__module__ for kind in (*listed.values(), *unlisted().values())}
+    homes = {kind.__module__ for kind in (*listed.values(), *implicit_modules().values())}
     faults = {
         f"{module} imports {target}"
         for module, _, target in own_imports()
@@ -57,10 +57,10 @@ def test_modules_are_set_by_their_type():
     [
         (["optimize.modules.expsure={}"], "no 'expsure'; expected one of .*; did you mean exposure"),
         (["optimize.modules.exposure=gain"], "expected a mapping of its keys"),
-        (["optimize.modules=[{type: transients, start: 1}, exposure]"], "'exposure' stands after 'transients'"),
+        (["optimize.modules=[{type: transients, start: 1}, exposure]"], "'exposure' is listed after 'transients'"),
         (["optimize.modules=[exposure, exposure]"], "'exposure' and 'exposure' exclude each other"),
         (["optimize.modules=[exposure, bilateral_grid]"], "'bilateral_grid' and 'exposure' exclude each other"),
-        (["optimize.modules.camera_optimizer={}", "model.background=directions"], "does not go together with sky"),
+        (["optimize.modules.camera_optimizer={}", "model.background=envmap"], "does not go together with sky"),
     ],
 )
 def test_lists_that_do_not_go_together_are_refused(settings, fault):
@@ -76,7 +76,7 @@ class Order(ModuleState):
         self.name, self.notes, self.skips = name, notes, skips
 
     def after_render(self, step) -> None:
-        step.own_losses.append(LossValue(self.name, lambda: 2.0))
+        step.module_losses.append(LossValue(self.name, lambda: 2.0))
         self.notes.append(f"forward {self.name}")
 
     def after_losses(self, step) -> None:
@@ -109,8 +109,8 @@ def test_a_step_goes_forward_in_order_and_back_in_reverse(device, rng):
 
 
 def test_a_module_that_is_not_known_is_named():
-    with pytest.raises(ConfigError, match="a module 'nosuch', which is not known; give its --plugin"):
-        kind_of("nosuch")
+    with pytest.raises(ConfigError, match="an unknown module 'nosuch'; load its plug-in"):
+        class_of("nosuch")
 
 
 NEEDED = {  # so that each acts within seven steps
@@ -126,7 +126,7 @@ def lists() -> list[list[dict[str, Any]]]:
     """Lists of all shipped modules, each in the first one with which it goes; the second run has a sky."""
     found: list[list[TrainingModule]] = [[], []]
     shipped = [kind for kind in variants(TrainingModule).values() if kind.__module__.startswith("clsplat.")]
-    for kind in sorted(shipped, key=lambda kind: kind.place):
+    for kind in sorted(shipped, key=lambda kind: kind.order):
         module = kind.model_validate({"type": (name := kind.model_fields["type"].default), **NEEDED.get(name, {})})
         for one, parts in zip(found, ([], ["sky"]), strict=True):
             if not ({*parts} & module.conflicts.keys()) and not conflict([*one, module]):
@@ -150,7 +150,7 @@ def conflict(modules: list[TrainingModule]) -> bool:
 def test_a_run_that_was_killed_has_the_same_bits(tiny_scene, tmp_path, number):
     """Of the model, of all tables and numbers of all modules, and of their side files."""
     settings = (*FEW, f"optimize.modules={json.dumps(lists()[number])}")
-    settings += ("model.background={type: directions, side: 16}",) if number else ()
+    settings += ("model.background={type: envmap, side: 16}",) if number else ()
     whole, again = tmp_path / "whole", tmp_path / "again"
     train(tiny_scene, whole, *settings)
     train(tiny_scene, killed(whole, again), *settings, resume=True)

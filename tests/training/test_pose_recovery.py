@@ -65,8 +65,8 @@ def learned(
     poses = CameraState(settings, views, views)
     poses.rates = *settings.rates(STEPS, VIEWS), settings.focal_rate(STEPS, 1)
     for table in poses.tables_of:
-        table.begin(poses.numbers, {})
-    poses.numbers |= {f"{DEPTHS}/{view.name}": DEPTH for view in views}
+        table.begin(poses.scalars, {})
+    poses.scalars |= {f"{DEPTHS}/{view.name}": DEPTH for view in views}
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians, []), background
     trainer = StepTrainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), STILL, modules=[poses])
     for step in range(1, STEPS + 1):

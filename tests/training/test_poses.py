@@ -14,7 +14,7 @@ from clsplat.pipeline.loading import load
 from clsplat.runs.model_file import evaluate, write_cameras
 from clsplat.scene.detect import read_scene
 from clsplat.training import checkpoint
-from clsplat.training.modules.base import attached
+from clsplat.training.modules.base import attach_modules
 from clsplat.training.modules.camera_optimizer import (
     DEPTHS,
     CameraOptimizer,
@@ -102,13 +102,13 @@ def test_cameras_that_were_not_trained_on_move_as_the_others_do(tiny_scene):
     scene = read_scene(tiny_scene, 5)
     poses = CameraState(CameraOptimizer(), scene.split("train"), scene.views)
     for table in poses.tables_of:
-        table.begin(poses.numbers, {})
-    poses.numbers |= {f"{DEPTHS}/{view.name}": 0.0 for view in poses.views}
-    for view, other in zip(scene.views, poses.scene(scene).views, strict=True):
+        table.begin(poses.scalars, {})
+    poses.scalars |= {f"{DEPTHS}/{view.name}": 0.0 for view in poses.views}
+    for view, other in zip(scene.views, poses.apply_to(scene).views, strict=True):
         assert other.world_to_camera == pytest.approx(view.world_to_camera, abs=1e-12)
     middle = np.mean([view.position for view in poses.views], axis=0)
-    poses.tables_of[1].begin(poses.numbers, {view.name: 0.1 * (view.position - middle) for view in poses.views})
-    for view, other in zip(scene.views, poses.scene(scene).views, strict=True):
+    poses.tables_of[1].begin(poses.scalars, {view.name: 0.1 * (view.position - middle) for view in poses.views})
+    for view, other in zip(scene.views, poses.apply_to(scene).views, strict=True):
         assert other.position == pytest.approx(middle + 1.1 * (view.position - middle))
         assert other.world_to_camera[:, :3] == pytest.approx(view.world_to_camera[:, :3])
 
@@ -126,12 +126,12 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_poses, tiny_s
     out = killed(with_poses, tmp_path / "run")
     run = train(tiny_scene, out, *ON, resume=True)
     assert digest(out) == digest(with_poses)
-    numbers = run.modules["camera_optimizer"].numbers
-    assert numbers == checkpoint.load(checkpoint.saved(with_poses)[-1])[0].modules["camera_optimizer"]
-    assert sum(value for name, value in numbers.items() if name.endswith("x/updates")) == 2 * (12 - 2)
-    assert attached([], run, 24)[0].move(run.scene.split("train")[0].name).shift.any(), "they stay"
+    scalars = run.modules["camera_optimizer"].scalars
+    assert scalars == checkpoint.load(checkpoint.saved(with_poses)[-1])[0].modules["camera_optimizer"]
+    assert sum(value for name, value in scalars.items() if name.endswith("x/updates")) == 2 * (12 - 2)
+    assert attach_modules([], run, 24)[0].move(run.scene.split("train")[0].name).shift.any(), "they stay"
     for table in run.modules["camera_optimizer"].tables_of:
-        rows = np.array([table.row(numbers, view) for view in table.views])
+        rows = np.array([table.row(scalars, view) for view in table.views])
         assert rows.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-12)
         assert np.abs(rows).max() > 1e-4
 
@@ -150,7 +150,7 @@ def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tin
     rows = json.loads((with_poses / "view_poses.json").read_text())["photographs"]
     assert sorted(row["learned"] for row in rows.values()) == [False] * 2 + [True] * 8
     scene = read_scene(tiny_scene, 5)
-    moved_views = CameraOptimizer.beside(with_poses / "point_cloud.ply", scene).views
+    moved_views = CameraOptimizer.apply_side_files(with_poses / "point_cloud.ply", scene).views
     assert any((a.world_to_camera != b.world_to_camera).any() for a, b in zip(scene.views, moved_views, strict=True))
     write_cameras(with_poses, tmp_path / "cameras", "nerfstudio", "copy")
     written = [view.world_to_camera for view in read_scene(tmp_path / "cameras", 5).views]
@@ -159,10 +159,10 @@ def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tin
     for damage in ("[]", json.dumps({"photographs": {scene.views[0].name: {"world_to_camera": [1, 2]}}})):
         (tmp_path / "view_poses.json").write_text(damage)
         with pytest.raises(DataError, match=r"view_poses.json: .*(expected a mapping|has no pose of 3 rows)"):
-            CameraOptimizer.beside(tmp_path / "point_cloud.ply", scene)
+            CameraOptimizer.apply_side_files(tmp_path / "point_cloud.ply", scene)
 
 
 @pytest.mark.slow
 def test_a_sky_is_refused(tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match=r"'camera_optimizer' does not go together with sky"):
-        train(tiny_scene, tmp_path / "run", *ON, "model.background=directions")
+        train(tiny_scene, tmp_path / "run", *ON, "model.background=envmap")

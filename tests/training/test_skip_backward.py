@@ -62,13 +62,13 @@ def slow_rule(skip: Skip, visits: list[tuple[str, float]]) -> list[bool]:
 
 def decisions(skip: Skip, visits: list[tuple[str, float]]) -> list[bool]:
     """What the rule decides, step by step, with what it keeps between them."""
-    numbers: dict[str, float] = {}
+    scalars: dict[str, float] = {}
     found = []
     for name, loss in visits:
-        before = dict(numbers)
-        visit = skip.decide(name, loss, numbers)
-        assert numbers == before
-        numbers.update(visit.numbers)
+        before = dict(scalars)
+        visit = skip.decide(name, loss, scalars)
+        assert scalars == before
+        scalars.update(visit.scalars)
         found.append(visit.skipped)
     return found
 
@@ -107,12 +107,12 @@ def test_the_least_share_of_whole_steps_is_kept_and_used(least):
 
 
 def test_a_loss_that_is_not_finite_changes_nothing():
-    skip, numbers = Skip(start=0, warm_up=1, least=0), {}
-    numbers.update(skip.decide("a", 1.0, numbers).numbers)
+    skip, scalars = Skip(start=0, warm_up=1, least=0), {}
+    scalars.update(skip.decide("a", 1.0, scalars).scalars)
     for loss in (math.nan, math.inf):
-        visit = skip.decide("a", loss, numbers)
-        assert (visit.skipped, dict(visit.numbers)) == (False, {})
-    assert skip.decide("a", 1.0, numbers).skipped, "a loss that is the average is not above it"
+        visit = skip.decide("a", loss, scalars)
+        assert (visit.skipped, dict(visit.scalars)) == (False, {})
+    assert skip.decide("a", 1.0, scalars).skipped, "a loss that is the average is not above it"
 
 
 def test_view_has_an_average_per_size_and_none_before_the_start():
@@ -127,7 +127,7 @@ def test_view_has_an_average_per_size_and_none_before_the_start():
         )
         state.after_losses(now)
         state.update(now)
-    averages = {name: value for name, value in state.numbers.items() if name.startswith("skip/loss/")}
+    averages = {name: value for name, value in state.scalars.items() if name.startswith("skip/loss/")}
     expected = {"skip/loss/40x30/a.png": 0.95 * 9 + 0.05 * 11, "skip/loss/20x30/a.png": 10.0}
     assert averages == pytest.approx(expected)
 
@@ -162,7 +162,7 @@ def state(run: Run) -> dict[str, Any]:
     """All that an update changes."""
     gaussians = run.model.gaussians
     tables = {name: gaussians.get(name).tobytes() for name in gaussians.tables}
-    of_filter = run.modules["haar"].numbers if "haar" in run.modules else {}
+    of_filter = run.modules["haar"].scalars if "haar" in run.modules else {}
     return {**tables, "updates": dict(run.adam.updates) if run.adam else {}, **of_filter}
 
 
@@ -192,7 +192,7 @@ def test_each_size_of_a_resolution_schedule_has_own_averages(tiny_scene, tmp_pat
     run, steps = begun(tiny_scene, tmp_path, "optimize.modules.skip={start: 2, warm_up: 40}", sizes, *NO_EDITS)
     for _ in range(36):
         next(steps)
-    averages = [name.split("/")[2] for name in run.modules["skip"].numbers if name.startswith("skip/loss/")]
+    averages = [name.split("/")[2] for name in run.modules["skip"].scalars if name.startswith("skip/loss/")]
     assert set(averages) == {"20x20", "40x40"}
     assert len(averages) > 8, "photographs"
 
@@ -201,7 +201,7 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
     run, steps = begun(tiny_scene, tmp_path, FROM_5)
     for _ in range(9):
         next(steps)
-    before = state(run), dict(run.modules["skip"].numbers)
+    before = state(run), dict(run.modules["skip"].scalars)
 
     def broken(trainer: StepTrainer, view: ViewLosses) -> ViewGradients:
         raise MemoryError
@@ -209,7 +209,7 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
     monkeypatch.setattr(StepTrainer, "backward", broken)
     with pytest.raises(MemoryError):
         next(steps)
-    assert (run.step, (state(run), dict(run.modules["skip"].numbers))) == (9, before)
+    assert (run.step, (state(run), dict(run.modules["skip"].scalars))) == (9, before)
 
 
 def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatch):
@@ -249,7 +249,7 @@ def test_a_run_that_skips_resumes_to_the_bit(tiny_scene, tmp_path, caplog):
         (again / name).unlink()
     resumed = train(tiny_scene, tmp_path / "again", *settings, resume=True)
     assert digest(resumed.out) == whole
-    assert resumed.modules["skip"].numbers == first.modules["skip"].numbers
+    assert resumed.modules["skip"].scalars == first.modules["skip"].scalars
     assert resumed.records.read("skip") == [told]
 
 
@@ -258,7 +258,7 @@ def test_auto_takes_its_share_from_the_warm_up(tiny_scene, tmp_path):
     settings = ("optimize.modules.skip={start: 2, warm_up: 40}", "optimize.steps=80", *NO_EDITS)
     run = train(tiny_scene, tmp_path / "run", *settings)
     (told,) = run.records.read("skip")
-    assert 8 / 40 <= told["least"] == run.modules["skip"].numbers["skip/above"] / 40
+    assert 8 / 40 <= told["least"] == run.modules["skip"].scalars["skip/above"] / 40
     assert told["steps"] == 78
     assert 0 < told["skipped"] <= (1 - told["least"]) * 78
 
@@ -267,11 +267,11 @@ def test_up_to_the_start_the_bits_are_those_without_it(tiny_scene, few_steps, tm
     run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.skip.start=12")
     assert digest(run.out) == digest(few_steps)
     assert [line["steps"] for line in run.records.read("skip")] == [0]
-    assert not run.modules["skip"].numbers
+    assert not run.modules["skip"].scalars
 
 
 def test_a_run_may_go_on_with_it(tiny_scene, killed_run, caplog):
     run = train(tiny_scene, killed_run, *FEW, "optimize.modules.skip={start: 8, warm_up: 1, least: 0}", resume=True)
     assert caplog.text.count("from here on the bits are not those of a run without a change") == 1
     assert json.loads((killed_run / "metrics.json").read_text())["steps"] == 12
-    assert run.modules["skip"].numbers["skip/steps"] == 4
+    assert run.modules["skip"].scalars["skip/steps"] == 4

@@ -15,7 +15,7 @@ from clsplat.core.reading import sha256
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.sky import Sky, keep_sky, sampled, sky_beside, texel_directions
 from clsplat.metrics.images import psnr
-from clsplat.photos.sky_detection import SkyEvidence, looked_at, panorama
+from clsplat.photos.sky_detection import SkyEvidence, detect_sky, panorama
 from clsplat.pipeline.loading import load, without_auto
 from clsplat.render.backdrops import Auto
 from clsplat.runs.model_file import evaluate
@@ -33,7 +33,7 @@ from tests.support.runs import FEW, digest, train
 
 pytestmark = pytest.mark.slow
 CAMERA, UP = Camera(64, 48, 60.0, 60.0, 32.0, 24.0), np.array([0.0, -1.0, 0.0])
-SKY = (*FEW, "model.background={type: directions, side: 16}")
+SKY = (*FEW, "model.background={type: envmap, side: 16}")
 LONGER = ("optimize.steps=300", "reset_opacity.every=1000", "optimize.evaluate.every=1000", "scene.holdout=4")
 
 
@@ -176,7 +176,7 @@ def test_directions_without_visible_sky_are_left_to_gaussians(yard):
     _, folder = yard
     scene = clsplat.read_scene(folder)
     photographs = [(view, np.rint(255 * view.photograph()).astype(np.uint8), None) for view in scene.views]
-    texels, free = panorama(list(looked_at(scene, photographs)), 32)
+    texels, free = panorama(list(detect_sky(scene, photographs)), 32)
     directions = texel_directions(32)
     looked = np.abs(directions[:, 1]) < 0.4
     assert not free[looked & (directions[:, 1] > 0.35)].any()
@@ -190,7 +190,7 @@ def test_directions_without_visible_sky_are_left_to_gaussians(yard):
 
 
 def test_the_best_model_is_left_with_the_sky_of_its_step(tiny_scene, tmp_path):
-    wild = "model.background={type: directions, side: 16, rate: {points: [[0, 0.005], [9, 5.0]], between: steps}}"
+    wild = "model.background={type: envmap, side: 16, rate: {points: [[0, 0.005], [9, 5.0]], between: steps}}"
     kept = (
         "scene.validation=2",
         "optimize.keep=best",
@@ -265,8 +265,8 @@ def test_what_a_sky_cannot_be_is_said(tiny_scene, yard, tmp_path, caplog):
     nothing = "export.sky: splats changes nothing: the model has no sky"
     few = ("optimize.steps=2", "init.count=60", "optimize.during=[]")
     for scene, key, said in (
-        (tiny_scene, "model.background={type: directions, side: 8}", [True, False]),
-        (yard[1], "model.background={type: directions, side: 8}", [False, False]),
+        (tiny_scene, "model.background={type: envmap, side: 8}", [True, False]),
+        (yard[1], "model.background={type: envmap, side: 8}", [False, False]),
         (yard[1], "model.background=null", [False, True]),
     ):
         caplog.clear()
@@ -306,7 +306,7 @@ def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
     for name, table in {"texels": behind["texels"][:-1], "biases": behind["moment1"]}.items():
         with pytest.raises(DataError, match=f"{name} of its sky"):
             SkyModule.check_saved({}, {**behind, name: table})
-    with pytest.raises(DataError, match="not of finite numbers"):
+    with pytest.raises(DataError, match="not finite float32 numbers"):
         SkyModule.check_saved({}, {**behind, "moment2": behind["moment2"] * np.nan})
     with pytest.raises(DataError, match="another sky"):
         SkyModule.check_saved({}, {"texels": behind["texels"], "biases": behind["biases"]})

@@ -10,19 +10,19 @@ from tests.support.runs import FEW, digest, train
 ON = (*FEW, "optimize.modules.transients={start: 4, above: 1, tail: 0}")
 
 
-def distribution(**numbers: float) -> dict[str, float]:
+def distribution(**scalars: float) -> dict[str, float]:
     """Numbers of residuals by bin."""
-    return {KEYS[int(name[1:])]: number for name, number in numbers.items()}
+    return {KEYS[int(name[1:])]: number for name, number in scalars.items()}
 
 
 def test_the_threshold_is_in_units_of_the_upper_edge_of_a_bin():
     settings = Transients(start=10, quantile=0.9, above=1, tail=0)
-    numbers = distribution(_40=50, _60=40, _80=10)
-    assert settings.threshold(numbers, 10) is None, "not yet"
+    scalars = distribution(_40=50, _60=40, _80=10)
+    assert settings.threshold(scalars, 10) is None, "not yet"
     assert settings.threshold({}, 11) is None
-    assert settings.threshold(numbers, 11) == 2.0**-12 * 2**7 * (1 + 5 / 8), "bin 61 begins there"
-    assert settings.model_copy(update={"above": 2}).threshold(numbers, 11) == 2 * settings.threshold(numbers, 11)
-    assert settings.model_copy(update={"quantile": 0.5}).threshold(numbers, 11) == 2.0**-12 * 2**5 * (1 + 1 / 8)
+    assert settings.threshold(scalars, 11) == 2.0**-12 * 2**7 * (1 + 5 / 8), "bin 61 begins there"
+    assert settings.model_copy(update={"above": 2}).threshold(scalars, 11) == 2 * settings.threshold(scalars, 11)
+    assert settings.model_copy(update={"quantile": 0.5}).threshold(scalars, 11) == 2.0**-12 * 2**5 * (1 + 1 / 8)
 
 
 def test_all_pixels_count_where_no_few_differ_much_more():
@@ -34,19 +34,19 @@ def test_all_pixels_count_where_no_few_differ_much_more():
 
 
 def test_the_distribution_fades():
-    settings, numbers = Transients(start=0, decay=0.5), {}
+    settings, scalars = Transients(start=0, decay=0.5), {}
     for _ in range(2):
-        settings.learn(numbers, np.eye(BINS, dtype=np.uint32)[3] * 8)
-    assert numbers == {key: 12.0 if key == KEYS[3] else 0.0 for key in KEYS}
+        settings.learn(scalars, np.eye(BINS, dtype=np.uint32)[3] * 8)
+    assert scalars == {key: 12.0 if key == KEYS[3] else 0.0 for key in KEYS}
 
 
 @pytest.mark.slow
 def test_a_run_learns_the_distribution_of_residuals(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path / "run", *ON)
-    assert sum(run.modules["transients"].numbers[key] for key in KEYS) > 40 * 40
+    assert sum(run.modules["transients"].scalars[key] for key in KEYS) > 40 * 40
     assert digest(tmp_path / "run") != digest(few_steps)
     state, _ = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])
-    assert state.modules["transients"] == run.modules["transients"].numbers
+    assert state.modules["transients"] == run.modules["transients"].scalars
 
 
 @pytest.mark.slow
@@ -73,7 +73,7 @@ def test_what_stands_in_one_photograph_alone_is_left_out_there(tiny_scene, tmp_p
     image = run.rasterizer.forward(run.model, photograph.camera, run.photographs.background).image
     residuals, _ = measure_residuals(workspace, photograph.camera, image, planes.colors, None)
     settings = Transients(start=150, tail=0)
-    threshold = settings.threshold(run.modules["transients"].numbers, 151)
+    threshold = settings.threshold(run.modules["transients"].scalars, 151)
     assert threshold is not None
     reach = max(1, round(settings.box * 40 / 2))
     left_out = mask_transients(workspace, photograph.camera, residuals, threshold, reach).get()[0, :40, :40] == 0

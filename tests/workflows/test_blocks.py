@@ -270,7 +270,7 @@ def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("model.background={type: directions}", "model.background is not for blocks: each block would learn its own"),
+        ("model.background={type: envmap}", "model.background is not for blocks: each block would learn its own"),
         ("model.time={degree: 1}", "model.time is not for blocks: a cell holds Gaussians at their own time"),
         ("optimize.modules.exposure={}", "optimize.modules is not for blocks: some would differ"),
         ("scene.validation=4", "scene.validation is not for blocks: a block has no views to choose by"),

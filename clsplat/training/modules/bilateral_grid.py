@@ -15,7 +15,7 @@ from clsplat.photos.appearance import ADAM, IDENTITY, LUMINANCE, MEANING, Floats
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.view import View
-from clsplat.training.modules.base import Numbers, Tables, TrainingStep
+from clsplat.training.modules.base import Scalars, Tables, TrainingStep
 from clsplat.training.modules.exposure import (
     TABLE,
     VIEW_COLORS,
@@ -61,10 +61,10 @@ class BilateralGrid(Appearance):
     """Factor of the loss that makes the grid of the photograph of a step smooth: the sum over the axes of the mean of
     the squared differences of neighbors."""
 
-    files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors", VIEW_GRIDS: "color grids"}
-    planes: ClassVar[int] = 9  # with the gradient that passes white
+    side_files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors", VIEW_GRIDS: "color grids"}
+    device_planes: ClassVar[int] = 9  # with the gradient that passes white
 
-    def state(self, run: Run) -> "GridState":
+    def create_state(self, run: Run) -> "GridState":
         return GridState(self, [view.name for view in run.scene.split("train")], run.device)
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
@@ -74,12 +74,12 @@ class BilateralGrid(Appearance):
         return super().device_bytes(views, tile) + bytes_of(self.cells, len({view.name for view in views}), rows)
 
     @classmethod
-    def check_saved(cls, numbers: Numbers, tables: Tables) -> None:
-        super().check_saved(numbers, tables)
+    def check_saved(cls, scalars: Scalars, tables: Tables) -> None:
+        super().check_saved(scalars, tables)
         shapes = {table.shape for table in tables.values()}
         if tables.keys() not in ({*TABLES}, {*TABLES[:1]}) or len(shapes) != 1 or shapes.pop()[1:2] != (ENTRIES,):
             raise DataError(f"its grids are not [photographs, {ENTRIES}, nz, ny, nx]")
-        named, held = sorted(row for key, row in numbers.items() if key.endswith("/row")), len(tables["values"])
+        named, held = sorted(row for key, row in scalars.items() if key.endswith("/row")), len(tables["values"])
         if named != list(range(held)):
             raise DataError(f"it has grids of the colors of {held} photographs, and its numbers name other rows")
 
@@ -111,22 +111,22 @@ class GridState(ColorState):
     def tables(self, whole: bool = True) -> Tables:
         return {name: self.arrays[name].get() for name in (TABLES if whole else TABLES[:1])}
 
-    def takes(self, numbers: Numbers, tables: Tables) -> bool:
+    def can_load(self, scalars: Scalars, tables: Tables) -> bool:
         return "values" in tables and tables["values"].shape == self.shape
 
-    def load(self, numbers: Numbers, tables: Tables) -> None:
+    def load(self, scalars: Scalars, tables: Tables) -> None:
         """Those that are not given become 0."""
-        super().load(numbers, tables)
+        super().load(scalars, tables)
         for name, array in self.arrays.items():
             array.set(np.ascontiguousarray(tables.get(name, np.zeros(self.shape, np.float32))))
 
-    def begin_with(self, log_gains: Mapping[str, Floats]) -> None:
+    def start_from(self, log_gains: Mapping[str, Floats]) -> None:
         matrices = np.zeros((len(self.names), 3, 4))
         for row, view in enumerate(self.names):
             matrices[row, range(3), range(3)] = np.expm1(log_gains.get(view, np.zeros(3)))
-            self.numbers |= {f"{TABLE}/{view}/row": float(row), f"{TABLE}/{view}/updates": 0.0}
+            self.scalars |= {f"{TABLE}/{view}/row": float(row), f"{TABLE}/{view}/updates": 0.0}
         values = matrices.reshape(len(matrices), ENTRIES, 1, 1, 1).astype(np.float32)
-        self.load(self.numbers, {"values": np.broadcast_to(values, self.shape)})
+        self.load(self.scalars, {"values": np.broadcast_to(values, self.shape)})
         self._center()
 
     def row(self, view: int) -> int:
@@ -139,16 +139,16 @@ class GridState(ColorState):
         image = step.image
         step.image = self.changed(step.workspace, step.camera, image, step.view)
         shares = self.smoothness(step.workspace, step.view)
-        step.own_losses.append(LossValue("colors", lambda: float(shares.get().sum(dtype=np.float64))))
-        step.keep(self, (image, []))
+        step.module_losses.append(LossValue("colors", lambda: float(shares.get().sum(dtype=np.float64))))
+        step.save(self, (image, []))
 
     def backward(self, step: TrainingStep) -> None:
-        if (kept := step.kept(self)) and step.view is not None:
+        if (kept := step.saved(self)) and step.view is not None:
             step.gradient, by_grid = self.differentiated(step.workspace, step.camera, kept[0], step.gradient, step.view)
             kept[1].append(by_grid)
 
     def update(self, step: TrainingStep) -> None:
-        if (kept := step.kept(self)) and step.view is not None:
+        if (kept := step.saved(self)) and step.view is not None:
             self.learn(step.workspace, step.view, kept[1][0], step.number)
 
     def written(self) -> Written:
@@ -236,7 +236,7 @@ class GridState(ColorState):
         by_grid: derivatives of the losses of the image, [row]; those of the smoothness are as `smoothness` left them.
         """
         key, row = f"{TABLE}/{self.views[view]}/updates", row_length(self.settings.cells)
-        self.numbers[key] = updates = self.numbers.get(key, 0.0) + 1
+        self.scalars[key] = updates = self.scalars.get(key, 0.0) + 1
         arguments: dict[str, Any] = dict(self.arrays)
         workspace.device.program("color_grid_table.cl").color_grid_update(
             items=row,

@@ -26,7 +26,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.reprojection import with_cameras
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, zooms
-from clsplat.training.modules.base import ModuleState, Numbers, TrainingModule, TrainingStep
+from clsplat.training.modules.base import ModuleState, Scalars, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 Floats = NDArray[np.float64]
@@ -63,13 +63,12 @@ class CameraOptimizer(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"turn", "shift", "focal", "start"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
-    outlasts: ClassVar[Literal["acts"]] = "acts"
     conflicts: ClassVar[Mapping[str, str]] = {
         "sky": "the model has a sky, which is not learned together with poses",
         "inverse_depth": "the loss would not move them",
         "blocks": "those of blocks would differ",
     }
-    files: ClassVar[Mapping[str, str]] = {VIEW_POSES: "poses"}
+    side_files: ClassVar[Mapping[str, str]] = {VIEW_POSES: "poses"}
 
     type: Literal["camera_optimizer"] = "camera_optimizer"
     turn: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = "auto"
@@ -104,15 +103,15 @@ class CameraOptimizer(TrainingModule):
         initial = min(max(bounds[0], needed), bounds[1])
         return Decay(initial=initial, final=initial / FALL, over=steps, start=self.start)
 
-    def check_in(self, run: Run) -> None:
+    def check_run(self, run: Run) -> None:
         if self.focal:
             require_zoom(run.original)
 
-    def state(self, run: Run) -> "CameraState":
+    def create_state(self, run: Run) -> "CameraState":
         return CameraState(self, run.scene.split("train"), run.original.views)
 
     @classmethod
-    def beside(cls, model: Path, scene: Scene) -> Scene:
+    def apply_side_files(cls, model: Path, scene: Scene) -> Scene:
         """Return a scene, at its full size, with the poses and focal lengths in the table next to a model file."""
         path = model.with_name(VIEW_POSES)
         if not path.is_file():
@@ -162,11 +161,13 @@ def _by_vector(turn: Floats, by_turn: Floats) -> Floats:
 
 
 class CameraState(ModuleState):
-    """What is added to the poses of the training views, and the factors of their cameras' focal lengths.
+    """The learned changes of the poses of the training views, and of the focal lengths of their cameras.
 
-    A view of several sizes has one row.  A factor is of both focal lengths; equal lenses, or equal pinhole cameras, of
-    the dataset as it was read, are one camera, by the name of the first view that has it.
+    A view of several sizes has one row.  One factor scales both focal lengths.  Views whose lens, or pinhole camera, is
+    the same in the dataset share a camera, which has the name of the first such view.
     """
+
+    after_training: ClassVar[Literal["dropped", "kept", "active"]] = "active"
 
     def __init__(self, settings: CameraOptimizer, views: Sequence[View], originals: Sequence[View]) -> None:
         super().__init__()
@@ -177,13 +178,13 @@ class CameraState(ModuleState):
         self.cameras = {view.name: first.setdefault(view.lens or view.camera, view.name) for view in originals}
         self.rates: tuple[Schedule, Schedule, Schedule] = 0.0, 0.0, 0.0
 
-    def takes(self, numbers: Numbers, tables: Any) -> bool:
-        return self.tables_of[0].begun(numbers)
+    def can_load(self, scalars: Scalars, tables: Any) -> bool:
+        return self.tables_of[0].begun(scalars)
 
-    def begin(self, run: Run) -> None:
+    def start(self, run: Run) -> None:
         for table in self.tables_of:
-            table.begin(self.numbers, {})
-        self.numbers |= {f"{DEPTHS}/{view.name}": depth_of(view, run.scene) for view in self.views}
+            table.begin(self.scalars, {})
+        self.scalars |= {f"{DEPTHS}/{view.name}": depth_of(view, run.scene) for view in self.views}
 
     def prepare(self, run: Run, last: int, trained: bool = True) -> None:
         if not trained:
@@ -201,33 +202,33 @@ class CameraState(ModuleState):
 
     def after_backward(self, step: TrainingStep) -> None:
         if step.view is not None and step.number > self.settings.start:
-            step.keep(self, pose_gradient(step.workspace, step.model, step.frame, step.pixel_sums))
+            step.save(self, pose_gradient(step.workspace, step.model, step.frame, step.pixel_sums))
 
     def update(self, step: TrainingStep) -> None:
-        if not (wait := step.kept(self)) or step.view is None:
+        if not (wait := step.saved(self)) or step.view is None:
             return
         sums, name, (turns, shifts), number = wait(), self.views[step.view].name, self.tables_of, step.number
         move, (turn, shift, focal) = self.move(name), self.rates
         by_turn, by_shift = move.gradients(self.pose(step.view), sums[:3], sums[3:6])
-        turns.update(self.numbers, name, by_turn, at_step(turn, number))
-        shifts.update(self.numbers, name, by_shift, move.depth * at_step(shift, number))
+        turns.update(self.scalars, name, by_turn, at_step(turn, number))
+        shifts.update(self.scalars, name, by_shift, move.depth * at_step(shift, number))
         self.zoom(name, float(sums[6]), at_step(focal, number))
 
     def zoom(self, view: str, by_log: float, rate: float) -> None:
         """Change the focal lengths of a view's camera by Adam; by_log: the derivative by the logarithm of a factor."""
         if rate:
             key = self._key(view)
-            adam_step(self.numbers, {key: self.numbers.get(key, 0.0)}, {key: by_log}, rate)
+            adam_step(self.scalars, {key: self.scalars.get(key, 0.0)}, {key: by_log}, rate)
 
     @property
     def zoomed(self) -> list[str]:
         """The cameras whose focal lengths have been learned."""
-        return [one for one in dict.fromkeys(self.cameras.values()) if self._key(one) in self.numbers]
+        return [one for one in dict.fromkeys(self.cameras.values()) if self._key(one) in self.scalars]
 
     def move(self, view: str) -> Move:
         """Return how far the camera of a view has moved."""
-        turn, shift = (table.row(self.numbers, view) for table in self.tables_of)
-        return Move(turn, shift, self.numbers[f"{DEPTHS}/{view}"])
+        turn, shift = (table.row(self.scalars, view) for table in self.tables_of)
+        return Move(turn, shift, self.scalars[f"{DEPTHS}/{view}"])
 
     def pose(self, view: int) -> Floats:
         """Return the pose, [3, 4], of a training view by its number."""
@@ -237,12 +238,12 @@ class CameraState(ModuleState):
 
     def factor(self, view: str) -> float:
         """Return what the focal lengths of a view are multiplied by."""
-        return math.exp(self.numbers.get(self._key(view), 0.0))
+        return math.exp(self.scalars.get(self._key(view), 0.0))
 
     def _key(self, view: str) -> str:
         return f"{FOCALS}/{self.cameras.get(view, view)}/log"
 
-    def scene(self, scene: Scene) -> Scene:
+    def apply_to(self, scene: Scene) -> Scene:
         """Return a scene with the learned cameras.
 
         Views that were not trained on have the focal lengths of their camera; they are moved as those of the training
@@ -273,7 +274,7 @@ class CameraState(ModuleState):
 
     def write(self, run: Run) -> None:
         """Write the poses that each photograph has for the model; log how far they have moved."""
-        views, names = self.scene(run.original).views, {view.name for view in self.views}
+        views, names = self.apply_to(run.original).views, {view.name for view in self.views}
         cameras = self.zoomed
         data = {
             "meaning": "poses in which the model shows each photograph, rows of [R | t] from the world to the camera; "

@@ -40,11 +40,10 @@ class CameraResponse(TrainingModule):
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
-    place: ClassVar[int] = 25  # before the colors of a photograph, which cut white
-    planes: ClassVar[int] = 8  # the image as the camera takes it, and its gradient, each with a fourth plane
-    outlasts: ClassVar[Literal["numbers"]] = "numbers"
+    order: ClassVar[int] = 25  # before the colors of a photograph, which cut white
+    device_planes: ClassVar[int] = 8  # the image as the camera takes it, and its gradient, each with a fourth plane
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
-    files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
+    side_files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
 
     type: Literal["camera_response"] = "camera_response"
     rate: NonNegative = 1e-3
@@ -53,16 +52,18 @@ class CameraResponse(TrainingModule):
     """Weight of the sum of the squared numbers of the step's camera among the losses, by step: what all photographs
     have in common the Gaussians can show as well."""
 
-    def state(self, run: Run) -> ModuleState:
+    def create_state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)
 
     @classmethod
-    def beside(cls, model: Path, scene: Scene) -> Scene:
+    def apply_side_files(cls, model: Path, scene: Scene) -> Scene:
         return with_rows(scene, TABLE.read(model.with_name(FILE)))
 
 
 class CameraResponseState(ModuleState):
     """The numbers of each camera, by the name of the first view that has it."""
+
+    after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
     def __init__(self, settings: CameraResponse, views: Sequence[str], cameras: dict[str, str]) -> None:
         """views: the names of the training views, by number; cameras: of each view, by name."""
@@ -71,26 +72,26 @@ class CameraResponseState(ModuleState):
 
     def row(self, view: str) -> Floats:
         """Return the numbers of a view's camera, [17]."""
-        return TABLE.row(self.numbers, self.cameras[view])
+        return TABLE.row(self.scalars, self.cameras[view])
 
     def after_render(self, step: TrainingStep) -> None:
         if step.view is not None:
             row, weight = self.row(self.views[step.view]), at_step(self.settings.weight, step.number)
-            step.own_losses.append(LossValue("response", lambda: weight * float(row @ row)))
-            step.keep(self, (step.image, row, 2 * weight * row, []))
+            step.module_losses.append(LossValue("response", lambda: weight * float(row @ row)))
+            step.save(self, (step.image, row, 2 * weight * row, []))
             step.image = taken(step.workspace, step.camera, step.image, row)
 
     def backward(self, step: TrainingStep) -> None:
-        if kept := step.kept(self):
+        if kept := step.saved(self):
             step.gradient = taken(step.workspace, step.camera, kept[0], kept[1], step.gradient)
             kept[3].append(step.workspace.array("response sums", (20, step.camera.rows)).get_later())
 
     def update(self, step: TrainingStep) -> None:
-        if (kept := step.kept(self)) and step.view is not None:
+        if (kept := step.saved(self)) and step.view is not None:
             gradient, rate = by_numbers(kept[1], kept[3][0]()) + kept[2], at_step(self.settings.rate, step.number)
-            TABLE.update(self.numbers, self.cameras[self.views[step.view]], gradient, rate)
+            TABLE.update(self.scalars, self.cameras[self.views[step.view]], gradient, rate)
 
-    def scene(self, scene: Scene) -> Scene:
+    def apply_to(self, scene: Scene) -> Scene:
         return with_rows(scene, {view: self.row(view) for view in self.cameras})
 
     def write(self, run: Run) -> None:
@@ -122,9 +123,9 @@ def taken(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats,
     the image, with the sums of rows in the workspace."""
     result = workspace.array("grad_response" if back else "response", image.shape)
     sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2
-    numbers = workspace.device.upload(np.concatenate([row[2:5], slopes_of(row).ravel()]).astype(np.float32))
+    scalars = workspace.device.upload(np.concatenate([row[2:5], slopes_of(row).ravel()]).astype(np.float32))
     center = {f"center_{x}": float(camera.values[f"c{x}"] + half * shift) for x, shift in zip("xy", row, strict=False)}
     given: dict[str, Any] = {"image": image, "gradient": back or image, "found": result, "row_sums": sums, **center}
-    given |= {"numbers": numbers, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
+    given |= {"numbers": scalars, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
     workspace.device.program(KERNEL).camera_response(groups=(1, camera.rows), **given, **camera.plane_arguments())
     return result

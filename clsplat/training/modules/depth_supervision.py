@@ -14,17 +14,17 @@ from clsplat.training.run import Run
 class DepthSupervision(TrainingModule):
     """The depths that a loss reads.  The loss brings it: no list names it."""
 
-    brought_as: ClassVar[str] = "depth_supervision"
-    place: ClassVar[int] = -10
+    implicit_type: ClassVar[str] = "depth_supervision"
+    order: ClassVar[int] = -10
 
     losses: list[Any]
 
     @classmethod
-    def brought(cls, run: Run, stage: Any) -> "DepthSupervision | None":
+    def implied(cls, run: Run, stage: Any) -> "DepthSupervision | None":
         losses = [loss for loss in getattr(stage, "losses", ()) if isinstance(loss, InverseDepth)]
-        return cls(type=cls.brought_as, losses=losses) if losses else None
+        return cls(type=cls.implicit_type, losses=losses) if losses else None
 
-    def check_in(self, run: Run) -> None:
+    def check_run(self, run: Run) -> None:
         """Raise DataError where nothing tells which photographs show a point, or one has no depth map, ConfigError
         where two losses name different folders."""
         if len({loss.folder for loss in self.losses}) > 1:
@@ -45,8 +45,8 @@ class DepthSupervision(TrainingModule):
         folder = self.losses[0].folder
         return DepthMaps(Path(folder)) if folder else None
 
-    def state(self, run: Run) -> "KnownDepthsState":
-        self.check_in(run)
+    def create_state(self, run: Run) -> "KnownDepthsState":
+        self.check_run(run)
         assert run.scene.tracks is not None
         views = run.scene.split("train")
         tracks, names = within(run.scene.tracks, views), [view.name for view in views]

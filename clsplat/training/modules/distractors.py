@@ -24,7 +24,7 @@ from clsplat.render.overlay import lay_over, look_behind
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
+from clsplat.training.modules.base import ModuleState, Scalars, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 UPDATES = "updates"
@@ -45,8 +45,8 @@ class Distractors(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
-    place: ClassVar[int] = 20  # in the colors of the scene
-    planes: ClassVar[int] = 12  # which rendering and comparing them take, at most
+    order: ClassVar[int] = 20  # in the colors of the scene
+    device_planes: ClassVar[int] = 12  # which rendering and comparing them take, at most
 
     type: Literal["distractors"] = "distractors"
     count: Annotated[int, Field(gt=0, le=10_000)] = 200
@@ -56,7 +56,7 @@ class Distractors(TrainingModule):
     cover: NonNegative = 0.1
     """Weight of the mean of what they cover of a photograph, from 0 to 1, among the losses; by step."""
 
-    def state(self, run: Run) -> "DistractorsState":
+    def create_state(self, run: Run) -> "DistractorsState":
         sort, budget = run.rasterizer.tiler.sort, run.rasterizer.budget
         own = Rasterizer(run.device, "radix" if sort == "auto" else sort, budget)
         return DistractorsState(self, run.scene.split("train"), own)
@@ -66,8 +66,8 @@ class Distractors(TrainingModule):
         return super().device_bytes(views, tile) + 4 * rows * (3 * sum(WIDTHS.values()) + 1)
 
     @classmethod
-    def check_saved(cls, numbers: Numbers, tables: Tables) -> None:
-        super().check_saved(numbers, tables)
+    def check_saved(cls, scalars: Scalars, tables: Tables) -> None:
+        super().check_saved(scalars, tables)
         widths = {name: width for one, width in WIDTHS.items() for name in (one, *moment_tables(one))} | {UPDATES: 1}
         photographs, rows = len(tables.get(UPDATES, ())), len(tables.get("means", ()))
         shapes = {name: (photographs if name == UPDATES else rows, width) for name, width in widths.items()}
@@ -86,16 +86,16 @@ class DistractorsState(ModuleState):
         self._rows = [self._names.index(view.name) for view in views]
         self._black = rasterizer.device.zeros(3)
 
-    def begin(self, run: Run) -> None:
+    def start(self, run: Run) -> None:
         views = run.scene.split("train")
         photographs = list({view.name: view for view in reversed(views)}.values())[::-1]
         counted = run.status.counted(photographs, "photographs", len(photographs))
         self.load({}, first_tables(self.settings.count, [(v, run.photographs.get(v).image()) for v in counted]))
 
-    def takes(self, numbers: Numbers, tables: Tables) -> bool:
+    def can_load(self, scalars: Scalars, tables: Tables) -> bool:
         return len(tables[UPDATES]) == len(self._names)
 
-    def load(self, numbers: Numbers, tables: Tables) -> None:
+    def load(self, scalars: Scalars, tables: Tables) -> None:
         self.adams = [_adam(self.rasterizer.device, tables, row) for row in range(len(tables[UPDATES]))]
 
     def tables(self, whole: bool = True) -> Tables:
@@ -112,11 +112,11 @@ class DistractorsState(ModuleState):
         scale = at_step(self.settings.cover, step.number) / (camera.width * camera.height)
         layer = lay_over(step.workspace, frame, step.image, scale)
         step.image = layer.image
-        step.own_losses.append(LossValue("distractors", layer.loss))
-        step.keep(self, (layer, []))
+        step.module_losses.append(LossValue("distractors", layer.loss))
+        step.save(self, (layer, []))
 
     def backward(self, step: TrainingStep) -> None:
-        if not (kept := step.kept(self)):
+        if not (kept := step.saved(self)):
             return
         layer, sums = kept
         frame = replace(layer.frame, image=layer.image)  # blending is differentiated from the colors of all
@@ -124,7 +124,7 @@ class DistractorsState(ModuleState):
         look_behind(step.workspace, frame, step.gradient)
 
     def update(self, step: TrainingStep) -> None:
-        if (kept := step.kept(self)) and step.view is not None:
+        if (kept := step.saved(self)) and step.view is not None:
             frame, pixel_sums = kept[1]
             self.adams[self._rows[step.view]].update(frame.drawn, frame, pixel_sums, RATES)
 

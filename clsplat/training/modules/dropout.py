@@ -17,13 +17,13 @@ class Dropout(TrainingModule):
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"probability"})
-    joins: ClassVar[bool] = True
+    optional_on_resume: ClassVar[bool] = True
 
     type: Literal["dropout"] = "dropout"
     probability: Probability
     """By step, 0.9 at most."""
 
-    def state(self, run: Run) -> ModuleState:
+    def create_state(self, run: Run) -> ModuleState:
         return _Dropping(self, run.seed)
 
 

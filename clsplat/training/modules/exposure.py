@@ -32,7 +32,7 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.training.modules.base import ModuleState, Numbers, Tables, TrainingModule, TrainingStep
+from clsplat.training.modules.base import ModuleState, Scalars, Tables, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -67,12 +67,11 @@ class Appearance(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
-    place: ClassVar[int] = 30  # after what stands in front of the scene
+    order: ClassVar[int] = 30  # after what stands in front of the scene
     family: ClassVar[str] = "appearance"
-    outlasts: ClassVar[Literal["numbers"]] = "numbers"
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
-    files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors"}
-    planes: ClassVar[int] = 6  # the image in the colors of its photograph, and its gradient
+    side_files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors"}
+    device_planes: ClassVar[int] = 6  # the image in the colors of its photograph, and its gradient
 
     rate: RateOrAuto = "auto"
     """Learning rate of the numbers, by Adam, by step; auto: 1e-2 to 1e-3, where each photograph is visited 400 times or
@@ -118,7 +117,7 @@ class Appearance(TrainingModule):
             initial, final = max(initial, needed), max(final, needed / 10)
         return Decay(initial=initial, final=final, over=steps)
 
-    def settled(self, run: Run) -> "Appearance":
+    def resolve_auto(self, run: Run) -> "Appearance":
         """Return it with the choice that follows from the exposures of the photographs; one that is made stays."""
         if self.when == "always" or self.chosen is not None:
             return self
@@ -137,7 +136,7 @@ class Appearance(TrainingModule):
         return self.model_copy(update={"chosen": chosen, "reason": reason})
 
     @classmethod
-    def measured_beside(cls, model: Path) -> "ColorModel | None":
+    def read_color_model(cls, model: Path) -> "ColorModel | None":
         path = model.with_name(VIEW_COLORS)
         if not path.is_file():
             return None
@@ -255,12 +254,14 @@ class Exposure(Appearance):
     def fit(self) -> ColorModel:
         return self.model
 
-    def state(self, run: Run) -> "ExposureState":
+    def create_state(self, run: Run) -> "ExposureState":
         return ExposureState(self, [view.name for view in run.scene.split("train")])
 
 
 class ColorState(ModuleState):
     """What a training has of the colors of its photographs, of whichever kind."""
+
+    after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
     def __init__(self, settings: Appearance, views: Sequence[str]) -> None:
         """views: the names of the training views, by number; one of several sizes has one row."""
@@ -268,20 +269,20 @@ class ColorState(ModuleState):
         self.settings, self.views, self.names = settings, views, tuple(dict.fromkeys(views))
         self.rate: Schedule = 0.0
 
-    def begin(self, run: Run) -> None:
+    def start(self, run: Run) -> None:
         exposures = exposures_of(run)
-        self.begin_with(exposures.log_gains)
-        self.numbers[KNOWN] = float(bool(exposures.log_gains))
+        self.start_from(exposures.log_gains)
+        self.scalars[KNOWN] = float(bool(exposures.log_gains))
         LOG.info("colors of photographs: %s", exposures.text)
 
     def prepare(self, run: Run, last: int, trained: bool = True) -> None:
-        self.rate = self.settings.rate_of(last, len(self.names), self.numbers.get(KNOWN, 1.0) > 0)
+        self.rate = self.settings.rate_of(last, len(self.names), self.scalars.get(KNOWN, 1.0) > 0)
 
-    def begin_with(self, log_gains: Mapping[str, Floats]) -> None:
+    def start_from(self, log_gains: Mapping[str, Floats]) -> None:
         """Set the first numbers.  log_gains: of red, green and blue by view, where known, [3]."""
 
     @property
-    def measured_as(self) -> ColorModel:
+    def color_model(self) -> ColorModel:
         return self.settings.fit
 
     @abstractmethod
@@ -315,45 +316,45 @@ class ExposureState(ColorState):
     def table(self) -> ViewTable:
         return ViewTable(TABLE, self.names, self.settings.model.columns)
 
-    def takes(self, numbers: Numbers, tables: Tables) -> bool:
-        return self.table.begun(numbers)
+    def can_load(self, scalars: Scalars, tables: Tables) -> bool:
+        return self.table.begun(scalars)
 
-    def begin_with(self, log_gains: Mapping[str, Floats]) -> None:
+    def start_from(self, log_gains: Mapping[str, Floats]) -> None:
         of_gains = self.settings.model.of_gains
-        self.table.begin(self.numbers, {view: of_gains(gains) for view, gains in log_gains.items()})
+        self.table.begin(self.scalars, {view: of_gains(gains) for view, gains in log_gains.items()})
 
     def after_render(self, step: TrainingStep) -> None:
         if step.view is None:
             return
-        row = self.table.row(self.numbers, self.views[step.view])
+        row = self.table.row(self.scalars, self.views[step.view])
         penalty, matrix, image = self.settings.model.penalty(row)[0], self.settings.model.matrix(row), step.image
-        step.keep(self, (image, matrix, []))
+        step.save(self, (image, matrix, []))
         step.image = change_colors(step.workspace, step.camera, image, matrix)
-        step.own_losses.append(LossValue("colors", lambda: penalty))
+        step.module_losses.append(LossValue("colors", lambda: penalty))
 
     def backward(self, step: TrainingStep) -> None:
-        if kept := step.kept(self):
+        if kept := step.saved(self):
             image, matrix, waits = kept
             step.gradient, wait = change_back(step.workspace, step.camera, image, matrix, step.gradient)
             waits.append(wait)
 
     def update(self, step: TrainingStep) -> None:
-        if not (kept := step.kept(self)) or step.view is None:
+        if not (kept := step.saved(self)) or step.view is None:
             return
         self.learn(step.view, kept[2][0](), step.number)
 
     def learn(self, view: int, by_matrix: Floats, step: int) -> None:
         """Change the numbers of a view; by_matrix: derivatives of the losses by its matrix, [3, 4]."""
-        row = self.table.row(self.numbers, self.views[view])
+        row = self.table.row(self.scalars, self.views[view])
         gradient = self.settings.model.gradient(row, by_matrix) + self.settings.model.penalty(row)[1]
-        self.table.update(self.numbers, self.views[view], gradient, at_step(self.rate, step))
+        self.table.update(self.scalars, self.views[view], gradient, at_step(self.rate, step))
 
     def matrix(self, view: int) -> Floats:
         """Return the matrix of a training view by its number, [3, 4]."""
-        return self.settings.model.matrix(self.table.row(self.numbers, self.views[view]))
+        return self.settings.model.matrix(self.table.row(self.scalars, self.views[view]))
 
     def written(self) -> Written:
-        rows = {view: self.table.row(self.numbers, view) for view in self.table.views}
+        rows = {view: self.table.row(self.scalars, view) for view in self.table.views}
         matrices = {view: self.settings.model.matrix(row) for view, row in rows.items()}
         model = self.settings.model
         photographs = {

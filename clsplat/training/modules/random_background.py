@@ -19,7 +19,7 @@ class RandomBackground(TrainingModule):
     """Draw the color behind everything in each step: uniform, by the seed and the step alone."""
 
     conflicts: ClassVar[Mapping[str, str]] = {"sky": "it is behind everything, and drawn colors would be too"}
-    joins: ClassVar[bool] = True
+    optional_on_resume: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"where"})
 
     type: Literal["random_background"] = "random_background"
@@ -29,7 +29,7 @@ class RandomBackground(TrainingModule):
     def is_active(self, scene: Scene | None = None) -> bool:
         return self.where == "always" or (scene is not None and background_shows(scene))
 
-    def state(self, run: Run) -> ModuleState:
+    def create_state(self, run: Run) -> ModuleState:
         if self.where == "transparent":
             LOG.info("background of the steps: random, since it shows behind photographs")
         run.photographs.keep_transparency()

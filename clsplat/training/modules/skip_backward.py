@@ -22,7 +22,7 @@ class Visit:
     """What a step does with its view."""
 
     skipped: bool = False
-    numbers: Mapping[str, float] = field(default_factory=dict)  # those that change when the step is done
+    scalars: Mapping[str, float] = field(default_factory=dict)  # those that change when the step is done
 
 
 class Skip(TrainingModule):
@@ -41,9 +41,8 @@ class Skip(TrainingModule):
     """
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
-    place: ClassVar[int] = 99  # it reads the losses of all others
-    outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "numbers"
-    joins: ClassVar[bool] = True
+    order: ClassVar[int] = 99  # it reads the losses of all others
+    optional_on_resume: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "decay", "warm_up", "least"})
 
     type: Literal["skip"] = "skip"
@@ -59,15 +58,15 @@ class Skip(TrainingModule):
     """Least share of steps that do the whole work; `auto`: the share of the warm-up that would not have been
     skipped."""
 
-    def state(self, run: Run) -> ModuleState:
+    def create_state(self, run: Run) -> ModuleState:
         return SkipState(self, run.scene.split("train"))
 
-    def decide(self, name: str, loss: float, numbers: Mapping[str, float]) -> Visit:
+    def decide(self, name: str, loss: float, scalars: Mapping[str, float]) -> Visit:
         """Decide on a step after `start`; name: of the view's average."""
         if not math.isfinite(loss):
             return Visit()
-        steps, whole, warm_up, above = (numbers.get(f"skip/{count}", 0.0) for count in COUNTS)
-        average, steps = numbers.get(name), steps + 1
+        steps, whole, warm_up, above = (scalars.get(f"skip/{count}", 0.0) for count in COUNTS)
+        average, steps = scalars.get(name), steps + 1
         converged = average is not None and loss <= average
         if warming := warm_up < self.warm_up:
             warm_up, above = warm_up + 1, above + (not converged)
@@ -82,6 +81,8 @@ class Skip(TrainingModule):
 
 
 class SkipState(ModuleState):
+    after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
+
     def __init__(self, settings: Skip, views: Sequence[View]) -> None:
         super().__init__()
         self.settings, self.names = settings, [view.name for view in views]
@@ -91,18 +92,18 @@ class SkipState(ModuleState):
             return
         camera = step.camera
         name = f"skip/loss/{camera.width}x{camera.height}/{self.names[step.view]}"
-        visit = self.settings.decide(name, step.loss, self.numbers)
+        visit = self.settings.decide(name, step.loss, self.scalars)
         step.skipped |= visit.skipped
-        step.keep(self, visit)
+        step.save(self, visit)
 
     def update(self, step: TrainingStep) -> None:
-        self.numbers.update(visit.numbers if (visit := step.kept(self)) else {})
+        self.scalars.update(visit.scalars if (visit := step.saved(self)) else {})
 
     update_skipped = update
 
     def finish(self, run: Run) -> None:
         """Say and record how many steps were skipped."""
-        steps, whole, warm_up, above = (self.numbers.get(f"skip/{count}", 0.0) for count in COUNTS)
+        steps, whole, warm_up, above = (self.scalars.get(f"skip/{count}", 0.0) for count in COUNTS)
         least, skipped = self.settings.share(above, warm_up), steps - whole
         run.records.add(run.step, "skip", steps=int(steps), skipped=int(skipped), least=least)
         whole_at_least = f"at least {least:.1%} were to do the whole work"

@@ -14,7 +14,7 @@ from pydantic import Field
 from clsplat.opencl.device import Array, constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
-from clsplat.training.modules.base import ModuleState, Numbers, TrainingModule, TrainingStep
+from clsplat.training.modules.base import ModuleState, Scalars, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
 _NAMES = constants("transients.cl")
@@ -34,9 +34,8 @@ class Transients(TrainingModule):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "quantile", "above", "tail", "box", "decay"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
-    planes: ClassVar[int] = 2  # residuals, and the mask that leaves out the large ones
-    place: ClassVar[int] = 90  # they compare what all others have made of both images
-    outlasts: ClassVar[Literal["no", "numbers", "acts"]] = "numbers"
+    device_planes: ClassVar[int] = 2  # residuals, and the mask that leaves out the large ones
+    order: ClassVar[int] = 90  # they compare what all others have made of both images
 
     type: Literal["transients"] = "transients"
     start: Annotated[int, Field(ge=0)]
@@ -52,21 +51,21 @@ class Transients(TrainingModule):
     decay: Annotated[float, Field(ge=0, lt=1)] = 0.95
     """Share of the distribution that stays at a step."""
 
-    def threshold(self, numbers: Mapping[str, float], step: int) -> float | None:
+    def threshold(self, scalars: Mapping[str, float], step: int) -> float | None:
         """Return the residual from which on pixels of a global step are left out; None where all count."""
-        reached = np.cumsum([numbers.get(key, 0.0) for key in KEYS])
+        reached = np.cumsum([scalars.get(key, 0.0) for key in KEYS])
         if step <= self.start or reached[-1] == 0:
             return None
         most, tail = (_upper(int((reached < share * reached[-1]).sum())) for share in (self.quantile, TAIL))
         return self.above * most if tail > self.tail * most else None
 
-    def state(self, run: Run) -> ModuleState:
+    def create_state(self, run: Run) -> ModuleState:
         return TransientsState(self)
 
-    def learn(self, numbers: Numbers, counts: NDArray[np.uint32]) -> None:
+    def learn(self, scalars: Scalars, counts: NDArray[np.uint32]) -> None:
         """Add the residuals of a step, [BINS], to the distribution."""
         for key, count in zip(KEYS, counts, strict=True):
-            numbers[key] = self.decay * numbers.get(key, 0.0) + float(count)
+            scalars[key] = self.decay * scalars.get(key, 0.0) + float(count)
 
 
 def _upper(bin_number: int) -> float:
@@ -75,6 +74,8 @@ def _upper(bin_number: int) -> float:
 
 
 class TransientsState(ModuleState):
+    after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
+
     def __init__(self, settings: Transients) -> None:
         super().__init__()
         self.settings = settings
@@ -82,13 +83,13 @@ class TransientsState(ModuleState):
     def after_render(self, step: TrainingStep) -> None:
         workspace, camera, planes = step.workspace, step.camera, step.planes
         residuals, counts = measure_residuals(workspace, camera, step.image, planes.colors, planes.mask)
-        if (threshold := self.settings.threshold(self.numbers, step.number)) is not None:
+        if (threshold := self.settings.threshold(self.scalars, step.number)) is not None:
             reach = max(1, round(self.settings.box * camera.width / 2))
             step.planes = replace(planes, mask=mask_transients(workspace, camera, residuals, threshold, reach))
-        step.keep(self, counts)
+        step.save(self, counts)
 
     def update(self, step: TrainingStep) -> None:
-        self.settings.learn(self.numbers, step.kept(self)())
+        self.settings.learn(self.scalars, step.saved(self)())
 
 
 def measure_residuals(

@@ -1,0 +1,129 @@
+"""Choose whether a model has a sky, from the photographs, and initialize it."""
+
+import logging
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.errors import ConfigError
+from clsplat.gaussians.model import Model
+from clsplat.gaussians.sky import Sky
+from clsplat.photos.sky_detection import SkyEvidence, detect_sky, panorama
+from clsplat.render.backdrops import Auto
+from clsplat.render.filters import ModelSettings
+from clsplat.scene.quality import is_transparent
+from clsplat.scene.scene import Scene
+from clsplat.training.modules.base import TrainingModule
+from clsplat.training.modules.sky import SKY, LearnedSky
+from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
+
+
+def sky_share(run: Run) -> float | None:
+    """Return the share of the training and validation photographs that show a sky; None if it is unknown."""
+    if _reason_unknown(run):
+        return None
+    background = run.model_settings.background
+    shown, count = _count(run, (background if isinstance(background, Auto) else Auto()).share)
+    return shown / count
+
+
+def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
+    """Return model settings in which `background: auto` is decided: no sky if a module excludes one.
+
+    Raises ConfigError if a module excludes a sky that the settings require.
+    """
+    background = settings.background
+    rival = next((one for one in modules if SKY in one.conflicts and one.is_active(run.scene)), None)
+    conflict = rival and f"'{rival.type}' does not go together with sky: {rival.conflicts[SKY]}"
+    if conflict and settings.sky:
+        raise ConfigError(f"model.background: {conflict}; leave one of them out")
+    if not isinstance(background, Auto) or background.chosen is not None:
+        return settings
+    chosen, reason = ("off", conflict) if conflict else _choice(background, run)
+    LOG.info("model.background: %s, since %s", chosen, reason)
+    decided = background.model_copy(update={"chosen": chosen, "reason": reason})
+    return settings.model_copy(update={"background": decided})
+
+
+def start_sky(run: Run, source: Model | None) -> None:
+    """Give the run's new model its first sky, if it has one: the sky of `source`, or colors from the photographs.
+
+    source: the model that the new one is made from.
+    """
+    initial, background = source and source.sky, choose_sky(run, run.model_settings, ()).sky
+    if background is None:
+        run.modules.pop(SKY, None)
+        if initial:
+            LOG.warning("the sky of the model is left out; set model.background: envmap to keep it")
+        return
+    if is_transparent(run.scene):
+        LOG.warning(
+            "model.background: the photographs are transparent, so the sky would learn the color that clsplat puts "
+            "behind them; leave model.background out"
+        )
+    texels, free = _first_texels(run, background.side)
+    sky = initial if initial and initial.side == background.side else Sky(texels)
+    run.modules[SKY] = LearnedSky(background, sky.upload(run.device), free)
+    LOG.info("sky: %d of %d x %d texels are learned", free.sum(), background.side, background.side)
+
+
+def sky_advice(run: Run) -> list[str]:
+    """Return a sentence for the report of a run in which `auto` added a sky."""
+    background = run.model_settings.background
+    if not isinstance(background, Auto) or background.sky is None:
+        return []
+    why, _, _ = background.reason.partition(";")
+    return [f"a sky was added, since {why}; other viewers show it if `export` has `sky: splats`"]
+
+
+def _reason_unknown(run: Run) -> str:
+    """Why the photographs do not tell whether they show a sky; empty if they do."""
+    if run.scene.points is None:
+        return "the dataset has no points, and what is far from them is not known"
+    return "the photographs have transparency" if is_transparent(run.scene) else ""
+
+
+def _count(run: Run, share: float) -> tuple[int, int]:
+    """Count the photographs with at least this share of sky in their upper third, and all photographs."""
+    evidence = _evidence(run, run.scene.with_fold())
+    return sum(one.share >= share for one in evidence), len(evidence)
+
+
+def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
+    """Decide whether there is a sky, and say why."""
+    if why := _reason_unknown(run):
+        return "off", why
+    shown, count = _count(run, background.share)
+    text = (
+        f"{shown} of {count} photographs show bright or blue regions above the horizon, without points, in "
+        f"{background.share:.0%} or more of their upper third"
+    )
+    enough = shown >= background.photographs * count
+    return ("on" if enough else "off"), f"{text}; {'' if enough else 'not '}{background.photographs:.0%} of them"
+
+
+def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the first colors of the map, and which texels are learned.
+
+    If no photograph shows a sky, all are learned, from the mean color of the photographs' upper thirds.
+    """
+    evidence = _evidence(run, run.scene)
+    if texels := panorama(evidence, side):
+        return texels
+    uppers = [one.upper.mean(axis=0) / 255 for one in evidence if len(one.upper)]
+    if not uppers:
+        LOG.warning("masks leave out the upper thirds of all photographs: the sky starts black")
+    mean = np.mean(uppers, axis=0) if uppers else np.zeros(3)
+    return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
+
+
+def _evidence(run: Run, scene: Scene) -> list[SkyEvidence]:
+    """Search each training photograph of a scene, at its first size, for sky."""
+    views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
+    counted = run.status.counted(views, "photographs", len(views))
+    photographs = ((view, run.photographs.get(view)) for view in counted)
+    return list(detect_sky(scene, ((view, one.image(), one.counted()) for view, one in photographs)))
