@@ -160,9 +160,7 @@ def test_what_cannot_be_decided_is_refused_in_a_sentence(adapt, complaint):
 def test_a_run_looks_for_a_sky_where_it_decides(tmp_path, rng, monkeypatch, count, clear, sky):
     scene = Yard(rng, count, clear).write(tmp_path / "yard")
     if sky is None:
-        monkeypatch.setattr(
-            "clsplat.runs.opening.sky_share", lambda run: pytest.fail("looked for a sky")
-        )
+        monkeypatch.setattr("clsplat.runs.opening.sky_share", lambda run: pytest.fail("looked for a sky"))
     text = describe(
         load("photos", [f"scene.path='{scene}'", "scene.holdout=0"]), RunState.read(tmp_path / "run"), None, "new"
     )
