@@ -47,7 +47,8 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
     if times := {name: view.time for view, name in zip(scene.views, names, strict=True) if view.time is not None}:
         write_times(out / "images", times)
     tracks = scene.tracks and scene.tracks.renamed({v.name: name for v, name in zip(scene.views, names, strict=True)})
-    write_model(out / "sparse" / "0", views, scene.points, tracks)
+    world = replace(scene, views=tuple(views), tracks=tracks).in_world()
+    write_model(out / "sparse" / "0", world.views, world.points, world.tracks)
     return len(views)
 
 

@@ -268,6 +268,7 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     for what, value, known in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
         if value not in known:
             raise ConfigError(f"no {what} {quoted(value)}; there are {', '.join(known)}")
+    scene = scene.in_world()
     views = checked(scene, format_)
     if images == "copy" and format_ in UNDISTORTED and any(one.view.lens is not None for one in views):
         raise DataError(

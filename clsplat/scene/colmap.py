@@ -339,7 +339,7 @@ class ColmapReader(Reader):
         table = read_point_table(model)
         points, tracks = (table.cloud(), tracks_of(images, table, views)) if table else (None, None)
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
-        return replace(scene, tracks=tracks, skipped=skipped)
+        return replace(scene, tracks=tracks and tracks.shifted(scene.origin), skipped=skipped)
 
     def list_parts(self, parts: Parts) -> None:
         found = [(folder, parts.attempt(read_images, folder) or []) for folder in find_models(parts.path)]

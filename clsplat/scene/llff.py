@@ -90,9 +90,10 @@ def view_from_row(path: Path, row: NDArray[np.float64], image: Path) -> View:
             f"{path}: {image.name} is {header.width} x {header.height} px, its camera {width:g} x {height:g}; "
             "expected the same aspect ratio: use the images that the poses were made from"
         )
-    rotation = matrix[:, :3] @ LLFF_TO_OPENCV  # camera to world
+    rotation = matrix[:, :3] @ LLFF_TO_OPENCV
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise DataError(f"{path}: the pose of {image.name} has no rotation; export the file again")
-    pose = np.hstack([rotation.T, -rotation.T @ matrix[:, 3:4]])
+    camera_to_world = np.vstack([np.hstack([rotation, matrix[:, 3:4]]), [0, 0, 0, 1]])
+    pose = np.linalg.inv(camera_to_world)[:3]
     camera = Camera(header.width, header.height, focal * scale, focal * scale, header.width / 2, header.height / 2)
-    return View(image.name, camera, pose, image)
+    return View(image.name, camera, pose, image, camera_to_world=camera_to_world)

@@ -52,7 +52,7 @@ class PointTable(NamedTuple):
         colors = np.asarray(self.rgb[kept], np.float32) / np.float32(255)
         moments = clock.of_points(self.file, self.times[kept]) if clock and len(self.times) else None
         times = None if moments is None else np.asarray(moments, np.float32)
-        return PointCloud(np.asarray(self.positions[kept], np.float32), colors, times)
+        return PointCloud(self.positions[kept], colors, times)
 
 
 def read_points_ply(path: Path, clock: Clock | None = None) -> PointCloud:
@@ -84,6 +84,8 @@ def read_ply_table(path: Path) -> PointTable:
 def write_points_ply(path: Path, points: PointCloud) -> None:
     """Write points as binary little-endian PLY, with their times where they have some.  Raises OutputError."""
     kind = POINT if points.times is None else TIMED_POINT
+    if points.positions.dtype == np.float64:  # world coordinates, which float32 may not hold
+        kind = np.dtype([(name, "<f8" if name in "xyz" else kind[name]) for name in kind.names or ()])
     table = np.empty(len(points), kind)
     if points.times is not None:
         table[TIME] = points.times
@@ -91,7 +93,8 @@ def write_points_ply(path: Path, points: PointCloud) -> None:
         table[name] = points.positions[:, i]
     for i, name in enumerate(RGB):
         table[name] = np.rint(points.colors[:, i] * 255)
-    properties = [f"{'uchar' if kind[name] == np.uint8 else 'float'} {name}" for name in kind.names or ()]
+    words = {"|u1": "uchar", "<f4": "float", "<f8": "double"}
+    properties = [f"{words[kind[name].str]} {name}" for name in kind.names or ()]
     with atomic(path) as file:
         file.write(format_ply_header((), vertex=(len(points), properties)) + table.tobytes())
 

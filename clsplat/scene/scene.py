@@ -8,6 +8,8 @@ Conventions of the whole project
     colors     as the image files store them, in [0, 1]
 """
 
+import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -19,6 +21,8 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quoted
 from clsplat.scene.view import Alpha, Floats, View, load_image
+
+LOG = logging.getLogger("clsplat")
 
 # Which points of a dataset each photograph shows, and where: what structure from motion has found.
 
@@ -32,6 +36,10 @@ class Tracks:
     misses: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)  # of the views whose places are known:
     # [K, 2] px of the photograph as it was taken, from where the camera shows each point to where the photograph does
 
+    def shifted(self, origin: Floats) -> "Tracks":
+        """Return the tracks in coordinates whose zero is at `origin`, [3] in the present coordinates."""
+        return replace(self, positions=self.positions - origin) if origin.any() else self
+
     def renamed(self, names: Mapping[str, str]) -> "Tracks":
         """Return the tracks of some views under other names, by their old ones."""
         seen = {names[old]: rows for old, rows in self.seen.items() if old in names}
@@ -41,6 +49,7 @@ class Tracks:
 Background = Literal["black", "white"]
 HOLDOUT = 8  # every 8th view is for testing where the dataset has no split: the default of pipelines
 MAX_DISTANCE = 10.0  # median distances: evenly spaced cameras on a line reach 2, an orbit 1, a close-up about 4
+MAX_OFFSET = 100  # x the median distance of the points; float32 then places them to 1e-5 of that distance
 MAX_STRAYED_SHARE = 0.2  # of the cameras
 MAX_THUMBNAILS = 4
 SPLITS = ("train", "test", "validation")
@@ -50,7 +59,7 @@ SPLITS = ("train", "test", "validation")
 class PointCloud:
     """Sparse colored points."""
 
-    positions: Floats  # [M, 3] float32, scene units
+    positions: Floats  # [M, 3] float32, scene units; as a file has them until make_scene subtracts the origin
     colors: Floats  # [M, 3] float32, in [0, 1]
     times: Floats | None = None  # [M] float32, in [0, 1], at which they were seen, where a moving scene has that
     sizes: Floats | None = None  # [M] float32, scene units, of the Gaussians they become; NaN and None: unknown
@@ -82,6 +91,7 @@ class Scene:
     background: Background = "black"  # on which papers show the photographs
     validation: tuple[int, ...] = ()  # kept out of the training, to choose by
     tracks: Tracks | None = None  # which points the photographs show, where the dataset has that
+    origin: Floats = field(default_factory=lambda: np.zeros(3))  # [3] float64, world coordinates of this scene's zero
     skipped: tuple[str, ...] = ()  # names of views that the dataset names and whose photographs are missing
 
     def split(self, name: str) -> tuple[View, ...]:
@@ -96,6 +106,15 @@ class Scene:
     def indices(self) -> dict[str, tuple[int, ...]]:
         """The indices of the views of each split."""
         return {"train": self.train, "test": self.test, "validation": self.validation}
+
+    def in_world(self) -> "Scene":
+        """Return the scene in world coordinates, as camera files have them: float64 points, origin 0."""
+        if not self.origin.any():
+            return self
+        views = tuple(view.shifted(-self.origin) for view in self.views)
+        points = self.points and replace(self.points, positions=self.points.positions + self.origin)
+        tracks = self.tracks and self.tracks.shifted(-self.origin)
+        return replace(self, views=views, points=points, tracks=tracks, origin=np.zeros(3))
 
     def with_fold(self) -> "Scene":
         """Return the scene with the validation views among those that are trained on."""
@@ -168,7 +187,7 @@ class Scene:
 def make_scene(
     path: Path, views: list[View], test: set[int], points: PointCloud | None, background: Background = "black"
 ) -> Scene:
-    """Return a scene of `views`, with its split and its extent.
+    """Return a scene of `views`, with its split, its extent and its origin, which is subtracted from all positions.
 
     Raises DataError when there is no view, when names repeat or when a pose or a camera is impossible.
     """
@@ -183,12 +202,40 @@ def make_scene(
             view.camera.check()
         except ValueError as error:
             raise DataError(f"{path}: {quoted(view.name)}: {error}; remove that image or fix its camera") from error
-    train = tuple(i for i in range(len(views)) if i not in test)
-    if not train:
-        raise DataError(f"{path}: every image is held out for testing; raise scene.holdout or add images")
-    extent = camera_extent([views[i] for i in train])
+    train = other_views(path, len(views), test)
     points = points if points and len(points) else None
-    return Scene(path, tuple(views), train, tuple(sorted(test)), points, extent, background)
+    origin = choose_origin(views, points)
+    if origin.any():
+        LOG.info("%s: coordinates are far from zero; the scene is moved by %s", path, -origin)
+        views = [view.shifted(origin) for view in views]
+        points = points and replace(points, positions=points.positions - origin)
+    views = [replace(view, camera_to_world=None) if view.camera_to_world is not None else view for view in views]
+    points = points and replace(points, positions=np.asarray(points.positions, np.float32))
+    extent = camera_extent([views[i] for i in train])
+    return Scene(path, tuple(views), train, tuple(sorted(test)), points, extent, background, origin=origin)
+
+
+def other_views(path: Path, count: int, test: set[int]) -> tuple[int, ...]:
+    """Return the indices below `count` that are not in `test`.  Raises DataError when there are none."""
+    if train := tuple(i for i in range(count) if i not in test):
+        return train
+    raise DataError(f"{path}: every image is held out for testing; raise scene.holdout or add images")
+
+
+def choose_origin(views: Sequence[View], points: PointCloud | None) -> Floats:
+    """Return the world coordinates, [3] float64, that become a scene's zero: 0 unless the scene is far from there.
+
+    Positions on the device are float32, which holds those of a map's coordinates to half a meter only.  The origin is a
+    multiple of a power of ten, so that differences are exact where the file's digits allow that.
+    """
+    centers = np.stack([view.position for view in views])
+    middle = np.median(centers, axis=0)
+    around = centers if points is None else np.asarray(points.positions, np.float64)
+    spread = float(np.median(np.linalg.norm(around - middle, axis=1)))
+    if np.abs(middle).max() <= MAX_OFFSET * (spread or 1.0):
+        return np.zeros(3)
+    step = 10.0 ** math.ceil(math.log10(10 * (spread or 1.0)))
+    return np.round(middle / step) * step + 0.0  # no -0.0
 
 
 def camera_extent(views: list[View]) -> float:

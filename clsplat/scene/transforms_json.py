@@ -146,8 +146,9 @@ def view_of(frame: JsonFrame, size: tuple[int, int] | None, clock: Clock | None 
     camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
     moment, still = frame.number("time"), frame.file("static_path")
     time = None if clock is None or moment is None else float(clock(moment))
-    name, pose = view_name(frame.value("file_path")), pose_of(frame)
-    return View(name, camera, pose, image, mask, lens=distortion, time=time, static_path=still)
+    name, matrix = view_name(frame.value("file_path")), camera_to_world_of(frame)
+    pose = np.linalg.inv(matrix)[:3]
+    return View(name, camera, pose, image, mask, lens=distortion, time=time, static_path=still, camera_to_world=matrix)
 
 
 def image_path_of(frame: JsonFrame) -> Path:
@@ -200,8 +201,8 @@ def lens_of(frame: JsonFrame, camera: Camera) -> Lens:
     return Lens(camera.width, camera.height, "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)], params)
 
 
-def pose_of(frame: JsonFrame) -> Floats:
-    """Return [3, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
+def camera_to_world_of(frame: JsonFrame) -> Floats:
+    """Return [4, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
     try:
         matrix = np.array(frame.value("transform_matrix"), np.float64)
     except (ValueError, TypeError, OverflowError):
@@ -215,11 +216,11 @@ def pose_of(frame: JsonFrame) -> Floats:
     camera_to_world = np.eye(4)
     camera_to_world[:3] = matrix[:3]
     camera_to_world[:3, 1:3] *= -1
-    return np.linalg.inv(camera_to_world)[:3]
+    return camera_to_world
 
 
 def opengl_matrix(pose: Floats) -> Floats:
-    """Return the camera-to-world matrix with OpenGL axes, [4, 4], from [3, 4]: the inverse of `pose_of`."""
+    """Return the camera-to-world matrix with OpenGL axes, [4, 4], from [3, 4] OpenCV world to camera."""
     matrix: Floats = np.linalg.inv(np.vstack([pose, [0, 0, 0, 1]])) @ np.diag([1.0, -1.0, -1.0, 1.0])
     matrix[3] = 0, 0, 0, 1
     return matrix
@@ -365,7 +366,7 @@ def _views(path: Path, splits: Any, name: str) -> list[View]:
             raise DataError(
                 f"{frame.where}: label is {quoted(label)}; expected the number of its halvings, 0 to 8: make it again"
             )
-        image = image_path_of(frame)
-        view = View(view_name(file), camera_of(frame, None), pose_of(frame), image, downscale=2**level)
-        views.append(view)
+        image, matrix = image_path_of(frame), camera_to_world_of(frame)
+        view = View(view_name(file), camera_of(frame, None), np.linalg.inv(matrix)[:3], image, downscale=2**level)
+        views.append(replace(view, camera_to_world=matrix))
     return views

@@ -78,6 +78,7 @@ class View:
     downscale: float = 1  # divisor of the original photograph's size
     time: float | None = None  # in [0, 1], of the scene's first to last moment; None: the scene does not move
     static_path: Path | None = None  # an image of the photograph's size, white in pixels that show nothing that moves
+    camera_to_world: Floats | None = None  # [4, 4] float64, as a file has it, until make_scene
     response: Callable[..., Any] | None = None  # workspace, camera, planes -> those as the camera takes them; measured
 
     def __post_init__(self) -> None:
@@ -102,6 +103,15 @@ class View:
             raise ValueError(f"{quoted(name)}: expected a target away from the position, and not along `up`")
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
         return cls(name, camera, np.column_stack([axes, -axes @ center]))
+
+    def shifted(self, origin: Floats) -> "View":
+        """Return the view in coordinates whose zero is at `origin`, [3] float64 in the present coordinates."""
+        if (matrix := self.camera_to_world) is not None:
+            matrix = np.array(matrix, np.float64)
+            matrix[:3, 3] -= origin
+            return replace(self, world_to_camera=np.linalg.inv(matrix)[:3], camera_to_world=None)
+        rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
+        return replace(self, world_to_camera=np.column_stack([rotation, translation + rotation @ origin]))
 
     @property
     def position(self) -> Floats:

@@ -13,7 +13,7 @@ from clsplat.core.errors import DataError, amount, quoted
 from clsplat.core.reading import read_text
 from clsplat.core.settings import ReadPath, Settings, in_one_sentence
 from clsplat.scene.images import Missing, is_image
-from clsplat.scene.scene import HOLDOUT, Scene, every_nth, make_scene
+from clsplat.scene.scene import HOLDOUT, Scene, camera_extent, every_nth, other_views
 
 LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
@@ -313,8 +313,9 @@ class Split:
 
 def _with_test(scene: Scene, test: set[int]) -> Scene:
     """The views of a scene, with its extent, where these are for testing."""
-    made = make_scene(scene.path, list(scene.views), test, scene.points, scene.background)
-    return replace(scene, train=made.train, test=made.test, extent=made.extent)
+    train = other_views(scene.path, len(scene.views), test)
+    extent = camera_extent([scene.views[i] for i in train])
+    return replace(scene, train=train, test=tuple(sorted(test)), extent=extent)
 
 
 def _of(

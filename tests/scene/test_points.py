@@ -52,7 +52,7 @@ def test_ply_dialects(tmp_path: Path, form: str, dialect: str) -> None:
     path = tmp_path / "p.ply"
     path.write_bytes(ply(form, properties, rows))
     points = read_points_ply(path)
-    np.testing.assert_array_equal(points.positions, np.float32(ROWS[:, :3]))
+    np.testing.assert_array_equal(np.float32(points.positions), np.float32(ROWS[:, :3]))
     np.testing.assert_allclose(points.colors, ROWS[:, 3:] / 255, atol=1e-7)
 
 

@@ -391,6 +391,8 @@ def read_parts(path: Path) -> Parts:
         if reader := reader_of(path):
             parts.kind = reader.name
             reader.list_parts(parts)
+            if parts.scene and parts.points:
+                parts.points = parts.points._replace(positions=parts.points.positions - parts.scene.origin)
     if parts.kind == "none":
         _list_photographs(parts)
     elif parts.image_folder or not parts.expected:

@@ -24,7 +24,7 @@ from clsplat.scene import camera_files
 from clsplat.scene.camera import Camera
 from clsplat.scene.camera_files import center_lost, width_lost
 from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
-from clsplat.scene.transforms_json import JsonFrame, opengl_matrix, pose_of
+from clsplat.scene.transforms_json import JsonFrame, camera_to_world_of, opengl_matrix
 from clsplat.scene.view import View
 from clsplat.viewer.video.paths import MAX_FRAMES, Floats, Size, around, checked_rate, checked_size, even_size, placed
 
@@ -73,7 +73,8 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         fov = frame.number("fov")
         if fov is None or not 0.01 <= fov < 179:
             raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0.01 to 179")
-        pose = pose_of(JsonFrame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
+        matrix = {"transform_matrix": _rows(own.get("camera_to_world"))}
+        pose = np.linalg.inv(camera_to_world_of(JsonFrame(path.parent, frame.where, matrix)))[:3]
         time = frame.number("render_time")
         if time is not None and not is_moment(time):
             raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1: export the path again")
