@@ -92,7 +92,7 @@ def test_the_fewest_that_make_a_share(weight, share, expected):
 def test_what_few_views_need_and_what_has_little_weight_goes(device, rng):
     gaussians = random_case(rng, 5).model(device).gaussians
     found = Weights(np.array([500.0, 300, 200, 0.5, 0.4]), np.array([3, 1, 2, 3, 4]))
-    survey = SimpleNamespace(once=lambda function, *arguments: found)
+    survey = SimpleNamespace(cached=lambda function, *arguments: found)
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3, survey=survey)
     edit.mark(copies=2, kept=1)
     PruneUseless(views_below=2, weight_total=0.999).mark(edit)
