@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
 from clsplat.core.errors import ConfigError, DataError, OutputError
-from clsplat.core.files import is_there, unwritable
+from clsplat.core.files import path_exists, write_error
 from clsplat.core.reading import sha256
 
 CHUNK = 1 << 20  # bytes
@@ -58,7 +58,7 @@ def fetch(source: WebArchive, out: Path, report: Report = print) -> Path:
     An interrupted download stays beside `out` as `….part`; the next call continues it.
     Raises DataError when the download fails, the checksum differs or a file lies outside of the archive's folder.
     """
-    if is_there(out):
+    if path_exists(out):
         report(f"{out} is there already: nothing to do")
         return out
     archive = out.with_name(f"{out.name}.{PurePosixPath(source.url.split('?')[0]).name}")
@@ -69,7 +69,7 @@ def fetch(source: WebArchive, out: Path, report: Report = print) -> Path:
         _unpack(archive, out, report)
         archive.unlink()
     except OSError as error:
-        raise unwritable(out, error) from error
+        raise write_error(out, error) from error
     report(f"{source.license}\n{out} is complete")
     return out
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
-from clsplat.core.manifest import Made, hash_of
+from clsplat.core.manifest import Manifest, hash_values
 from clsplat.core.progress import Count
 from clsplat.scene.colmap import ColmapReader, image_folder
 from clsplat.scene.detect import read_scene, reader_of
@@ -37,10 +37,10 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
             "expected the photograph's name with .png appended, or in place of its suffix"
         )
     written, count = 0, Count("masks written", len(views))
-    made = Made(target)
+    made = Manifest(target)
     for number, (view, source) in enumerate(zip(views, sources, strict=True), 1):
         path = target / Path(view.name).with_suffix(".png")
-        if made.is_due(path, hash_of(view.image_path, threshold) if source is None else hash_of(source)):
+        if made.is_due(path, hash_values(view.image_path, threshold) if source is None else hash_values(source)):
             white = _from_alpha(view, threshold) if source is None else _from_file(view, source)
             write_image(path, np.repeat(np.where(white, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
             written += 1

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from clsplat.core.errors import DataError, first_few
-from clsplat.core.files import told_as
+from clsplat.core.files import raising_output_error
 from clsplat.core.progress import Count
 from clsplat.scene.images import is_image, write_image
 from clsplat.scene.multicamera import VIDEO_SUFFIXES, VIDEOS
@@ -71,7 +71,7 @@ def _write(video: Path, out: Path, places: list[int], long_side: int | None) -> 
         for place, image in enumerate(decoded(video)):
             for number in (i for i, wanted in enumerate(places) if wanted == place):
                 write_image(half / f"{number:04}.png", np.ascontiguousarray(limited(image, long_side)[:, :, ::-1]))
-        with told_as(out):
+        with raising_output_error(out):
             half.rename(out)
     finally:
         shutil.rmtree(half, ignore_errors=True)

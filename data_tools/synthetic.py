@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from clsplat.core.errors import DataError, OutputError
-from clsplat.core.files import is_there
+from clsplat.core.files import path_exists
 from clsplat.core.reading import read_file
 from clsplat.scene.images import write_image
 from clsplat.scene.points import write_points_ply
@@ -80,7 +80,7 @@ def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = No
     `workers` processes share the views (default: one per core; 1 = this process).  Raises DataError when `out` exists
     and is another data set, OutputError when it cannot be written.
     """
-    if is_there(out):
+    if path_exists(out):
         if is_complete(out, options):
             return f"{out} is complete already: nothing to do"
         raise DataError(f"{out} exists and is not this data set; remove it or choose another folder")

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import quick
-from clsplat.core.settings import Settings, rebuild
+from clsplat.core.settings import Settings, rebuild_models
 from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.opencl import device as opencl_device
 from clsplat.opencl import device as program
@@ -251,7 +251,7 @@ def without_plugins() -> Iterator[None]:
     for name in [name for name in sys.modules if name.startswith("clsplat_plugin_")]:
         del sys.modules[name]
     if not is_clean:
-        rebuild()
+        rebuild_models()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -423,11 +423,11 @@ def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html", publi
 
     published: a YAML file of figures that others have published, which are shown below, apart.
     """
-    from clsplat.core.files import check_result
+    from clsplat.core.files import check_result_path
     from clsplat.sweeps.compare.comparison import read_published
     from clsplat.sweeps.compare.page import write_comparison
 
-    check_result(Path(out), ".html")
+    check_result_path(Path(out), ".html")
     tables = [] if published is None else read_published(Path(published))
     return write_comparison([Path(folder) for folder in runs], Path(out), published=tables)
 

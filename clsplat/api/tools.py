@@ -52,14 +52,14 @@ def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection"
     scene: a folder, or that of a run, which stands for the one it was trained on; page: a file to write, with the
     cameras and points in 3D.  Raises DataError only where there is no such folder.
     """
-    from clsplat.core.files import check_result
+    from clsplat.core.files import check_result_path
     from clsplat.prepare.inspect.findings import Inspection
     from clsplat.prepare.inspect.page import write_page
     from clsplat.runs.model_file import photographs_of
 
     load_plugins()
     if page is not None:
-        check_result(Path(page), ".html")
+        check_result_path(Path(page), ".html")
     inspection = Inspection.of(photographs_of(Path(scene)))
     if page is not None:
         write_page(inspection, Path(page))

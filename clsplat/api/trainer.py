@@ -214,7 +214,7 @@ class Trainer:
 
         It lies in `out`, where the newest two are kept.  Raises OutputError when it cannot be written.
         """
-        with nullcontext() if self._state == "open" else lock.held(self.out):
+        with nullcontext() if self._state == "open" else lock.lock_folder(self.out):
             return checkpoint.save(self._run, keep=2)
 
     def _record_end(self) -> None:

@@ -10,8 +10,8 @@ import typer
 from clsplat.api import commands, pictures
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
 from clsplat.core import terminal
-from clsplat.core.errors import ConfigError, amount, quoted
-from clsplat.core.files import is_there
+from clsplat.core.errors import ConfigError, pluralize, quote
+from clsplat.core.files import path_exists
 
 
 def _numbers(option: str, text: str | None, expected: str) -> list[float] | None:
@@ -19,7 +19,7 @@ def _numbers(option: str, text: str | None, expected: str) -> list[float] | None
     try:
         return None if text is None else [float(part) for part in text.split(",")]
     except ValueError:
-        raise ConfigError(f"{option} {quoted(text)}: expected {expected}") from None
+        raise ConfigError(f"{option} {quote(text)}: expected {expected}") from None
 
 
 @command(
@@ -47,12 +47,12 @@ def evaluate(
     device: DeviceOption = None,
 ) -> None:
     """Measure a model on a scene's test and training views."""
-    from clsplat.core.files import check_result, write_text
+    from clsplat.core.files import check_result_path, write_text
 
     if out is None:
         terminal.keep_stdout_for_json()
     else:
-        check_result(out, ".json")
+        check_result_path(out, ".json")
     divisors = _numbers("--downscales", downscales, "numbers, separated by commas, such as 1,2,4")
     found = commands.evaluate(
         model,
@@ -92,12 +92,12 @@ def view(
     ] = None,
 ) -> None:
     """Write a page to walk through a model, beside its photographs; it opens offline."""
-    before = "replaced; " if is_there(out) else ""
-    with terminal.counted():
+    before = "replaced; " if path_exists(out) else ""
+    with terminal.counts_on_terminal():
         page = commands.view(
             *models, scene=scene, out=out, photographs=photographs, photograph_budget=photograph_budget, splats=splats
         )
-    terminal.remark(f"{page}: {before}{page.stat().st_size / 1e6:.1f} MB; open it in a browser")
+    terminal.print_message(f"{page}: {before}{page.stat().st_size / 1e6:.1f} MB; open it in a browser")
 
 
 @command(
@@ -162,7 +162,7 @@ def convert(
     )
     share = 100 * done["bytes"] / max(done["bytes_read"], 1)
     size = f"{done['bytes'] / 1e6:.3g} MB, {share:,.1f} % of what was read"
-    terminal.remark(f"{done['file']}: {done['format']}, {done['gaussians']:,} Gaussians, {size}")
+    terminal.print_message(f"{done['file']}: {done['format']}, {done['gaussians']:,} Gaussians, {size}")
 
 
 @command(
@@ -199,7 +199,9 @@ def compress(
     terminal.show(table(found))
     chosen, source = found["chosen"], found["source"]
     size = f"{chosen['bytes'] / 1e6:.3g} MB, {chosen['bytes'] / source['bytes']:.1%} of the model"
-    terminal.remark(f"{found['file']}: {size}, {chosen['psnr'] - source['psnr']:+z.2f} dB; page: {found['page']}")
+    terminal.print_message(
+        f"{found['file']}: {size}, {chosen['psnr'] - source['psnr']:+z.2f} dB; page: {found['page']}"
+    )
 
 
 @command("lod", "clsplat lod runs/splat_7k site/scene", "clsplat lod point_cloud.ply site/scene --levels 3")
@@ -226,7 +228,7 @@ def lod(
     )
     terminal.show(table(found))
     measured = f"; PSNR of {found['split']} views, not yet quantized" if found["split"] else ""
-    terminal.remark(f"{found['folder']}/lod-meta.json: {found['bytes'] / 1e6:.3g} MB{measured}")
+    terminal.print_message(f"{found['folder']}/lod-meta.json: {found['bytes'] / 1e6:.3g} MB{measured}")
 
 
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")
@@ -241,7 +243,7 @@ def compare(
 ) -> None:
     """Show runs side by side on one page that opens offline."""
     count = commands.compare_runs(runs, out, published)
-    terminal.remark(f"{count} runs compared in {out}")
+    terminal.print_message(f"{count} runs compared in {out}")
 
 
 # The command that renders: pictures of views, and films.
@@ -314,7 +316,7 @@ def render(
         options["times"] = times if time is None else time
         options |= {"depth": depth, "alpha": alpha, "save_path": save_path, "downscale": scale, "kind": format_}
         found = pictures.render_path(model, scene, file, out=out, device=device, **options)
-        terminal.remark(_told(found, pictures_wide=1 if side is None else 2))
+        terminal.print_message(_told(found, pictures_wide=1 if side is None else 2))
         return
     of_films: dict[str, Any] = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--times": times}
     of_films["--save-path"] = save_path
@@ -332,7 +334,7 @@ def render(
         time=time,
         device=device,
     )
-    terminal.remark(f"{amount(count, 'image')} written to {out}")
+    terminal.print_message(f"{pluralize(count, 'image')} written to {out}")
 
 
 def _told(found: dict[str, Any], pictures_wide: int) -> str:

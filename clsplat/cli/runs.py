@@ -9,7 +9,7 @@ from clsplat.api import commands
 from clsplat.api import commands as api
 from clsplat.cli.app import DeviceOption, JsonOption, LiveOption, PipelineArgument, SetOption, command, recipe_names
 from clsplat.core import terminal
-from clsplat.core.errors import ClsplatError, ConfigError, DataError, OutputError, in_shell
+from clsplat.core.errors import ClsplatError, ConfigError, DataError, OutputError, shell_quote
 
 OnOption = Annotated[
     Path | None,
@@ -99,7 +99,7 @@ def _show_summary(folder: Path) -> None:
     from clsplat.runs.status import summary
 
     for line in summary(folder):
-        terminal.remark(line)
+        terminal.print_message(line)
 
 
 @command(
@@ -217,7 +217,7 @@ def pipelines(
         if as_json:
             terminal.show_json({"copy": str(target)})
         else:
-            terminal.remark(f"{target}: a copy of {name}; `clsplat check {in_shell(target)}` validates it")
+            terminal.print_message(f"{target}: a copy of {name}; `clsplat check {shell_quote(target)}` validates it")
     elif as_json:
         terminal.show_json(commands.pipelines(name or None))
     else:
@@ -293,9 +293,11 @@ def blocks(
         return
     terminal.show(table(found))
     if plan:
-        terminal.remark(f"{out}/partition.json: the plan; the same command without --plan trains the blocks")
+        terminal.print_message(f"{out}/partition.json: the plan; the same command without --plan trains the blocks")
     else:
-        terminal.remark(f"`clsplat view {in_shell(found['run'])}` shows {found['metrics']['gaussians']:,} Gaussians")
+        terminal.print_message(
+            f"`clsplat view {shell_quote(found['run'])}` shows {found['metrics']['gaussians']:,} Gaussians"
+        )
 
 
 # Commands about the cells of a sweep.
@@ -329,7 +331,7 @@ def cancel(
     cell: Annotated[str | None, typer.Argument(metavar="[CELL]", help="A cell's name or key; default: all.")] = None,
 ) -> None:
     """Let cells that run, on whatever machine, save their state and stop."""
-    terminal.remark(f"{store}: {commands.cancel(store, cell)} asked to stop")
+    terminal.print_message(f"{store}: {commands.cancel(store, cell)} asked to stop")
 
 
 @command(

@@ -91,7 +91,7 @@ def inspect(
             terminal.show_json(found)
         else:
             terminal.show(table(found))
-            terminal.remark(BY_POINTS)
+            terminal.print_message(BY_POINTS)
         return
     inspection = tools.inspect_scene(scene, page)
     if as_json:

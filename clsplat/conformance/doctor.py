@@ -16,9 +16,9 @@ from clsplat.conformance.checks import KERNELS, SPEED
 from clsplat.conformance.host import system
 from clsplat.conformance.quick import forget, remember
 from clsplat.conformance.supervision import CheckResult, supervised
-from clsplat.core.errors import amount
-from clsplat.core.files import check_result, told_as, write_text
-from clsplat.core.page import duration, render
+from clsplat.core.errors import pluralize
+from clsplat.core.files import check_result_path, raising_output_error, write_text
+from clsplat.core.page import duration_text, render
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo, choose, resolve_schedule
 from clsplat.opencl.kernel_caches import kernel_caches
@@ -234,7 +234,7 @@ def progress(schedule: str, result: CheckResult) -> str:
     """Return a line for one check."""
     failures = result.failures
     count = len(result.figures)
-    holds = f"{amount(count, 'figure')} hold{'s' if count == 1 else ''}" if count else "measured"
+    holds = f"{pluralize(count, 'figure')} hold{'s' if count == 1 else ''}" if count else "measured"
     words = f"WRONG: {failures[0]}" if failures else holds
     return f"  {f'{schedule:<5}{result.name}':<54}{result.seconds:5.1f} s  {words}"
 
@@ -244,8 +244,8 @@ def progress(schedule: str, result: CheckResult) -> str:
 
 def check_place(out: Path) -> None:
     """Raise ConfigError for a file of another kind or of a run, OutputError where a page cannot be written."""
-    check_result(out, ".html")
-    with told_as(out):
+    check_result_path(out, ".html")
+    with raising_output_error(out):
         if out.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -296,7 +296,7 @@ def _facts(report: DeviceReport) -> dict[str, str]:
         "system": f"{host['system']}, {host['processors']} processors",
         "Python": f"{host['python']}, NumPy {host['numpy']}",
         "environment": ", ".join(f"{name}={value}" for name, value in host["environment"].items()) or "nothing set",
-        "took": duration(report.seconds),
+        "took": duration_text(report.seconds),
     }
     if training:
         first, last = training["losses"]

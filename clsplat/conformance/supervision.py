@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import IO, Any
 
 from clsplat.conformance.check import Check, Figure, Note
-from clsplat.core.errors import shortened
+from clsplat.core.errors import shorten
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.opencl.kernel_caches import empty_kernel_caches
 
@@ -44,7 +44,7 @@ class CheckResult:
     @property
     def failures(self) -> list[str]:
         """A sentence for everything that is wrong."""
-        stopped = [f"{self.name}: {shortened(self.fault, 240)}"] if self.fault else []
+        stopped = [f"{self.name}: {shorten(self.fault, 240)}"] if self.fault else []
         return stopped + [figure.text for figure in self.figures if not figure.holds]
 
 
@@ -123,7 +123,7 @@ def _fill(result: CheckResult, lines: "queue.Queue[str | None]", seconds: float)
         try:
             line: dict[str, Any] = json.loads(text)
         except ValueError:
-            return f"ends in the middle of a line: {shortened(text, 100)}"
+            return f"ends in the middle of a line: {shorten(text, 100)}"
         if "figure" in line:
             result.figures.append(Figure(**line["figure"]))
         elif "note" in line:
@@ -149,7 +149,7 @@ def _death(process: "subprocess.Popen[str]", errors: IO[str]) -> str:
         return "closes its output, and does not end"
     errors.seek(0)
     written = [line.strip() for line in errors.read().splitlines() if line.strip()]
-    last = f" ({shortened(written[-1], 300)})" if written else ""
+    last = f" ({shorten(written[-1], 300)})" if written else ""
     if code < 0:
         names = {one.value: one.name for one in signal.Signals}
         return f"the runtime ends the process with {names.get(-code, f'signal {-code}')}{last}"

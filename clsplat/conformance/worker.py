@@ -16,8 +16,8 @@ from typing import Any, TextIO
 
 from clsplat.conformance.check import Check, Note
 from clsplat.conformance.checks import BY_NAME
-from clsplat.core.errors import ClsplatError, KernelError, MemoryLimitError, as_clsplat_error, one_line, shortened
-from clsplat.core.signals import only_reader_of_stdin, only_writer_of_stdout
+from clsplat.core.errors import ClsplatError, KernelError, MemoryLimitError, as_clsplat_error, one_line, shorten
+from clsplat.core.signals import take_stdin, take_stdout
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import Schedule, list_devices
 
@@ -26,8 +26,8 @@ LOG_LIMIT = 4000  # characters of a build log
 
 def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> None:
     """Open the device and run the checks of these names."""
-    threading.Thread(target=_end_with, args=(only_reader_of_stdin(),), daemon=True).start()
-    out = only_writer_of_stdout()
+    threading.Thread(target=_end_with, args=(take_stdin(),), daemon=True).start()
+    out = take_stdout()
     info = next(info for info in list_devices() if info.place == (platform, number))
     opened = cache(lambda: Device(info, schedule))
     for name in names:
@@ -48,7 +48,7 @@ def _run(out: TextIO, check: Check, opened: Callable[[], Device]) -> None:
         log = str(error.__cause__)[:LOG_LIMIT] if isinstance(error, KernelError) and error.__cause__ else ""
         _print(
             out,
-            fault=shortened(what, 600),
+            fault=shorten(what, 600),
             log=log,
             out_of_memory=isinstance(as_clsplat_error(error), MemoryLimitError),
         )

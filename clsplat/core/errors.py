@@ -39,8 +39,8 @@ class OverrideError(ConfigError):
     """A value of `--set` does not fit the pipeline; `reason` is the fault."""
 
     def __init__(self, override: str, reason: str) -> None:
-        self.reason = shortened(" ".join(reason.split()), 500)
-        super().__init__(f"--set {shortened(' '.join(override.split()))}: {self.reason}")
+        self.reason = shorten(" ".join(reason.split()), 500)
+        super().__init__(f"--set {shorten(' '.join(override.split()))}: {self.reason}")
 
 
 class PluginError(ConfigError):
@@ -83,7 +83,7 @@ class NotFiniteError(NumericError):
     """The state of a training is not finite; it was set aside, as failed_N.npz."""
 
 
-class NoneInsideError(NumericError):
+class EmptyRegionError(NumericError):
     """No Gaussian lies in a part of space."""
 
 
@@ -128,8 +128,8 @@ def _plugin_place(error: BaseException) -> str | None:
 
 def one_line(error: BaseException | str) -> str:
     """Return a message as one line of limited length, without characters that a terminal obeys."""
-    text = shortened(" ".join(str(error).split()), MESSAGE_LIMIT)
-    return shortened("".join(c if c.isprintable() else ascii(c)[1:-1] for c in text), MESSAGE_LIMIT)
+    text = shorten(" ".join(str(error).split()), MESSAGE_LIMIT)
+    return shorten("".join(c if c.isprintable() else ascii(c)[1:-1] for c in text), MESSAGE_LIMIT)
 
 
 def first_few(names: Sequence[str]) -> str:
@@ -138,7 +138,7 @@ def first_few(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMES_SHOWN]) + more
 
 
-def amount(count: int, word: str) -> str:
+def pluralize(count: int, word: str) -> str:
     """Return a number with its noun: `1 view`, `2,000 views`."""
     return f"{count:,} {word}{'s' if count != 1 else ''}"
 
@@ -148,20 +148,20 @@ def size_text(gaussians: int | None, parameters: int | None) -> str:
     return f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
 
 
-def in_shell(path: object) -> str:
+def shell_quote(path: object) -> str:
     """Return a path as a shell reads it, for a command in a message."""
     return subprocess.list2cmdline([str(path)]) if os.name == "nt" else shlex.quote(str(path))
 
 
-def shortened(text: str, limit: int = QUOTE_LIMIT) -> str:
+def shorten(text: str, limit: int = QUOTE_LIMIT) -> str:
     """Return the text, cut in the middle where it is longer than `limit` characters."""
     kept = limit - 3
     return text if len(text) <= limit else f"{text[: kept - kept // 2]} … {text[-(kept // 2) :]}"
 
 
-def quoted(value: object) -> str:
+def quote(value: object) -> str:
     """Return a value of the input as a message shows it, in one line of QUOTE_LIMIT characters."""
-    return shortened(" ".join(_QUOTES.repr(value).split()))
+    return shorten(" ".join(_QUOTES.repr(value).split()))
 
 
 class _Quotes(reprlib.Repr):

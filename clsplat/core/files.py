@@ -26,23 +26,23 @@ _open: set[str] = set()  # names of the temporary files that this process writes
 
 
 @contextmanager
-def atomic(path: Path) -> Iterator[BinaryIO]:
+def open_atomic(path: Path) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`; when the block ends without an error, sync it and rename it to `path`.
 
     Then the folder is synced, so that the new name outlasts a power cut.
     Raises OutputError with the file's name when it cannot be written; an earlier file then stays unchanged.
     """
-    with atomic_name(path) as temporary, temporary.open("wb") as file:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
         yield file
         file.flush()
         os.fsync(file.fileno())
 
 
 @contextmanager
-def atomic_name(path: Path, suffix: str = "") -> Iterator[Path]:
-    """Yield a temporary name beside `path` for what opens files itself and looks at their suffix; then as `atomic`.
+def atomic_path(path: Path, suffix: str = "") -> Iterator[Path]:
+    """Yield a temporary path next to `path`, and rename it to `path` as `open_atomic` does.
 
-    Who takes the name syncs the file.
+    This is for libraries that open files themselves and look at the suffix.  The caller syncs the file.
     """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
@@ -55,7 +55,7 @@ def atomic_name(path: Path, suffix: str = "") -> Iterator[Path]:
         _replace(temporary, path)
         sync_folder(path.parent)
     except OSError as error:
-        raise unwritable(path, error) from error
+        raise write_error(path, error) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -72,7 +72,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
     require_free(folder)
     with scratch_folder(folder) as temporary:
         yield temporary
-        with told_as(folder):
+        with raising_output_error(folder):
             if folder.exists():
                 folder.rmdir()  # it is empty; Windows replaces no folder
             _replace(temporary, folder)
@@ -87,7 +87,7 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
     """
     temporary = _temporary(folder)
     try:
-        with told_as(folder):
+        with raising_output_error(folder):
             make_folder(folder.parent)
             temporary.mkdir()
             _sweep_beside(folder)
@@ -99,19 +99,19 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
 
 def require_free(folder: Path) -> None:
     """Raise ConfigError where something but an empty folder lies at the place of a new one."""
-    with told_as(folder):
-        is_free = not is_there(folder) or (folder.is_dir() and not any(folder.iterdir()))
+    with raising_output_error(folder):
+        is_free = not path_exists(folder) or (folder.is_dir() and not any(folder.iterdir()))
     if not (is_free and folder.name) or folder.is_symlink() or os.path.ismount(folder):  # which a rename cannot replace
         raise ConfigError(f"{folder}: is in use; give the name of a new folder")
 
 
 @contextmanager
-def told_as(path: Path) -> Iterator[None]:
+def raising_output_error(path: Path) -> Iterator[None]:
     """Raise OutputError, with the name of what cannot be written, for an OSError of the block."""
     try:
         yield
     except OSError as error:
-        raise unwritable(path, error) from error
+        raise write_error(path, error) from error
 
 
 def _temporary(path: Path, suffix: str = "") -> Path:
@@ -134,7 +134,7 @@ def _replace(temporary: Path, path: Path) -> None:
 
 def append(path: Path, data: bytes) -> None:
     """Append to a file and sync it; where that fails it is as it was.  Raises OutputError."""
-    with told_as(path):
+    with raising_output_error(path):
         size = path.stat().st_size if path.exists() else None
         try:
             with path.open("ab") as file:
@@ -184,7 +184,7 @@ def _sync(path: Path, flags: int) -> None:
             raise
 
 
-def sweep(folder: Path, border: str) -> None:
+def remove_partial_files(folder: Path, border: str) -> None:
     """Remove the temporary files of killed processes below a folder, but not below folders that hold a `border`."""
     for base, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if not os.path.exists(os.path.join(base, name, border))]
@@ -211,20 +211,20 @@ def _is_left(name: str) -> bool:
     return process == os.getpid() or not is_alive(process)  # an earlier container had the same number
 
 
-def is_there(path: Path) -> bool:
+def path_exists(path: Path) -> bool:
     """Return whether something lies where a file or folder is to be made.  Raises OutputError where nothing can."""
-    with told_as(path):
+    with raising_output_error(path):
         return path.exists() or path.is_symlink()
 
 
-def unwritable(path: Path, error: OSError) -> OutputError:
+def write_error(path: Path, error: OSError) -> OutputError:
     """Return the OutputError for a file that cannot be written."""
     return OutputError(f"{path}: cannot be written ({error.strerror or error}); check the folder and its space")
 
 
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically.  Raises OutputError."""
-    with atomic(path) as file:
+    with open_atomic(path) as file:
         file.write(text.encode())
 
 
@@ -237,7 +237,7 @@ RECORDS = "metrics.jsonl"
 TRIAL = "trial.jsonl"
 STATUS = "status.json"
 LOG_FILE = "log.txt"
-NOTE = "prepared.json"
+PREPARE_SUMMARY = "prepared.json"
 INPUTS = "inputs.json"
 CHECKSUMS = "checksums.json"
 LOCK = "run.lock"
@@ -245,30 +245,30 @@ CHECKPOINTS = "checkpoints"
 UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
-MODULE_FILES = "view_"  # what the side files of modules begin with
+MODULE_FILE_PREFIX = "view_"  # what the side files of modules begin with
 RESERVED = frozenset(
     {
-        *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
+        *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, PREPARE_SUMMARY, INPUTS, CHECKSUMS, LOCK),
         *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json"),
     }
 )
-BEFORE_A_RUN = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml
-OF_A_RUN = BEFORE_A_RUN | {PIPELINE, METRICS, RECORDS, TRIAL, NOTE, INPUTS, CHECKSUMS, CHECKPOINTS}
-OF_A_MATRIX = frozenset({STATUS, LOCK, PIPELINE, COMPARISON})
+EARLY_RUN_FILES = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml
+RUN_FILES = EARLY_RUN_FILES | {PIPELINE, METRICS, RECORDS, TRIAL, PREPARE_SUMMARY, INPUTS, CHECKSUMS, CHECKPOINTS}
+MATRIX_FILES = frozenset({STATUS, LOCK, PIPELINE, COMPARISON})
 END_STATES = ("done", "failed", "interrupted")  # of status.json
-SILENT = 60  # seconds without a heartbeat there after which a run may have ended
-LONGEST = 200  # bytes; systems allow 255, and temporary names are longer
+HEARTBEAT_TIMEOUT = 60  # seconds without a heartbeat there after which a run may have ended
+MAX_NAME_BYTES = 200  # bytes; systems allow 255, and temporary names are longer
 _DEVICES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # of Windows
 
 
-def fault_of_name(name: str) -> str | None:
+def invalid_name_reason(name: str) -> str | None:
     """Return why not every system can hold a file of this name, or None."""
     try:
         size = len(name.encode())
     except UnicodeEncodeError:
         return f"{name!r} is not text"
-    if size > LONGEST:
-        return f"a name has {size} bytes; the limit is {LONGEST}"
+    if size > MAX_NAME_BYTES:
+        return f"a name has {size} bytes; the limit is {MAX_NAME_BYTES}"
     if any(letter < " " or letter in '<>:"|?*\x7f' for letter in name):
         return f"{name!r} holds a character that not every system allows"
     if _DEVICES.fullmatch(name.rstrip(" .")) or re.search(r"~\d", name) or name != name.rstrip(" ."):
@@ -282,36 +282,36 @@ def is_inside(text: str) -> bool:
     return bool(path.parts) and not path.anchor and ".." not in path.parts
 
 
-def fault_of_output(text: str) -> str | None:
+def invalid_output_reason(text: str) -> str | None:
     """Return why a pipeline may not choose a path in the run folder, or None."""
     parts = PureWindowsPath(text).parts
     if not is_inside(text):
         return "it is not inside"
-    if parts[0].casefold() in RESERVED or parts[0].casefold().startswith(MODULE_FILES):
+    if parts[0].casefold() in RESERVED or parts[0].casefold().startswith(MODULE_FILE_PREFIX):
         return f"'{parts[0]}' is written by the run itself"
     if any(part.startswith(".") for part in parts):
         return "names with a dot in front are for temporary files"
-    return next(filter(None, map(fault_of_name, parts)), None)
+    return next(filter(None, map(invalid_name_reason, parts)), None)
 
 
 # Where commands may write their results: not over a file of a run.
 
 
-def check_result(path: Path, suffix: str) -> None:
+def check_result_path(path: Path, suffix: str) -> None:
     """Raise ConfigError where a command would write a file of another kind, or over a file of a run."""
     if path.suffix.lower() != suffix:
         raise ConfigError(f"{path}: expected the name of a file that ends in {suffix}")
     if path.name != COMPARISON:
-        check_no_file_of_a_run(path)
+        check_not_run_file(path)
 
 
-def check_no_file_of_a_run(path: Path) -> None:
+def check_not_run_file(path: Path) -> None:
     """Raise ConfigError where a command would write over a file of a run."""
     folder = path.absolute().parent
     run = next(
         (one for one in (folder, *folder.parents) if any((one / n).is_file() for n in (CHECKSUMS, STATUS))), None
     )
-    if run and is_there(path) and _is_of(run, path):
+    if run and path_exists(path) and _is_of(run, path):
         raise ConfigError(f"{path}: is a file of a run; give another name")
 
 

@@ -39,7 +39,7 @@ def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.round(mean / np.sqrt(max(size, 1.0)), DIGITS))
 
 
-def rotated_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the coefficients [N, (K-1)*3], coefficient-major, of the same colors after a rotation [3, 3].
 
     A rotation maps each band onto itself, so each band's matrix follows from values at a few directions.

@@ -20,8 +20,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import DataError, OutputError, shortened
-from clsplat.core.files import END_STATES, LOCK, SILENT, STATUS, told_as
+from clsplat.core.errors import DataError, OutputError, shorten
+from clsplat.core.files import END_STATES, HEARTBEAT_TIMEOUT, LOCK, STATUS, raising_output_error
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json
 
@@ -58,7 +58,7 @@ def require_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
     if named is None or (named.boot == this.boot if owner.get("boot") and this.boot else named.host == this.host):
         return {}
     beat = _heartbeat(path)
-    if beat is not None and (silent := time.time() - beat) < SILENT:
+    if beat is not None and (silent := time.time() - beat) < HEARTBEAT_TIMEOUT:
         raise OutputError(
             f"{in_use(folder, owner)}; its heartbeat is {max(0, silent):.0f} s old, though the lock is free here: "
             f"if that process has ended, wait for a minute, or remove {path}"
@@ -71,7 +71,7 @@ def until_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
 
     That it comes counts, not its time: the clocks of two machines may differ.
     """
-    beat, end, told = _heartbeat(path), time.monotonic() + SILENT, False
+    beat, end, told = _heartbeat(path), time.monotonic() + HEARTBEAT_TIMEOUT, False
     while True:
         try:
             return require_silent(file, path, folder)
@@ -116,7 +116,7 @@ def in_use(folder: Path, owner: dict[str, Any]) -> str:
         since = "an unknown time"
     return (
         f"{folder}: is in use by process {owner.get('process')} on {owner.get('host')} since {since} "
-        f"({shortened(str(owner.get('command')))}); wait for it, or give another folder"
+        f"({shorten(str(owner.get('command')))}); wait for it, or give another folder"
     )
 
 
@@ -127,7 +127,7 @@ _reserving = threading.Lock()
 
 
 @contextmanager
-def held(folder: Path, path: Path | None = None) -> Iterator[Callable[[], None]]:
+def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[], None]]:
     """Hold the lock of a folder in the block: a file `path`, by default `run.lock` in it.
 
     Yields a function that raises OutputError where that file was removed or replaced, so that another may hold the
@@ -135,7 +135,7 @@ def held(folder: Path, path: Path | None = None) -> Iterator[Callable[[], None]]
     """
     path = _path(folder, path or folder / LOCK)
     with _reserved(path, folder):
-        with told_as(path):
+        with raising_output_error(path):
             file = _locked(path, folder)
 
         def require_held() -> None:
@@ -168,12 +168,12 @@ def _reserved(path: Path, folder: Path) -> Iterator[None]:
 
 
 def check_free(folder: Path) -> bool:
-    """Raise OutputError where `held` would at once; nothing is written.
+    """Raise OutputError where `lock_folder` would at once; nothing is written.
 
-    Returns False where `held` would wait for the heartbeat of a run on another machine.
+    Returns False where `lock_folder` would wait for the heartbeat of a run on another machine.
     """
     path = _path(folder, folder / LOCK)
-    with told_as(path), suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
+    with raising_output_error(path), suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
         try:
             if not _system_lock(file):
                 raise OutputError(in_use(folder, read(file)))

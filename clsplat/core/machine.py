@@ -38,13 +38,13 @@ def cache_folder() -> Path:
     except RuntimeError:  # no HOME, and a user that the system does not know
         fault = "there is no home folder"
     else:
-        fault = next(filter(None, map(_fault, [*folders, *named_by_user()])), "")
+        fault = next(filter(None, map(_fault, [*folders, *user_cache_folders()])), "")
         if not fault:
             return folders[0]
     moved = _temporary()
     LOG.warning("%s; caches are in %s instead; XDG_CACHE_HOME can name a folder that lasts", fault, moved)
     os.environ["XDG_CACHE_HOME"] = str(moved)  # what all libraries read, in this process and those that it starts
-    if named_by_user():
+    if user_cache_folders():
         os.environ["POCL_CACHE_DIR"] = str(moved / "pocl")
     ours = moved / "clsplat"
     if fault := _fault(ours):
@@ -52,7 +52,7 @@ def cache_folder() -> Path:
     return ours
 
 
-def named_by_user() -> list[Path]:
+def user_cache_folders() -> list[Path]:
     """The folder that PoCL was told to use, which stands before the folder of caches."""
     return [Path(os.environ["POCL_CACHE_DIR"])] if os.environ.get("POCL_CACHE_DIR") else []
 
@@ -109,14 +109,14 @@ LIMITS = (  # variables by which a runtime is told how many threads to start
 Cores = Sequence[int]  # numbers, as the system counts them
 
 
-def usable() -> tuple[int, ...]:
+def usable_cores() -> tuple[int, ...]:
     """Return the cores that this process may use; where the system does not say, all of them."""
     if hasattr(os, "sched_getaffinity"):
         return tuple(sorted(os.sched_getaffinity(0)))
     return tuple(range(os.cpu_count() or 1))
 
 
-def shares(cores: Cores, processes: int) -> list[tuple[int, ...]]:
+def split_cores(cores: Cores, processes: int) -> list[tuple[int, ...]]:
     """Return the cores of each process: equal parts of neighbors, which share caches and memory.
 
     Cores that are left over belong to nobody, so that all processes have as many.
@@ -125,12 +125,12 @@ def shares(cores: Cores, processes: int) -> list[tuple[int, ...]]:
     return [tuple(cores[number * each : (number + 1) * each]) for number in range(processes)]
 
 
-def limited(cores: Cores, variables: Mapping[str, str] = os.environ) -> dict[str, str]:
+def limited_environment(cores: Cores, variables: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Return the environment of a process that is kept to these cores: as many threads."""
     return {**variables, **dict.fromkeys(LIMITS, str(len(cores)))}
 
 
-def keep_to(cores: Cores, process: int = 0) -> None:
+def pin_to_cores(cores: Cores, process: int = 0) -> None:
     """Keep a process, 0 this one, and what it starts from now on, to these cores, where the system can."""
     if hasattr(os, "sched_setaffinity"):
         with suppress(OSError):  # it has ended, or a container has other cores by now

@@ -5,13 +5,13 @@ import json
 from pathlib import Path
 
 from clsplat.core.errors import DataError
-from clsplat.core.files import append, make_folder, unwritable
+from clsplat.core.files import append, make_folder, write_error
 from clsplat.core.reading import read_file, sha256
 
 RECORD = ".made.jsonl"
 
 
-class Made:
+class Manifest:
     """The record of a folder: a line for each file, with a hash of what it is made from.
 
     Files are written whole, after their line is on the disk; a file that was made from something else is removed before
@@ -49,7 +49,7 @@ class Made:
                 line = "\n" + json.dumps({"file": name, "from": source})  # behind a line cut short
                 append(self.folder / RECORD, line.encode())
         except OSError as error:
-            raise unwritable(path, error) from error
+            raise write_error(path, error) from error
         self._sources[name] = source
         return True
 
@@ -62,7 +62,7 @@ class Made:
         return path.relative_to(self.folder).as_posix()
 
 
-def hash_of(*parts: object) -> str:
+def hash_values(*parts: object) -> str:
     """Return a hash of values; a path stands for the content of its file.  Raises DataError."""
     state = hashlib.sha256()
     for part in parts:

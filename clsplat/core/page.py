@@ -37,13 +37,13 @@ def render(template: str, **values: Any) -> str:
     return text.encode("utf-8", "replace").decode("utf-8")
 
 
-def require_end(path: Path) -> None:
+def require_complete(path: Path) -> None:
     """Raise DataError where the file of a page cannot be read, or has lost its end."""
     if not read_file(path).rstrip().endswith(b"</html>"):
         raise DataError(f"{path}: ends before its end")
 
 
-def charts(drawings: Iterable[str]) -> list[Markup]:
+def safe_charts(drawings: Iterable[str]) -> list[Markup]:
     """Mark SVG drawings as safe and drop empty ones; templates escape all other values."""
     return [_safe(drawing) for drawing in drawings if drawing]
 
@@ -68,7 +68,7 @@ def _safe(text: str) -> Markup:
     return Markup(text)
 
 
-def duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a time in words: `1 h 2 min`, `3 min 4 s`, `5 s`."""
     minutes, rest = divmod(round(seconds), 60)
     if minutes >= 60:
@@ -76,7 +76,7 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def embedded(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
+def data_url(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
     """Return an RGB image, [height, width, 3], as a data URL: .jpg, or .png, which keeps every bit."""
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix == ".jpg" else []
     _, data = cv2.imencode(suffix, image[..., ::-1], options)
@@ -84,7 +84,7 @@ def embedded(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
-def shrunk(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+def shrink(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
     """Return an image whose longer side is at most `longest` px, with its aspect."""
     height, width = image.shape[:2]
     factor = longest / max(width, height)
@@ -101,5 +101,5 @@ THUMBNAIL = 160  # px, the larger side
 
 def summary(rows: Mapping[str, str], images: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> str:
     """Return a table of names and values, and images, [height, width, 3], with their names, as a piece of HTML."""
-    thumbnails = [(name, embedded(shrunk(image, THUMBNAIL))) for name, image in images]
+    thumbnails = [(name, data_url(shrink(image, THUMBNAIL))) for name, image in images]
     return render("notebook.html.j2", rows=rows, thumbnails=thumbnails)

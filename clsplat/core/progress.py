@@ -30,7 +30,7 @@ _level: ContextVar[int] = ContextVar("level", default=logging.INFO)  # of the li
 
 
 @contextmanager
-def only(level: int) -> Iterator[None]:
+def log_level(level: int) -> Iterator[None]:
     """Leave out what the block tells below a level of `logging`: who calls it says the same in other words."""
     before = LOG.level
     LOG.setLevel(level)
@@ -41,7 +41,7 @@ def only(level: int) -> Iterator[None]:
 
 
 @contextmanager
-def kept(level: int) -> Iterator[list[str]]:
+def captured_log(level: int) -> Iterator[list[str]]:
     """Collect what the block tells from a level of `logging` on, in the place of telling it: it is shown elsewhere."""
     told: list[str] = []
 
@@ -49,7 +49,7 @@ def kept(level: int) -> Iterator[list[str]]:
         told.append(record.getMessage())
         return False
 
-    with only(level):
+    with log_level(level):
         LOG.addFilter(keep)
         try:
             yield told
@@ -58,10 +58,10 @@ def kept(level: int) -> Iterator[list[str]]:
 
 
 @contextmanager
-def heard_by(listener: Listener) -> Iterator[None]:
+def listening(listener: Listener) -> Iterator[None]:
     """Call `listener` for each step of the work in this block, beside those of blocks around it.
 
-    It is called from the thread of the block, or of a `watched` one.
+    It is called from the thread of the block, or of a `polled` one.
     """
     around = _listener.get()
 
@@ -77,7 +77,7 @@ def heard_by(listener: Listener) -> Iterator[None]:
 
 
 @contextmanager
-def counts_shown() -> Iterator[None]:
+def counts_as_debug() -> Iterator[None]:
     """Log the counts of the block as details: something else shows them."""
     token = _level.set(logging.DEBUG)
     try:
@@ -129,7 +129,7 @@ def counted(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
 
 
 @contextmanager
-def watched(count: Count, look: Callable[[], int]) -> Iterator[None]:
+def polled(count: Count, look: Callable[[], int]) -> Iterator[None]:
     """Count work that does not count by itself: a thread looks now and then how many pieces are done."""
     ended, context = threading.Event(), contextvars.copy_context()
 

@@ -24,7 +24,7 @@ KINDS = {
 
 
 @contextmanager
-def opened(
+def open_file(
     path: Path, expected: str = "a file", kind: type[ClsplatError] = DataError, limit: int | None = None
 ) -> Iterator[BufferedReader]:
     """Open a regular file of at most `limit` bytes for reading.
@@ -32,7 +32,7 @@ def opened(
     Raises an error of this `kind` when that fails, or when the block cannot read.
     """
     try:
-        with regular(path, limit) as file:
+        with open_regular(path, limit) as file:
             yield file
     except OSError as error:
         raise kind(f"{path}: cannot be read ({error.strerror or error}); expected {expected}") from error
@@ -41,8 +41,8 @@ def opened(
 def read_file(
     path: Path, expected: str = "a file", kind: type[ClsplatError] = DataError, limit: int | None = None
 ) -> bytes:
-    """Return the bytes of a regular file.  Raises DataError, or another `kind`, as `opened` does."""
-    with opened(path, expected, kind, limit) as file:
+    """Return the bytes of a regular file.  Raises DataError, or another `kind`, as `open_file` does."""
+    with open_file(path, expected, kind, limit) as file:
         return file.read()
 
 
@@ -59,14 +59,14 @@ def read_text(
 
 def sha256(path: Path, expected: str = "a file", kind: type[ClsplatError] = DataError) -> str:
     """Return the SHA-256 of a regular file, as `sha256sum` prints it.  Raises DataError, or another `kind`."""
-    with opened(path, expected, kind) as file:
+    with open_file(path, expected, kind) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_json(
     path: Path, expected: str = "a JSON file", kind: type[ClsplatError] = DataError, limit: int = MAX_JSON
 ) -> Any:
-    """Return what a JSON file holds.  Raises DataError, or another `kind`, as `opened` does, and for other text."""
+    """Return what a JSON file holds.  Raises DataError, or another `kind`, as `open_file` does, and for other text."""
     data = read_file(path, expected, kind, limit)
     try:
         return json.loads(data)
@@ -75,14 +75,14 @@ def read_json(
         raise kind(f"{path}: not a JSON file ({reason}); expected {expected}: make it again") from error
 
 
-def regular(path: Path, limit: int | None = None) -> BufferedReader:
-    """Open a regular file of at most `limit` bytes, as `opened` does, but raise OSError."""
+def open_regular(path: Path, limit: int | None = None) -> BufferedReader:
+    """Open a regular file of at most `limit` bytes, as `open_file` does, but raise OSError."""
     try:
         state = os.stat(path)
     except ValueError as error:  # a NUL in the name, or text that no file system can hold
         raise OSError(errno.EINVAL, "no file has such a name") from error
     if not stat.S_ISREG(state.st_mode):
-        raise OSError(errno.EINVAL, f"it is {KINDS.get(stat.S_IFMT(state.st_mode), 'not a regular file')}")
+        raise OSError(errno.EINVAL, f"it is {KINDS.get(stat.S_IFMT(state.st_mode), 'not a open_regular file')}")
     if limit is not None and state.st_size > limit:
         raise OSError(errno.EFBIG, f"it has {state.st_size} bytes, more than {limit}")
     return path.open("rb")

@@ -56,7 +56,7 @@ class Curve(Settings):
     def values(self) -> list[float]:
         """The values that bounds are checked on: the smallest must be among them."""
 
-    def divided(self, factor: float) -> "Curve":
+    def divide(self, factor: float) -> "Curve":
         """Return the curve with its values divided by a factor.  Raises ConfigError where it has no such values."""
         raise ConfigError(f"{type(self).__name__}: cannot follow the number of steps; expected a number or points")
 
@@ -84,7 +84,7 @@ class Points(Curve):
     def values(self) -> list[float]:
         return [value for _, value in self.points]
 
-    def divided(self, factor: float) -> "Points":
+    def divide(self, factor: float) -> "Points":
         return self.model_copy(update={"points": [[step, value / factor] for step, value in self.points]})
 
 
@@ -110,7 +110,7 @@ class Decay(Curve):
     def values(self) -> list[float]:
         return [self.initial, self.final]
 
-    def divided(self, factor: float) -> "Decay":
+    def divide(self, factor: float) -> "Decay":
         return self.model_copy(update={"initial": self.initial / factor, "final": self.final / factor})
 
 
@@ -129,7 +129,7 @@ class Every(Curve):
     def values(self) -> list[float]:
         return [self.value, 0.0]
 
-    def divided(self, factor: float) -> "Every":
+    def divide(self, factor: float) -> "Every":
         return self.model_copy(update={"value": self.value / factor})
 
 
@@ -139,26 +139,26 @@ NOTATIONS = (
 )
 
 
-def explained(more: str = "") -> WrapValidator:
+def explain_schedule(more: str = "") -> WrapValidator:
     """Make one sentence of the errors of all notations; `more` names other values that the field accepts."""
     return in_one_sentence(NOTATIONS + more)
 
 
-Schedule = Annotated[float | PointList | Annotated[Curve, _Curves()], explained()]
+Schedule = Annotated[float | PointList | Annotated[Curve, _Curves()], explain_schedule()]
 
 
-def values_of(schedule: Schedule) -> list[float]:
+def schedule_values(schedule: Schedule) -> list[float]:
     """Return all values of a schedule's notation."""
     if isinstance(schedule, list):
         return [value for _, value in schedule]
     return schedule.values if isinstance(schedule, Curve) else [schedule]
 
 
-def divided(schedule: Schedule, factor: float) -> Schedule:
+def divide(schedule: Schedule, factor: float) -> Schedule:
     """Return a schedule with its values divided by a factor."""
     if isinstance(schedule, list):
         return [[step, value / factor] for step, value in schedule]
-    return schedule.divided(factor) if isinstance(schedule, Curve) else schedule / factor
+    return schedule.divide(factor) if isinstance(schedule, Curve) else schedule / factor
 
 
 class Bounded:
@@ -168,11 +168,11 @@ class Bounded:
         self.lowest, self.above, self.most = lowest, above, most
 
     def __call__(self, schedule: Any) -> Any:
-        lowest = min(values_of(schedule))
+        lowest = min(schedule_values(schedule))
         if lowest < self.lowest or (self.above and lowest == self.lowest):
             bound = "larger than" if self.above else "at least"
             raise ValueError(f"expected values {bound} {self.lowest:g}")
-        if max(values_of(schedule)) > self.most:
+        if max(schedule_values(schedule)) > self.most:
             raise ValueError(f"expected values of at most {self.most:g}")
         return schedule
 
@@ -198,26 +198,28 @@ EverySteps = Annotated[
 ]
 
 
-def is_act(every: float, step: int) -> bool:
+def fires_at(every: float, step: int) -> bool:
     """Return whether there is an act at a step, counted from 1."""
-    return step % every == 0 if isinstance(every, int) else acts(every, step) > acts(every, step - 1)
+    return step % every == 0 if isinstance(every, int) else count_fired(every, step) > count_fired(every, step - 1)
 
 
-def acts(every: float, step: int) -> int:
+def count_fired(every: float, step: int) -> int:
     """Return the number of acts up to a step."""
     steps, parts = _ratio(every)
     return ((step + 1) * parts - 1) // steps
 
 
-def place(every: float, number: int) -> int:
+def fire_step(every: float, number: int) -> int:
     """Return the step of an act, by its number, counted from 1."""
     steps, parts = _ratio(every)
     return number * steps // parts
 
 
-def places(every: float, start: int, stop: int) -> list[int]:
+def fire_steps(every: float, start: int, stop: int) -> list[int]:
     """Return the steps of the acts after `start` and before `stop`."""
-    return [place(every, number) for number in range(acts(every, start) + 1, acts(every, stop - 1) + 1)]
+    return [
+        fire_step(every, number) for number in range(count_fired(every, start) + 1, count_fired(every, stop - 1) + 1)
+    ]
 
 
 @lru_cache(maxsize=1024)

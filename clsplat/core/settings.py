@@ -69,7 +69,7 @@ class Settings(BaseModel):
     def place_of(self, key: str, scene: str | None) -> Path | None:
         """Return the file or folder that is read where a key names one, else None.  scene: folder of the dataset."""
         value = getattr(self, key)
-        return Path(value) if isinstance(value, str) and is_read(type(self), key) else None
+        return Path(value) if isinstance(value, str) and is_input_path(type(self), key) else None
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -80,18 +80,18 @@ class Settings(BaseModel):
         return found
 
 
-def nested(value: Any, place: str = "") -> Iterator[tuple[str, Settings]]:
+def iter_settings(value: Any, place: str = "") -> Iterator[tuple[str, Settings]]:
     """Yield all settings inside of settings or a list, each with its place, such as stages[1].optimize.losses[0]."""
     if isinstance(value, list | tuple):
         for i, inner in enumerate(value):
-            yield from nested(inner, f"{place}[{i}]")
+            yield from iter_settings(inner, f"{place}[{i}]")
     elif isinstance(value, dict):
-        yield from nested(list(value.values()), place)
+        yield from iter_settings(list(value.values()), place)
     elif isinstance(value, Settings):
         place = f"{place}.{name}" if (name := getattr(value, "stage", None)) else place
         yield place, value
         for key, inner in value.parts().items():
-            yield from nested(inner, f"{place}.{key}" if place else key)
+            yield from iter_settings(inner, f"{place}.{key}" if place else key)
 
 
 @functools.cache
@@ -124,7 +124,7 @@ def tag_of(kind: type[Settings]) -> tuple[str, str] | None:
     return None
 
 
-def resumable(kind: type[Settings], key: str) -> Literal["output", "training"] | None:
+def resume_effect(kind: type[Settings], key: str) -> Literal["output", "training"] | None:
     """Return what a change of a key means when a run goes on; None where it cannot.  Subclasses add to their bases."""
     bases = [base for base in kind.__mro__ if issubclass(base, Settings)]
     if any(key in base.output_keys for base in bases):
@@ -150,7 +150,7 @@ def _named(base: type[Base], defined: tuple[type["Settings"], ...]) -> dict[str,
     return found
 
 
-def fault_of(kind: type[Settings]) -> str | None:
+def invalid_variant_reason(kind: type[Settings]) -> str | None:
     """Return why no pipeline file can name a class that is meant as a variant, or None."""
     if kind.__subclasses__():
         return None
@@ -218,13 +218,13 @@ def in_one_sentence(expected: str) -> WrapValidator:
     return WrapValidator(validated)
 
 
-ReadPath = Annotated[str, AfterValidator(_readable)]  # a file or folder that is read
+InputPath = Annotated[str, AfterValidator(_readable)]  # a file or folder that is read
 
 
-def is_read(kind: type[Settings], key: str) -> bool:
+def is_input_path(kind: type[Settings], key: str) -> bool:
     """Return whether a key holds the path of a file or folder that is read."""
     field = kind.model_fields[key]
-    return ReadPath in (field.annotation, *typing.get_args(field.annotation)) or any(
+    return InputPath in (field.annotation, *typing.get_args(field.annotation)) or any(
         isinstance(one, AfterValidator) and one.func is _readable for one in field.metadata
     )
 
@@ -256,7 +256,7 @@ def import_modules(package: str, path: Iterable[str]) -> None:
         importlib.import_module(f"{package}.{module.name}")
 
 
-def rebuild() -> None:
+def rebuild_models() -> None:
     """Rebuild all models, so that their fields accept variants defined since, such as those of a plug-in."""
     complete = [kind for kind in Settings.defined if kind.__pydantic_complete__]  # others are built at their first use
     for kind in complete:  # a schema holds those of its variants, and theirs

@@ -106,7 +106,7 @@ def stop_at_once() -> None:
         raise KeyboardInterrupt
 
 
-def stop_if_signalled() -> None:
+def stop_if_signaled() -> None:
     """Raise KeyboardInterrupt where a signal came in the outermost block: a library may have caught the first one."""
     if _received.number and threading.current_thread() is threading.main_thread():
         raise KeyboardInterrupt
@@ -223,7 +223,7 @@ def _silence(stream: Any) -> None:
         os.close(null)
 
 
-def only_reader_of_stdin() -> int:
+def take_stdin() -> int:
     """Return a number for stdin; runtimes get an empty one: on Windows asking about a pipe may wait for readers."""
     pipe, empty = os.dup(0), os.open(os.devnull, os.O_RDONLY)
     os.dup2(empty, 0)
@@ -231,7 +231,7 @@ def only_reader_of_stdin() -> int:
     return pipe
 
 
-def only_writer_of_stdout() -> TextIO:
+def take_stdout() -> TextIO:
     """Return stdout, and send what runtimes print there to stderr from here on."""
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)

@@ -16,9 +16,9 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from clsplat.core import signals
 from clsplat.core.errors import OutputError
-from clsplat.core.files import told_as
+from clsplat.core.files import raising_output_error
 from clsplat.core.progress import Progress as TrainingProgress
-from clsplat.core.progress import clock, counts_shown, heard_by
+from clsplat.core.progress import clock, counts_as_debug, listening
 from clsplat.core.resources import full_version
 
 LOG = logging.getLogger("clsplat")
@@ -65,7 +65,7 @@ def keep_stdout_for_json() -> None:
             handler.remarks = ERRORS
 
 
-def remark(text: str) -> None:
+def print_message(text: str) -> None:
     """Print what was done; where that cannot be written nothing is lost."""
     CONSOLE.print(text, markup=False)
 
@@ -112,7 +112,7 @@ def logging_to(path: Path) -> Iterator[None]:
         raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or give another folder")
     form = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
     first = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (full_version(),), None)
-    with told_as(path):
+    with raising_output_error(path):
         with path.open("a", encoding="utf-8") as file:
             file.write(form.format(first) + "\n")
         handler = _LogFile(path)
@@ -134,7 +134,7 @@ def logging_to(path: Path) -> Iterator[None]:
         handler.close()
 
 
-def line(progress: TrainingProgress) -> str:
+def progress_line(progress: TrainingProgress) -> str:
     """Return the progress at a step as text."""
     p = progress
     least = "" if p.growth_known else "at least "
@@ -163,7 +163,7 @@ def device_text(device: dict[str, Any]) -> str:
 def progress_bar(status: WatchedStatus) -> Iterator[Callable[[TrainingProgress], None]]:
     """Yield a function that shows reports; between them a terminal shows what `status` counts."""
     if not CONSOLE.is_terminal:
-        yield lambda progress: LOG.info(line(progress))
+        yield lambda progress: LOG.info(progress_line(progress))
         return
     bar = _RunBar(status)
     with _drawn(bar):
@@ -171,7 +171,7 @@ def progress_bar(status: WatchedStatus) -> Iterator[Callable[[TrainingProgress],
 
 
 @contextmanager
-def counted() -> Iterator[None]:
+def counts_on_terminal() -> Iterator[None]:
     """Show how far the counted work of the block is, where the output is a terminal; a log has its lines."""
     if not CONSOLE.is_terminal:
         yield
@@ -183,7 +183,7 @@ def counted() -> Iterator[None]:
         left = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
         bar.update(task, total=total, completed=done, description=f"{what}: {done} of {total}{left}", visible=True)
 
-    with _drawn(bar), heard_by(update):
+    with _drawn(bar), listening(update):
         yield
 
 
@@ -198,7 +198,7 @@ class _RunBar:
 
     def report(self, progress: TrainingProgress) -> None:
         self.last = time.monotonic(), progress
-        LOG.debug(line(progress))
+        LOG.debug(progress_line(progress))
 
     def __rich__(self) -> Progress:
         now = self.status.now
@@ -217,7 +217,7 @@ class _RunBar:
         if self.last and self.last[1].steps == steps:
             since, report = self.last
             left = max(0.0, report.seconds_left - (time_now - since))
-            return line(replace(report, step=step, seconds_left=left))
+            return progress_line(replace(report, step=step, seconds_left=left))
         if self.first is None or self.first[2] != steps:
             self.first = time_now, step, steps
         since, before, _ = self.first
@@ -232,7 +232,7 @@ def _new_bar() -> Progress:
 @contextmanager
 def _drawn(bar: "Progress | _RunBar") -> Iterator[None]:
     """Draw a bar in the block, several times a second; lines of the log stand above it."""
-    with Live(bar, console=CONSOLE, refresh_per_second=4, transient=True) as live, counts_shown():
+    with Live(bar, console=CONSOLE, refresh_per_second=4, transient=True) as live, counts_as_debug():
         _bars.append(live)
         try:
             yield

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.schedule import NonNegative, explained
+from clsplat.core.schedule import NonNegative, explain_schedule
 from clsplat.core.settings import Settings
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -31,7 +31,7 @@ class PixelQuantile(Settings):
     """Take the quantile over the photographs' pixels."""
 
 
-Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explained(", or {quantile, of}")]
+Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explain_schedule(", or {quantile, of}")]
 
 
 def _no_photographs(share: float) -> float:

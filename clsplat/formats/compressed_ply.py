@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
-from clsplat.core.reading import opened
+from clsplat.core.reading import open_file
 from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, written
 from clsplat.formats.ply import (
     MAX_HEADER,
@@ -55,7 +55,7 @@ def is_compressed(header: PlyHeader) -> bool:
 
 def read_compressed_ply(path: Path) -> SplatFile:
     """Read a compressed PLY.  Raises DataError when it is missing or damaged."""
-    with opened(path, "a PLY file") as file:
+    with open_file(path, "a PLY file") as file:
         header = parse_ply_header(path, file.read(MAX_HEADER))
         size = file.seek(0, os.SEEK_END)
         tables = {}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quoted
+from clsplat.core.errors import DataError, quote
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file
 from clsplat.formats.packing import Output, written
@@ -88,7 +88,7 @@ class Gltf:
         buffer = self.tree["buffers"][_index(view["buffer"])]
         if WIDTHS.get(one["type"]) != width or "sparse" in one or view["buffer"] or "uri" in buffer:
             raise DataError(
-                f"{self.path}: accessor {number} is a {quoted(one['type'])}, or lies elsewhere; expected {width} "
+                f"{self.path}: accessor {number} is a {quote(one['type'])}, or lies elsewhere; expected {width} "
                 "numbers a row in the file itself: export it again"
             )
         size = width * np.dtype(kind).itemsize
@@ -117,9 +117,9 @@ class Gltf:
     def _check(self, extension: dict[str, Any]) -> None:
         kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
         if kernel != "ellipse":
-            raise DataError(f"{self.path}: its kernel is {quoted(kernel)}; expected 'ellipse': export it again")
+            raise DataError(f"{self.path}: its kernel is {quote(kernel)}; expected 'ellipse': export it again")
         if space != "srgb_rec709_display":
-            LOG.warning("%s: its colors are %s; they are taken as they are", self.path, quoted(space))
+            LOG.warning("%s: its colors are %s; they are taken as they are", self.path, quote(space))
 
     def _meshes(self) -> list[tuple[int, NDArray[np.float64]]]:
         """The meshes of the scene, each with the matrix of its node."""
@@ -180,7 +180,7 @@ def fault(error: Exception) -> str:
     if isinstance(error, RecursionError):
         return "nested too deeply"
     if isinstance(error, KeyError):
-        return f"{quoted(error.args[0])} is missing or unknown"
+        return f"{quote(error.args[0])} is missing or unknown"
     if isinstance(error, IndexError):
         return "an index is beyond the end of its list"
     return "a value is of another kind, size or shape than in glTF 2.0"
@@ -189,7 +189,7 @@ def fault(error: Exception) -> str:
 def _index(value: Any) -> int:
     """A whole number from 0 on.  Raises NoIndex."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 40:
-        raise NoIndex(f"{quoted(value)} where a whole number from 0 on is expected")
+        raise NoIndex(f"{quote(value)} where a whole number from 0 on is expected")
     return value
 
 

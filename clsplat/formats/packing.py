@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, OutputError
-from clsplat.core.files import atomic
+from clsplat.core.files import open_atomic
 
 LOG = logging.getLogger("clsplat")
 MORTON_BITS = 21  # an axis: three fit into 63 bits
@@ -159,6 +159,6 @@ class Output:
 
 @contextmanager
 def written(path: Path) -> Iterator[Output]:
-    """Open a file as `atomic` does.  Raises OutputError."""
-    with atomic(path) as file:
+    """Open a file as `open_atomic` does.  Raises OutputError."""
+    with open_atomic(path) as file:
         yield Output(file)

@@ -20,8 +20,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quoted, shortened
-from clsplat.core.reading import opened
+from clsplat.core.errors import DataError, quote, shorten
+from clsplat.core.reading import open_file
 from clsplat.formats.packing import written
 from clsplat.formats.splats import (
     FLAT_LOG_SCALE,
@@ -116,7 +116,7 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
                 pass
             case _:
                 raise DataError(
-                    f"{path}: line {number}: cannot read {quoted(line.strip())}; expected a PLY header whose vertices "
+                    f"{path}: line {number}: cannot read {quote(line.strip())}; expected a PLY header whose vertices "
                     "have single numbers as properties: export it again"
                 )
     if not form:
@@ -139,12 +139,12 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise DataError(
-            f"{path}: has no vertices, only {shortened(', '.join(names)) or 'a header'}; expected 'element vertex N'"
+            f"{path}: has no vertices, only {shorten(', '.join(names)) or 'a header'}; expected 'element vertex N'"
         )
     *before, vertex = elements[: names.index("vertex") + 1]
     if lists := [element.name for element in before if element.has_list]:
         raise DataError(
-            f"{path}: {quoted(lists[0])}, with a list, stands before the vertices; export it with vertices first"
+            f"{path}: {quote(lists[0])}, with a list, stands before the vertices; export it with vertices first"
         )
     properties = [name for name, _ in vertex.properties]
     if not properties or len(set(properties)) < len(properties):
@@ -193,7 +193,7 @@ def read_ply(path: Path) -> SplatFile:
 
     Raises DataError when it is missing, damaged or not a splat.
     """
-    with opened(path, "a PLY file") as file:
+    with open_file(path, "a PLY file") as file:
         header = parse_ply_header(path, file.read(MAX_HEADER))
         if header.format == "ascii":
             raise DataError(f"{path}: is an ascii PLY; expected binary_little_endian or big_endian: export it again")
@@ -266,14 +266,14 @@ def checked_numbers(path: Path, values: dict[str, Any]) -> dict[str, Any]:
         value = values.get(name)
         if value is not None and (not isinstance(value, int | float) or not 0 <= value < MAX_NUMBER):
             raise DataError(
-                f"{path}: its comment says {name} = {quoted(value)}; expected a number from 0 to {MAX_NUMBER:g}: "
+                f"{path}: its comment says {name} = {quote(value)}; expected a number from 0 to {MAX_NUMBER:g}: "
                 "export it again, or correct that line"
             )
     try:
         json.dumps(values, allow_nan=False)
     except (ValueError, RecursionError) as error:
         raise DataError(
-            f"{path}: its comment holds what no JSON holds ({quoted(error)}); export it again, or correct it"
+            f"{path}: its comment holds what no JSON holds ({quote(error)}); export it again, or correct it"
         ) from error
     return values
 
@@ -356,7 +356,7 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
     with written(path) as output:
         output.write(format_ply_header(first.comments, vertex=(count, properties)))
         for number, (part, header) in enumerate(zip(parts, headers, strict=True)):
-            with opened(part, "a PLY file") as file:
+            with open_file(part, "a PLY file") as file:
                 file.seek(header.start)
                 for start in range(0, header.count, PIECE_ROWS):
                     size = min(PIECE_ROWS, header.count - start) * header.dtype.itemsize
@@ -370,7 +370,7 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
 
 
 def _header(part: Path) -> PlyHeader:
-    with opened(part, "a PLY file") as file:
+    with open_file(part, "a PLY file") as file:
         header = parse_ply_header(part, file.read(MAX_HEADER))
     kinds = {header.dtype[name] for name in header.dtype.names or ()}
     if header.format != "binary_little_endian" or list(header.sections) != ["vertex"] or kinds != {np.dtype("<f4")}:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quoted
+from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_file, read_json
 from clsplat.formats import packing
 from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, written
@@ -108,7 +108,7 @@ class Files:
     def _member(self, archive: zipfile.ZipFile, name: str) -> bytes:
         found = next((one for one in archive.infolist() if one.filename.rpartition("/")[2] == name), None)
         if found is None or found.compress_type not in KINDS:
-            fault = f"has no {quoted(name)}" if found is None else f"{quoted(name)} is compressed in another way"
+            fault = f"has no {quote(name)}" if found is None else f"{quote(name)} is compressed in another way"
             raise DataError(
                 f"{self.path}: {fault}; expected the files that {META} names, stored or deflated: export it again"
             )
@@ -117,7 +117,7 @@ class Files:
         with archive.open(found) as member:
             data = member.read(most + 1)
         if len(data) > most:
-            raise DataError(f"{self.path}: {quoted(name)} has more than {most} bytes; export it again")
+            raise DataError(f"{self.path}: {quote(name)} has more than {most} bytes; export it again")
         return data
 
 
@@ -132,7 +132,7 @@ def sog_files(path: Path) -> Iterator[Files]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             yield Files(path, archive, len(data))
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError, KeyError) as error:
-        raise DataError(f"{path}: a damaged ZIP ({quoted(error)}); copy or export the file again") from error
+        raise DataError(f"{path}: a damaged ZIP ({quote(error)}); copy or export the file again") from error
 
 
 PIXELS_PER_BYTE = 16  # of all images; real ones have less than one
@@ -167,7 +167,7 @@ class _Sog:
         self.old = "version" not in meta and isinstance(first, list)
         version = 1 if self.old else meta.get("version")
         if version not in (1, 2):
-            raise DataError(f"{path}: SOG of version {quoted(version)}; expected 1 or 2: export it again")
+            raise DataError(f"{path}: SOG of version {quote(version)}; expected 1 or 2: export it again")
         self.count = self._whole("count", first[0] if self.old and first else meta.get("count"))
         self.images = {name: self._data(name) for name in PARTS}
         if self.count > SLACK + PIXELS_PER_BYTE * files.size:
@@ -286,11 +286,11 @@ class _Sog:
         names = self._part(name).get("files")
         if not isinstance(names, list) or not 1 <= len(names) <= 2 or not all(isinstance(one, str) for one in names):
             raise DataError(
-                f"{self.path}: {name}.files is {quoted(names)}; expected the names of one or two files: export it again"
+                f"{self.path}: {name}.files is {quote(names)}; expected the names of one or two files: export it again"
             )
         if wrong := [one for one in names if not is_beside(one)]:
             raise DataError(
-                f"{self.path}: {name}.files has {quoted(wrong[0])}; "
+                f"{self.path}: {name}.files has {quote(wrong[0])}; "
                 "expected the name of a file beside it: export it again"
             )
         return [self.files.read(one) for one in names]
@@ -305,14 +305,14 @@ class _Sog:
         fits = isinstance(value, list) and count <= len(value) <= 256
         if not fits or not all(isinstance(one, int | float) and abs(one) < LIMIT for one in value):
             raise DataError(
-                f"{self.path}: {place} is {quoted(value)}; expected {count} numbers below {LIMIT:g}: export it again"
+                f"{self.path}: {place} is {quote(value)}; expected {count} numbers below {LIMIT:g}: export it again"
             )
         return np.array(value, np.float64)
 
     def _whole(self, place: str, value: Any, most: int = packing.MAX_SIDE**2) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most or math.isnan(value):
             raise DataError(
-                f"{self.path}: {place} is {quoted(value)}; expected a whole number from 1 to {most}: export it again"
+                f"{self.path}: {place} is {quote(value)}; expected a whole number from 1 to {most}: export it again"
             )
         return value
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quoted
-from clsplat.core.files import fault_of_name, is_inside
+from clsplat.core.errors import DataError, quote
+from clsplat.core.files import invalid_name_reason, is_inside
 from clsplat.core.reading import read_json
 from clsplat.formats.packing import morton_order, written
 from clsplat.formats.sog import MAX_META, META, read_sog, with_images, write_as_ordered
@@ -96,19 +96,19 @@ def files_of_lod(path: Path) -> list[Path]:
 def _meta(path: Path) -> dict[str, Any]:
     meta = read_json(path, "a lod-meta.json", limit=MAX_META)
     if not isinstance(meta, dict) or meta.get("version") != 1:
-        version = quoted(meta.get("version") if isinstance(meta, dict) else meta)
+        version = quote(meta.get("version") if isinstance(meta, dict) else meta)
         raise DataError(f"{path}: streamed SOG of version {version}; expected 1: export it again")
     names, counts = meta.get("filenames"), meta.get("counts")
     if not isinstance(names, list) or len({_inside(path, name) for name in names}) < len(names):
-        raise DataError(f"{path}: filenames is {quoted(names)}; expected names of files, each once: export it again")
+        raise DataError(f"{path}: filenames is {quote(names)}; expected names of files, each once: export it again")
     if not isinstance(counts, list) or not 1 <= len(counts) <= MOST_LEVELS:
         raise DataError(
-            f"{path}: counts is {quoted(counts)}; expected a number for each of 1 to {MOST_LEVELS} levels: export it "
+            f"{path}: counts is {quote(counts)}; expected a number for each of 1 to {MOST_LEVELS} levels: export it "
             "again"
         )
     if (levels := meta.get("lodLevels")) != len(counts):
         raise DataError(
-            f"{path}: lodLevels is {quoted(levels)}; expected {len(counts)}, as it has counts: export it again"
+            f"{path}: lodLevels is {quote(levels)}; expected {len(counts)}, as it has counts: export it again"
         )
     return meta
 
@@ -116,13 +116,13 @@ def _meta(path: Path) -> dict[str, Any]:
 def _inside(path: Path, name: Any) -> str:
     """The name of a meta.json below the folder."""
     if not isinstance(name, str) or not _is_meta_below(name):
-        raise DataError(f"{path}: names {quoted(name)}; expected a {META} in a folder below; export it again")
+        raise DataError(f"{path}: names {quote(name)}; expected a {META} in a folder below; export it again")
     return name
 
 
 def _is_meta_below(name: str) -> bool:
     path = PureWindowsPath(name)
-    return is_inside(name) and path.name == META and "\\" not in name and not any(map(fault_of_name, path.parts))
+    return is_inside(name) and path.name == META and "\\" not in name and not any(map(invalid_name_reason, path.parts))
 
 
 def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
@@ -133,7 +133,7 @@ def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
         for name, run in leaf.items():
             if name not in numbers:
                 raise DataError(
-                    f"{path}: a leaf names level {quoted(name)}; expected 0 to {len(levels) - 1}: export it again"
+                    f"{path}: a leaf names level {quote(name)}; expected 0 to {len(levels) - 1}: export it again"
                 )
             file, offset, count = (_whole(path, key, run) for key in ("file", "offset", "count"))
             levels[numbers[name]].setdefault(file, []).append((offset, count))
@@ -147,7 +147,7 @@ def _require_count(path: Path, meta: dict[str, Any], level: int, runs: Runs) -> 
     found, declared = sum(count for one in runs.values() for _, count in one), meta["counts"][level]
     if found != declared:
         raise DataError(
-            f"{path}: declares {quoted(declared)} splats of level {level}; its leaves have {found}: export it again"
+            f"{path}: declares {quote(declared)} splats of level {level}; its leaves have {found}: export it again"
         )
 
 
@@ -162,13 +162,13 @@ def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
         elif isinstance(children, list):
             waiting += children[::-1]
         else:
-            raise DataError(f"{path}: a node of its tree is {quoted(node)}; expected children or lods: export it again")
+            raise DataError(f"{path}: a node of its tree is {quote(node)}; expected children or lods: export it again")
 
 
 def _whole(path: Path, key: str, run: Any) -> int:
     value = run.get(key) if isinstance(run, dict) else None
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise DataError(f"{path}: {key} of a leaf is {quoted(value)}; expected a whole number: export it again")
+        raise DataError(f"{path}: {key} of a leaf is {quote(value)}; expected a whole number: export it again")
     return value
 
 
@@ -179,7 +179,7 @@ def _part(path: Path, name: str, runs: list[Run]) -> SplatFile:
     for offset, count in runs:
         if offset < end or offset + count > len(part):
             raise DataError(
-                f"{path}: a leaf has {count} splats from {offset} on of {quoted(name)}, which holds {len(part)} and "
+                f"{path}: a leaf has {count} splats from {offset} on of {quote(name)}, which holds {len(part)} and "
                 f"whose first {end} are in other leaves; export it again"
             )
         end = offset + count

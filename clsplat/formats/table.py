@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.core.errors import ConfigError, DataError, OutputError, quoted, shortened
-from clsplat.core.reading import opened
+from clsplat.core.errors import ConfigError, DataError, OutputError, quote, shorten
+from clsplat.core.reading import open_file
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
 from clsplat.formats.gltf_usd import read_glb, write_glb, write_usda
 from clsplat.formats.ply import MAX_HEADER, PlyHeader, checked_numbers, parse_ply_header, read_ply, write_ply
@@ -95,7 +95,7 @@ def bytes_of(path: Path) -> int:
     try:
         return sum(one.stat().st_size for one in files_of(place))
     except OSError as error:
-        missing = "" if error.filename == str(place) else f"names {quoted(error.filename)}, which "
+        missing = "" if error.filename == str(place) else f"names {quote(error.filename)}, which "
         raise DataError(f"{place}: {missing}cannot be read ({error.strerror}); copy or export it again") from error
 
 
@@ -221,7 +221,7 @@ def endings(reads: bool = False) -> list[str]:
 
 def detect(path: Path) -> Codec | None:
     """Return the format of a file by its content, or None.  Raises DataError when it cannot be read."""
-    with opened(path, "a model file") as file:
+    with open_file(path, "a model file") as file:
         start = Start(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
     return next((codec for codec in CODECS if codec.is_one(start)), None)
 
@@ -258,8 +258,8 @@ def for_writing(path: Path) -> Codec:
     codec = named(path)
     if codec is None or codec.write is None:
         how = "written " + codec.writes.partition(":")[0] if codec and codec.writes else "read, not written"
-        what = f"{codec.name} is {how}" if codec else f"no format has the name {quoted(path.name)}"
-        raise ConfigError(f"{shortened(str(path))}: {what}; expected a name that ends in {', '.join(endings())}")
+        what = f"{codec.name} is {how}" if codec else f"no format has the name {quote(path.name)}"
+        raise ConfigError(f"{shorten(str(path))}: {what}; expected a name that ends in {', '.join(endings())}")
     return codec
 
 

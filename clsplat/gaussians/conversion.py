@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from clsplat.core.errors import ConfigError, DataError, quoted
-from clsplat.core.files import check_no_file_of_a_run, is_there, scratch_folder, told_as
+from clsplat.core.errors import ConfigError, DataError, quote
+from clsplat.core.files import check_not_run_file, path_exists, raising_output_error, scratch_folder
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import (
     EXPECTED,
@@ -123,7 +123,7 @@ class ConversionOptions:
         codec, reads_axes = for_writing(out), _reads_axes(sources)
         for name, value, known in (("axes", self.axes, AXES), ("quality", self.quality, QUALITIES)):
             if value not in known:
-                raise ConfigError(f"--{name} {quoted(value)}: expected one of {', '.join(known)}")
+                raise ConfigError(f"--{name} {quote(value)}: expected one of {', '.join(known)}")
         if self.spz_version not in (3, 4):
             raise ConfigError(f"--spz-version {self.spz_version}: expected 3 or 4")
         if not codec.has_bits and (self.sh_bits is not None or self.spz_version != 3):
@@ -171,7 +171,7 @@ def check_place(sources: Sequence[Path], out: Path) -> None:
     """Raise ConfigError where the file to write is one of those that are read, or belongs to a run."""
     if any(_is_same(out, model_at(source)) for source in sources):
         raise ConfigError(f"{out}: is one of the files that are read; give another name")
-    check_no_file_of_a_run(out)
+    check_not_run_file(out)
 
 
 def transform_of(text: str) -> NDArray[np.float64]:
@@ -181,7 +181,7 @@ def transform_of(text: str) -> NDArray[np.float64]:
     Raises ConfigError.
     """
     expected = (
-        f"--transform {quoted(text)}: expected scale=S, rotate=X,Y,Z (degrees) and translate=X,Y,Z with blanks "
+        f"--transform {quote(text)}: expected scale=S, rotate=X,Y,Z (degrees) and translate=X,Y,Z with blanks "
         "between, or the 12 or 16 numbers of a matrix, row by row"
     )
     try:
@@ -200,7 +200,7 @@ def transform_of(text: str) -> NDArray[np.float64]:
     turned = matrix[:3, :3]
     if not np.abs(matrix).max() < MAX_NUMBER or not (np.abs(turned).max() or 1) > 1 / MAX_NUMBER:
         raise ConfigError(
-            f"--transform {quoted(text)}: expected a scale from {1 / MAX_NUMBER:g} to {MAX_NUMBER:g}, and a "
+            f"--transform {quote(text)}: expected a scale from {1 / MAX_NUMBER:g} to {MAX_NUMBER:g}, and a "
             "translation below that"
         )
     scale2 = turned @ turned.T
@@ -209,7 +209,7 @@ def transform_of(text: str) -> NDArray[np.float64]:
         or np.linalg.det(turned) <= 0
         or not np.allclose(scale2, scale2[0, 0] * np.eye(3), atol=1e-5 * scale2[0, 0])
     ):
-        raise ConfigError(f"--transform {quoted(text)}: stretches or mirrors; expected one scale and a rotation")
+        raise ConfigError(f"--transform {quote(text)}: stretches or mirrors; expected one scale and a rotation")
     return matrix
 
 
@@ -236,14 +236,14 @@ def crop_of(text: str) -> tuple[float, ...]:
     except ValueError:
         box = ()
     if len(box) != 6 or not all(low <= high for low, high in zip(box[:3], box[3:], strict=True)):
-        raise ConfigError(f"--crop {quoted(text)}: expected x0,y0,z0,x1,y1,z1, the least first, in scene units")
+        raise ConfigError(f"--crop {quote(text)}: expected x0,y0,z0,x1,y1,z1, the least first, in scene units")
     return box
 
 
 def sh_bits_of(text: str) -> tuple[int, int]:
     """Return the bits of `A/B`: of band 1 and of the others.  Raises ConfigError."""
     if not (found := re.fullmatch("([1-8])/([1-8])", text)):
-        raise ConfigError(f"--sh-bits {quoted(text)}: expected two numbers from 1 to 8, such as 8/6")
+        raise ConfigError(f"--sh-bits {quote(text)}: expected two numbers from 1 to 8, such as 8/6")
     return int(found[1]), int(found[2])
 
 
@@ -337,9 +337,9 @@ def _all_or_as_before(places: Sequence[Path]) -> Iterator[None]:
     Raises OutputError.
     """
     folder = places[0].parent
-    was_there = is_there(folder)
+    was_there = path_exists(folder)
     try:
-        with scratch_folder(folder / "series") as kept, told_as(folder):
+        with scratch_folder(folder / "series") as kept, raising_output_error(folder):
             before = [place for place in places if place.is_file()]
             for place in before:
                 _keep(place, kept / place.name)
@@ -369,7 +369,7 @@ def _keep(place: Path, other: Path) -> None:
 def _require_no_others(folder: Path, names: re.Pattern[str], places: Sequence[Path]) -> None:
     """Raise ConfigError where a folder has frames of another series, which a player would take for this one's."""
     own = {place.name for place in places}
-    with told_as(folder):
+    with raising_output_error(folder):
         there = sorted(os.listdir(folder)) if folder.is_dir() else []
     if others := [name for name in there if names.fullmatch(name) and name not in own]:
         raise ConfigError(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.core.files import METRICS, is_inside
-from clsplat.core.harmonics import rotated_sh
+from clsplat.core.harmonics import rotate_sh
 from clsplat.core.quaternions import multiply, unit_quaternions
 from clsplat.core.reading import read_json
 from clsplat.formats import splats as columns
@@ -227,7 +227,7 @@ class Model:
                 "means": scale * self.means.astype(np.float64) @ turn.T + np.asarray(translation, np.float64),
                 "quats": multiply(unit_quaternions(turn), self.quats.astype(np.float64)),
                 "log_scales": self.log_scales + np.log(scale),
-                "sh_rest": rotated_sh(self.sh_rest, turn),
+                "sh_rest": rotate_sh(self.sh_rest, turn),
             }
             if self.motion is not None:
                 changed["motion"] = transformed_motion(self.motion, scale, turn)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
-from clsplat.core.files import unwritable, write_text
+from clsplat.core.files import write_error, write_text
 from clsplat.core.reading import read_json, sha256
 from clsplat.opencl.device import Array, Device
 
@@ -158,7 +158,7 @@ def keep_sky(sky: Sky | None, model: Path, digest: str) -> None:
         try:
             path.unlink()
         except OSError as error:
-            raise unwritable(path, error) from error
+            raise write_error(path, error) from error
 
 
 def sky_beside(model: Path, expected: bool = False) -> Sky | None:

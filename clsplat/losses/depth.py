@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import at_step
-from clsplat.core.settings import ReadPath
+from clsplat.core.settings import InputPath
 from clsplat.losses.base import Comparison, ImageLoss, LossValue
 from clsplat.render.rasterizer import Content
 
@@ -22,7 +22,7 @@ class InverseDepth(ImageLoss):
     """
 
     type: Literal["inverse_depth"] = "inverse_depth"
-    folder: ReadPath | None = None
+    folder: InputPath | None = None
     """Folder of depth maps, one for each photograph: `a.png` for a.jpg, 8 or 16 bits, bright is near, linear in 1/z.
     Each is fitted to the points of its photograph, and compared with in their place; without it, the points alone."""
     reads_photograph: ClassVar[bool] = False

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PrivateAttr, ValidationError
 
-from clsplat.core.errors import ConfigError, NumericError, quoted
+from clsplat.core.errors import ConfigError, NumericError, quote
 from clsplat.core.schedule import NonNegative, Schedule, at_step
 from clsplat.losses.base import Comparison, ImageLoss, LossValue
 
@@ -30,7 +30,7 @@ class HostLoss(ImageLoss):
             super().__init__(weight=weight.item() if isinstance(weight, np.generic) else weight)
         except ValidationError as error:
             reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-            raise ConfigError(f"the weight of the loss is {quoted(weight)}; {reason}") from None
+            raise ConfigError(f"the weight of the loss is {quote(weight)}; {reason}") from None
         self._function = function
 
     @property
@@ -65,7 +65,7 @@ class HostLoss(ImageLoss):
             value, derivative = float(value), np.asarray(derivative, np.float32)
         except (TypeError, ValueError):
             raise ValueError(
-                f"the loss '{self.name}' returned {quoted(found)}; expected (value, derivative by the image)"
+                f"the loss '{self.name}' returned {quote(found)}; expected (value, derivative by the image)"
             ) from None
         if derivative.shape != image.shape:
             raise ValueError(

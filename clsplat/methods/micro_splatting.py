@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.core.schedule import NonNegative, Positive, explained
+from clsplat.core.schedule import NonNegative, Positive, explain_schedule
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import largest
 from clsplat.density.mixture import mass_of, merge
@@ -111,7 +111,7 @@ class SplitOversized(Subdivide):
     type: Literal["split_oversized"] = "split_oversized"
     training_keys: ClassVar[frozenset[str]] = frozenset({"rms_above"})
 
-    rms_above: Annotated[Quantile | Positive, explained(", or {quantile}")] = 0.01
+    rms_above: Annotated[Quantile | Positive, explain_schedule(", or {quantile}")] = 0.01
     """Smallest rms scale, a share of the scene's extent by step, or a quantile of all rms scales."""
     pixels: Annotated[float, Field(gt=0)] | None = None
     """Smallest rms scale in px of the nearest training view; replaces `rms_above`."""

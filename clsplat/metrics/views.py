@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, NumericError, amount
+from clsplat.core.errors import DataError, NumericError, pluralize
 from clsplat.formats.splats import inverse_opacities
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import Comparison
@@ -238,7 +238,7 @@ def tell_of_colors(averages: dict[str, Any]) -> None:
     elif reason:
         LOG.warning(
             "in the photographs' colors: PSNR %.2f dB, the mean of %s: %s",
-            *(figure, amount(averages["psnr_color_views"], "view"), reason),
+            *(figure, pluralize(averages["psnr_color_views"], "view"), reason),
         )
     else:
         differ = figure - averages["psnr"] > GUESSED

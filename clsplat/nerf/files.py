@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from clsplat.core.errors import DataError, one_line, quoted, shortened
-from clsplat.core.files import atomic, is_there
+from clsplat.core.errors import DataError, one_line, quote, shorten
+from clsplat.core.files import open_atomic, path_exists
 from clsplat.core.reading import sha256
 from clsplat.core.resources import __version__
 from clsplat.gaussians.model import Rendering, file_of_run
@@ -71,7 +71,7 @@ class FieldModel:
             background=shown.background or "black",
             alpha=shown.alpha,
         )
-        with atomic(path) as file:
+        with open_atomic(path) as file:
             archive.write(file, notes.model_dump(), [(PARAMETERS, self.parameters[:, None])])
         return sha256(path)
 
@@ -95,19 +95,19 @@ def load_field(path: str | Path) -> FieldModel:
     Raises DataError when it is missing, damaged or of something else.
     """
     path = field_of_run(Path(path)) if Path(path).is_dir() else Path(path)
-    if not is_there(path):
+    if not path_exists(path):
         raise DataError(f"{path}: not found; expected a file of the stage export_field")
     try:
         return _checked(*archive.read(path))
     except (DataError, ValueError) as error:
-        reason = shortened(one_line(error))
+        reason = shorten(one_line(error))
         raise DataError(f"{path}: {reason}; expected a file of the stage export_field, whole") from error
 
 
 def _checked(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel:
     """A field of what a file holds.  Raises DataError or ValueError."""
     if notes.get("format") != FORMAT or "shape" not in notes:
-        raise DataError(f"is of format {quoted(str(notes.get('format')))}, or of something else than a field")
+        raise DataError(f"is of format {quote(str(notes.get('format')))}, or of something else than a field")
     try:
         found = Notes.model_validate(dict(notes))
     except ValidationError as error:

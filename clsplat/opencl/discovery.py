@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from clsplat.core.errors import ConfigError, DeviceError, one_line, quoted
+from clsplat.core.errors import ConfigError, DeviceError, one_line, quote
 from clsplat.opencl import runtimes
 
 runtimes.prepare()
@@ -157,7 +157,7 @@ def _named(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
     name, number = numbered.groups() if numbered else (device_name, "0")
     matching = [info for info in devices if info.matches(name)]
     if int(number) >= len(matching):
-        raise DeviceError(f"no device matches {quoted(device_name)}; there are: {'; '.join(i.text for i in devices)}")
+        raise DeviceError(f"no device matches {quote(device_name)}; there are: {'; '.join(i.text for i in devices)}")
     info = matching[int(number)]
     fault = info.fault()
     if fault is not None:

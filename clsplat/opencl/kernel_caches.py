@@ -16,8 +16,8 @@ import platformdirs
 
 from clsplat.core.errors import DataError, OutputError
 from clsplat.core.files import write_text
-from clsplat.core.machine import LIBRARIES, cache_folder, named_by_user
-from clsplat.core.reading import read_text, regular
+from clsplat.core.machine import LIBRARIES, cache_folder, user_cache_folders
+from clsplat.core.reading import open_regular, read_text
 
 LOG = logging.getLogger("clsplat")
 SQLITE, SQLITE_HEADER = b"SQLite format 3\0", 100  # bytes
@@ -77,7 +77,7 @@ def _kernels_of_pocl(folder: Path) -> list[Path]:
 def _is_cut(library: Path) -> bool:
     """Whether a library is empty, is none, or ends before its table of sections, which linkers write last."""
     try:
-        with regular(library) as file:
+        with open_regular(library) as file:
             head, size = file.read(ELF_HEADER), file.seek(0, os.SEEK_END)
     except OSError:
         return False
@@ -92,7 +92,7 @@ def _is_cut(library: Path) -> bool:
 
 def _is_database(file: Path) -> bool:
     """Whether a file can be that of SQLite, with all pages that its header counts; an empty one is a new one."""
-    with suppress(OSError), regular(file) as opened:
+    with suppress(OSError), open_regular(file) as opened:
         head = opened.read(SQLITE_HEADER)
         if len(head) < SQLITE_HEADER or not head.startswith(SQLITE):
             return not head
@@ -112,7 +112,7 @@ def empty_kernel_caches() -> Iterator[dict[str, str]]:
 
 def _kernel_folders() -> list[Path]:
     pyopencl, pytools, pocl = (Path(platformdirs.user_cache_dir(name, name)) for name in LIBRARIES)
-    return [pyopencl, pytools, next(iter(named_by_user()), pocl)]
+    return [pyopencl, pytools, next(iter(user_cache_folders()), pocl)]
 
 
 def _is_full(folder: Path) -> bool:

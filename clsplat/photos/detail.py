@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.core.schedule import EverySteps, Points, acts, place
+from clsplat.core.schedule import EverySteps, Points, count_fired, fire_step
 from clsplat.core.settings import Settings
 
 Floats = NDArray[np.float64]
@@ -97,8 +97,8 @@ class DetailDivisor(Settings):
     @property
     def changes(self) -> list[int]:
         """The steps before those at which the size may change; at the last one it is the full size."""
-        first, last = acts(self.every, self.start) + 1, acts(self.every, self.until - 1) + 1
-        return [place(self.every, number) for number in range(first, last + 1)]
+        first, last = count_fired(self.every, self.start) + 1, count_fired(self.every, self.until - 1) + 1
+        return [fire_step(self.every, number) for number in range(first, last + 1)]
 
     def of(self, photographs: Iterable[NDArray[np.uint8]]) -> Points:
         """Return the divisors of training photographs, each [height, width, 3], by step."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.schedule import AtLeastOne, Points, at_step, explained
+from clsplat.core.schedule import AtLeastOne, Points, at_step, explain_schedule
 from clsplat.core.settings import OneOf, Settings
 from clsplat.photos.detail import DetailDivisor, course
 from clsplat.photos.transforms import PhotographTransform
@@ -95,7 +95,7 @@ class ViewSettings(Settings):
 
     order: OneOf[Order] = Uniform()
     """Which view a step trains on."""
-    resolution: Annotated[DetailDivisor | AtLeastOne, explained(", or {follows: detail, until, …}")] = 1.0
+    resolution: Annotated[DetailDivisor | AtLeastOne, explain_schedule(", or {follows: detail, until, …}")] = 1.0
     """Divisor of the photographs' size beside `scene.downscale`, at least 1: by step, or from their detail."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
     """Transforms of the photograph, in order."""

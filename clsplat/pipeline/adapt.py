@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from clsplat.core.errors import amount
+from clsplat.core.errors import pluralize
 from clsplat.core.settings import Settings
 from clsplat.scene.quality import Measures
 from clsplat.stages.densify import Densify
@@ -74,7 +74,7 @@ class Photos(Adaptation):
 
     def decide(self, training: Optimize, measures: Measures) -> Iterator[Decision]:
         count, few = measures.photographs, measures.photographs < FEW
-        counted = amount(count, "training photograph")
+        counted = pluralize(count, "training photograph")
         hull = "few leave too large a hull" if few else "many leave a small hull"
         why = f"{counted}; of transparent photographs, the silhouettes of {hull}"
         yield Decision(key="init.transparent", value="random" if few else "hull", reason=why)

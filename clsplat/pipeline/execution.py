@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.settings import ReadPath, Settings
+from clsplat.core.settings import InputPath, Settings
 from clsplat.pipeline.explanation import explain, first_fault
 from clsplat.pipeline.yaml_file import read_yaml
 
@@ -28,11 +28,11 @@ class Placement(Settings):
 class Tls(Settings):
     """The certificates of a scheduler elsewhere, PEM files."""
 
-    ca: ReadPath
+    ca: InputPath
     """Certificate of the authority."""
-    cert: ReadPath
+    cert: InputPath
     """Certificate of this side."""
-    key: ReadPath
+    key: InputPath
     """Its private key."""
 
 
@@ -50,7 +50,7 @@ class Execution(Settings):
     engine: Annotated[str, BeforeValidator(_engine), Field(pattern=ENGINE)] = "inline"
     """inline: one after the other in this process; local: one process a device of this machine; dask://HOST:PORT or
     tls://HOST:PORT: the devices that `clsplat worker` offers to that scheduler."""
-    store: ReadPath | None = None
+    store: InputPath | None = None
     """Folder of cells and results, shared by all machines; without it runs/store, and inline runs without a store."""
     devices: Literal["auto"] | Annotated[list[str], Field(min_length=1)] = "auto"
     """Devices of this machine, as `--device` takes them; auto: every device that works; inline: the first."""

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from clsplat.core.errors import quoted, shortened
+from clsplat.core.errors import quote, shorten
 from clsplat.core.settings import TAGS, Settings, Variants, variants
 from clsplat.pipeline.yaml_file import Document, Place
 
@@ -142,17 +142,17 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
         known = [name for name in (model.model_fields if model else {}) if name not in TAGS]
-        return f"unknown key {quoted(place[-1])}{_nearest(str(place[-1]), known)}"
+        return f"unknown key {quote(place[-1])}{_nearest(str(place[-1]), known)}"
     if kind == "missing":
         return f"'{place[-1]}' is missing"
     if kind == "union_tag_invalid":
         known = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
-        tag = shortened(str(error["ctx"]["tag"]))
+        tag = shorten(str(error["ctx"]["tag"]))
         return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}; one of a plug-in needs --plugin FILE.py"
     if kind == "union_tag_not_found":
         tag = Variants(bases(annotation)[0]).tag
         return f"expected a '{tag}', the name of the {_kind(annotation)}"
-    got = f", got {quoted(value)}"
+    got = f", got {quote(value)}"
     if kind in EXPECTATIONS:
         return f"expected {EXPECTATIONS[kind].format(**error.get('ctx', {}))}{got}"
     message = error["msg"].removeprefix("Value error, ")
@@ -178,7 +178,7 @@ def place_text(place: Place) -> str:
     """Return a place as text, such as stages[1].optimize.steps."""
     text = ""
     for part in place:
-        name = shortened(str(part))
+        name = shorten(str(part))
         text += f"[{part}]" if isinstance(part, int) else f".{name}" if text else name
     return text
 

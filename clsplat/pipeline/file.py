@@ -13,8 +13,8 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import AfterValidator, Field, field_validator
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.files import fault_of_name
-from clsplat.core.settings import OneOf, ReadPath, Settings, nested
+from clsplat.core.files import invalid_name_reason
+from clsplat.core.settings import InputPath, OneOf, Settings, iter_settings
 from clsplat.opencl.discovery import Schedule
 from clsplat.pipeline.adapt import Adaptation
 from clsplat.prepare.steps import Step
@@ -37,7 +37,7 @@ class SceneSettings(Settings):
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"image_budget"})
 
-    path: ReadPath | None = None
+    path: InputPath | None = None
     """Folder of the dataset; usually given by --scene."""
     downscale: Annotated[float, Field(ge=1)] = 1
     """Divisor of the photographs' size."""
@@ -45,7 +45,7 @@ class SceneSettings(Settings):
     """Number of sizes in training: at `downscale`, and at twice, four times, … that."""
     alpha: Alpha = "transparency"
     """Fourth channel of photographs: blended with the background, or a mask of the pixels that count."""
-    masks: ReadPath | None = None
+    masks: InputPath | None = None
     """Folder of masks that something else has made, for a dataset without: `a.png` or `a.jpg.png` of the photograph
     a.jpg, of its size, white in pixels that count.  A photograph without one counts whole."""
     background: Literal["auto", "black", "white"] = "auto"
@@ -137,7 +137,7 @@ STAGE_LISTS = ("prepare", "stages")
 
 
 def _folder_name(name: str) -> str:
-    if fault := fault_of_name(name):
+    if fault := invalid_name_reason(name):
         raise ValueError(f"expected the name of a folder: {fault}")
     return name
 
@@ -171,7 +171,7 @@ class PipelineFile(Settings):
 
     def check_together(self) -> None:
         """Raise ConfigError for the first settings that do not go together, as their classes say."""
-        found = list(nested(self))
+        found = list(iter_settings(self))
         for place, one in found:
             one.check_with(self)
             for name, why in one.excluded().items():
@@ -186,7 +186,7 @@ class PipelineFile(Settings):
     def harmonics(self) -> Harmonics:
         """Where harmonics lie: `auto` is the device where a stage needs all of them there, or bands above 0 lack."""
         asked = self.rasterizer.harmonics
-        is_needed = any(ON_HOST in one.excluded() for _, one in nested(self.stages))
+        is_needed = any(ON_HOST in one.excluded() for _, one in iter_settings(self.stages))
         return "device" if asked == "auto" and (self.model.sh_degree == 0 or is_needed) else asked
 
     @property

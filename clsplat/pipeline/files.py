@@ -8,7 +8,7 @@ import difflib
 import re
 from pathlib import Path
 
-from clsplat.core.errors import ConfigError, in_shell, quoted
+from clsplat.core.errors import ConfigError, quote, shell_quote
 from clsplat.core.files import PIPELINE
 from clsplat.core.resources import resource_dir
 
@@ -38,7 +38,7 @@ def find(name: str) -> Path:
         is_run = is_folder and (path / PIPELINE).is_file()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise ConfigError(f"{quoted(name)}: not the name of a file ({reason})") from error
+        raise ConfigError(f"{quote(name)}: not the name of a file ({reason})") from error
     if is_file:
         return path
     if path.suffix in (".yaml", ".yml"):
@@ -50,12 +50,12 @@ def find(name: str) -> Path:
         return files[name]
     if is_run:
         raise ConfigError(
-            f"{path}: is a run folder, expected a pipeline; `clsplat resume {in_shell(path)}` goes on with the run"
+            f"{path}: is a run folder, expected a pipeline; `clsplat resume {shell_quote(path)}` goes on with the run"
         )
     if is_folder:
-        remedy = f"with a scene it is `clsplat run splat_7k --scene {in_shell(path)}`"
+        remedy = f"with a scene it is `clsplat run splat_7k --scene {shell_quote(path)}`"
         raise ConfigError(f"{path}: is a folder, expected a pipeline file; {remedy}")
     near = difflib.get_close_matches(name, files, n=1)
     unknown = ", and no such file or folder; `clsplat pipelines` lists pipelines"
     hint = f"; did you mean '{near[0]}'?" if near else unknown
-    raise ConfigError(f"no pipeline named {quoted(name)}{hint}")
+    raise ConfigError(f"no pipeline named {quote(name)}{hint}")

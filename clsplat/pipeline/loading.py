@@ -9,10 +9,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from clsplat.core.errors import ConfigError, OverrideError, one_line, quoted
+from clsplat.core.errors import ConfigError, OverrideError, one_line, quote
 from clsplat.core.files import PREPARED
-from clsplat.core.schedule import is_act
-from clsplat.core.settings import nested, variants
+from clsplat.core.schedule import fires_at
+from clsplat.core.settings import iter_settings, variants
 from clsplat.density.edit import Rule
 from clsplat.pipeline import plugins
 from clsplat.pipeline.adapt import Decision
@@ -130,7 +130,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
         settings.check_together()
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
-    found = [one for _, one in nested(settings)]
+    found = [one for _, one in iter_settings(settings)]
     kinds = {*map(type, found), *(kind for one in found if isinstance(one, Rule) for kind in one.columns)}
     return settings.model_copy(update={"plugins": plugins.used_by(kinds)})
 
@@ -193,7 +193,7 @@ def _keeping(settings: PipelineFile, places: Sequence[Place]) -> PipelineFile:
         return settings
     keep, data, keys = adapt.keep, settings.model_dump(mode="json"), adapt.keys(settings.optimize)
     if unknown := [key for key in (*keep, *(one.key for one in adapt.decisions or ())) if key not in keys]:
-        raise ConfigError(f"adapt: {adapt.type} does not decide {quoted(unknown[0])}; there are {', '.join(keys)}")
+        raise ConfigError(f"adapt: {adapt.type} does not decide {quote(unknown[0])}; there are {', '.join(keys)}")
     for key in keys:
         try:
             own = apply(copy.deepcopy(data), f"{key}=null", PipelineFile)
@@ -274,7 +274,7 @@ def _late(stages: Sequence[Stage], need: str) -> str:
         for inner in training.during:
             if need in inner.makes and inner.every:
                 cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
-                acts = any(is_act(inner.every, one) for one in range(step + 1, step + training.steps))
+                acts = any(fires_at(inner.every, one) for one in range(step + 1, step + training.steps))
                 remedies = [] if acts else [f"set {inner.stage}.every below {training.steps}"]
                 remedies += [f"set {inner.stage}.start earlier"] if acts or inner.start >= step + training.steps else []
                 return f"{cadence}; the training ends before: {' and '.join(remedies)}, or use --minutes"

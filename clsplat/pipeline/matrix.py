@@ -23,9 +23,9 @@ from typing import Annotated, Any
 
 from pydantic import Field, JsonValue, ValidationError, model_validator
 
-from clsplat.core.errors import ConfigError, OverrideError, quoted, shortened
-from clsplat.core.files import fault_of_output
-from clsplat.core.settings import ReadPath, Settings
+from clsplat.core.errors import ConfigError, OverrideError, quote, shorten
+from clsplat.core.files import invalid_output_reason
+from clsplat.core.settings import InputPath, Settings
 from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.explanation import explain, place_text
 from clsplat.pipeline.file import Name
@@ -59,9 +59,9 @@ MAX_CELLS = 1000
 class Matrix(Settings):
     """The axes; the names of cells hold the values of all axes in the file."""
 
-    pipelines: list[ReadPath] = Field([])
+    pipelines: list[InputPath] = Field([])
     """Pipeline files, or names of shipped pipelines; without them, the stages of this file."""
-    scenes: list[ReadPath] = Field([])
+    scenes: list[InputPath] = Field([])
     """Folders of datasets; without them, the scene of the pipeline or of --scene."""
     seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field([])
     """Seeds; without them, the seed of the pipeline."""
@@ -79,7 +79,7 @@ class Matrix(Settings):
             raise ValueError("expected one of pipelines, scenes, seeds and set")
         for axis in axes:
             if len({json.dumps(value) for value in axis}) < len(axis):
-                raise ValueError(f"the same value twice in {quoted(axis)}")
+                raise ValueError(f"the same value twice in {quote(axis)}")
         return self
 
 
@@ -214,7 +214,7 @@ def _cell(base: _Base, choices: Sequence[_Choice], overrides: Sequence[str]) -> 
     try:
         pipeline = checked(base.path, base.document, [*overrides, *(choice.override for choice in choices)])
     except OverrideError as error:
-        raise ConfigError(f"{base.path}: cell '{shortened(name)}' of the matrix: {error.reason}") from error
+        raise ConfigError(f"{base.path}: cell '{shorten(name)}' of the matrix: {error.reason}") from error
     return Cell(name, pipeline)
 
 
@@ -244,8 +244,8 @@ def _check_overrides(path: Path, axes: Sequence[Sequence[_Choice]], overrides: S
 
 def _check_names(path: Path, cells: Sequence[Cell]) -> None:
     for cell in cells:
-        if fault := fault_of_output(cell.name):
-            raise ConfigError(f"{path}: a cell of the matrix would be named '{shortened(cell.name)}': {fault}")
+        if fault := invalid_output_reason(cell.name):
+            raise ConfigError(f"{path}: a cell of the matrix would be named '{shorten(cell.name)}': {fault}")
     names = [cell.name.casefold() for cell in cells]  # some file systems ignore case
     if twice := next((cell.name for cell in cells if names.count(cell.name.casefold()) > 1), None):
         raise ConfigError(f"{path}: two cells of the matrix would be named '{twice}'; rename a pipeline or a folder")

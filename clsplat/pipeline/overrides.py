@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from clsplat.core.errors import ConfigError, OverrideError, quoted, shortened
+from clsplat.core.errors import ConfigError, OverrideError, quote, shorten
 from clsplat.core.settings import TAGS, Variants, descriptions, variants
 from clsplat.pipeline.explanation import annotations, bases, inside_list, model_of, with_tags
 from clsplat.pipeline.yaml_file import Place, parse_value
@@ -57,9 +57,9 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
         node.data[i] = with_tags(parsed, node.inside)
         return (*node.place, i)
     if not isinstance(node.data, dict):
-        raise NoSuchKey(text, f"nothing lies below {quoted(node.place[-1])}")
+        raise NoSuchKey(text, f"nothing lies below {quote(node.place[-1])}")
     if not node.place and last not in root.model_fields:
-        raise NoSuchKey(text, f"no key {quoted(last)} at the top of a pipeline")
+        raise NoSuchKey(text, f"no key {quote(last)} at the top of a pipeline")
     node.data[last] = with_tags(parsed, node.annotation(last))
     return (*node.place, last)
 
@@ -94,12 +94,12 @@ class _Node:
         if isinstance(self.data, list):
             return self._item(self.number(name, text))
         if not isinstance(self.data, dict):
-            raise NoSuchKey(text, f"nothing lies below {quoted(self.place[-1])}")
+            raise NoSuchKey(text, f"nothing lies below {quote(self.place[-1])}")
         if stage := self._stage(name, text):
             return stage
         if self.data.get(name) is None:
             if not self.place and name not in self._fields:
-                raise NoSuchKey(text, f"no {quoted(name)} in this pipeline")
+                raise NoSuchKey(text, f"no {quote(name)} in this pipeline")
             default = self._fields[name].get_default(call_default_factory=True) if name in self._fields else None
             is_list = isinstance(default, list)
             self.data[name] = _as_written(default) if isinstance(default, BaseModel) else [] if is_list else {}
@@ -119,7 +119,7 @@ class _Node:
         if name not in kinds:
             near = difflib.get_close_matches(name, kinds, n=1)
             meant = f"; did you mean {near[0]}?" if near else ""
-            raise OverrideError(text, f"no {quoted(name)}; expected one of {', '.join(kinds)}{meant}")
+            raise OverrideError(text, f"no {quote(name)}; expected one of {', '.join(kinds)}{meant}")
         if value is not None and not isinstance(value, dict):
             raise OverrideError(text, "expected a mapping of its keys, such as {}, or null")
         places = [one["type"] for one in self.data]
@@ -138,7 +138,7 @@ class _Node:
         if re.fullmatch(r"[0-9]{1,9}", name) and int(name) < len(self.data):
             return int(name)
         count = len(self.data)
-        raise NoSuchKey(text, f"expected a number below {count} in a list of {count}, got {quoted(name)}")
+        raise NoSuchKey(text, f"expected a number below {count} in a list of {count}, got {quote(name)}")
 
     @property
     def _fields(self) -> dict[str, Any]:
@@ -176,8 +176,8 @@ class _Node:
         if not found and not self.place:
             found = [inner for node in own for inner in node._stages() if inner.data["stage"] == name]
         if len(found) > 1:
-            numbers = shortened(" or ".join(_address(node.place) for node in found), 200)
-            raise OverrideError(text, f"there are {len(found)} stages named {quoted(name)}; write {numbers} for it")
+            numbers = shorten(" or ".join(_address(node.place) for node in found), 200)
+            raise OverrideError(text, f"there are {len(found)} stages named {quote(name)}; write {numbers} for it")
         return found[0] if found else None
 
 

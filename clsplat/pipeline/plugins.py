@@ -21,7 +21,7 @@ from types import ModuleType
 import clsplat.pipeline.file  # noqa: F401  defines all settings of the package
 from clsplat.core.errors import PLUGIN_MARK, ClsplatError, ConfigError
 from clsplat.core.reading import read_file
-from clsplat.core.settings import Settings, fault_of, rebuild
+from clsplat.core.settings import Settings, invalid_variant_reason, rebuild_models
 from clsplat.scene.detect import readers
 from clsplat.scene.reader import Reader
 
@@ -152,11 +152,11 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
             yield kinds
         added = [kind for known, old in zip(lists, before, strict=True) for kind in known if kind not in old]
         kinds += [kind for kind in added if not _within(kind.__module__, "clsplat")]
-        rebuild()
+        rebuild_models()
         readers()
         for kind in kinds:
             setattr(sys.modules[kind.__module__], PLUGIN_MARK, True)
-            if issubclass(kind, Settings) and (fault := fault_of(kind)):
+            if issubclass(kind, Settings) and (fault := invalid_variant_reason(kind)):
                 raise ConfigError(f"class {kind.__name__}: {fault}")
     except BaseException as error:
         place = _place(module, path, error)
@@ -166,7 +166,7 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
                 del sys.modules[name]
         for known, old in zip(lists, before, strict=True):
             known[:] = [kind for kind in known if kind in old or _within(kind.__module__, "clsplat")]
-        rebuild()
+        rebuild_models()
         if isinstance(error, KeyboardInterrupt):
             raise
         raise _failure(place, error) from error

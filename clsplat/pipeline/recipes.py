@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.files import is_there, write_text
+from clsplat.core.files import path_exists, write_text
 from clsplat.core.settings import Settings, needs_settings, variants
 from clsplat.core.text_table import text_table
 from clsplat.pipeline.execution import Execution
@@ -71,8 +71,8 @@ def manual_text(found: dict[str, Any]) -> str:
 def copy(name: str, file: Path) -> Path:
     """Copy a pipeline to a file, or into a folder; return the copy.  Raises ConfigError when the copy exists."""
     source = find(name)
-    target = file / source.name if is_there(file) and file.is_dir() else file
-    if is_there(target):
+    target = file / source.name if path_exists(file) and file.is_dir() else file
+    if path_exists(target):
         raise ConfigError(f"{target}: exists and is not overwritten; give another name")
     write_text(target, read_pipeline(source))
     return target

@@ -13,7 +13,7 @@ from fractions import Fraction
 from itertools import pairwise
 from typing import Any, TypeVar
 
-from clsplat.core.schedule import acts, divided, places
+from clsplat.core.schedule import count_fired, divide, fire_steps
 from clsplat.core.settings import Settings
 from clsplat.pipeline.file import PipelineFile
 from clsplat.stages.densify import Densify
@@ -56,17 +56,17 @@ class Axis:
     def start(self, start: int, every: float) -> int:
         """Return the step after which what acted after `start` acts: before its first act, and from the last
         one that is left out on."""
-        number = acts(every, start)
+        number = count_fired(every, start)
         return max(0, min(max(self.at(start), self._act(every, number)), self._act(every, number + 1) - 1))
 
     def stop(self, stop: int, every: float) -> int:
         """Return the step before which what acted before `stop` acts: behind its last act."""
-        number = acts(every, stop - 1)
+        number = count_fired(every, stop - 1)
         return min(max(self._act(every, number) + 1, min(self.at(stop), self._act(every, number + 1))), MOST)
 
     def until(self, until: int, every: float) -> int:
         """Return the step up to which acts follow, the last of them at it or next behind it: behind those before."""
-        number = acts(every, until - 1)
+        number = count_fired(every, until - 1)
         return max(1, min(max(self._act(every, number) + 1, self.at(until)), self._act(every, number + 1)))
 
     def _act(self, every: float, number: int) -> int:
@@ -105,7 +105,7 @@ def fewest_steps(training: Training) -> int:
         step
         for stage in training.during
         if stage.edits and stage.every is not None and stage.every != 1
-        for step in places(stage.every, stage.start, min(stage.stop or MOST, training.steps))
+        for step in fire_steps(stage.every, stage.start, min(stage.stop or MOST, training.steps))
     }
     if isinstance(training, Optimize):
         found |= {int(step) for step in training.views.changes}
@@ -156,7 +156,7 @@ def _stretched(value: Any, axis: Axis) -> Any:
         name: _steps(name, field, axis, every) if name in keys else _stretched(field, axis)
         for name, field in fields.items()
     }
-    changed |= {name: divided(changed[name], float(axis.exact)) for name in type(value).rate_keys if axis.exact != 1}
+    changed |= {name: divide(changed[name], float(axis.exact)) for name in type(value).rate_keys if axis.exact != 1}
     return value.model_copy(update={name: new for name, new in changed.items() if new is not fields[name]})
 
 

@@ -16,7 +16,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
-from clsplat.core.errors import ConfigError, quoted, shortened
+from clsplat.core.errors import ConfigError, quote, shorten
 from clsplat.core.reading import read_text
 from clsplat.pipeline.files import origin
 
@@ -101,7 +101,7 @@ def _short(text: str, path: Path, file: Path) -> str:
     for place, value in {"name": path.stem, **values}.items():
         if not (node := _node(root, place)):
             where = f"{file}:{document.line(('short', place))}: short"
-            raise ConfigError(f"{where}: the file has no {quoted(place)}; expected one of its keys, as in --set")
+            raise ConfigError(f"{where}: the file has no {quote(place)}; expected one of its keys, as in --set")
         edits.append((node.start_mark.index, node.end_mark.index, value))
     for first, last, new in sorted(edits, reverse=True):
         text = text[:first] + new + text[last:]
@@ -160,7 +160,7 @@ def _parse(text: str, name: str) -> Document:
         line, complaint = error.line, str(error)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        complaint = shortened((error.problem or error.context or "this is not YAML").splitlines()[0], 200)
+        complaint = shorten((error.problem or error.context or "this is not YAML").splitlines()[0], 200)
     except ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         complaint = f"the character U+{ord(text[error.position]):04X} is not allowed in YAML"
@@ -195,7 +195,7 @@ class _Reader:
             return str(node.value)
         if isinstance(node, ScalarNode) and node.tag in SCALAR_TAGS:
             return self._scalar(node)
-        tag = shortened(str(node.tag).replace(CORE, "!!"))
+        tag = shorten(str(node.tag).replace(CORE, "!!"))
         raise _NotPlain(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
 
     def _map(self, node: MappingNode, place: Place) -> dict[str, Any]:
@@ -211,7 +211,7 @@ class _Reader:
                     key_node, "expected text as a key; put a number, a date or a word such as true in quotes"
                 )
             if key in data:
-                raise _NotPlain(key_node, f"found duplicate key {quoted(key)}")
+                raise _NotPlain(key_node, f"found duplicate key {quote(key)}")
             self._lines[*place, key] = key_node.start_mark.line + 1
             data[key] = self._plain(value, (*place, key))
         for other in merged:
@@ -234,7 +234,7 @@ class _Reader:
             value = self._scalars.construct_object(node)
         except (ValueError, KeyError, IndexError):
             kind = str(node.tag).removeprefix(CORE)
-            raise _NotPlain(node, f"{quoted(node.value)} cannot be read as {kind}") from None
+            raise _NotPlain(node, f"{quote(node.value)} cannot be read as {kind}") from None
         if isinstance(value, int) and abs(value) >= INTEGER_LIMIT:
-            raise _NotPlain(node, f"{quoted(node.value)} is too large; expected a whole number of at most 64 bits")
+            raise _NotPlain(node, f"{quote(node.value)} is too large; expected a whole number of at most 64 bits")
         return next((plain(value) for plain in PLAIN_TYPES if isinstance(value, plain)), None)

@@ -14,7 +14,17 @@ from typing import Any
 
 from clsplat.core import lock
 from clsplat.core.errors import DataError
-from clsplat.core.files import LOCK, NOTE, make_folder, sweep, sync_below, sync_folder, told_as, unwritable, write_text
+from clsplat.core.files import (
+    LOCK,
+    PREPARE_SUMMARY,
+    make_folder,
+    raising_output_error,
+    remove_partial_files,
+    sync_below,
+    sync_folder,
+    write_error,
+    write_text,
+)
 from clsplat.core.progress import Count
 from clsplat.core.reading import read_json, sha256
 from clsplat.prepare.database import IMAGES, MODEL
@@ -90,9 +100,9 @@ def prepare(
 @contextmanager
 def _only_one_making(one: Planned) -> Iterator[None]:
     """Hold a result: what an interrupted call left is gone on with by one process alone."""
-    with told_as(one.folder.parent):
+    with raising_output_error(one.folder.parent):
         make_folder(one.folder.parent)
-    with lock.held(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
+    with lock.lock_folder(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
         yield
 
 
@@ -120,7 +130,7 @@ def note(planned: Sequence[Planned]) -> dict[str, str]:
 def noted(out: Path) -> dict[str, str] | None:
     """Return the note of a run folder, or None."""
     try:
-        text = read_json(out / NOTE)
+        text = read_json(out / PREPARE_SUMMARY)
         return {"inputs": str(text["inputs"]), "folder": str(text["folder"])}
     except (DataError, KeyError, TypeError):
         return None
@@ -140,7 +150,7 @@ def _do(one: Planned, source: Path, root: Path) -> None:
     start = time.perf_counter()
     try:
         if one.step.resumes:
-            sweep(temporary, border=RECORD)
+            remove_partial_files(temporary, border=RECORD)
         else:
             shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True, exist_ok=True)
@@ -158,7 +168,7 @@ def _do(one: Planned, source: Path, root: Path) -> None:
         if isinstance(error, DataError) or not one.step.resumes:  # the same data would be refused again
             shutil.rmtree(temporary, ignore_errors=True)
         if isinstance(error, OSError):
-            raise unwritable(one.folder, error) from error
+            raise write_error(one.folder, error) from error
         if isinstance(error, DataError) and str(source.resolve()) != one.origin:  # it is the result of a step before
             raise DataError(str(error).replace(str(source.resolve() / IMAGES), one.origin)) from error
         raise
@@ -262,9 +272,9 @@ def place_photographs(
         MatchFeatures(matching=matching),
         MapCameras(mapper=mapper),
     ]
-    with told_as(out):
+    with raising_output_error(out):
         make_folder(out / STEPS)
-    with lock.held(out, out / STEPS / LOCK):
+    with lock.lock_folder(out, out / STEPS / LOCK):
         _require_free(out)  # again: another call may have ended since
         result = prepare(plan(steps, source, out / STEPS), source, out / STEPS)
         _show(result, out)
@@ -282,7 +292,7 @@ def _require_free(out: Path) -> None:
 
 def _show(result: Path, out: Path) -> None:
     """Let `out` be a COLMAP folder: link the images of the last step, copy its model.  Raises OutputError."""
-    with told_as(out):
+    with raising_output_error(out):
         (out / IMAGES).unlink(missing_ok=True)
         link(result / IMAGES, out / IMAGES)
         half = out / STEPS / f".{MODEL}"

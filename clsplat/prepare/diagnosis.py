@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import amount, first_few
+from clsplat.core.errors import first_few, pluralize
 from clsplat.prepare.database import feature_counts, verified
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS
 from clsplat.scene.quality import is_blurred, sharpness_of
@@ -100,7 +100,7 @@ def _parts(matched: Matched, groups: Sequence[list[str]]) -> str:
         return f"no two of them show enough of the same: {max(matched.pairs.values())} matches at most"
     others = f", and {len(alone)} without a good match ({first_few(alone)})" if alone else ""
     largest = f"{len(groups[0])} ({first_few(groups[0])})"
-    return f"they do not belong together: {amount(count, 'group')} of good matches, the largest of {largest}{others}"
+    return f"they do not belong together: {pluralize(count, 'group')} of good matches, the largest of {largest}{others}"
 
 
 def reasons(matched: Matched, models: Sequence[set[str]]) -> dict[str, str]:
@@ -123,7 +123,7 @@ def _reason(matched: Matched, name: str, placed: set[str], middle: NDArray[np.fl
     matches = matched.matches[name]
     among = {other: count for other, count in matches.items() if other in placed}
     if matched.features[name] < FEW_FEATURES:
-        return f"only {amount(matched.features[name], 'feature')}: blurred, dark, or of a plain surface"
+        return f"only {pluralize(matched.features[name], 'feature')}: blurred, dark, or of a plain surface"
     is_soft = is_blurred(matched.sharpness_of(name), middle)
     may_be = "; it may be blurred" if is_soft else ""
     if not matches:  # no more is known: one of broad shapes is as soft as a blurred one

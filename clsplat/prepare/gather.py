@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from clsplat.core.errors import DataError, amount, first_few, in_shell
-from clsplat.core.files import atomic
+from clsplat.core.errors import DataError, first_few, pluralize, shell_quote
+from clsplat.core.files import open_atomic
 from clsplat.core.progress import Count
-from clsplat.core.reading import read_file, regular
+from clsplat.core.reading import open_regular, read_file
 from clsplat.scene.images import (
     IMAGE_SUFFIXES,
     JPEG,
@@ -63,7 +63,7 @@ def require_folder(folder: Path) -> None:
     """Raise DataError where there is no such folder of photographs; of a video, with what makes one."""
     if folder.suffix.lower() in VIDEO_SUFFIXES and folder.is_file():
         raise DataError(
-            f"{folder}: is a video; `clsplat data video {in_shell(folder)} FOLDER` makes a folder of photographs of it"
+            f"{folder}: is a video; `clsplat data video {shell_quote(folder)} FOLDER` extracts photographs from it"
         )
     if not folder.is_dir():
         found = "is a file" if folder.is_file() else "no such folder"
@@ -77,7 +77,7 @@ def require_photographs(folder: Path, without: Path | None = None) -> None:
         suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
         more = "".join(f"; {text}" for text in _how_to_convert(unreadable))
         raise DataError(
-            f"{folder}: found {amount(len(names), 'photograph')}; expected at least {MIN_PHOTOGRAPHS}, "
+            f"{folder}: found {pluralize(len(names), 'photograph')}; expected at least {MIN_PHOTOGRAPHS}, "
             f"of {suffixes}{more}"
         )
 
@@ -88,7 +88,7 @@ def _how_to_convert(unreadable: list[str]) -> list[str]:
     for kind, (suffixes, command) in CONVERTED.items():
         if found := [name for name in unreadable if Path(name).suffix.lower() in suffixes]:
             are = "is" if len(found) == 1 else "are"
-            named = f"{amount(len(found), f'{kind} file')} such as {found[0]} {are} left out"
+            named = f"{pluralize(len(found), f'{kind} file')} such as {found[0]} {are} left out"
             texts.append(f"{named}: make JPEG files of them, such as by {command}")
     return texts
 
@@ -141,7 +141,7 @@ def why_unreadable(photograph: Path, error: DataError) -> str:
 
     error: what reading it raised.
     """
-    with suppress(OSError), regular(photograph) as file:
+    with suppress(OSError), open_regular(photograph) as file:
         head = file.read(12)
         for kind, brands in BRANDS.items():
             if head[4:8] == b"ftyp" and head[8:] in brands:
@@ -172,7 +172,7 @@ def _gather_one(source: Path, target: Path) -> None:
         link(source, target)
     else:
         _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(pixels[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
-        with atomic(target) as file:
+        with open_atomic(target) as file:
             file.write(copied(data, encoded.tobytes()))
 
 
@@ -228,9 +228,9 @@ def left_out(figures: Mapping[str, Any]) -> list[str]:
         )
     if others := figures.get("other_models"):
         are = "is" if len(others) == 1 else "are"
-        sizes = ", ".join([*map(str, others[:-1]), amount(others[-1], "photograph")])
+        sizes = ", ".join([*map(str, others[:-1]), pluralize(others[-1], "photograph")])
         texts.append(
-            f"{amount(len(others), 'smaller model')}, of {sizes}, {are} left out: add photographs that join "
+            f"{pluralize(len(others), 'smaller model')}, of {sizes}, {are} left out: add photographs that join "
             f"{'it' if len(others) == 1 else 'them'} to the largest"
         )
     return texts

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, amount
+from clsplat.core.errors import DataError, pluralize
 from clsplat.core.files import write_text
-from clsplat.core.progress import Count, watched
+from clsplat.core.progress import Count, polled
 from clsplat.core.reading import read_json
 from clsplat.prepare.database import (
     DATABASE,
@@ -119,7 +119,7 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
         done = rows.num_matched_image_pairs()
     if not missing:
         return
-    LOG.info("matching %s more, of photographs that are left out", amount(len(missing), "pair"))
+    LOG.info("matching %s more, of photographs that are left out", pluralize(len(missing), "pair"))
     with explained(database, "match photographs"), _counted(database, done + len(missing)):
         _match_listed(database, missing, _options(pycolmap, threads))
 
@@ -203,7 +203,7 @@ def _is_spaced(name: str) -> bool:
 def _counted(database: Path, pairs: int) -> Iterator[None]:
     """Count the pairs that pycolmap looks at in the block."""
     count = Count("pairs matched", pairs)
-    with watched(count, lambda: pairs_done(database)):
+    with polled(count, lambda: pairs_done(database)):
         yield
     count.reach(pairs)
 

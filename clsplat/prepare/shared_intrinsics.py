@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
-from clsplat.core.errors import amount
+from clsplat.core.errors import pluralize
 from clsplat.scene.images import optics_of, read_header
 
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
@@ -38,5 +38,5 @@ def sharing_text(images: Path, groups: Sequence[Sequence[str]]) -> str:
     count = sum(map(len, unknown))
     return (
         f"{count} photographs have no EXIF data of their lens: those of one size share a camera, "
-        f"{amount(len(unknown), 'camera')} in all; --set find_features.cameras=per_image gives each its own"
+        f"{pluralize(len(unknown), 'camera')} in all; --set find_features.cameras=per_image gives each its own"
     )

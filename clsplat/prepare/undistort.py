@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from clsplat.core.errors import DataError
-from clsplat.core.manifest import Made, hash_of
+from clsplat.core.manifest import Manifest, hash_values
 from clsplat.core.progress import Count
 from clsplat.scene.camera import shared
 from clsplat.scene.colmap_writer import write_model
@@ -29,7 +29,7 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
     Raises DataError when the scene cannot be read, or when an image in `out` has another origin.
     """
     scene = read_scene(source, holdout=0)
-    names, made = _png_names([view.name for view in scene.views]), Made(out)
+    names, made = _png_names([view.name for view in scene.views]), Manifest(out)
     for name in names:
         made.require_own(out / "images" / name)
     views, count = [], Count("photographs undistorted", len(names))
@@ -55,7 +55,7 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
 def _source(view: View) -> str:
     """A hash of all that decides over the pixels of an undistorted image and its mask."""
     files = [view.image_path, *([view.mask_path] if view.mask_path else [])]
-    return hash_of(*files, view.lens, view.camera)
+    return hash_values(*files, view.lens, view.camera)
 
 
 def _shown(view: View, blank: Blank) -> View:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from clsplat.core import lock
-from clsplat.core.errors import DataError, amount
+from clsplat.core.errors import DataError, pluralize
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.estimate import expected
@@ -109,7 +109,7 @@ def _detail(stage: Stage, run: Run | None) -> str:
     if isinstance(stage, Evaluate) and run:
         views = run.original.downscaled(run.downscale).split(stage.split)
         sizes = ", ".join(f"1/{downscale:g}" for downscale in stage.downscales or [run.downscale])
-        return f"{amount(len(views), f'{stage.split} view')} at {sizes}"
+        return f"{pluralize(len(views), f'{stage.split} view')} at {sizes}"
     return ""
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clsplat.core.errors import DataError
-from clsplat.core.schedule import values_of
+from clsplat.core.schedule import schedule_values
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, adapted
 from clsplat.prepare.cache import Planned
@@ -131,7 +131,7 @@ def most_of(training: Optimize, pixels: int) -> float | None:
     pixels: of a photograph.
     """
     growing = [stage for stage in training.during if isinstance(stage, Densify)]
-    limits = [max(values_of(one.max_gaussians)) for one in growing if one.max_gaussians is not None]
+    limits = [max(schedule_values(one.max_gaussians)) for one in growing if one.max_gaussians is not None]
     return min([*limits, *(one.per_pixel * pixels for one in growing if one.per_pixel)], default=None)
 
 

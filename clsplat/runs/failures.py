@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Literal
 
-from clsplat.core.errors import ClsplatError, Interrupted, OutputError, as_clsplat_error, in_shell, one_line
+from clsplat.core.errors import ClsplatError, Interrupted, OutputError, as_clsplat_error, one_line, shell_quote
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
@@ -67,7 +67,7 @@ def failures_recorded(status: StatusFile, as_raised: bool = False) -> Iterator[N
 
 def _stopped(status: StatusFile) -> Interrupted:
     """What to tell of a run that a signal ended at once, and how it goes on."""
-    now, resume = status.now, f"`clsplat resume {in_shell(status.out)}`"
+    now, resume = status.now, f"`clsplat resume {shell_quote(status.out)}`"
     if not (status.has_run and now.step):  # its folder is as it was before
         return Interrupted("stopped at once; to go on, run the same command again")
     if now.checkpoint:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance.quick import open_correct
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.core.files import PIPELINE, check_no_file_of_a_run
+from clsplat.core.files import PIPELINE, check_not_run_file
 from clsplat.core.progress import counted
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import Model, load
@@ -185,7 +185,7 @@ def view(
     if out.suffix.lower() not in (".html", ".htm"):
         raise ConfigError(f"{out}: expected a name that ends in .html, as browsers open it")
     if not (out.is_file() and is_viewer(out)):
-        check_no_file_of_a_run(out)
+        check_not_run_file(out)
     if splats is not None and splats < 1:
         raise ConfigError(f"--splats {splats}: expected a number of at least 1")
     if photographs not in ("none", "test", "all"):

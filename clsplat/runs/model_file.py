@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance.quick import open_correct
-from clsplat.core.errors import ConfigError, DataError, in_shell
-from clsplat.core.files import METRICS, PIPELINE, atomic, is_there, told_as, write_text
+from clsplat.core.errors import ConfigError, DataError, shell_quote
+from clsplat.core.files import METRICS, PIPELINE, open_atomic, path_exists, raising_output_error, write_text
 from clsplat.core.progress import counted
 from clsplat.core.reading import read_json
 from clsplat.formats.table import located
@@ -142,11 +142,11 @@ def _no_model(folder: Path, name: str = MODEL) -> DataError:
     if _has_field(folder):
         return DataError(f"{folder}: has no file of its field; run its pipeline again with the stage export_field")
     if has_pipeline(folder):
-        return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {in_shell(folder)}`")
+        return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {shell_quote(folder)}`")
     fault = f"{folder}: has no {PIPELINE}; expected a model file or a run folder"
     if any(map(is_image, chain(folder.glob("*"), folder.glob("images/*")))):
         return DataError(
-            f"{fault}; for a model of its photographs, run `clsplat run photos --scene {in_shell(folder)}` first"
+            f"{fault}; for a model of its photographs, run `clsplat run photos --scene {shell_quote(folder)}` first"
         )
     return DataError(fault)
 
@@ -271,7 +271,7 @@ def write_pictures(
 
 def _remove(out: Path, frames: set[str]) -> None:
     """Remove frames of an earlier film from a folder and its record."""
-    with told_as(out):
+    with raising_output_error(out):
         for name in frames:
             (out / name).unlink(missing_ok=True)
     _note(out, {name: framed for name, framed in _rendered(out).items() if name not in frames})
@@ -286,7 +286,7 @@ def _of_layer(path: Path, layer: str) -> Path:
 def _write_array(path: Path, array: NDArray[np.float32]) -> None:
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
-    with atomic(path) as stream:
+    with open_atomic(path) as stream:
         stream.write(buffer.getvalue())
 
 
@@ -300,7 +300,7 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
             )
     own = _rendered(out)
     for path in paths:
-        if is_there(path) and path.relative_to(out).as_posix() not in own:
+        if path_exists(path) and path.relative_to(out).as_posix() not in own:
             raise ConfigError(f"{path}: exists, and is no render of an earlier call; give another --out")
 
 

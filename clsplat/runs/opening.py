@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.conformance.quick import open_correct
-from clsplat.core.errors import ConfigError, DataError, amount
+from clsplat.core.errors import ConfigError, DataError, pluralize
 from clsplat.core.files import UNDISTORTED
 from clsplat.core.machine import Owner
-from clsplat.core.progress import Listener, heard_by, only
+from clsplat.core.progress import Listener, listening, log_level
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.file import SceneSettings
@@ -76,7 +76,7 @@ class RunScene:
             LOG.warning(
                 "%s: is trained on %s: a model of fewer than %d fits these and shows little else; add photographs, or "
                 "put back those that are missing",
-                *(scene.path, amount(len(original.train), "photograph"), FEWEST),
+                *(scene.path, pluralize(len(original.train), "photograph"), FEWEST),
             )
         files = decode_all(view for one in (original, downscaled) for split in SPLITS for view in one.split(split))
         require_whole(scene.path, files)
@@ -112,7 +112,7 @@ def open_run(
         status.enter("preparing", device=opened.text)
     status = status or StatusFile(out)
     folder, root = pipeline.settings.scene.folder, prepared_folder(out)
-    with heard_by(counts_of(status)):
+    with listening(counts_of(status)):
         folder = prepare(planned, folder, root, status.stage)
         with status.stage(READ_SCENE):
             run = make_run(pipeline, read(pipeline.settings.scene, folder), opened, out, status)
@@ -179,7 +179,7 @@ def check_preparation(pipeline: Pipeline, out: Path) -> list[Planned]:
 
 def _check_split(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> None:
     """Raise DataError where the photographs that are to be prepared do not have the split, however many are placed."""
-    with only(logging.ERROR):
+    with log_level(logging.ERROR):
         names = listed(pipeline, planned, out)
     if not names:
         return
@@ -201,7 +201,7 @@ def _applied(pipeline: Pipeline, names: Sequence[str]) -> Scene:
     folder, split = pipeline.settings.scene.folder, pipeline.settings.scene.split
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
-    with only(logging.ERROR):
+    with log_level(logging.ERROR):
         return split.applied(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
 
 

@@ -6,16 +6,16 @@ from pathlib import Path
 
 from clsplat.core.errors import ConfigError, OutputError
 from clsplat.core.files import (
-    BEFORE_A_RUN,
     CHECKSUMS,
+    EARLY_RUN_FILES,
     LOCK,
     LOG_FILE,
     METRICS,
-    OF_A_RUN,
     PIPELINE,
     RECORDS,
+    RUN_FILES,
     TRIAL,
-    is_there,
+    path_exists,
     write_text,
 )
 from clsplat.core.machine import Owner
@@ -104,14 +104,14 @@ def check_places(pipeline: Pipeline, state: RunState) -> None:
     Raises OutputError where there can be no such folder.
     """
     out = state.out
-    is_there(out)
+    path_exists(out)
     folder, scene = out.resolve(), pipeline.settings.scene
     if folder == folder.parent:
         raise ConfigError(f"{out}: is the root of a file system; give another folder for the run")
     taken = [folder, folder.parent] if pipeline.settings.prepare else [folder]  # the photographs' folder is hashed
     if scene.path is not None and scene.folder.resolve() in taken:
         raise ConfigError(f"{out}: is the folder of the photographs, or right in it; give another folder for the run")
-    check_names(state, OF_A_RUN, [path for stage in pipeline.stages for path in stage.outputs(out)])
+    check_names(state, RUN_FILES, [path for stage in pipeline.stages for path in stage.outputs(out)])
 
 
 def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path] = ()) -> None:
@@ -120,7 +120,7 @@ def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path]
     folder = out.resolve()
     if outside := [path for path in files if not path.resolve().is_relative_to(folder)]:
         raise ConfigError(f"{outside[0]}: a link leads outside of the run folder; remove it, or choose another name")
-    own = BEFORE_A_RUN if Owner.named_by(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
+    own = EARLY_RUN_FILES if Owner.named_by(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
     left = {out / name for name in own}  # by a run that has not begun
     for path in files if state.phase < Phase.BEGUN else ():
         if path not in left and (path.is_file() or (path.is_dir() and any(path.iterdir()))):

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from clsplat.core.errors import ConfigError, DataError, shortened
+from clsplat.core.errors import ConfigError, DataError, shorten
 from clsplat.core.files import METRICS, PIPELINE
 from clsplat.core.reading import read_file
 from clsplat.pipeline import plugins
@@ -150,8 +150,8 @@ def read_metrics(path: Path) -> RunMetrics:
         return RunMetrics.model_validate_json(read_file(path))
     except ValidationError as error:
         first = error.errors()[0]
-        place = shortened(".".join(str(part) for part in first["loc"]))
-        message = shortened(first["msg"].removeprefix("Invalid JSON: "), 200)
+        place = shorten(".".join(str(part) for part in first["loc"]))
+        message = shorten(first["msg"].removeprefix("Invalid JSON: "), 200)
         raise DataError(
             f"{path}: {place + ': ' if place else ''}{message}; the file is damaged: run the pipeline again"
         ) from error

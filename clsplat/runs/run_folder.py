@@ -9,21 +9,21 @@ from typing import Any, Literal, get_args
 from clsplat.core import lock
 from clsplat.core.errors import ClsplatError, ConfigError, InternalError, OutputError, as_clsplat_error
 from clsplat.core.files import (
-    BEFORE_A_RUN,
     CHECKPOINTS,
     CHECKSUMS,
+    EARLY_RUN_FILES,
     INPUTS,
     LOCK,
     METRICS,
-    NOTE,
-    OF_A_RUN,
     PIPELINE,
+    PREPARE_SUMMARY,
     RECORDS,
+    RUN_FILES,
     STATUS,
     TRIAL,
     make_folder,
-    sweep,
-    told_as,
+    raising_output_error,
+    remove_partial_files,
     write_text,
 )
 from clsplat.core.reading import read_text
@@ -48,13 +48,13 @@ def opened(state: RunState, start: Start, **values: Any) -> Iterator[StatusFile]
     check_run_folder(state, start)
     out = state.out
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    with told_as(out):
+    with raising_output_error(out):
         make_folder(out)
     try:
-        with lock.held(out) as require_held:
+        with lock.lock_folder(out) as require_held:
             state = RunState.read(out)  # again, now that it is held: another process may have run there since
             check_run_folder(state, start)
-            sweep(out, border=PIPELINE)
+            remove_partial_files(out, border=PIPELINE)
             before = read_text(out / STATUS) if state.phase is Phase.DONE else None
             status = StatusFile(out, require_held, **values)
             status.begin()
@@ -68,10 +68,10 @@ def opened(state: RunState, start: Start, **values: Any) -> Iterator[StatusFile]
                         write_text(out / STATUS, before)
                 is_defect = isinstance(as_clsplat_error(error), InternalError)  # its log has the traceback
                 if PIPELINE not in state.names and not status.now.step and not is_defect:
-                    written = BEFORE_A_RUN if status.now.cells else OF_A_RUN - {CHECKPOINTS}
+                    written = EARLY_RUN_FILES if status.now.cells else RUN_FILES - {CHECKPOINTS}
                     with suppress(OutputError):
                         status.require_held()
-                        _remove_unused(out, written, kept={LOCK} if made else BEFORE_A_RUN)
+                        _remove_unused(out, written, kept={LOCK} if made else EARLY_RUN_FILES)
                 raise
     except BaseException:
         with suppress(OSError):  # where a folder holds anything, it stays
@@ -99,8 +99,8 @@ def clear(status: StatusFile) -> None:
     status.write()
     out = status.out
     states = (out / CHECKPOINTS).glob("*_[0-9]*.npz")  # failed and damaged ones too
-    for file in [*states, *(out / name for name in (CHECKSUMS, METRICS, RECORDS, TRIAL, INPUTS, NOTE))]:
-        with told_as(file):
+    for file in [*states, *(out / name for name in (CHECKSUMS, METRICS, RECORDS, TRIAL, INPUTS, PREPARE_SUMMARY))]:
+        with raising_output_error(file):
             file.unlink(missing_ok=True)
 
 

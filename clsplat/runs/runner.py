@@ -7,8 +7,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from clsplat.core.errors import ConfigError, DataError, Interrupted, in_shell, shortened
-from clsplat.core.files import INPUTS, NOTE, PIPELINE, write_text
+from clsplat.core.errors import ConfigError, DataError, Interrupted, shell_quote, shorten
+from clsplat.core.files import INPUTS, PIPELINE, PREPARE_SUMMARY, write_text
 from clsplat.core.progress import Progress, Stopped
 from clsplat.core.reading import read_json
 from clsplat.core.signals import stop_at_once, stopping_on_signals
@@ -98,7 +98,7 @@ def require_same_inputs(scene: Path, identity: Identity | None, out: Path, diges
         changes = ", ".join(identity.changes(before)) if before else ""
         changes = changes or f"{INPUTS} is missing or damaged, so what changed is not known"
         raise ConfigError(
-            f"{scene}: not what the run was started with: {shortened(changes, 500)}; put that back, or begin anew: "
+            f"{scene}: not what the run was started with: {shorten(changes, 500)}; put that back, or begin anew: "
             "`clsplat run` with --restart or another --out"
         )
 
@@ -172,7 +172,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
     write_pipeline(pipeline, run)
     write_inputs(run)
     if run.prepared:
-        write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
+        write_text(run.out / PREPARE_SUMMARY, json.dumps(run.prepared) + "\n")
     run.records.start(run.is_refit)
     return before
 
@@ -229,7 +229,7 @@ def run_stages(pipeline: Pipeline, run: Run) -> None:
         if run.interrupted:
             path = checkpoint.save(run)
             raise Interrupted(
-                f"stopped in {stage.stage}, saved in {path}; `clsplat resume {in_shell(run.out)}` goes on from it"
+                f"stopped in {stage.stage}, saved in {path}; `clsplat resume {shell_quote(run.out)}` goes on from it"
             )
         if is_due(run):
             run_stages(pipeline, run)

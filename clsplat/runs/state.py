@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import ConfigError, DataError, in_shell, one_line
+from clsplat.core.errors import ConfigError, DataError, one_line, shell_quote
 from clsplat.core.files import CHECKSUMS, END_STATES, INPUTS, PIPELINE, STATUS, is_inside
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json, sha256
@@ -111,8 +111,8 @@ class RunState:
         """The command that begins the run again."""
         pipeline = "…"
         with suppress(ConfigError):  # where it is lost
-            pipeline = in_shell(self.pipeline.path)
-        return f"`clsplat run {pipeline} --out {in_shell(self.out)} --restart`"
+            pipeline = shell_quote(self.pipeline.path)
+        return f"`clsplat run {pipeline} --out {shell_quote(self.out)} --restart`"
 
 
 def has_pipeline(folder: Path) -> bool:

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import DataError, in_shell, one_line, size_text
-from clsplat.core.files import END_STATES, METRICS, PIPELINE, SILENT, STATUS
+from clsplat.core.errors import DataError, one_line, shell_quote, size_text
+from clsplat.core.files import END_STATES, HEARTBEAT_TIMEOUT, METRICS, PIPELINE, STATUS
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json
 from clsplat.core.settings import variants
@@ -36,7 +36,7 @@ def run_status(state: RunState) -> dict[str, Any]:
         known = status_of(status)
     except DataError as error:
         raise DataError(
-            f"{out / STATUS}: damaged ({error}); `clsplat check {in_shell(out)}` tells what else is"
+            f"{out / STATUS}: damaged ({error}); `clsplat check {shell_quote(out)}` tells what else is"
         ) from error
     if known is None:
         raise DataError(f"{out / STATUS}: of a newer clsplat; update clsplat to read it")
@@ -46,7 +46,7 @@ def run_status(state: RunState) -> dict[str, Any]:
     if status["state"] not in (*END_STATES, "killed"):
         silent = round(time.time() - known.time)
         status["silent"] = max(0, silent)
-        if silent <= -SILENT:
+        if silent <= -HEARTBEAT_TIMEOUT:
             status["ahead"] = -silent
     metrics = None
     if METRICS in state.names:
@@ -69,7 +69,7 @@ def _last(out: Path) -> dict[str, Any] | None:
 def status_text(status: dict[str, Any]) -> str:
     """Return what run_status found as lines of text."""
     lines = [f"{status['run']}: {status['state']}{_progress(status)}"]
-    if status.get("silent", 0) >= SILENT:
+    if status.get("silent", 0) >= HEARTBEAT_TIMEOUT:
         lines.append(f"no sign of life for {status['silent']} s{_place(status)}")
     if status.get("ahead"):
         lines.append(f"its clock is ahead by {status['ahead']} s{_place(status)}: its silence cannot be told")
@@ -90,13 +90,13 @@ def status_text(status: dict[str, Any]) -> str:
 def _advice(state: RunState) -> str:
     """How to continue a run that has stopped before its end."""
     out, status = state.out, state.status
-    message, resume = str(status.get("message")), f"clsplat resume {in_shell(out)}"
+    message, resume = str(status.get("message")), f"clsplat resume {shell_quote(out)}"
     if PIPELINE not in state.names or resume in message or "--restart" in message:
         return ""
     if "cells" in status or state.checkpoints:
         return f"`{resume}` goes on with it"
     if status.get("checkpoint"):  # without which it does not go on
-        again = f"`clsplat run {in_shell(out / PIPELINE)} --out {in_shell(out)} --restart`"
+        again = f"`clsplat run {shell_quote(out / PIPELINE)} --out {shell_quote(out)} --restart`"
         return f"its checkpoints are gone; {again} begins it again"
     return f"no checkpoint was saved; `{resume}` begins it again"
 
@@ -176,7 +176,7 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"  time     {', '.join(long)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
-        more = f"; `clsplat resume {in_shell(folder)} --steps {2 * metrics['steps']}` trains longer"
+        more = f"; `clsplat resume {shell_quote(folder)} --steps {2 * metrics['steps']}` trains longer"
         if metrics.get("overfit"):
             more = "; the photographs are learned by heart: more of them help most"
         elif kept and (kept["refit"] or kept["step"] < kept["last"]["step"]):  # validation has found where to end

@@ -16,8 +16,8 @@ from typing import Any
 
 from clsplat.core.errors import ConfigError, Interrupted
 from clsplat.core.files import scratch_folder
-from clsplat.core.progress import Progress, only
-from clsplat.core.signals import stop_if_signalled
+from clsplat.core.progress import Progress, log_level
+from clsplat.core.signals import stop_if_signaled
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import fewest_steps, last_edit, of_trainings, stretched, with_steps
@@ -129,7 +129,7 @@ def _execute_until(
     except Interrupted:
         if not corrected:
             raise
-        stop_if_signalled()
+        stop_if_signaled()
     return corrected[0] if corrected else None
 
 
@@ -170,7 +170,7 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: fl
             raise _Enough
 
     run.status.note(seconds_left=None)
-    with scratch_folder(run.out / "rehearsal") as out, only(logging.WARNING), run.status.stage("rehearse"):
+    with scratch_folder(run.out / "rehearsal") as out, log_level(logging.WARNING), run.status.stage("rehearse"):
         one = new_run(run, short_pipeline, out=out, status=StatusFile(out), show=show, between=look)
         one.records.start()
         try:

@@ -6,21 +6,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import ConfigError, DataError, in_shell, one_line, shortened, size_text
+from clsplat.core.errors import ConfigError, DataError, one_line, shell_quote, shorten, size_text
 from clsplat.core.files import (
     CHECKPOINTS,
     CHECKSUMS,
     COMPARISON,
     INPUTS,
     METRICS,
-    NOTE,
     PIPELINE,
+    PREPARE_SUMMARY,
     RECORDS,
     STATUS,
     is_inside,
-    is_there,
+    path_exists,
 )
-from clsplat.core.page import require_end
+from clsplat.core.page import require_complete
 from clsplat.core.reading import read_json, sha256
 from clsplat.formats.table import endings
 from clsplat.gaussians.model import load as load_model
@@ -84,7 +84,7 @@ def sums_file(expected: list[str], path: Path) -> str:
     sums = read_json(path)
     if not isinstance(sums, dict) or not all(isinstance(value, str) for value in sums.values()):
         raise DataError("expected the SHA-256 of each file")
-    faults = [f"'{shortened(name)}' is no file of the run" for name in sums if not is_inside(name)]
+    faults = [f"'{shorten(name)}' is no file of the run" for name in sums if not is_inside(name)]
     if absent := [f"'{name}'" for name in expected if name not in sums]:
         faults.append(f"lacks {', '.join(absent)}")
     if faults:
@@ -149,7 +149,7 @@ def _objects(state: RunState, cells: dict[str, RunState], whole: bool = False) -
         for name, cell in sorted(cells.items()):
             yield from ({**found, "file": f"{name}/{found['file']}"} for found in _objects(cell, {}, done))
         if done or COMPARISON in names:
-            yield one(COMPARISON, require_end)
+            yield one(COMPARISON, require_complete)
         return
     saved = [*(path.name for path in state.checkpoints), str(status.get("checkpoint") or "")]
     saved += sorted(path.name for path in (out / CHECKPOINTS).glob("failed_*.npz"))
@@ -164,8 +164,8 @@ def _objects(state: RunState, cells: dict[str, RunState], whole: bool = False) -
         yield {"file": CHECKSUMS, "whole": False, "detail": NO_SUMS}
     if done or INPUTS in names:
         yield one(INPUTS, lambda path: Identity.from_data(read_json(path)))
-    if (done and settings.get("prepare")) or NOTE in names:
-        yield one(NOTE, note_file)
+    if (done and settings.get("prepare")) or PREPARE_SUMMARY in names:
+        yield one(PREPARE_SUMMARY, note_file)
     for name in dict.fromkeys([*sums, *files, *sorted({METRICS, RECORDS} & names)]):
         if name != PIPELINE:
             yield one(name, partial(output, sums.get(name)))
@@ -221,9 +221,9 @@ def _remedy(state: RunState, verified: dict[str, Any]) -> str:
     goes_on |= state.phase < Phase.STATELESS and not (state.checkpoints or state.status.get("checkpoint"))
     if state.out / PIPELINE not in whole:
         how = "--resume" if goes_on else "--restart"
-        return f"give its `clsplat run … --out {in_shell(state.out)}` again, with {how}"
+        return f"give its `clsplat run … --out {shell_quote(state.out)}` again, with {how}"
     if goes_on:
-        return f"`clsplat resume {in_shell(state.out)}` runs the stages after its newest checkpoint again"
+        return f"`clsplat resume {shell_quote(state.out)}` runs the stages after its newest checkpoint again"
     return f"begin again: {state.restart}"
 
 
@@ -243,12 +243,12 @@ def check(pipeline: str) -> dict[str, Any]:
     Of a run folder and of a model file return what `verify` and `examine` say, of the file of a field its parameters.
     Raises ConfigError; DataError for a folder without a run.
     """
-    if is_field(Path(pipeline)) and is_there(Path(pipeline)):
+    if is_field(Path(pipeline)) and path_exists(Path(pipeline)):
         return {"path": pipeline, "name": Path(pipeline).name, "parameters": load_field(pipeline).shape.learned}
     state = RunState.read(Path(pipeline))
     if not state.phase and pipeline not in shipped() and is_model(Path(pipeline)):
         return examine(Path(pipeline))
-    if len(Path(pipeline).parts) > 1 and not is_there(origin(Path(pipeline))):
+    if len(Path(pipeline).parts) > 1 and not path_exists(origin(Path(pipeline))):
         raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
     if Path(pipeline).is_dir() and (state.phase or pipeline not in shipped()):
         return verify(state)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quoted
+from clsplat.core.errors import DataError, quote
 
 MAX_SIDE = 4096 * 8  # px: the tiles that cl_kernels/tiles.h can name, of the smallest size that a device has
 MIN_FOCAL = 1e-3  # px, in a dataset: with less an image shows half of all directions
@@ -204,7 +204,7 @@ class Lens:
         bottom = self.undistort(along_x, np.full(BORDER_POINTS, float(self.height)))[1]
         if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
             raise DataError(
-                f"the lens {self.model} {quoted(self.params)} cannot be inverted; calibrate the camera again"
+                f"the lens {self.model} {quote(self.params)} cannot be inverted; calibrate the camera again"
             )
         u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
         if self.whole:
@@ -215,7 +215,7 @@ class Lens:
         width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
         if min(width, height) < 1:
             raise DataError(
-                f"the lens {self.model} {quoted(self.params)} leaves no pixel of its image; calibrate the camera again"
+                f"the lens {self.model} {quote(self.params)} leaves no pixel of its image; calibrate the camera again"
             )
         return Camera(width, height, fx, fy, float(-u0 * fx), float(-v0 * fy))
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.core.errors import ConfigError, DataError, PoseError, quoted
-from clsplat.core.files import atomic, is_there, write_text
+from clsplat.core.errors import ConfigError, DataError, PoseError, quote
+from clsplat.core.files import open_atomic, path_exists, write_text
 from clsplat.core.progress import counted
-from clsplat.core.reading import opened, read_json
+from clsplat.core.reading import open_file, read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens
 from clsplat.scene.colmap_writer import FILES, MODEL, write_colmap
 from clsplat.scene.images import BESIDE, is_image, write_exposures
@@ -34,9 +34,9 @@ def posed(scene: Scene) -> list[Posed]:
     seen: set[str] = set()
     for name in names:
         if not name.isprintable() or name != name.strip():
-            raise DataError(f"{scene.path}: an image is called {quoted(name)}; expected a name in one line of text")
+            raise DataError(f"{scene.path}: an image is called {quote(name)}; expected a name in one line of text")
         if name in seen:
-            raise DataError(f"{scene.path}: two images would be called {quoted(name)}; rename one")
+            raise DataError(f"{scene.path}: two images would be called {quote(name)}; rename one")
         seen.add(name)
     test = set(scene.test)
     return [Posed(name, view, i in test) for i, (name, view) in enumerate(zip(names, scene.views, strict=True))]
@@ -54,7 +54,7 @@ def image_files(views: list[Posed], folder: Path) -> dict[Path, Path]:
     """Return where each photograph lies, by where it belongs below a folder.  Raises DataError without a photograph."""
     for one in views:
         if one.view.image_path == NO_FILE:
-            raise DataError(f"the view {quoted(one.name)} has no photograph to copy; write the cameras alone")
+            raise DataError(f"the view {quote(one.name)} has no photograph to copy; write the cameras alone")
     return {folder / one.name: one.view.image_path for one in views}
 
 
@@ -149,7 +149,7 @@ def _array(one: JsonFrame, key: str, shape: tuple[int, ...]) -> "np.ndarray[Any,
     except (ValueError, TypeError, OverflowError):
         array = np.empty(0)
     if array.shape != shape or not np.isfinite(array).all():
-        raise DataError(f"{one.where}: {key} is {quoted(one.value(key))}; expected finite numbers, {shape}")
+        raise DataError(f"{one.where}: {key} is {quote(one.value(key))}; expected finite numbers, {shape}")
     return array
 
 
@@ -267,7 +267,7 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     """
     for what, value, known in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
         if value not in known:
-            raise ConfigError(f"no {what} {quoted(value)}; there are {', '.join(known)}")
+            raise ConfigError(f"no {what} {quote(value)}; there are {', '.join(known)}")
     scene = scene.in_world()
     views = checked(scene, format_)
     if images == "copy" and format_ in UNDISTORTED and any(one.view.lens is not None for one in views):
@@ -278,7 +278,7 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     copies = image_files(views, out / IMAGES) if images == "copy" else {}
     beside = [out / IMAGES / BESIDE] if copies else []
     for path in () if over else (*(out / place for place in PLACES[format_]), *copies, *beside):
-        if is_there(path):
+        if path_exists(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
     written = WRITERS[format_](out, views, scene.points, scene.tracks)
     if format_ != SPLIT and scene.test:
@@ -289,7 +289,7 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     if format_ != TRACKS and copies and scene.tracks is not None:
         LOG.warning("%s: %s does not keep which points the photographs show; %s does", out, format_, TRACKS)
     for path, source in counted(copies.items(), "photographs copied", len(copies)):
-        with opened(source, "an image") as old, atomic(path) as new:
+        with open_file(source, "an image") as old, open_atomic(path) as new:
             shutil.copyfileobj(old, new)
     if copies:
         found = camera_exposures([one.view for one in views])

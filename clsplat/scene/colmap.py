@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quoted, shortened
+from clsplat.core.errors import DataError, quote, shorten
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Lens, shared
@@ -71,7 +71,7 @@ class ImageRecord(NamedTuple):
 def parameter_count(where: str, model: str) -> int:
     """Return the number of parameters of a camera model.  Raises DataError, starting with `where`, for others."""
     if model not in PARAMETERS:
-        raise DataError(f"{where}: unknown camera model {quoted(model)}; expected one of {', '.join(PARAMETERS)}")
+        raise DataError(f"{where}: unknown camera model {quote(model)}; expected one of {', '.join(PARAMETERS)}")
     return PARAMETERS[model]
 
 
@@ -165,9 +165,7 @@ def _convert(where: str, words: list[str], kinds: Sequence[Callable[[str], Any]]
     try:
         return [kind(word) for kind, word in zip(kinds, words, strict=True)]
     except ValueError as error:
-        raise DataError(
-            f"{where}: {shortened(str(error))}; expected {layout}: remove that entry or {REMEDY}"
-        ) from error
+        raise DataError(f"{where}: {shorten(str(error))}; expected {layout}: remove that entry or {REMEDY}") from error
 
 
 def _id(word: str) -> int:
@@ -408,14 +406,14 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
     image_path = inside(folder, image.name, image.where)
     if image.camera not in cameras:
         raise DataError(
-            f"{image.where}: image {quoted(image.name)} names camera {image.camera}; expected one of the cameras file, "
+            f"{image.where}: image {quote(image.name)} names camera {image.camera}; expected one of the cameras file, "
             f"{sorted(cameras)[:8]}: {REMEDY}"
         )
     try:
         pose = pose_matrix(image.quaternion, image.translation)
     except ValueError as error:
         raise DataError(
-            f"{image.where}: the pose of {quoted(image.name)} is {error}: remove that image or {REMEDY}"
+            f"{image.where}: the pose of {quote(image.name)} is {error}: remove that image or {REMEDY}"
         ) from error
     lens = shared(_lens(image.camera, cameras[image.camera]))
     camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
@@ -436,7 +434,7 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
     if not valid or not all(abs(value) < MAX_VALUE for value in camera.params):
         raise DataError(
             f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters "
-            f"{quoted(camera.params)}; expected a positive size of at most {MAX_SIDE}, focal lengths from "
+            f"{quote(camera.params)}; expected a positive size of at most {MAX_SIDE}, focal lengths from "
             f"{MIN_FOCAL:g} on and finite numbers: {REMEDY}"
         )
     return Lens(camera.width, camera.height, camera.model, camera.params)
@@ -451,7 +449,7 @@ def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> ND
     sizes = len(quaternion), len(translation)
     if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(part) < MAX_VALUE for part in translation):
         raise ValueError(
-            f"quaternion {quoted(tuple(quaternion))}, translation {quoted(tuple(translation))}; "
+            f"quaternion {quote(tuple(quaternion))}, translation {quote(tuple(translation))}; "
             "expected finite numbers and a rotation"
         )
     return np.column_stack([rotation_matrix(*(part / length for part in quaternion)), translation])

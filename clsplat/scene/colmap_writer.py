@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.files import atomic
+from clsplat.core.files import open_atomic
 from clsplat.core.quaternions import unit_quaternions
 from clsplat.scene.camera import Lens
 from clsplat.scene.colmap import MODELS, POINT2D
@@ -45,7 +45,7 @@ def write_model(folder: Path, views: Sequence[View], points: PointCloud | None, 
         [] if points is None else _points(points, shown),
     )
     for name, records in zip(FILES, rows, strict=True):
-        with atomic(folder / name) as file:
+        with open_atomic(folder / name) as file:
             file.write(struct.pack("<Q", len(records)) + b"".join(records))
 
 

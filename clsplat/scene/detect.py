@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from clsplat.core.errors import ConfigError, DataError, in_shell
+from clsplat.core.errors import ConfigError, DataError, shell_quote
 from clsplat.formats.table import detect as model_format
 from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.images import is_image
@@ -71,7 +71,7 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
         return split.applied(reader.read(path, split.of_reader))
     if any(is_image(file) for file in path.iterdir()):
         raise DataError(
-            f"{path}: photographs without cameras; `clsplat run photos --scene {in_shell(path)}` finds the cameras"
+            f"{path}: photographs without cameras; `clsplat run photos --scene {shell_quote(path)}` finds the cameras"
         )
     known = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
     raise DataError(f"{path}: no dataset found; looked for {known}")

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quoted, shortened
-from clsplat.core.files import atomic, write_text
-from clsplat.core.reading import opened, read_file, read_json
+from clsplat.core.errors import DataError, quote, shorten
+from clsplat.core.files import open_atomic, write_text
+from clsplat.core.reading import open_file, read_file, read_json
 
 # The size, the orientation and the end of a photograph, from its bytes, without decoding it.
 
@@ -140,7 +140,7 @@ def pixels_only(data: bytes) -> bytes:
             break
         if kind in USED or not kind[0] & 0x20:
             if zlib.crc32(view[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
-                raise ValueError(f"byte {at}: the checksum of the chunk {quoted(kind.decode('latin-1'))} is wrong")
+                raise ValueError(f"byte {at}: the checksum of the chunk {quote(kind.decode('latin-1'))} is wrong")
             kept.append(view[at:end])
         if kind == b"IEND":
             return b"".join(kept)
@@ -171,7 +171,7 @@ def write_image(path: Path, pixels: NDArray[np.uint8]) -> None:
     assert pixels.dtype == np.uint8, pixels.dtype
     assert pixels.shape[2:] in ((3,), (4,)), pixels.shape
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]))
-    with atomic(path) as file:
+    with open_atomic(path) as file:
         file.write(encoded.tobytes())
 
 
@@ -185,7 +185,7 @@ def inside(folder: Path, name: str, where: str) -> Path:
     """Return `folder / name`.  Raises DataError, starting with `where`, when that lies outside the folder."""
     path = PureWindowsPath(name)  # splits at both kinds of slash and at drives
     if path.anchor or ".." in path.parts or not path.parts or any(letter < " " for letter in name):
-        raise DataError(f"{where}: the file name {quoted(name)} is not a path below {folder}; rename it")
+        raise DataError(f"{where}: the file name {quote(name)} is not a path below {folder}; rename it")
     return folder / name
 
 
@@ -204,7 +204,7 @@ def present(
     found = [os.path.exists(file) for file in files]  # unlike Path.exists, never raises
     lost = [str(file) for file, there in zip(files, found, strict=True) if not there]
     if lost:
-        names = ", ".join(map(shortened, lost[:3])) + (", ..." if len(lost) > 3 else "")
+        names = ", ".join(map(shorten, lost[:3])) + (", ..." if len(lost) > 3 else "")
         fault = f"{path}: {len(lost)} of {len(files)} image files are missing: {names}"
         if missing == "refuse" or len(lost) == len(files):
             raise DataError(f"{fault}; put them back{remedy if len(lost) < len(files) else ''}")
@@ -214,7 +214,7 @@ def present(
 
 def read_header(path: Path) -> Header:
     """Return the header of an image file; formats but PNG and JPEG are decoded.  Raises DataError."""
-    with opened(path, "an image", limit=MAX_BYTES) as file:
+    with open_file(path, "an image", limit=MAX_BYTES) as file:
         head = file.read(HEAD_SIZE)
         file.seek(max(0, file.seek(0, 2) - TAIL_SIZE))
         tail = file.read(TAIL_SIZE)
@@ -298,7 +298,7 @@ class CameraExposure:
 
 def exposure_of(path: Path) -> CameraExposure | None:
     """Return the exposure that a JPEG file tells; None where it does not.  Raises DataError when it cannot be read."""
-    with opened(path, "an image") as file:
+    with open_file(path, "an image") as file:
         return parsed(file.read(HEAD_SIZE))
 
 
@@ -313,7 +313,7 @@ def optics_of(path: Path) -> tuple[Value, ...] | None:
 
     Raises DataError when it cannot be read.
     """
-    with opened(path, "an image") as file:
+    with open_file(path, "an image") as file:
         tags = _tags(file.read(HEAD_SIZE))
     told = [tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL, FOCAL_35)]
     return tuple(told) if any(told[2:]) else None

@@ -6,7 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from clsplat.core.errors import DataError, first_few, in_shell
+from clsplat.core.errors import DataError, first_few, shell_quote
 from clsplat.scene.colmap import camera_views, find_models, read_images
 from clsplat.scene.images import is_image, read_header
 from clsplat.scene.reader import Reader
@@ -90,7 +90,7 @@ def _frames(path: Path) -> dict[str, list[Path]]:
     if packed:
         raise DataError(
             f"{packed[0]}: is a video without a folder {packed[0].with_suffix('')} of its frames; "
-            f"`clsplat data moments {in_shell(path)}` writes the frames of all cameras"
+            f"`clsplat data moments {shell_quote(path)}` writes the frames of all cameras"
         )
     if not frames:
         raise DataError(f"{path / VIDEOS}: has no folders of frames; expected {VIDEOS}/NAME/0000.png … for each camera")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, amount
+from clsplat.core.errors import DataError, pluralize
 from clsplat.scene.images import read_image, write_image
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, load_image, load_mask
@@ -81,7 +81,7 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
             "that count: name the files so, or give another folder as scene.masks"
         )
     if missing:
-        masked = f"{count - len(missing)} of {amount(count, 'photograph')}"
+        masked = f"{count - len(missing)} of {pluralize(count, 'photograph')}"
         LOG.warning("%s: has masks of %s; the others count whole, such as %s", folder, masked, missing[0])
     return replace(scene, views=views)
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quoted, shortened
-from clsplat.core.files import atomic
+from clsplat.core.errors import DataError, quote, shorten
+from clsplat.core.files import open_atomic
 from clsplat.core.reading import read_file
 from clsplat.formats.ply import PlyHeader, format_ply_header, parse_ply_header
 from clsplat.scene.scene import PointCloud
@@ -74,7 +74,7 @@ def read_ply_table(path: Path) -> PointTable:
         raise DataError(f"{path}: is big-endian; expected ascii or binary_little_endian: export it again")
     names = header.dtype.names or ()
     if not set(POINT.names or ()) <= set(names) or any(header.dtype[name] != np.uint8 for name in RGB):
-        raise DataError(f"{path}: expected x y z and uchar red green blue of each vertex, found {quoted(names)}")
+        raise DataError(f"{path}: expected x y z and uchar red green blue of each vertex, found {quote(names)}")
     table = _read_ascii(path, data, header) if header.format == "ascii" else _read_binary(path, data, header)
     positions, rgb = (np.stack([table[name] for name in names], axis=1) for names in ("xyz", RGB))
     times = np.asarray(table[TIME], np.float64) if TIME in names else np.empty(0)
@@ -95,7 +95,7 @@ def write_points_ply(path: Path, points: PointCloud) -> None:
         table[name] = np.rint(points.colors[:, i] * 255)
     words = {"|u1": "uchar", "<f4": "float", "<f8": "double"}
     properties = [f"{words[kind[name].str]} {name}" for name in kind.names or ()]
-    with atomic(path) as file:
+    with open_atomic(path) as file:
         file.write(format_ply_header((), vertex=(len(points), properties)) + table.tobytes())
 
 
@@ -127,7 +127,7 @@ def _read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
         table = np.loadtxt(body, header.dtype, comments=None, max_rows=header.count, ndmin=1)
     except (ValueError, OverflowError) as error:
         raise DataError(
-            f"{path}: {shortened(str(error), 200)} after the header; expected one number for each property"
+            f"{path}: {shorten(str(error), 200)} after the header; expected one number for each property"
         ) from error
     if len(table) < header.count:
         raise DataError(

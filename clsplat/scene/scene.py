@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quoted
+from clsplat.core.errors import DataError, quote
 from clsplat.scene.view import Alpha, Floats, View, load_image
 
 LOG = logging.getLogger("clsplat")
@@ -196,12 +196,12 @@ def make_scene(
     seen: set[str] = set()
     for view in views:
         if view.name in seen:
-            raise DataError(f"{path}: two images are called {quoted(view.name)}; names must differ")
+            raise DataError(f"{path}: two images are called {quote(view.name)}; names must differ")
         seen.add(view.name)
         try:
             view.camera.check()
         except ValueError as error:
-            raise DataError(f"{path}: {quoted(view.name)}: {error}; remove that image or fix its camera") from error
+            raise DataError(f"{path}: {quote(view.name)}: {error}; remove that image or fix its camera") from error
     train = other_views(path, len(views), test)
     points = points if points and len(points) else None
     origin = choose_origin(views, points)

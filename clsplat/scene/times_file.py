@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from clsplat.core.errors import DataError, quoted
+from clsplat.core.errors import DataError, quote
 from clsplat.core.files import write_text
 from clsplat.core.reading import read_json
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE
@@ -33,7 +33,7 @@ def read_times(folder: Path) -> dict[str, float] | None:
     for name, value in table.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
             raise DataError(
-                f"{path}: the time of {quoted(name)} is {quoted(value)}; expected {BELOW_MAX}: write all times in "
+                f"{path}: the time of {quote(name)} is {quote(value)}; expected {BELOW_MAX}: write all times in "
                 "another unit"
             )
     return {name: float(value) for name, value in table.items()}

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.core.errors import DataError, quoted
+from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, shared
 from clsplat.scene.images import Missing, image_size, inside, present, read_header, require_files
@@ -47,7 +47,7 @@ class JsonFrame:
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
-            raise DataError(f"{self.where}: {key} is {quoted(value)}; expected {BELOW_MAX}: export the file again")
+            raise DataError(f"{self.where}: {key} is {quote(value)}; expected {BELOW_MAX}: export the file again")
         return float(value)
 
     def file(self, key: str, suffix: str = "") -> Path | None:
@@ -56,7 +56,7 @@ class JsonFrame:
         if value is None:
             return None
         if not isinstance(value, str):
-            raise DataError(f"{self.where}: {key} is {quoted(value)}; expected a path below {self.folder}")
+            raise DataError(f"{self.where}: {key} is {quote(value)}; expected a path below {self.folder}")
         path = inside(self.folder, view_name(value), self.where)
         return path if path.suffix else path.with_name(path.name + suffix)
 
@@ -192,7 +192,7 @@ def lens_of(frame: JsonFrame, camera: Camera) -> Lens:
     given = {key: frame.number(key) or 0.0 for key in DISTORTION}
     surplus = [key for key, value in given.items() if value and key not in (used or DISTORTION)]
     if used is None or surplus:
-        fault = f"camera_model {quoted(model)}" + (f" with {', '.join(surplus)}" if surplus else "")
+        fault = f"camera_model {quote(model)}" + (f" with {', '.join(surplus)}" if surplus else "")
         raise DataError(
             f"{frame.where}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
             "undistort the images first, for example with `colmap image_undistorter`"
@@ -312,7 +312,7 @@ def _listed(transforms: Transforms, key: str) -> set[str] | None:
     unknown = sorted(names - {view_name(path) for frame in transforms.frames if (path := frame.value("file_path"))})
     if unknown:
         raise DataError(
-            f"{transforms.path}: {key} lists {quoted(unknown[0])}, which no frame has; remove it from the list"
+            f"{transforms.path}: {key} lists {quote(unknown[0])}, which no frame has; remove it from the list"
         )
     return names
 
@@ -364,7 +364,7 @@ def _views(path: Path, splits: Any, name: str) -> list[View]:
         level = frame.number("label")
         if level is None or not 0 <= level <= 8 or level % 1:
             raise DataError(
-                f"{frame.where}: label is {quoted(label)}; expected the number of its halvings, 0 to 8: make it again"
+                f"{frame.where}: label is {quote(label)}; expected the number of its halvings, 0 to 8: make it again"
             )
         image, matrix = image_path_of(frame), camera_to_world_of(frame)
         view = View(view_name(file), camera_of(frame, None), np.linalg.inv(matrix)[:3], image, downscale=2**level)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.core.errors import DataError, PoseError, quoted
+from clsplat.core.errors import DataError, PoseError, quote
 from clsplat.formats.splats import EXPECTED, is_moment
 from clsplat.scene.camera import MODELS, Camera, Lens
 from clsplat.scene.images import CameraExposure, exposure_of, read_exposures, read_image
@@ -26,15 +26,15 @@ def checked_pose(name: str, pose: ArrayLike) -> Floats:
     """Return a world-to-camera pose, [3, 4] float64, of the view `name`.  Raises PoseError without a rotation."""
     found = np.asarray(pose, np.float64)
     if found.shape != (3, 4):
-        raise PoseError(f"the pose of {quoted(name)} has shape {found.shape}; expected (3, 4)")
+        raise PoseError(f"the pose of {quote(name)} has shape {found.shape}; expected (3, 4)")
     rotation = found[:, :3]
     if not np.isfinite(found).all():
-        raise PoseError(f"the pose of {quoted(name)} has values that are not finite; expected finite numbers")
+        raise PoseError(f"the pose of {quote(name)} has values that are not finite; expected finite numbers")
     with np.errstate(all="ignore"):  # numbers near the end of the range
         turned = rotation @ rotation.T
     if not np.allclose(turned, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
         raise PoseError(
-            f"the pose of {quoted(name)} has no rotation in its first three columns; "
+            f"the pose of {quote(name)} has no rotation in its first three columns; "
             "expected axes of length 1 at right angles, not mirrored"
         )
     return found
@@ -45,9 +45,9 @@ def checked_time(name: str, time: float | None) -> float | None:
     if time is None:
         return None
     if isinstance(time, bool) or not isinstance(time, int | float | np.floating | np.integer):
-        raise PoseError(f"the time of {quoted(name)} is {quoted(time)}; expected a number from 0 to 1, or None")
+        raise PoseError(f"the time of {quote(name)} is {quote(time)}; expected a number from 0 to 1, or None")
     if not is_moment(time):
-        raise PoseError(f"the time of {quoted(name)} is {float(time):g}; {EXPECTED}")
+        raise PoseError(f"the time of {quote(name)} is {float(time):g}; {EXPECTED}")
     return float(time)
 
 
@@ -95,12 +95,12 @@ class View:
         """
         center, point, above = (np.asarray(vector, np.float64) for vector in (position, target, up))
         if not center.shape == point.shape == above.shape == (3,):
-            raise ValueError(f"{quoted(name)}: expected a position, a target and `up` of 3 numbers each")
+            raise ValueError(f"{quote(name)}: expected a position, a target and `up` of 3 numbers each")
         forward = point - center
         right = np.cross(forward, above)
         axes = np.stack([right, np.cross(forward, right), forward])
         if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(above):
-            raise ValueError(f"{quoted(name)}: expected a target away from the position, and not along `up`")
+            raise ValueError(f"{quote(name)}: expected a target away from the position, and not along `up`")
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
         return cls(name, camera, np.column_stack([axes, -axes @ center]))
 
@@ -126,7 +126,7 @@ class View:
         """
         if not 0 < downscale < math.inf:
             raise ValueError(
-                f"the downscale of {quoted(self.name)} is {downscale:g}; expected a divisor above 0, such as 2"
+                f"the downscale of {quote(self.name)} is {downscale:g}; expected a divisor above 0, such as 2"
             )
         if downscale == self.downscale:
             return self
@@ -148,11 +148,11 @@ def color_of(background: ArrayLike) -> Floats:
     try:
         color = np.asarray(background, np.float64)
     except (ValueError, TypeError):
-        raise ValueError(f"the background is {quoted(background)}; expected one number or three in [0, 1]") from None
+        raise ValueError(f"the background is {quote(background)}; expected one number or three in [0, 1]") from None
     if color.shape not in ((), (3,)):
         raise ValueError(f"the background has shape {color.shape}; expected one number or three")
     if not ((color >= 0) & (color <= 1)).all():
-        raise ValueError(f"the background is {quoted(background)}; expected one number or three in [0, 1]")
+        raise ValueError(f"the background is {quote(background)}; expected one number or three in [0, 1]")
     return np.broadcast_to(color, (3,))
 
 
@@ -233,7 +233,7 @@ def _as_taken(view: View, path: Path) -> NDArray[Any]:
     Raises DataError as is_turned does.
     """
     if path == NO_FILE:
-        raise DataError(f"the view {quoted(view.name)} has no photograph; expected one with an image_path")
+        raise DataError(f"the view {quote(view.name)} has no photograph; expected one with an image_path")
     decoded: dict[bool, NDArray[Any]] = {}
 
     def size(upright: bool) -> Size:

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from clsplat.core.errors import DataError, amount, quoted
+from clsplat.core.errors import DataError, pluralize, quote
 from clsplat.core.reading import read_text
-from clsplat.core.settings import ReadPath, Settings, in_one_sentence
+from clsplat.core.settings import InputPath, Settings, in_one_sentence
 from clsplat.scene.images import Missing, is_image
 from clsplat.scene.scene import HOLDOUT, Scene, camera_extent, every_nth, other_views
 
@@ -48,7 +48,7 @@ class Choice(Settings):
     """Place of the first of them, counted from 0."""
     names: Annotated[list[Annotated[str, BeforeValidator(_text)]], Field(min_length=1)] | None = None
     """Names of the views."""
-    file: ReadPath | None = None
+    file: InputPath | None = None
     """Text file with a name a line; a relative path is one in the folder of the dataset."""
 
     @model_validator(mode="before")
@@ -61,7 +61,7 @@ class Choice(Settings):
             raise ValueError(f"{NOTATIONS} (YAML needs a blank after each colon)")
         offset = value.get("offset")
         if isinstance(offset, int) and offset < 0:
-            raise ValueError(f"expected an offset of 0 or more, not {quoted(offset)}")
+            raise ValueError(f"expected an offset of 0 or more, not {quote(offset)}")
         if "offset" in value and len(value) == 1:
             raise ValueError("expected every beside offset, as in {every: 8, offset: 4}")
         return value
@@ -96,7 +96,7 @@ class Choice(Settings):
                     raise _taken(place, name, key)
                 del found_at[name]
         if lost := len({*listed}) - len(found_at):
-            LOG.info("%s: skipped %s whose photograph is missing", place, amount(lost, "name"))
+            LOG.info("%s: skipped %s whose photograph is missing", place, pluralize(lost, "name"))
         chosen = {name: _only(name, found, names, place) for name, found in found_at.items()}
         for name, i in chosen.items():
             _tell_of_another(name, names[i], place)
@@ -142,7 +142,7 @@ def _taken(place: str, name: str, key: TakenBy) -> DataError:
         "holdout": ("is held out for testing", "out of scene.holdout"),
         "train": ("is left out by scene.train", "put it into scene.train"),
     }[key]
-    told = f"{quoted(name)} {why}; expected training photographs: take it out of this list, or {remedy}"
+    told = f"{quote(name)} {why}; expected training photographs: take it out of this list, or {remedy}"
     return OfPlaced(f"{place}: {told}")
 
 
@@ -193,7 +193,7 @@ def _tell_of_another(listed: str, found: str, place: str) -> None:
     """Log that a name in another folder, of another kind of image, is meant."""
     wanted, path = PurePosixPath(listed), PurePosixPath(found)
     if is_image(wanted) and wanted.suffix != path.suffix and wanted.with_suffix("") != path.with_suffix(""):
-        LOG.info("%s: %s means %s", place, quoted(listed), quoted(found))
+        LOG.info("%s: %s means %s", place, quote(listed), quote(found))
 
 
 def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -> int:
@@ -201,17 +201,15 @@ def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -
     if len(found) == 1:
         return found[0]
     if found:
-        both = " and ".join(quoted(names[i]) for i in found[:2])
-        raise OfPlaced(f"{place}: {quoted(listed)} means {both}; give more of the path")
+        both = " and ".join(quote(names[i]) for i in found[:2])
+        raise OfPlaced(f"{place}: {quote(listed)} means {both}; give more of the path")
     raise _unknown(listed, names, place)
 
 
 def _unknown(listed: str, names: Sequence[str], place: str) -> DataError:
     near = get_close_matches(listed, [*names, *(PurePosixPath(name).name for name in names)], 1)
-    more = (
-        f"did you mean {quoted(near[0])}?" if near else f"the first is {quoted(names[0])}: correct or remove the name"
-    )
-    return OfPlaced(f"{place}: no photograph is called {quoted(listed)}; {more}")
+    more = f"did you mean {quote(near[0])}?" if near else f"the first is {quote(names[0])}: correct or remove the name"
+    return OfPlaced(f"{place}: no photograph is called {quote(listed)}; {more}")
 
 
 # Which views of a scene are for training, for validation and for testing, and which are left out.
@@ -261,7 +259,7 @@ class Split:
             kept = _of(scene, "train", self.train, folders) | set(scene.test)
             if kept == set(scene.test):
                 raise DataError(f"{scene.path}: scene.train leaves no photograph to train with; expected some of them")
-            LOG.info("scene.train leaves out %s", amount(len(scene.views) - len(kept), "photograph"))
+            LOG.info("scene.train leaves out %s", pluralize(len(scene.views) - len(kept), "photograph"))
             views = [view for i, view in enumerate(scene.views) if i in kept]
             left_out = [view.name for i, view in enumerate(scene.views) if i not in kept]
             tested = {scene.views[i].name for i in scene.test}
@@ -348,7 +346,7 @@ def _auto(scene: Scene) -> set[int]:
     count = len(scene.train)
     if count < LEAST:
         raise DataError(
-            f"{scene.path}: has {amount(count, 'training photograph')}; expected {LEAST} or more to keep some for "
+            f"{scene.path}: has {pluralize(count, 'training photograph')}; expected {LEAST} or more to keep some for "
             "validation: take more, or set scene.validation to 0"
         )
     order = sorted(scene.train, key=lambda i: scene.views[i].name)

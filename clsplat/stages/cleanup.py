@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from clsplat.core.errors import NoneInsideError, NumericError
+from clsplat.core.errors import EmptyRegionError, NumericError
 from clsplat.core.settings import OneOf
 from clsplat.density.control import Box, apply_marks, keep_rows, mark
 from clsplat.density.edit import Edit, Rule
@@ -99,7 +99,7 @@ class Crop(Stage):
         gaussians = run.model.gaussians
         kept = np.flatnonzero(self.inside.holds(gaussians.get("means")))
         if not len(kept):
-            raise NoneInsideError(f"crop: none of {gaussians.count:,} Gaussians lies inside; expected a larger box")
+            raise EmptyRegionError(f"crop: none of {gaussians.count:,} Gaussians lies inside; expected a larger box")
         change = keep_rows(gaussians, kept, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))

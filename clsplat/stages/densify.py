@@ -10,8 +10,8 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from clsplat.core.errors import NumericError, amount
-from clsplat.core.schedule import AtLeastOne, places
+from clsplat.core.errors import NumericError, pluralize
+from clsplat.core.schedule import AtLeastOne, fire_steps
 from clsplat.core.settings import OneOf, variants
 from clsplat.density.budget import Budget, BudgetContext
 from clsplat.density.control import Box, densify
@@ -109,7 +109,7 @@ class Densify(Scheduled):
             most = f"{fits:,} Gaussians, the most that fit in the device's memory; with {more} more do"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))
-        LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", amount(change.after, "Gaussian"))
+        LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", pluralize(change.after, "Gaussian"))
         if change.after == 0:
             raise NumericError(f"step {run.step}: every Gaussian was pruned; weaken the prune rules or lower the rates")
 
@@ -142,6 +142,6 @@ class Densify(Scheduled):
             sizes = [view.camera.width * view.camera.height for view in views]
             yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._outside(edit)
         if self.budget and self.every and self.stop:
-            left = len(places(self.every, run.step - 1, self.stop))
+            left = len(fire_steps(self.every, run.step - 1, self.stop))
             context = BudgetContext(run.step / self.stop, left, run.divisor)
             yield self.budget.limit(edit, context, run.scalars)

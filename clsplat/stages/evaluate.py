@@ -5,9 +5,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, field_validator
 
-from clsplat.core.errors import amount
-from clsplat.core.files import fault_of_output
-from clsplat.core.settings import ReadPath
+from clsplat.core.errors import pluralize
+from clsplat.core.files import invalid_output_reason
+from clsplat.core.settings import InputPath
 from clsplat.gaussians.model import load
 from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
 from clsplat.metrics.views import mean, measure, tell_of_colors
@@ -22,7 +22,7 @@ Downscale = Annotated[float, Field(ge=1)]
 
 
 def _inside(text: str) -> str:
-    if fault := fault_of_output(text):
+    if fault := invalid_output_reason(text):
         raise ValueError(f"expected a path inside the run folder: {fault}")
     return text
 
@@ -56,7 +56,7 @@ class Evaluate(Scheduled):
     """Divisors of the photographs' size; without it, the smallest in training."""
     metrics: list[Metric] = Field(["psnr", "ssim"])
     """Metrics beside LPIPS; psnr and ssim must be among them."""
-    lpips: ReadPath | None = None
+    lpips: InputPath | None = None
     """ONNX file of LPIPS."""
     lpips_input: InputRange = "-1..1"
     """Range of the values for LPIPS; 0..1 as in the tables of 3DGS and Mip-Splatting."""
@@ -105,6 +105,6 @@ class Evaluate(Scheduled):
             LOG.info(
                 "step %d  %s%s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%s)",
                 *(run.model_step, f"{self.file}, " if self.file else "", self.split, downscale),
-                *(averages["psnr"], averages["ssim"], amount(len(results), "view")),
+                *(averages["psnr"], averages["ssim"], pluralize(len(results), "view")),
             )
             tell_of_colors(averages)

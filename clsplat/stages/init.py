@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.core.settings import ReadPath
+from clsplat.core.settings import InputPath
 from clsplat.formats.splats import Parameters, with_degree
 from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import Gaussians
@@ -134,7 +134,7 @@ class Init(Stage):
     still."""
     min_duration: Annotated[float, Field(gt=0)] = 0.1
     """Shortest duration of the Gaussians whose points moved, with `times: per_frame`, by the scene's duration."""
-    file: ReadPath | None = None
+    file: InputPath | None = None
     """Model file of any format, or a run folder, for `source: model`."""
 
     def check(self) -> None:

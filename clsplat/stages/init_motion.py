@@ -4,7 +4,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from clsplat.core.errors import ConfigError, DataError, in_shell
+from clsplat.core.errors import ConfigError, DataError, shell_quote
 from clsplat.formats.splats import MOTION, Parameters, fields_of
 from clsplat.gaussians.motion import still
 from clsplat.render.filters import Motion
@@ -85,6 +85,6 @@ def with_motion(parameters: Parameters, motion: Motion | None, file: str) -> Par
         have = "another degree or rotation" if expected else "no `model.time`"
         raise ConfigError(
             f"{file}: holds Gaussians that move, and the pipeline has {have}; give those of the file, "
-            f"or start from one moment of it: `clsplat convert {in_shell(file)} FRAME.ply --time T`"
+            f"or start from one moment of it: `clsplat convert {shell_quote(file)} FRAME.ply --time T`"
         )
     return {**parameters, MOTION: still(len(parameters["means"]), expected)}

@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 
 from clsplat.core.errors import ConfigError
 from clsplat.core.progress import Progress
-from clsplat.core.schedule import place
+from clsplat.core.schedule import fire_step
 from clsplat.core.settings import OneOf
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewLosses
@@ -87,7 +87,7 @@ class Keeping(Training):
         if self.patience is None:
             return self.steps
         every = self.measuring(getattr(self, "during", ()))[-1].every or self.steps
-        return min(self.steps, place(every, 1 + self.patience)) + (place(every, 1) if self.refit else 0)
+        return min(self.steps, fire_step(every, 1 + self.patience)) + (fire_step(every, 1) if self.refit else 0)
 
     def in_turn(self, during: Sequence[Scheduled]) -> list[Scheduled]:
         """Return all stages of `during` in the order in which they act: first the measurements of `keep: best`, since

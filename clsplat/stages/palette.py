@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.core.errors import amount
+from clsplat.core.errors import pluralize
 from clsplat.core.harmonics import basis
 from clsplat.density.survey import WEIGHT, RenderedView
 from clsplat.formats.sog import Harmonics
@@ -74,7 +74,7 @@ class PaletteSh(Scheduled):
         set_clusters(gaussians, found.labels, error.weights)
         if run.adam is not None:
             run.adam.forget("sh_rest")
-        LOG.info("%s of %s", amount(len(found.palette), "harmonic"), amount(gaussians.count, "Gaussian"))
+        LOG.info("%s of %s", pluralize(len(found.palette), "harmonic"), pluralize(gaussians.count, "Gaussian"))
 
 
 class SharePalette(Scheduled):

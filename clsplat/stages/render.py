@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.core.errors import amount
+from clsplat.core.errors import pluralize
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.metrics.views import render_view
 from clsplat.render.camera import upload_camera
@@ -50,7 +50,7 @@ class Render(Stage):
             camera = upload_camera(run.device, view)
             write_image(path, render_view(run.painter(), camera))
         if views:
-            LOG.info("%s written to %s", amount(len(views), "image"), run.out / self.folder)
+            LOG.info("%s written to %s", pluralize(len(views), "image"), run.out / self.folder)
 
 
 def image_paths(folder: Path, views: Sequence[str], suffix: str = ".png") -> list[Path]:

@@ -13,9 +13,9 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from clsplat.core.errors import amount, size_text
+from clsplat.core.errors import pluralize, size_text
 from clsplat.core.files import PIPELINE, write_text
-from clsplat.core.page import charts, duration, embedded, render
+from clsplat.core.page import data_url, duration_text, render, safe_charts
 from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import SHARES, Gains, ViewMetrics, measure, render_view
@@ -87,7 +87,7 @@ def of_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
     """What the training views, and where all views stand, tell."""
     number = len({view.name for view in train})
     if number < FEW:
-        yield f"{amount(number, 'training photograph')}: few; show every place in five, from several sides"
+        yield f"{pluralize(number, 'training photograph')}: few; show every place in five, from several sides"
     if gap := widest_gap(views):
         degrees, one, other = gap
         yield f"no photograph is from the {degrees:.0f}° between {one} and {other}; take some there"
@@ -162,7 +162,7 @@ def cameras(run: Run) -> list[Markup]:
     means = run.model.gaussians.get("means") if run.gaussians else np.zeros((0, 3), np.float32)
     points = flat(means[:: max(1, len(means) // MOST_POINTS)].astype(np.float64))
     near = points[(np.abs(points - middle) < max(reach, 1e-9)).all(axis=1)]
-    return charts([plan("cameras from above", marks, near)])
+    return safe_charts([plan("cameras from above", marks, near)])
 
 
 def _axes(views: Sequence[View]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -186,7 +186,7 @@ def training_charts(run: Run) -> list[Markup]:
     psnr = list(zip([r["step"] for r in train], over_views([r["psnr"] for r in train]), strict=True))
     line = {key: [(r["step"], r[key]) for r in train if key in r] for key in ("loss", "gaussians", "ms")}
     seen = Line(psnr, f"training views, mean of the last {VIEWS}", COLORS[0], running)
-    return charts(
+    return safe_charts(
         [
             curve("PSNR, dB", [seen, *measured]),
             *([curve("PSNR before the refit, dB", trial)] if trial else []),
@@ -220,7 +220,7 @@ def gaussians_charts(run: Run) -> list[Markup]:
     def quantiles(name: str) -> list[Line]:
         return [Line([(r["step"], r[name][i]) for r in lines], share) for i, share in enumerate(shares)]
 
-    return charts(
+    return safe_charts(
         [
             curve("size (rms scale, scene units), quantiles", quantiles("size"), logarithmic=True),
             curve("anisotropy (longest by shortest axis), quantiles", quantiles("anisotropy"), logarithmic=True),
@@ -375,7 +375,7 @@ def _figure(record: dict[str, Any], image: Image, photograph: Image) -> ViewFigu
     difference = np.clip(np.abs(image.astype(np.int16) - photograph) * 4, 0, 255).astype(np.uint8)
     images = {"render": image, "photograph": photograph, "difference": difference}
     caption = f"{record['view']} ({record['split']}): {record['psnr']:.2f} dB, SSIM {record['ssim']:.4f}"
-    return ViewFigure(caption, {label: embedded(pixels) for label, pixels in images.items()})
+    return ViewFigure(caption, {label: data_url(pixels) for label, pixels in images.items()})
 
 
 LOG = logging.getLogger("clsplat")
@@ -409,7 +409,7 @@ class HtmlReport(Stage):
             main=_main(run),
             overfitting_note=overfitting_note(run),
             advice=advised,
-            photographs=photographs_text(run.found) or f"{amount(len(run.original.views), 'photograph')}",
+            photographs=photographs_text(run.found) or f"{pluralize(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
             models=_addresses(run, "export", run.out / self.file),
             views=views(run),
@@ -437,7 +437,7 @@ def _main(run: Run) -> str:
     test = run.metrics.get("test", {}).get(f"{run.downscale:g}")
     quality = [f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}"] if test else []
     quality += [f"the model of step {run.model_step:,}"] if run.model_step != run.step else []
-    others = _size(run), f"trained for {duration(run.train_seconds)}"
+    others = _size(run), f"trained for {duration_text(run.train_seconds)}"
     return " · ".join([*quality, *others])
 
 
@@ -450,10 +450,10 @@ def _figures(run: Run) -> dict[str, str]:
     for split, by_downscale in sorted(run.metrics.items(), key=lambda item: SPLITS.index(item[0])):
         for downscale, averages in by_downscale.items():
             suffix = "" if downscale == f"{run.downscale:g}" else f" at 1/{downscale}"
-            values[f"{split} PSNR{suffix} ({amount(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
+            values[f"{split} PSNR{suffix} ({pluralize(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
             for key, (name, unit) in MORE.items():
                 if averages.get(key) is not None:
-                    some = f" ({amount(averages[f'{key}_views'], 'view')})" if f"{key}_views" in averages else ""
+                    some = f" ({pluralize(averages[f'{key}_views'], 'view')})" if f"{key}_views" in averages else ""
                     values[f"{split} {name}{suffix}{some}"] = f"{averages[key]:.2f} {unit}"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     if run.is_refit and run.best:
@@ -463,7 +463,7 @@ def _figures(run: Run) -> dict[str, str]:
     number, _, what = _size(run).partition(" ")
     values[what] = number
     values["steps"] = f"{run.step:,}"
-    values["training"] = duration(run.train_seconds)
+    values["training"] = duration_text(run.train_seconds)
     return values
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from clsplat.core.errors import ConfigError, quoted
-from clsplat.core.progress import counted, heard_by
-from clsplat.core.settings import ReadPath
+from clsplat.core.errors import ConfigError, quote
+from clsplat.core.progress import counted, listening
+from clsplat.core.settings import InputPath
 from clsplat.scene.images import image_size, read_image, write_image
 from clsplat.scene.view import View
 from clsplat.training.run import Run
@@ -63,7 +63,7 @@ class Snapshot(Scheduled):
         found = {view.name: view for view in scene.views}
         if self.view not in found:
             near = difflib.get_close_matches(self.view, found, n=1, cutoff=0.0)
-            raise ConfigError(f"snapshot: the scene has no view {quoted(self.view)}; did you mean {quoted(near[0])}?")
+            raise ConfigError(f"snapshot: the scene has no view {quote(self.view)}; did you mean {quote(near[0])}?")
         return found[self.view]
 
     def run(self, run: Run) -> None:
@@ -98,7 +98,7 @@ class Timelapse(Stage):
     def run(self, run: Run) -> None:
         files = self._files(run)
         if not files:
-            raise ConfigError(f"timelapse: no stage snapshot has written into {quoted(self.folder)}; name its folder")
+            raise ConfigError(f"timelapse: no stage snapshot has written into {quote(self.folder)}; name its folder")
         size = image_size(files[-1])
         with encoding.opened(run.out / self.file, size, self.fps) as write:
             for path in run.status.counted(run.until_interrupted(files), "frames", len(files)):
@@ -116,7 +116,7 @@ class Video(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"painter"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"path", "frames", "fps", "size", "times", "file"})
 
-    path: ReadPath = "ellipse"
+    path: InputPath = "ellipse"
     """One of ellipse, spiral, orbit, through, views and fixed, fixed:NAME of a view, or a file camera_path.json."""
     frames: Annotated[int, Field(gt=0, le=MAX_FRAMES)] = FRAMES
     """Number of frames."""
@@ -155,7 +155,7 @@ class Video(Stage):
             return counted(run.until_interrupted(views), "frames rendered", len(views))
 
         canvas = Canvas(run.painter())
-        with heard_by(run.status.count):
+        with listening(run.status.count):
             shoot(canvas, film, {"color": path}, None, through)
         LOG.info("video of %d frames written to %s, %.2f MB", len(film.views), path, path.stat().st_size / 1e6)
 

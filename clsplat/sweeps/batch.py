@@ -10,7 +10,7 @@ from pathlib import Path
 
 from clsplat.core import terminal
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted
-from clsplat.core.files import PIPELINE, told_as
+from clsplat.core.files import PIPELINE, raising_output_error
 from clsplat.core.progress import Count
 from clsplat.core.reading import read_json
 from clsplat.core.signals import stop_at_once, stopping_on_signals
@@ -43,7 +43,7 @@ def place_copy(source: Path, target: Path) -> None:
 
     Raises OutputError.
     """
-    with told_as(target):
+    with raising_output_error(target):
         for old in (target / MANIFEST, *checkpoint.saved(target)):  # later checkpoints are of another run
             old.unlink(missing_ok=True)
         copy_files(source, target, {LEASE, ERRORS, MANIFEST})
@@ -111,7 +111,7 @@ class Batch:
         device: the one of the engine inline.  Raises Interrupted, Different.
         """
         driving = threading.Event()
-        with stopping_on_signals(lambda: ask_to_stop(self._stop, driving)), terminal.counted():
+        with stopping_on_signals(lambda: ask_to_stop(self._stop, driving)), terminal.counts_on_terminal():
             wanted = self._wanted()
             with _engine(execution, self.store, device, self._is_stopped) as engine:
                 terms = Terms(self.store.now(), execution.retries)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.core import machine
-from clsplat.core.files import told_as
+from clsplat.core.files import raising_output_error
 from clsplat.core.machine import Cores
 from clsplat.pipeline import plugins
 from clsplat.sweeps.store import ERRORS, PIPELINE_FILE, CellAttempt
@@ -48,17 +48,17 @@ def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], b
     Where `is_stopped`, the run saves its state and ends.  own: the cores that it is kept to, none: those of this
     process.  Raises LeaseLost.
     """
-    with told_as(attempt.path), (attempt.path / ERRORS).open("wb") as errors:
+    with raising_output_error(attempt.path), (attempt.path / ERRORS).open("wb") as errors:
         process = subprocess.Popen(
             filled(command, attempt.path / PIPELINE_FILE, attempt.path),
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=errors,
-            env=machine.limited(own) if own else None,
+            env=machine.limited_environment(own) if own else None,
             **APART,
         )
         if own:
-            machine.keep_to(own, process.pid)  # before it has started a runtime
+            machine.pin_to_cores(own, process.pid)  # before it has started a runtime
     try:
         code = _wait(process, attempt, is_stopped)
     finally:

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.core import machine
-from clsplat.core.errors import ConfigError, DataError, DeviceError, OutputError, amount
+from clsplat.core.errors import ConfigError, DataError, DeviceError, OutputError, pluralize
 from clsplat.core.files import write_text
 from clsplat.core.machine import Owner, cache_folder
-from clsplat.core.manifest import hash_of
+from clsplat.core.manifest import hash_values
 from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
 from clsplat.pipeline.files import shipped
@@ -37,10 +37,12 @@ def shares_of(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
 
     Raises ConfigError for more runs than cores.
     """
-    own = machine.usable()
+    own = machine.usable_cores()
     if packing > len(own):
-        raise ConfigError(f"execution.packing: {packing} runs cannot share {amount(len(own), 'core')}; expected fewer")
-    parts: Parts = machine.shares(own, packing) if packing > 1 else [()]
+        raise ConfigError(
+            f"execution.packing: {packing} runs cannot share {pluralize(len(own), 'core')}; expected fewer"
+        )
+    parts: Parts = machine.split_cores(own, packing) if packing > 1 else [()]
     return [parts if info.kind == "CPU" else [()] for info in devices]
 
 
@@ -110,7 +112,7 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 
     Raises DeviceError where it fails.
     """
-    key = hash_of(Owner.this().host, info.text, info.driver, code_digest(), shipped()[PIPELINE])
+    key = hash_values(Owner.this().host, info.text, info.driver, code_digest(), shipped()[PIPELINE])
     note = cache_folder() / "bits" / f"{key[:16]}.json"
     with suppress(DataError):
         found = read_json(note)

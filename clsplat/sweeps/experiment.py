@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.core import terminal
-from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, in_shell
-from clsplat.core.files import COMPARISON, LOG_FILE, OF_A_MATRIX, PIPELINE, STATUS, is_there, write_text
+from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, shell_quote
+from clsplat.core.files import COMPARISON, LOG_FILE, MATRIX_FILES, PIPELINE, STATUS, path_exists, write_text
 from clsplat.core.reading import sha256
-from clsplat.core.signals import stop_at_once, stop_if_signalled, stopping_on_signals
+from clsplat.core.signals import stop_at_once, stop_if_signaled, stopping_on_signals
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Experiment, load_experiment
@@ -59,10 +59,10 @@ def run_pipeline(
     ):
         if live:
             live.follow(status)
-        with terminal.counted():
+        with terminal.counts_on_terminal():
             run = opening.open_run(pipeline, out, device, start, status)
             pipeline = settle(pipeline, run)
-            stop_if_signalled()
+            stop_if_signaled()
 
         def execute(pipeline: Pipeline, run: Run, start: Start, show: Show) -> None:
             with live.showing(run) if live else nullcontext():
@@ -111,7 +111,7 @@ class Job:
         """
         state = None
         if out is not None:
-            is_there(out)  # raises where no file can have that name
+            path_exists(out)  # raises where no file can have that name
             state = RunState.read(out)
         return cls._open(pipeline, state, scene, overrides, start, execution)
 
@@ -151,7 +151,9 @@ class Job:
         """
         state = RunState.read(out)
         if PIPELINE not in state.names:
-            again = f"; run its `clsplat run … --out {in_shell(out)} --resume` again" if STATUS in state.names else ""
+            again = (
+                f"; run its `clsplat run … --out {shell_quote(out)} --resume` again" if STATUS in state.names else ""
+            )
             raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has started{again}")
         if steps is not None:
             overrides = [*overrides, f"{state.steps_key}={steps}"]
@@ -186,7 +188,7 @@ class Job:
             elif start := start_of(self.work, self.state, self.start):
                 folder = self.work.settings.scene.folder
                 if start == "resume" and not folder.exists():
-                    remedy = f"`clsplat resume {in_shell(self.out)} --scene DIR` says where they are now"
+                    remedy = f"`clsplat resume {shell_quote(self.out)} --scene DIR` says where they are now"
                     raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
                 run_pipeline(self.work, self.state, device, start, preview, minutes)
             else:
@@ -209,7 +211,7 @@ def previewed(port: int | None) -> Iterator[Live | None]:
         yield None
         return
     with Live(port) as live:
-        terminal.remark(live.text)  # not in the log, which others may read: its address is a secret
+        terminal.print_message(live.text)  # not in the log, which others may read: its address is a secret
         yield live
 
 
@@ -236,7 +238,9 @@ def run_matrix(
                     if cell.name not in done:
                         run_pipeline(cell.pipeline, before[cell.name], device, start, live)
             except Interrupted as stopped:
-                raise Interrupted(f"stopped in {title}; `clsplat resume {in_shell(out)}` goes on with it") from stopped
+                raise Interrupted(
+                    f"stopped in {title}; `clsplat resume {shell_quote(out)}` goes on with it"
+                ) from stopped
             status.note(done=number, failed=failures.texts())
             status.refresh()
 
@@ -273,7 +277,7 @@ def read_cells(experiment: Experiment, out: Path, start: Start) -> tuple[dict[st
 
 def check_matrix_folder(state: RunState) -> None:
     """Raise ConfigError when the folder holds a single run, or files of others under the names of a matrix."""
-    outputs.check_names(state, OF_A_MATRIX)
+    outputs.check_names(state, MATRIX_FILES)
     out = state.out
     if PIPELINE in state.names and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")

@@ -36,17 +36,17 @@ from clsplat.core.files import (
     LOCK,
     LOG_FILE,
     METRICS,
-    NOTE,
     PARTIAL,
+    PREPARE_SUMMARY,
     PREPARED,
     RECORDS,
     STATUS,
     TRIAL,
     UNDISTORTED,
     make_folder,
+    raising_output_error,
     sync_below,
     sync_folder,
-    told_as,
     write_text,
 )
 from clsplat.core.machine import Owner
@@ -98,7 +98,9 @@ def link_or_copy(source: Path, target: Path) -> None:
 # An attempt at a cell: a run folder with a lease, and with a manifest when its run is done.
 
 LEASE, MANIFEST, PIPELINE_FILE, ERRORS = "lease.json", "manifest.json", "cell.yaml", "errors.txt"
-OWN = frozenset({LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, NOTE})  # of one attempt alone; NOTE has a path
+OWN = frozenset(
+    {LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, PREPARE_SUMMARY}
+)  # of one attempt alone; NOTE has a path
 MEASURED = ("psnr", "ssim", "views")  # figures of metrics.json that a device's bits decide
 BEAT = 10.0  # seconds between two beats of a lease
 Rank = tuple[bool, int]  # of a checkpoint: whether it is of a refit, and its step
@@ -185,7 +187,7 @@ class CellAttempt:
         """
         for _, path, other in whole(others):
             own = self.path / CHECKPOINTS / path.name
-            with told_as(self.path):
+            with raising_output_error(self.path):
                 own.parent.mkdir(exist_ok=True)
                 try:
                     link_or_copy(path, own)
@@ -328,7 +330,7 @@ class CellFolder:
     def begin(self, worker: str, since: float) -> CellAttempt:
         """Make a new attempt, which goes on from the newest checkpoint of all that is whole.  Raises OutputError."""
         attempt = CellAttempt(self.path / ATTEMPTS / uuid.uuid4().hex)
-        with told_as(attempt.path):
+        with raising_output_error(attempt.path):
             make_folder(attempt.path)
             (self.path / FAILED).unlink(missing_ok=True)  # it is tried again
         attempt.take_lease(worker, since)
@@ -350,7 +352,7 @@ class CellFolder:
         """
         attempt.require_lease()
         ours = attempt.manifest()
-        with told_as(attempt.path):
+        with raising_output_error(attempt.path):
             sync_below(attempt.path)
         with suppress(OSError):
             os.rename(attempt.path, self.result)
@@ -435,7 +437,7 @@ class Store:
     def now(self) -> float:
         """Return the time by the clock of the store's file system, in seconds, which all machines share."""
         clock = self.root / EVENTS / f".{self._own}.clock"
-        with told_as(clock):
+        with raising_output_error(clock):
             make_folder(clock.parent)
             clock.touch()
             return clock.stat().st_mtime
@@ -443,7 +445,7 @@ class Store:
     def tell(self, event: str, **values: Any) -> None:
         """Append an event to the file of this process."""
         path = self.root / EVENTS / f"{self._own}.jsonl"
-        with told_as(path):
+        with raising_output_error(path):
             make_folder(path.parent)
             with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps({"time": round(time.time(), 3), "event": event, **values}) + "\n")
@@ -495,7 +497,7 @@ class Store:
     def stop(self, name: str) -> None:
         """Let what began under a name, or all, stop."""
         flag = self.root / CANCEL / name
-        with told_as(flag):
+        with raising_output_error(flag):
             make_folder(flag.parent)
             flag.touch()
             os.utime(flag)

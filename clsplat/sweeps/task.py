@@ -16,7 +16,7 @@ from clsplat.core.errors import (
     OutputError,
     one_line,
 )
-from clsplat.core.files import INPUTS, NOTE, PREPARED, UNDISTORTED, make_folder, write_text
+from clsplat.core.files import INPUTS, PREPARE_SUMMARY, PREPARED, UNDISTORTED, make_folder, write_text
 from clsplat.core.reading import read_json
 from clsplat.sweeps.cell import CellRun
 from clsplat.sweeps.child import Command, supervise
@@ -124,7 +124,7 @@ def _equip(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt
 def _require_same_scene(cell: CellRun, attempt: CellAttempt) -> None:
     """Raise DataError where the photographs, or other files, are not those that the cell was named by."""
     cell.require_files()
-    for name, key in ((NOTE, "inputs"), (INPUTS, "digest")):
+    for name, key in ((PREPARE_SUMMARY, "inputs"), (INPUTS, "digest")):
         if not (attempt.path / name).is_file():
             continue
         if read_json(attempt.path / name).get(key) != cell.spec["scene"]:

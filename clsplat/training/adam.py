@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.schedule import Decay, NonNegative, Schedule, at_step, divided, explained
+from clsplat.core.schedule import Decay, NonNegative, Schedule, at_step, divide, explain_schedule
 from clsplat.core.settings import Settings
 from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients
 from clsplat.gaussians.deferred import Deferred
@@ -43,15 +43,15 @@ class FullSizeDecay(Settings):
 def _times(rate: FullSizeDecay | Schedule, factor: float) -> FullSizeDecay | Schedule:
     if isinstance(rate, FullSizeDecay):
         return rate.model_copy(update={"initial": rate.initial * factor, "final": rate.final * factor})
-    return divided(rate, 1 / factor)
+    return divide(rate, 1 / factor)
 
 
 class Rates(Settings):
     """Learning rates by parameter, each by step.  Those of `means` are multiplied by the scene's extent."""
 
-    means: Annotated[FullSizeDecay | NonNegative, explained(", or {initial, final, until, start: full_size}")] = Decay(
-        initial=1.6e-4, final=1.6e-6, over=30_000
-    )
+    means: Annotated[
+        FullSizeDecay | NonNegative, explain_schedule(", or {initial, final, until, start: full_size}")
+    ] = Decay(initial=1.6e-4, final=1.6e-6, over=30_000)
     """Of the means, as shares of the scene's extent."""
     quats: NonNegative = 1.0e-3
     """Of the quaternions."""

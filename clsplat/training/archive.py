@@ -19,8 +19,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, OutputError, one_line, shortened
-from clsplat.core.reading import regular
+from clsplat.core.errors import DataError, OutputError, one_line, shorten
+from clsplat.core.reading import open_regular
 
 META, META_DIGEST, DIGESTS = "meta", "meta_sha256", "sha256"
 DAMAGE = {None, errno.EINVAL, errno.EISDIR, errno.EIO}  # a place before the beginning, a folder, a bad part of the disk
@@ -42,7 +42,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
     Raises OutputError and MemoryError where the system cannot read it, which says nothing about the file.
     """
     try:
-        with regular(path) as file, zipfile.ZipFile(file) as archive:
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             _require_sizes(archive, path.stat().st_size)
             notes = _notes(archive)
             digests = notes.pop(DIGESTS)
@@ -58,7 +58,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
         if isinstance(error, DataError):
             raise
         empty = isinstance(error, zipfile.BadZipFile) and path.stat().st_size == 0
-        reason = shortened(one_line(error) or type(error).__name__)
+        reason = shorten(one_line(error) or type(error).__name__)
         if isinstance(error, OSError) and error.errno == errno.EIO:
             raise DataError(f"the disk cannot read it: {error.strerror}") from error
         raise DataError("is empty" if empty else f"differs from its checksum ({reason})") from error

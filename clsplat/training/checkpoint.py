@@ -25,10 +25,10 @@ from clsplat.core.errors import (
     Interrupted,
     NotFiniteError,
     OutputError,
-    in_shell,
     one_line,
+    shell_quote,
 )
-from clsplat.core.files import CHECKPOINTS, PIPELINE, atomic
+from clsplat.core.files import CHECKPOINTS, PIPELINE, open_atomic
 from clsplat.core.resources import full_version
 from clsplat.core.schedule import at_step
 from clsplat.density.statistics import PREFIX as STATS_PREFIX
@@ -297,7 +297,7 @@ def set_aside(run: Run, broken: list[str]) -> str:
     good = saved(run.out)
     return (
         f"parameters not finite: {', '.join(broken) or 'none'}; {state}; "
-        f"`clsplat resume {in_shell(run.out)} --set {lower_rate(run, broken)}` lowers a rate and "
+        f"`clsplat resume {shell_quote(run.out)} --set {lower_rate(run, broken)}` lowers a rate and "
         f"{f'goes on from {good[-1].name}' if good else 'starts again'}"
     )
 
@@ -340,9 +340,7 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
     when no checkpoint is whole, or all are gone.
     """
     paths = saved(run.out)
-    again = (
-        f"`clsplat run {in_shell(run.out / PIPELINE)} --out {in_shell(run.out)} --restart` starts from the beginning"
-    )
+    again = f"`clsplat run {shell_quote(run.out / PIPELINE)} --out {shell_quote(run.out)} --restart` starts over"
     for path in reversed(paths):
         try:
             state, tables = load(path)
@@ -416,7 +414,7 @@ def _write(run: Run, kind: str) -> Path:
         pipeline=run.pipeline,
     )
     path = run.out / CHECKPOINTS / f"{kind}_{run.step:06d}.npz"
-    with atomic(path) as file:
+    with open_atomic(path) as file:
         archive.write(file, state.model_dump(), tables_of(run))
     return path
 
@@ -443,7 +441,7 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
             raise ConfigError(f"{path} is of a refit, whose steps validation has found: {difference}; {remedy}")
         is_end = difference.place.endswith(".steps")  # an end before the one that was planned
         if difference.stage == state.cursor and state.is_trained(run.pipeline) and not is_end:
-            more = f"`clsplat resume {in_shell(run.out)} --steps {2 * state.stage_step}` with that setting trains on"
+            more = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` with that setting trains on"
             raise ConfigError(f"{path}: no step is left to train, at step {state.step}: {difference}; {more}")
         changed.append(f"step {state.step}: {difference}")
     run.changes = [*state.changes, *changed]

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field
 
-from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, divided
+from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, divide
 from clsplat.core.settings import Settings
 from clsplat.formats.splats import MOTION, fields_of
 from clsplat.gaussians.gaussians import Gaussians
@@ -44,7 +44,7 @@ class MotionRates(Settings):
 
     def times(self, factor: float) -> "MotionRates":
         """Return all rates times a factor."""
-        return self.model_copy(update={name: divided(getattr(self, name), 1 / factor) for name in self._rates})
+        return self.model_copy(update={name: divide(getattr(self, name), 1 / factor) for name in self._rates})
 
     @property
     def _rates(self) -> list[str]:

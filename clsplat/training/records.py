@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
-from clsplat.core.files import RECORDS, TRIAL, append, told_as, write_text
+from clsplat.core.files import RECORDS, TRIAL, append, raising_output_error, write_text
 from clsplat.core.reading import read_file
 from clsplat.opencl.device import Timings
 
@@ -41,7 +41,7 @@ class Records:
         """Begin anew, for a refit; the lines so far are in trial.jsonl then.  Raises OutputError."""
         self.write()
         self._require_held()
-        with told_as(self.trial):
+        with raising_output_error(self.trial):
             self.path.replace(self.trial)
         self.lines = 0
 
@@ -52,7 +52,7 @@ class Records:
         Those of the state that cannot be read are lost, with all behind them, and a warning says so.
         """
         if not is_refit and self.trial.exists():
-            with told_as(self.trial):
+            with raising_output_error(self.trial):
                 self.trial.replace(self.path)
         kept: list[dict[str, Any]] = []
         fault = "it ends before"

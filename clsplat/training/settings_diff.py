@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
-from clsplat.core.errors import shortened
-from clsplat.core.settings import TAGS, Settings, resumable, tag_of
+from clsplat.core.errors import shorten
+from clsplat.core.settings import TAGS, Settings, resume_effect, tag_of
 
 Kind = Literal["output", "training"] | None
 
@@ -19,7 +19,7 @@ class Difference(NamedTuple):
     kind: Kind  # as its class says; None: a run cannot go on with the new value
 
     def __str__(self) -> str:
-        return f"{self.place} was {shortened(repr(self.was), 80)}, is {shortened(repr(self.now), 80)}"
+        return f"{self.place} was {shorten(repr(self.was), 80)}, is {shorten(repr(self.now), 80)}"
 
     def is_of_place(self, were: Mapping[str, str], are: Mapping[str, str]) -> bool:
         """Whether the same file lies at another place now.  were, are: hashes of the files that settings name."""
@@ -76,6 +76,6 @@ def _inside(settings: Any, key: str) -> tuple[Any, Kind]:
     if not isinstance(settings, Settings):
         return None, None
     if key in type(settings).model_fields:
-        return getattr(settings, key), resumable(type(settings), key)
+        return getattr(settings, key), resume_effect(type(settings), key)
     named = any(getattr(settings, tag, None) == key for tag in TAGS)  # a stage is written as {name: fields}
     return settings if named else None, None

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args
 
 from pydantic import AfterValidator, Field, field_validator
 
-from clsplat.core.errors import Interrupted, in_shell
-from clsplat.core.files import fault_of_output
+from clsplat.core.errors import Interrupted, shell_quote
+from clsplat.core.files import invalid_output_reason
 from clsplat.core.progress import Stopped
-from clsplat.core.schedule import EverySteps, is_act
+from clsplat.core.schedule import EverySteps, fires_at
 from clsplat.core.settings import OneOf, Settings
 from clsplat.training import checkpoint
 from clsplat.training.run import Run
@@ -31,7 +31,7 @@ def path_in_run(*suffixes: str) -> PathInRun:
     """Mark a field that holds a file in the run folder whose name ends in one of `suffixes`, or a folder in it."""
 
     def checked(text: str) -> str:
-        fault = fault_of_output(text)
+        fault = invalid_output_reason(text)
         if fault is None and suffixes and not PurePosixPath(text).name.lower().endswith(suffixes):
             fault = f"it does not end in {', '.join(suffixes)}"
         if fault:
@@ -119,7 +119,7 @@ class Scheduled(Stage):
 
     def due(self, step: int, is_last: bool = False) -> bool:
         """Return whether the stage runs at a global step, counted from 1; `is_last` of the training."""
-        if self.every is None or not (is_act(self.every, step) or (is_last and self.ends)):
+        if self.every is None or not (fires_at(self.every, step) or (is_last and self.ends)):
             return False
         return step > self.start and (self.stop is None or step < self.stop)
 
@@ -241,7 +241,7 @@ class Training(Stage):
             self.act_between(run)
         run.between()
         if run.interrupted:
-            told = f"saved in {checkpoint.save(run)}; `clsplat resume {in_shell(run.out)}` goes on from it"
+            told = f"saved in {checkpoint.save(run)}; `clsplat resume {shell_quote(run.out)}` goes on from it"
             raise Interrupted(f"stopped at step {run.step}, {told}")
         if self.has_ended(run):
             self.leave(run)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import OutputError
 from clsplat.core.files import write_text
-from clsplat.core.page import embedded, inline, render, shrunk
+from clsplat.core.page import data_url, inline, render, shrink
 from clsplat.core.reading import read_file
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
@@ -194,8 +194,8 @@ def described(
     for view in through(scene.views):
         pixels, split = read(view), "test" if view.name in test else "train"
         wanted = which == "all" or which == split
-        photograph = embedded(shrunk(pixels, LARGEST)) if wanted else None
-        thumbnail = embedded(shrunk(pixels, THUMBNAIL))
+        photograph = data_url(shrink(pixels, LARGEST)) if wanted else None
+        thumbnail = data_url(shrink(pixels, THUMBNAIL))
         views.append(
             {"name": view.name, "split": split, "thumbnail": thumbnail, "photograph": photograph, **camera_data(view)}
         )

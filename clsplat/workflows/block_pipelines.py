@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.schedule import divided, values_of
+from clsplat.core.schedule import divide, schedule_values
 from clsplat.gaussians.model import MODEL
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, checked
@@ -137,8 +137,8 @@ def _limited(densify: Densify, block: Block) -> Densify:
     """The stage in a block: Gaussians grow in its cell, up to its share, by pairs, of the number of the whole."""
     changed: dict[str, Any] = {"inside": block.cell.grown(GROWTH)}
     if densify.max_gaussians is not None:
-        changed["max_gaussians"] = divided(densify.max_gaussians, 1 / block.pairs)
-        if min(values_of(changed["max_gaussians"])) < 1:
+        changed["max_gaussians"] = divide(densify.max_gaussians, 1 / block.pairs)
+        if min(schedule_values(changed["max_gaussians"])) < 1:
             told = f"densify.max_gaussians: {block.name} has none of so few Gaussians"
             raise ConfigError(f"{told}; expected more of them, or fewer --blocks")
     return densify.model_copy(update=changed)

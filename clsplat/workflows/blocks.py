@@ -18,14 +18,14 @@ from clsplat.core.errors import (
     ClsplatError,
     ConfigError,
     DataError,
-    NoneInsideError,
-    amount,
-    in_shell,
+    EmptyRegionError,
     one_line,
-    quoted,
+    pluralize,
+    quote,
+    shell_quote,
 )
 from clsplat.core.files import METRICS
-from clsplat.core.progress import only
+from clsplat.core.progress import log_level
 from clsplat.core.reading import read_json, sha256
 from clsplat.core.text_table import text_table
 from clsplat.formats.ply import join_plys
@@ -105,7 +105,7 @@ class BlocksPlan:
         if not 0 <= self.sight < 1:
             raise ConfigError(f"--sight {self.sight:g}: expected a share of a view's pixels from 0 to below 1")
         if self.steps not in get_args(Steps):
-            raise ConfigError(f"--steps {quoted(self.steps)}: expected one of {', '.join(get_args(Steps))}")
+            raise ConfigError(f"--steps {quote(self.steps)}: expected one of {', '.join(get_args(Steps))}")
 
 
 class Blocks:
@@ -182,23 +182,23 @@ class Blocks:
         for block in partition.blocks:
             if block.name in failures:
                 continue
-            LOG.info("%s of %d: %s", block.name, len(pipelines), amount(len(block.views), "view"))
+            LOG.info("%s of %d: %s", block.name, len(pipelines), pluralize(len(block.views), "view"))
             with failures.kept(block.name):
                 try:
                     model = trained(pipelines[block.name], self.out / block.name, self.device)
                     files.append((block, as_trained(model)))
-                except NoneInsideError:
+                except EmptyRegionError:
                     LOG.warning("%s: no Gaussian is left in its cell; the model goes on without it", block.name)
         if failures:
             remedy = "when that is mended, the same command trains them, and leaves the others alone"
-            kept = in_shell(self.out / COARSE)
+            kept = shell_quote(self.out / COARSE)
             other = f"other settings need another --out; --coarse {kept} keeps the coarse model there"
             whole = failures.whole(len(pipelines))
             error = ClsplatError(f"{whole}; {remedy if self.given else f'{remedy}; {other}'}")
             error.exit_code = whole.exit_code
             raise error
         if not files:
-            raise NoneInsideError("no Gaussian is left in any block; expected another pipeline, with another --out")
+            raise EmptyRegionError("no Gaussian is left in any block; expected another pipeline, with another --out")
         return files
 
     def _train_as_cells(self, execution: Execution, pipelines: dict[str, Pipeline], failures: Failures) -> None:
@@ -222,7 +222,7 @@ class Blocks:
                 raise DataError(f"{path}: holds Gaussians outside its cell; remove its folder, and train it again")
 
         count = join_plys(file, [path for _, path in parts], check)
-        LOG.info("%s of %s merged", amount(count, "Gaussian"), amount(len(parts), "block"))
+        LOG.info("%s of %s merged", pluralize(count, "Gaussian"), pluralize(len(parts), "block"))
         return file
 
     def finish(self, file: Path) -> Path:
@@ -317,7 +317,7 @@ def plan_blocks(
     Raises ConfigError for a number of blocks out of bounds, DataError where the scene has no points, or too few.
     """
     settings = load(pipeline, [f"scene.path={as_setting(photographs_of(scene))}", "init.file=points"]).settings
-    with only(logging.ERROR):  # it is read again, and told then
+    with log_level(logging.ERROR):  # it is read again, and told then
         points = read_run_scene(settings.scene, settings.scene.folder).original.points
     if points is None or not len(points):
         raise DataError(f"{scene}: has no points to cut by; `clsplat blocks --plan` trains a coarse model first")
@@ -329,4 +329,4 @@ def plan_blocks(
         try:
             return work.plan_of(work.partition())
         except DataError as error:
-            raise DataError(f"{scene}, by its {amount(len(points), 'point')}: {error}") from error
+            raise DataError(f"{scene}, by its {pluralize(len(points), 'point')}: {error}") from error

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from clsplat.core.errors import ConfigError, quoted
+from clsplat.core.errors import ConfigError, quote
 from clsplat.core.files import write_text
-from clsplat.core.page import charts, render
+from clsplat.core.page import render, safe_charts
 from clsplat.core.reading import read_file, sha256
 from clsplat.core.text_table import text_table
 from clsplat.formats.packing import written
@@ -111,16 +111,16 @@ class CompressionTarget:
         found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*([a-z]+)\s*", text, re.IGNORECASE | re.ASCII)
         unit = found[2].lower() if found else ""
         if found is None or unit not in (*UNITS, "db"):
-            raise ConfigError(f"--target {quoted(text)}: {EXPECTED}")
+            raise ConfigError(f"--target {quote(text)}: {EXPECTED}")
         value = float(found[1])
         if not math.isfinite(value * UNITS.get(unit, 1)):
-            raise ConfigError(f"--target {quoted(text)}: {EXPECTED}")
+            raise ConfigError(f"--target {quote(text)}: {EXPECTED}")
         if unit == "db":
             if value > 0:
-                raise ConfigError(f"--target {quoted(text)}: a gain; {EXPECTED}")
+                raise ConfigError(f"--target {quote(text)}: a gain; {EXPECTED}")
             return cls(text.strip(), change=value)
         if value * UNITS[unit] < 1:
-            raise ConfigError(f"--target {quoted(text)}: {EXPECTED}")
+            raise ConfigError(f"--target {quote(text)}: {EXPECTED}")
         return cls(text.strip(), most=int(value * UNITS[unit]))
 
     def is_met(self, point: Point, psnr: float) -> bool:
@@ -200,7 +200,7 @@ def page(
         subtitle=f"{model}; PSNR and SSIM of {split} views, of every file as it is read back",
         result=result,
         verdict=_verdict(target, source, chosen),
-        curves=charts([curve("PSNR, dB, over the file's size, MB", _lines(target, source, points))]),
+        curves=safe_charts([curve("PSNR, dB, over the file's size, MB", _lines(target, source, points))]),
         headings=HEADINGS,
         rows=[(point.file, cells(point, source), point == chosen) for point in (source, *points)],
     )
@@ -297,7 +297,7 @@ def compress(
     if steps is not None:
         require_steps(steps)
     if form not in get_args(Format):
-        raise ConfigError(f"--format {quoted(form)}: expected one of {', '.join(get_args(Format))}")
+        raise ConfigError(f"--format {quote(form)}: expected one of {', '.join(get_args(Format))}")
     opened = ModelFile(model, scene, device)
     source, first, measurer = opened.source, opened.gaussians, Measurer(opened)
     require_still(source.file, first.as_file(), form)

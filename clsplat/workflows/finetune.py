@@ -11,7 +11,15 @@ from typing import Any
 
 from clsplat.core import lock
 from clsplat.core.errors import ConfigError, DataError, Interrupted
-from clsplat.core.files import LOCK, PIPELINE, is_there, make_folder, sweep, told_as, write_text
+from clsplat.core.files import (
+    LOCK,
+    PIPELINE,
+    make_folder,
+    path_exists,
+    raising_output_error,
+    remove_partial_files,
+    write_text,
+)
 from clsplat.core.reading import read_json
 from clsplat.gaussians.model import MODEL, Model
 from clsplat.metrics.views import mean, measure
@@ -98,7 +106,7 @@ def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL)
         if state.checkpoints and not is_whole:
             LOG.warning("%s: no checkpoint is whole; it is trained again from the beginning", folder)
         begun: Start = "resume" if is_whole else "restart"
-        start: Start = begun if is_there(folder) else "new"
+        start: Start = begun if path_exists(folder) else "new"
         try:
             run_pipeline(pipeline, state, device, start)
         except Interrupted as error:
@@ -156,11 +164,11 @@ def claimed(out: Path, question: dict[str, Any], record: str, what: str, remedy:
     Raises ConfigError where it holds something else, OutputError where another process uses it.
     """
     _require_own(out, question, record, what, remedy)
-    with told_as(out):
+    with raising_output_error(out):
         make_folder(out)
-    with lock.held(out):
+    with lock.lock_folder(out):
         _require_own(out, question, record, what, remedy)  # again: another may have begun since
-        sweep(out, border=PIPELINE)
+        remove_partial_files(out, border=PIPELINE)
         if not (out / record).exists():
             write_text(out / record, json.dumps(question, indent=1) + "\n")
         yield
@@ -168,8 +176,8 @@ def claimed(out: Path, question: dict[str, Any], record: str, what: str, remedy:
 
 def _require_own(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> None:
     """Raise ConfigError where a folder holds another question, or something else."""
-    if not is_there(out / record):
-        if is_there(out) and not (out.is_dir() and all(_is_nobodys(path.name) for path in out.iterdir())):
+    if not path_exists(out / record):
+        if path_exists(out) and not (out.is_dir() and all(_is_nobodys(path.name) for path in out.iterdir())):
             raise ConfigError(f"{out}: holds something else than {what}; give {remedy}")
         return
     try:

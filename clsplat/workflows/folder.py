@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clsplat.core.errors import DataError, in_shell, one_line
+from clsplat.core.errors import DataError, one_line, shell_quote
 from clsplat.core.files import END_STATES
 from clsplat.core.reading import read_json
 from clsplat.runs import verify
@@ -60,7 +60,7 @@ def verify_blocks(out: Path) -> dict[str, Any]:
         "state": state,
         "whole": all(one["whole"] for one in objects),
         "objects": objects,
-        "remedy": f"give its `clsplat blocks … --out {in_shell(out)}` again, which makes again what is lost",
+        "remedy": f"give its `clsplat blocks … --out {shell_quote(out)}` again, which makes again what is lost",
     }
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from clsplat.core.errors import ConfigError, DataError, amount
+from clsplat.core.errors import ConfigError, DataError, pluralize
 from clsplat.core.files import new_folder, require_free
 from clsplat.core.reading import sha256
 from clsplat.core.text_table import text_table
@@ -217,7 +217,7 @@ def levels_of_detail(
     require_still(model, first.as_file(), "SOG")
     require_moderate(model, first.as_file(), "SOG")
     if len(first) < FEW:
-        told = amount(len(first), "Gaussian")
+        told = pluralize(len(first), "Gaussian")
         LOG.warning("%s: has %s; below a million one SOG is better: `clsplat convert`", model, told)
     training = LevelTrainer(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
     with new_folder(folder) as place:
@@ -278,7 +278,7 @@ def _levels(first: Model, plan: LodPlan, training: LevelTrainer | None) -> list[
     levels = [training.measured(first) if training else DetailLevel(first)]
     for number in range(1, plan.levels):
         fewer = decimated(levels[-1].model, plan.keep)
-        LOG.info("level %d: %s", number, amount(len(fewer), "Gaussian"))
+        LOG.info("level %d: %s", number, pluralize(len(fewer), "Gaussian"))
         levels.append(training.trained(number, fewer) if training else DetailLevel(fewer))
     return levels
 

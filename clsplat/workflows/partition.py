@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, amount
+from clsplat.core.errors import DataError, pluralize
 from clsplat.core.files import write_text
 from clsplat.density.control import Box
 from clsplat.density.survey import WEIGHT, RenderedView
@@ -65,7 +65,7 @@ def owners(means: NDArray[np.floating], found: list[PartitionCell]) -> NDArray[n
     for number, cell in enumerate(found):
         owner[cell.box.holds(means)] = number
     if (owner < 0).any():
-        lost = f"{int((owner < 0).sum()):,} of {amount(len(owner), 'Gaussian')}"
+        lost = f"{int((owner < 0).sum()):,} of {pluralize(len(owner), 'Gaussian')}"
         raise DataError(f"{lost} of the coarse model have places that are not finite; train it again")
     return owner
 
@@ -88,7 +88,7 @@ def _cut(means: Floats, weights: Floats, box: Box, count: int) -> list[Partition
     below = means[:, axis] < place
     if below.all() or not below.any() or not (weights[below].any() and weights[~below].any()):
         raise DataError(
-            f"the model cannot be cut: {amount(len(means), 'Gaussian')} for {count} blocks; give fewer --blocks"
+            f"the model cannot be cut: {pluralize(len(means), 'Gaussian')} for {count} blocks; give fewer --blocks"
         )
     parts = ((below, "high", first), (~below, "low", count - first))
     return [

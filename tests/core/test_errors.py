@@ -16,11 +16,11 @@ from clsplat.core.errors import (
     QUOTE_LIMIT,
     DataError,
     OverrideError,
-    amount,
-    in_shell,
     one_line,
-    quoted,
-    shortened,
+    pluralize,
+    quote,
+    shell_quote,
+    shorten,
 )
 from tests.support.commands import process
 
@@ -38,28 +38,28 @@ VALUES = [
 
 @pytest.mark.parametrize("value", VALUES, ids=[type(value).__name__ for value in VALUES])
 def test_a_value_in_a_message_is_one_line_of_limited_length(value):
-    assert 1 <= len(quoted(value)) <= QUOTE_LIMIT
-    assert "\n" not in quoted(value)
+    assert 1 <= len(quote(value)) <= QUOTE_LIMIT
+    assert "\n" not in quote(value)
 
 
 def test_one_is_no_plural():
-    assert [amount(count, "view") for count in (0, 1, 2000)] == ["0 views", "1 view", "2,000 views"]
+    assert [pluralize(count, "view") for count in (0, 1, 2000)] == ["0 views", "1 view", "2,000 views"]
 
 
 def test_a_short_value_in_a_message_is_whole():
     for value in (3, -0.5, "a b", None, True, ["a", 1], {"b": 1, "a": {"c": [2]}}, (1.0, 2.0), float("inf")):
-        assert quoted(value) == repr(value)
+        assert quote(value) == repr(value)
 
 
 def test_a_list_that_holds_itself_can_be_shown():
     endless: list[object] = []
     endless.append(endless)
-    assert len(quoted(endless)) <= QUOTE_LIMIT
+    assert len(quote(endless)) <= QUOTE_LIMIT
 
 
 def test_text_is_cut_in_the_middle_to_the_limit():
-    assert shortened("a" * 50 + "b" * 50, 21) == "a" * 9 + " … " + "b" * 9
-    assert shortened("a" * 80) == "a" * 80
+    assert shorten("a" * 50 + "b" * 50, 21) == "a" * 9 + " … " + "b" * 9
+    assert shorten("a" * 80) == "a" * 80
 
 
 def test_message_is_one_line_without_control_characters():
@@ -136,9 +136,9 @@ NO_PATHS = {"lower_rate(run, broken)", "2 * state.stage_step", "2 * metrics['ste
 
 
 def test_a_path_in_a_command_is_one_word_of_a_shell():
-    assert in_shell("runs/a-1.b_2") == "runs/a-1.b_2", "no quotes where none are needed"
+    assert shell_quote("runs/a-1.b_2") == "runs/a-1.b_2", "no quotes where none are needed"
     for name in ("my ü/a 'b' $c", "(x)", "a;b"):
-        assert shlex.split(f"clsplat resume {in_shell(Path(name))} --steps 2") == [
+        assert shlex.split(f"clsplat resume {shell_quote(Path(name))} --steps 2") == [
             "clsplat",
             "resume",
             name,
@@ -153,4 +153,4 @@ def test_every_command_in_a_message_has_its_paths_quoted():
     commands = re.findall(r"`clsplat [^`\n]*`", sources)
     places = {place for command in commands for place in re.findall(r"\{([^{}]*)\}", command)}
     assert len(places) > 8
-    assert {place for place in places if not place.startswith("in_shell(")} <= NO_PATHS
+    assert {place for place in places if not place.startswith("shell_quote(")} <= NO_PATHS

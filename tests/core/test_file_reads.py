@@ -9,7 +9,7 @@ import pytest
 
 import clsplat
 from clsplat.core.errors import ClsplatError, ConfigError, DataError
-from clsplat.core.manifest import Made, hash_of
+from clsplat.core.manifest import Manifest, hash_values
 from clsplat.data_tools.video import write_frames
 from clsplat.pipeline import recipes
 from clsplat.pipeline.matrix import load_experiment
@@ -111,7 +111,7 @@ READERS = {
     "a matrix": (lambda path: load_experiment(str(path)), ConfigError),
     "a plug-in": (digest_of, ConfigError),
     "a video": (lambda path: write_frames(path, path.with_name("frames"), 2), DataError),
-    "a file that is hashed": (hash_of, DataError),
+    "a file that is hashed": (hash_values, DataError),
     "a checkpoint": (archive.read, ClsplatError),
 }
 
@@ -126,7 +126,7 @@ def test_a_pipe_is_refused_at_once(name, pipe):
 def test_records_of_ours_that_are_pipes_count_as_missing(pipe, tmp_path, monkeypatch, caplog):
     with failing("the reader waits", seconds=20):
         pipe.rename(tmp_path / ".made.jsonl")
-        assert not Made(tmp_path).knows(tmp_path / "x.png")
+        assert not Manifest(tmp_path).knows(tmp_path / "x.png")
         os.mkfifo(tmp_path / "known.txt")
         monkeypatch.setattr(identity, "cache_folder", lambda: tmp_path)
         (tmp_path / "decoded").mkdir()

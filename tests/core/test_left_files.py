@@ -13,9 +13,9 @@ import pytest
 import clsplat
 from clsplat.core import files
 from clsplat.core.errors import OutputError
-from clsplat.core.files import append, atomic, write_text
+from clsplat.core.files import append, open_atomic, write_text
 from clsplat.core.manifest import RECORD as RECORD_OF_A_TOOL
-from clsplat.core.manifest import Made
+from clsplat.core.manifest import Manifest
 from clsplat.core.settings import Settings
 from clsplat.prepare.cache import RECORD, STEPS, Planned, _show, prepare
 from clsplat.prepare.steps import Step
@@ -53,7 +53,7 @@ def test_what_a_process_still_writes_is_not_swept(tmp_path):
     other, old = tmp_path / f".a.{os.getppid()}-0.partial", tmp_path / f".b.{os.getpid()}-99999999.partial"
     for path in (other, old):
         path.write_text("x")
-    with atomic(tmp_path / "c") as file:
+    with open_atomic(tmp_path / "c") as file:
         file.write(b"x")
         with run_folder.opened(RunState.read(tmp_path), "new", step=0):
             pass
@@ -64,14 +64,14 @@ def test_what_a_process_still_writes_is_not_swept(tmp_path):
 
 def test_process_killed_at_any_write_leaves_what_is_swept_next(tmp_path):
     code = (
-        "import os, signal, sys; from pathlib import Path; from clsplat.core.files import atomic\n"
-        "with atomic(Path(sys.argv[1]) / 'a.txt') as file:\n"
+        "import os, signal, sys; from pathlib import Path; from clsplat.core.files import open_atomic\n"
+        "with open_atomic(Path(sys.argv[1]) / 'a.txt') as file:\n"
         "    file.write(b'x'); file.flush(); os.kill(os.getpid(), signal.SIGKILL)"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
     (name,) = [path.name for path in tmp_path.iterdir()]
     assert files.PARTIAL.fullmatch(name)
-    files.sweep(tmp_path, border="pipeline.yaml")
+    files.remove_partial_files(tmp_path, border="pipeline.yaml")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -138,12 +138,12 @@ def test_a_run_folder_is_on_the_disk_with_the_folders_above_it(tmp_path, calls):
 
 @has_proc
 def test_a_folder_that_is_made_is_on_the_disk_with_its_file(tmp_path, calls):
-    with atomic(tmp_path / "a" / "b" / "c.txt") as file:
+    with open_atomic(tmp_path / "a" / "b" / "c.txt") as file:
         file.write(b"x")
     synced = [name for kind, name in calls if kind == "sync"]
     assert (synced[:2], synced[3:]) == (["a", tmp_path.name], ["b"])
     calls.clear()
-    with atomic(tmp_path / "a" / "b" / "c.txt") as file:
+    with open_atomic(tmp_path / "a" / "b" / "c.txt") as file:
         file.write(b"y")
     assert [name for kind, name in calls if kind == "sync"][1:] == ["b"], "the others are there since"
 
@@ -179,10 +179,10 @@ def test_photograph_model_is_synced_before_it_is_renamed(tmp_path, calls):
 
 @has_proc
 def test_a_line_of_a_tool_is_on_the_disk_before_its_file_is_made(tmp_path, calls):
-    assert Made(tmp_path / "frames").is_due(tmp_path / "frames" / "a.png", "x")
+    assert Manifest(tmp_path / "frames").is_due(tmp_path / "frames" / "a.png", "x")
     assert calls == [("sync", tmp_path.name), ("sync", RECORD_OF_A_TOOL), ("sync", "frames")]
     calls.clear()
-    assert Made(tmp_path / "frames").is_due(tmp_path / "frames" / "b.png", "x")
+    assert Manifest(tmp_path / "frames").is_due(tmp_path / "frames" / "b.png", "x")
     assert calls == [("sync", RECORD_OF_A_TOOL)]
 
 
@@ -192,11 +192,11 @@ def test_a_folder_that_cannot_be_synced_is_no_failure(number, tmp_path, monkeypa
     monkeypatch.setattr(
         os, "open", lambda path, *a, **k: real(path, *a, **k) if Path(path).is_file() else _raise(number)
     )
-    with atomic(tmp_path / "a") as file:
+    with open_atomic(tmp_path / "a") as file:
         file.write(b"x")
     assert (tmp_path / "a").read_bytes() == b"x"
     monkeypatch.delattr(os, "O_DIRECTORY")
-    with atomic(tmp_path / "a") as file:
+    with open_atomic(tmp_path / "a") as file:
         file.write(b"y")
     assert (tmp_path / "a").read_bytes() == b"y"
 
@@ -222,7 +222,7 @@ def test_threads_that_write_one_file_do_not_disturb_each_other(tmp_path):
     def write(letter: bytes) -> None:
         try:
             for _ in range(50):
-                with atomic(tmp_path / "a") as file:
+                with open_atomic(tmp_path / "a") as file:
                     file.write(letter * 1000)
                 assert len(set((tmp_path / "a").read_bytes())) == 1
         except Exception as error:

@@ -45,7 +45,7 @@ def holder(folder: Path) -> subprocess.Popen:
 def test_another_process_is_refused_and_learns_the_owner(tmp_path):
     process = holder(tmp_path)
     try:
-        with pytest.raises(OutputError, match="is in use by process") as refused, lock.held(tmp_path):
+        with pytest.raises(OutputError, match="is in use by process") as refused, lock.lock_folder(tmp_path):
             pass
         assert f"process {process.pid} on " in str(refused.value)
         assert "since 2" in str(refused.value)
@@ -61,7 +61,7 @@ def test_a_lock_ends_with_its_process_however_it_ends(tmp_path):
         end(process)
         process.wait()
         assert (tmp_path / LOCK).exists()
-        with lock.held(tmp_path):
+        with lock.lock_folder(tmp_path):
             assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
         assert not (tmp_path / LOCK).exists()
 
@@ -78,7 +78,7 @@ def test_children_do_not_hold_the_lock_of_a_killed_parent(tmp_path):
     try:
         process.kill()
         process.wait()
-        with lock.held(tmp_path):
+        with lock.lock_folder(tmp_path):
             pass
     finally:
         os.kill(child, getattr(signal, "SIGKILL", signal.SIGTERM))
@@ -87,11 +87,11 @@ def test_children_do_not_hold_the_lock_of_a_killed_parent(tmp_path):
 def test_one_process_holds_a_folder_once_by_whatever_name(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").symlink_to("a")
-    with lock.held(tmp_path / "a"):
+    with lock.lock_folder(tmp_path / "a"):
         for folder in (tmp_path / "a", tmp_path / "b", tmp_path / "a" / ".." / "a"):
-            with pytest.raises(OutputError, match="is in use by this process"), lock.held(folder):
+            with pytest.raises(OutputError, match="is in use by this process"), lock.lock_folder(folder):
                 pass
-    with lock.held(tmp_path / "b"):
+    with lock.lock_folder(tmp_path / "b"):
         pass
 
 
@@ -139,7 +139,7 @@ def test_a_file_that_its_holder_has_just_removed_is_not_the_lock(tmp_path, monke
         return system_lock(file)
 
     monkeypatch.setattr(lock, "_system_lock", late)
-    with lock.held(tmp_path):
+    with lock.lock_folder(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
 
 
@@ -196,7 +196,7 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
 def test_run_just_starting_in_the_default_folder_is_not_joined(tmp_path):
     assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
     (tmp_path / "splat").mkdir()
-    with lock.held(tmp_path / "splat"):
+    with lock.lock_folder(tmp_path / "splat"):
         assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat-2"
     assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
 
@@ -222,7 +222,7 @@ def test_a_folder_that_another_thread_is_locking_is_held(tmp_path, monkeypatch):
         return locked(path, folder)
 
     def hold():
-        with lock.held(tmp_path):
+        with lock.lock_folder(tmp_path):
             pass
 
     monkeypatch.setattr(lock, "_locked", slow)
@@ -266,7 +266,7 @@ def test_remote_run_is_not_joined_where_locks_are_local(name, status, tmp_path, 
     assert not lock.check_free(tmp_path)
     with (
         pytest.raises(OutputError, match=rf"by process 7 on {name} .*heartbeat is \d+ s old.*remove .*lock"),
-        lock.held(tmp_path),
+        lock.lock_folder(tmp_path),
     ):
         pass
     assert (tmp_path / LOCK).read_text() == before
@@ -284,7 +284,7 @@ def test_run_silent_for_a_minute_is_taken_over_by_any_clock(ahead, tmp_path, mon
     monkeypatch.setattr(holder_file.time, "sleep", lambda seconds: now.append(now[-1] + seconds))
     monkeypatch.setattr(holder_file.time, "monotonic", lambda: now[-1])
     monkeypatch.setattr(holder_file.time, "time", lambda: start + now[-1])
-    with lock.held(tmp_path):
+    with lock.lock_folder(tmp_path):
         pass
     assert now[-1] == (58 if ahead < 0 else 60)
     assert "waiting for its heartbeat, a minute at most" in caplog.text
@@ -310,7 +310,7 @@ def test_lock_of_a_run_that_ended_elsewhere_is_taken_over(owner, status, tmp_pat
     if status is not None:
         (tmp_path / "status.json").write_text(json.dumps(status))
     assert lock.check_free(tmp_path)
-    with lock.held(tmp_path):
+    with lock.lock_folder(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
     lines = [f"{tmp_path}: taken over from process 7 on another"] * (not owner)
     assert [line for line in caplog.messages if "taken over" in line] == lines
@@ -322,11 +322,11 @@ def test_a_run_that_was_silent_and_goes_on_notices_who_took_over(tmp_path, monke
     own = lock.own_text
     with monkeypatch.context() as patch:
         patch.setattr(lock, "own_text", lambda: json.dumps({**json.loads(own()), "host": "another", "boot": "another"}))
-        first = lock.held(tmp_path)
+        first = lock.lock_folder(tmp_path)
         require_held = first.__enter__()
     (tmp_path / "status.json").write_text(json.dumps({"state": "running", "time": time.time() - 61}))
     lock._held.clear()
-    with lock.held(tmp_path) as second:
+    with lock.lock_folder(tmp_path) as second:
         with pytest.raises(OutputError, match=f"replaced while .* process {os.getpid()} on .* holds it now"):
             require_held()
         first.__exit__(None, None, None)
@@ -369,6 +369,6 @@ def test_windows_locks_one_byte_behind_the_text(tmp_path, monkeypatch):
         assert holder_file.read(other) == {"process": 7}, "readers need no lock"
     path.unlink()
     locked.clear()
-    with lock.held(tmp_path):
+    with lock.lock_folder(tmp_path):
         assert json.loads(path.read_text())["process"] == os.getpid()
     assert not path.exists()

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from clsplat.core import progress, terminal
-from clsplat.core.progress import Count, Progress, clock, heard_by, watched
+from clsplat.core.progress import Count, Progress, clock, listening, polled
 from clsplat.prepare.cache import Planned, prepare
 from clsplat.prepare.gather import photographs_text
 from clsplat.prepare.steps import FindFeatures, MapCameras
@@ -51,7 +51,7 @@ def test_pieces_that_differ_much_tell_no_time(now):
 
 def test_nothing_to_count_is_not_heard(tmp_path):
     heard = []
-    with heard_by(lambda *what, seconds_left: heard.append((*what, seconds_left))):
+    with listening(lambda *what, seconds_left: heard.append((*what, seconds_left))):
         prepare([], tmp_path, tmp_path)
         Count("photographs", 0).reach(0)
         assert heard == []
@@ -63,8 +63,8 @@ def test_nothing_to_count_is_not_heard(tmp_path):
 def test_everyone_around_hears(now):
     inner, outer = [], []
     with (
-        heard_by(lambda *what, seconds_left: outer.append((*what, seconds_left))),
-        heard_by(lambda *what, seconds_left: inner.append(what)),
+        listening(lambda *what, seconds_left: outer.append((*what, seconds_left))),
+        listening(lambda *what, seconds_left: inner.append(what)),
     ):
         count = Count("pairs", 4)
         now[0] += 3
@@ -83,7 +83,7 @@ def test_work_that_does_not_count_is_watched(monkeypatch):
         if done == 2:
             seen.set()
 
-    with heard_by(listen), watched(Count("pairs", 9), lambda: 2):
+    with listening(listen), polled(Count("pairs", 9), lambda: 2):
         assert seen.wait(5)
     assert heard == [0, 2]
     assert not [thread for thread in threading.enumerate() if thread.name == "count"]
@@ -103,12 +103,12 @@ def test_no_time_left_is_shown_while_preparation_steps_remain(tmp_path):
 
 
 def test_a_terminal_shows_a_bar_and_a_pipe_does_not(monkeypatch, capsys):
-    with terminal.counted():
+    with terminal.counts_on_terminal():
         Count("pairs matched", 4).reach(2)
     assert capsys.readouterr().out == ""
     console = terminal.Console(force_terminal=True, width=100)
     monkeypatch.setattr(terminal, "CONSOLE", console)
-    with console.capture() as shown, terminal.counted():
+    with console.capture() as shown, terminal.counts_on_terminal():
         Count("pairs matched", 4).reach(2)
     assert "pairs matched: 2 of 4" in shown.get()
 
@@ -158,7 +158,7 @@ def test_the_bar_of_a_run_moves_between_reports(tmp_path, monkeypatch):
 
 
 def test_warnings_stand_above_the_bar(screen, log_shown):
-    with terminal.counted():
+    with terminal.counts_on_terminal():
         Count("pairs matched", 4)
         terminal.LOG.warning("cannot be renamed")
         text = screen.getvalue()
@@ -167,7 +167,7 @@ def test_warnings_stand_above_the_bar(screen, log_shown):
 
 
 def test_counts_are_not_said_above_a_bar(now, screen, log_shown):
-    with terminal.counted():
+    with terminal.counts_on_terminal():
         count = Count("pairs matched", 4)
         now[0] += 9
         count.reach(2)

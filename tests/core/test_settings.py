@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.settings import OneOf, Settings, descriptions, rebuild, tag_of, variants
+from clsplat.core.settings import OneOf, Settings, descriptions, rebuild_models, tag_of, variants
 from clsplat.density.edit import Edit, Rule
 from clsplat.losses.base import ImageLoss, Loss, Penalty
 from clsplat.photos.sampling import Order, ShuffleOrder
@@ -47,7 +47,7 @@ def own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     with monkeypatch.context() as patch:
         patch.setattr(Settings, "defined", list(Settings.defined))
         yield
-    rebuild()
+    rebuild_models()
 
 
 def test_variants_are_the_subclasses_with_a_name():
@@ -76,7 +76,7 @@ def test_a_variant_defined_later_is_known_after_a_rebuild(loaded):
     assert variants(Rule)["thin"] is Thin
     with pytest.raises(ConfigError, match="no rule named 'thin'"):
         loaded(rules="[thin]")
-    rebuild()
+    rebuild_models()
     assert loaded(rules="[{type: thin, nth: 3}]").settings.training.during[0].rules == [Thin(nth=3)]
     assert "Thin" in json_schema()["$defs"]
 
@@ -93,7 +93,7 @@ def test_nested_variants_are_known_in_any_definition_order(tmp_path):
         def run(self, run: Run) -> None:
             pass
 
-    rebuild()
+    rebuild_models()
 
     class Thin(Rule):
         type: Literal["thin"] = "thin"
@@ -101,7 +101,7 @@ def test_nested_variants_are_known_in_any_definition_order(tmp_path):
         def mark(self, edit: Edit) -> None:
             pass
 
-    rebuild()
+    rebuild_models()
     (tmp_path / "apply.yaml").write_text("name: apply\nstages: [{apply: {rule: thin}}]\n")
     assert load(str(tmp_path / "apply.yaml")).stages == [Apply(rule=Thin())]
 

@@ -127,7 +127,7 @@ def test_what_prints_never_fails_and_what_is_wanted_is_missed(error, monkeypatch
     monkeypatch.setattr(signals.STDOUT, "fault", None)
     signals.STDOUT.install()
     print("by a plug-in")
-    terminal.remark("by a command")
+    terminal.print_message("by a command")
     if isinstance(error, BrokenPipeError):
         terminal.show("the product")
     else:
@@ -155,7 +155,7 @@ def test_the_product_of_a_command_is_missed(arguments, tmp_path, monkeypatch, ca
 def test_a_signal_within_a_write_loses_its_line_alone(monkeypatch):
     monkeypatch.setattr(sys, "stdout", Broken(RuntimeError("reentrant call inside <_io.BufferedWriter>")))
     monkeypatch.setattr(signals.STDOUT, "fault", None)
-    terminal.remark("finishing the step")
+    terminal.print_message("finishing the step")
     assert signals.STDOUT.fault is None
 
 

@@ -39,9 +39,9 @@ def test_missing_locks_are_warned_of_and_a_dead_owner_replaced(tmp_path, without
     ended.wait()
     for values in ({"process": ended.pid}, {}):  # {}: an earlier process with the number of this one
         owned_by(tmp_path, **values)
-        with lock.held(tmp_path):
+        with lock.lock_folder(tmp_path):
             assert f"taken over from process {values.get('process', os.getpid())}, which has ended" in caplog.text
-            with pytest.raises(OutputError, match="is in use by this process"), lock.held(tmp_path):
+            with pytest.raises(OutputError, match="is in use by this process"), lock.lock_folder(tmp_path):
                 pass
         assert not (tmp_path / LOCK).exists()
     assert "its file system knows no locks" in caplog.text
@@ -52,14 +52,17 @@ def test_the_owner_before_a_start_of_the_machine_has_ended(tmp_path, without_loc
     monkeypatch.setattr(machine, "_pid_namespace", lambda: machine.FIRST_PID_NAMESPACE)
     monkeypatch.setattr(machine, "_boot", lambda: "now")
     owned_by(tmp_path, process=os.getppid(), boot="before")
-    with lock.held(tmp_path):
+    with lock.lock_folder(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["boot"] == "now"
 
 
 def test_a_lock_that_is_just_being_made_is_somebodys(tmp_path, without_locks):
     """Between making the file and writing into it; or a process was killed there."""
     (tmp_path / LOCK).touch()
-    with pytest.raises(OutputError, match=r"another process; .* has ended, remove .*run.lock"), lock.held(tmp_path):
+    with (
+        pytest.raises(OutputError, match=r"another process; .* has ended, remove .*run.lock"),
+        lock.lock_folder(tmp_path),
+    ):
         pass
     assert (tmp_path / LOCK).exists()
 
@@ -77,7 +80,7 @@ def test_newer_lock_is_not_removed_with_a_dead_one(tmp_path, without_locks, monk
         return ended
 
     monkeypatch.setattr(lock, "_has_ended", slow)
-    with pytest.raises(OutputError, match=f"in use by process {os.getppid()} on"), lock.held(tmp_path):
+    with pytest.raises(OutputError, match=f"in use by process {os.getppid()} on"), lock.lock_folder(tmp_path):
         pass
     assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getppid()
     assert [path.name for path in tmp_path.iterdir()] == [LOCK]
@@ -95,7 +98,7 @@ def test_newer_lock_is_not_removed_with_a_dead_one(tmp_path, without_locks, monk
 )
 def test_without_locks_an_owner_that_may_live_keeps_the_folder(values, tmp_path, without_locks):
     owned_by(tmp_path, **values)
-    with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"), lock.held(tmp_path):
+    with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"), lock.lock_folder(tmp_path):
         pass
     with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"):
         lock.check_free(tmp_path)

@@ -6,7 +6,7 @@ import pytest
 
 from clsplat.core.errors import Interrupted
 from clsplat.core.progress import Progress
-from clsplat.core.settings import rebuild
+from clsplat.core.settings import rebuild_models
 from clsplat.density.edit import Edit, Rule
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.pipeline.loading import load
@@ -33,7 +33,7 @@ def edits_seen(without_plugins):
             gaussians.set("edits_seen", seen)
             edit.choose(seen[:, 0] >= 3, copies=0, kept=0)
 
-    rebuild()
+    rebuild_models()
 
 
 @pytest.mark.usefixtures("edits_seen")

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import clsplat
 from clsplat.cli import app
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.core.files import check_no_file_of_a_run
+from clsplat.core.files import check_not_run_file
 from clsplat.core.harmonics import basis
 from clsplat.density.mixture import mass_of
 from clsplat.formats.ply import write_ply
@@ -53,7 +53,7 @@ def test_a_file_that_no_run_has_written_is_replaced(few_steps, tmp_path):
     for name in ("report.html", "metrics.json"):
         assert (run / name).is_file()
         with pytest.raises(ConfigError, match="is a file of a run; give another name"):
-            check_no_file_of_a_run(run / name)
+            check_not_run_file(run / name)
 
 
 def test_no_file_of_a_run_is_replaced(source, tmp_path):

@@ -10,7 +10,7 @@ from clsplat.api.renderer import Renderer
 from clsplat.conformance.reference import sh_basis
 from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.core.errors import OutputError
-from clsplat.core.harmonics import basis, rotated_sh
+from clsplat.core.harmonics import basis, rotate_sh
 from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.scene.view import View
 from tests.support.devices import on_one_setting
@@ -103,7 +103,7 @@ def test_turned_harmonics_are_the_old_from_the_turned_side(rng):
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     np.testing.assert_allclose(basis(directions), sh_basis(directions, 3)[:, 1:], atol=1e-12)
     coefficients = rng.normal(size=(4, 45))
-    turned = rotated_sh(coefficients, turn)
+    turned = rotate_sh(coefficients, turn)
     seen = np.einsum("dk,nkc->ndc", sh_basis(directions @ turn.T, 3)[:, 1:], turned.reshape(4, 15, 3))
     expected = np.einsum("dk,nkc->ndc", sh_basis(directions, 3)[:, 1:], coefficients.reshape(4, 15, 3))
     np.testing.assert_allclose(seen, expected, atol=1e-10)

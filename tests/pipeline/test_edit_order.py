@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.schedule import is_act, places
+from clsplat.core.schedule import fire_steps, fires_at
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import Axis, fewest_steps, in_steps, last_edit, with_steps
@@ -86,10 +86,10 @@ def test_an_average_begins_after_growth_in_the_fewest_steps_too(steps):
 
 
 def test_fractional_cadence_fires_at_or_below_its_multiples():
-    assert places(2.5, 0, 13) == [2, 5, 7, 10, 12] == [step for step in range(1, 13) if is_act(2.5, step)]
-    assert places(2.5, 5, 12) == [7, 10]
-    assert places(5.8824, 90, 101) == [94, 100]
-    assert [step for step in range(1, 30) if is_act(10, step)] == places(10, 0, 30) == places(10.0, 0, 30)
+    assert fire_steps(2.5, 0, 13) == [2, 5, 7, 10, 12] == [step for step in range(1, 13) if fires_at(2.5, step)]
+    assert fire_steps(2.5, 5, 12) == [7, 10]
+    assert fire_steps(5.8824, 90, 101) == [94, 100]
+    assert [step for step in range(1, 30) if fires_at(10, step)] == fire_steps(10, 0, 30) == fire_steps(10.0, 0, 30)
 
 
 def test_a_cadence_below_a_step_is_refused():

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import pytest
 
 from clsplat.core.errors import ConfigError
-from clsplat.core.settings import rebuild
+from clsplat.core.settings import rebuild_models
 from clsplat.losses.base import Penalty
 from clsplat.pipeline.loading import load
 
@@ -74,7 +74,7 @@ def test_a_class_of_a_plugin_declares_a_conflict_in_its_stage(tmp_path, without_
 
         def add(self, inputs): ...
 
-    rebuild()
+    rebuild_models()
     losses = "optimize.losses=[l1, wave]"
     load("smoke", [losses])
     with pytest.raises(

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.core.errors import DataError, in_shell
+from clsplat.core.errors import DataError, shell_quote
 from clsplat.prepare import diagnosis as reasons_tool
 from clsplat.prepare import mapping
 from clsplat.prepare.cache import fingerprint
@@ -193,7 +193,7 @@ def test_files_named_as_another_kind_come_with_how_to_convert(tmp_path):
 def test_video_given_as_a_folder_comes_with_what_makes_one(tmp_path, read):
     (tmp_path / "my walk.AVI").write_bytes(b"RIFF")
     (tmp_path / "notes").touch()
-    command = f"`clsplat data video {in_shell(tmp_path / 'my walk.AVI')} FOLDER`"
+    command = f"`clsplat data video {shell_quote(tmp_path / 'my walk.AVI')} FOLDER`"
     assert command in refusal(read, tmp_path / "my walk.AVI")
     assert "is a file; expected a folder with photographs" in refusal(read, tmp_path / "notes")
     assert "no such folder" in refusal(read, tmp_path / "none.avi")

@@ -344,12 +344,14 @@ def test_one_process_makes_a_result_at_a_time(pipeline, photos, tmp_path):
     (one,) = checked.preparation(tmp_path / "runs" / "a")
     other = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3", "find_features.long_side=50"])
     one.folder.parent.mkdir(parents=True)
-    with lock.held(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
+    with lock.lock_folder(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
         with pytest.raises(OutputError, match=f"{one.folder.name}: is in use by this process"):
             opening.open_run(checked, tmp_path / "runs" / "a", None)
         opening.open_run(other, tmp_path / "runs" / "c", None)  # another result
     opening.open_run(checked, tmp_path / "runs" / "a", None)
-    with lock.held(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):  # where all is there, nobody waits
+    with lock.lock_folder(
+        one.folder, one.folder.with_name(f".{one.folder.name}.lock")
+    ):  # where all is there, nobody waits
         opening.open_run(checked, tmp_path / "runs" / "b", None)
     assert not list(one.folder.parent.glob(".*")), "no lock is left"
 

@@ -15,7 +15,7 @@ import pytest
 
 from clsplat.core import progress
 from clsplat.core.errors import DataError
-from clsplat.core.progress import heard_by
+from clsplat.core.progress import listening
 from clsplat.prepare import features as features_tool
 from clsplat.prepare import mapping as mapping_tool
 from clsplat.prepare import undistort as undistort_tool
@@ -296,7 +296,7 @@ def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
     """A reader in pycolmap's own process would release the locks of its writes."""
     monkeypatch.setattr(progress, "WATCH", 0.01)
     heard: set[int] = set()
-    with heard_by(lambda what, done, total, seconds_left: heard.add(done)):
+    with listening(lambda what, done, total, seconds_left: heard.add(done)):
         match_features(placed.parent / "features", tmp_path)
     assert max(heard) == 14 * 13 // 2
     assert len(heard) > 2, "counts between none and all of them"
@@ -310,7 +310,7 @@ def test_features_are_counted_while_they_are_found(few, tmp_path):
         if what == "photographs with features":
             heard.append(done)
 
-    with heard_by(hear):
+    with listening(hear):
         find_features(few, tmp_path, Sought(320, 500))
     assert heard == [0, 1, 2, 3, 4, 5]
 

@@ -212,7 +212,7 @@ def test_only_a_few_photographs_are_held_at_once(scene, monkeypatch):
 
 def test_whoever_listens_hears_how_far_it_is(scene):
     heard: list[tuple[str, int, int]] = []
-    with progress.heard_by(lambda *what, seconds_left: heard.append(what)):
+    with progress.listening(lambda *what, seconds_left: heard.append(what)):
         decode_all(views(scene))
     assert heard == [("photographs decoded", i, 10) for i in range(11)]
 

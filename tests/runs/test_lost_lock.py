@@ -43,7 +43,7 @@ def removed(out: Path) -> dict[str, bytes]:
 
 
 def test_who_holds_a_folder_can_ask_whether_it_still_does(tmp_path):
-    with lock.held(tmp_path) as require_held:
+    with lock.lock_folder(tmp_path) as require_held:
         require_held()
         (tmp_path / LOCK).unlink()
         with pytest.raises(OutputError, match=f"{GONE}; nothing more was written") as gone:

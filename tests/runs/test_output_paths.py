@@ -82,7 +82,7 @@ def test_no_stage_can_write_outside_its_folder_or_over_records(kind):
         suffix = next(iter(suffixes), "")
         for path in OUTSIDE:
             for text in {path, path + suffix} - ({"~\u0000/x"} if suffix else set()):
-                if suffix and text != path and files.fault_of_output(text) is None:
+                if suffix and text != path and files.invalid_output_reason(text) is None:
                     continue  # another name, which is allowed
                 with pytest.raises(ValueError, match="expected a path inside the run folder"):
                     kind.model_validate({field: text})

@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core import files as names
 from clsplat.core.errors import InternalError, OutputError
-from clsplat.core.settings import rebuild
+from clsplat.core.settings import rebuild_models
 from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, outputs, runner
@@ -66,7 +66,7 @@ def test_what_a_run_writes_is_in_the_table_of_reserved_names(finished):
 
 def test_names_of_run_files_are_in_one_table_and_reserved():
     table = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
-    table -= {names.SYSTEM, names.MODULE_FILES}
+    table -= {names.SYSTEM, names.MODULE_FILE_PREFIX}
     assert {"pipeline.yaml", "run.lock", "compare.html", "undistorted"} < table <= names.RESERVED
     faults = []
     for file in Path(names.__file__).parents[1].rglob("*.py"):
@@ -142,7 +142,7 @@ def test_later_stage_that_damages_the_model_is_an_error(tiny_scene, tmp_path, wi
         def run(self, run: Run) -> None:
             change_a_value(run.out / "point_cloud.ply")
 
-    rebuild()
+    rebuild_models()
     file = tmp_path / "pipeline.yaml"
     file.write_text(
         "name: spoilt\nstages: [{init: {count: 50, source: random}}, {optimize: {steps: 1, losses: [l1]}}, "

@@ -38,7 +38,7 @@ def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
 
 
 def test_a_link_that_leads_outside_is_not_followed(tiny_scene, tmp_path):
-    for name in ("renders", "report.html", "point_cloud.ply", *files.OF_A_RUN - {files.PIPELINE}):
+    for name in ("renders", "report.html", "point_cloud.ply", *files.RUN_FILES - {files.PIPELINE}):
         out = tmp_path / f"run of {name}"
         out.mkdir()
         (out / name).symlink_to(tmp_path / "elsewhere")
@@ -68,7 +68,7 @@ def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path
 
 
 def test_foreign_files_with_names_of_a_run_are_not_replaced(tiny_scene, tmp_path):
-    for name in files.OF_A_RUN - {files.PIPELINE, files.CHECKPOINTS, files.UNDISTORTED}:
+    for name in files.RUN_FILES - {files.PIPELINE, files.CHECKPOINTS, files.UNDISTORTED}:
         out = tmp_path / f"run of {name}"
         out.mkdir()
         (out / name).write_text('{"state": "mine"}')
@@ -80,7 +80,7 @@ def test_foreign_files_with_names_of_a_run_are_not_replaced(tiny_scene, tmp_path
 
 
 def test_foreign_files_with_names_of_a_matrix_are_not_replaced(tmp_path):
-    for name in files.OF_A_MATRIX - {files.PIPELINE}:
+    for name in files.MATRIX_FILES - {files.PIPELINE}:
         (tmp_path / name).write_text("mine")
         with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
             experiment.check_matrix_folder(RunState.read(tmp_path))

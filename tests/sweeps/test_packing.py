@@ -21,12 +21,12 @@ GPU = replace(CPU, name="g", kind="GPU")
 
 
 def test_cores_are_shared_in_equal_parts_of_neighbors():
-    assert machine.shares((0, 1, 2, 5, 6, 7), 2) == [(0, 1, 2), (5, 6, 7)]
-    assert machine.shares(range(6), 4) == [(0,), (1,), (2,), (3,)], "all have as many"
+    assert machine.split_cores((0, 1, 2, 5, 6, 7), 2) == [(0, 1, 2), (5, 6, 7)]
+    assert machine.split_cores(range(6), 4) == [(0,), (1,), (2,), (3,)], "all have as many"
 
 
 def test_threads_match_cores_and_devices_need_no_second_check(monkeypatch):
-    found = machine.limited((3, 4), {"a": "b"})
+    found = machine.limited_environment((3, 4), {"a": "b"})
     assert found == {"a": "b", **dict.fromkeys(machine.LIMITS, "2")}
     before = code_variables()
     for name in machine.LIMITS:
@@ -35,15 +35,15 @@ def test_threads_match_cores_and_devices_need_no_second_check(monkeypatch):
 
 
 def test_only_cpus_are_shared_by_as_many_runs_as_cores(monkeypatch):
-    monkeypatch.setattr(machine, "usable", lambda: tuple(range(4)))
-    assert shares_of([CPU, GPU], 4) == [machine.shares(range(4), 4), [()]]
+    monkeypatch.setattr(machine, "usable_cores", lambda: tuple(range(4)))
+    assert shares_of([CPU, GPU], 4) == [machine.split_cores(range(4), 4), [()]]
     assert shares_of([CPU], 1) == [[()]], "kept to no cores"
     with pytest.raises(ConfigError, match=r"execution.packing: 5 runs cannot share 4 cores; expected fewer"):
         shares_of([CPU], 5)
 
 
 def test_each_run_that_shares_a_device_is_a_place_of_its_own(monkeypatch):
-    monkeypatch.setattr(machine, "usable", lambda: (0, 1, 2, 3))
+    monkeypatch.setattr(machine, "usable_cores", lambda: (0, 1, 2, 3))
     monkeypatch.setattr(devices, "list_devices", lambda: [CPU])
     monkeypatch.setattr(devices, "choose", lambda name: CPU)
     monkeypatch.setattr(devices, "bits_class", lambda info, infos: "b")
@@ -55,7 +55,7 @@ def test_each_run_that_shares_a_device_is_a_place_of_its_own(monkeypatch):
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system keeps no process to cores")
 def test_the_run_of_a_cell_is_kept_to_its_cores(tmp_path):
-    attempt, own = CellAttempt(tmp_path / "attempt"), (machine.usable()[-1],)
+    attempt, own = CellAttempt(tmp_path / "attempt"), (machine.usable_cores()[-1],)
     attempt.path.mkdir()
     attempt.take_lease("a", 0.0)
     code = "import os, sys, json, time; time.sleep(0.3)\n"

@@ -3,7 +3,7 @@
 import pytest
 
 from clsplat.core.progress import Progress
-from clsplat.core.terminal import line
+from clsplat.core.terminal import progress_line
 from clsplat.training.records import VIEWS, Forecast
 
 LAST, GROWTH_END = 3000, 1600
@@ -39,7 +39,7 @@ def test_before_the_growth_it_is_the_least():
     assert early.seconds_left == pytest.approx(seconds_at(100) * (LAST - 200))
     assert forecast_at(400).growth_known
     progress = Progress(200, LAST, 0.1, 20.0, 8000, 12.0, early.seconds_left, early.growth_known)
-    assert line(progress).endswith("at least 0:34 left")
+    assert progress_line(progress).endswith("at least 0:34 left")
 
 
 def test_where_no_rule_grows_the_model_it_is_a_product():

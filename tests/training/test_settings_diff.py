@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 import pytest
 
-from clsplat.core.settings import rebuild, resumable, variants
+from clsplat.core.settings import rebuild_models, resume_effect, variants
 from clsplat.pipeline.loading import checked
 from clsplat.pipeline.overrides import CADENCE
 from clsplat.pipeline.yaml_file import read_yaml
@@ -90,7 +90,7 @@ def test_a_stage_of_a_plugin_says_what_of_it_may_change(pipeline, without_plugin
 
         def run(self, run) -> None: ...
 
-    rebuild()
+    rebuild_models()
     stages = TRAINING.replace("- evaluate: {every: 5}", "- shake: {every: 5}")
     before = pipeline(stages)
     for change, kind in {
@@ -107,7 +107,7 @@ def test_a_stage_of_a_plugin_says_what_of_it_may_change(pipeline, without_plugin
 def test_stages_that_only_read_the_model_may_change_entirely():
     for name in ("evaluate", "export", "render", "report", "checkpoint"):
         kind = variants(Stage)[name]
-        assert {resumable(kind, key) for key in kind.model_fields if key != "stage"} == {"output"}, name
+        assert {resume_effect(kind, key) for key in kind.model_fields if key != "stage"} == {"output"}, name
     assert Evaluate.output_keys > base.CADENCE == frozenset(CADENCE)
 
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import clsplat
 from clsplat.cli import app
 from clsplat.core.errors import ConfigError, OutputError
-from clsplat.core.progress import heard_by
+from clsplat.core.progress import listening
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.runs.film import names
@@ -49,7 +49,7 @@ def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
 def test_more_splats_than_a_page_shows_smoothly_come_with_advice(run, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr("clsplat.runs.film.MANY", 10)
     heard = []
-    with heard_by(lambda *what, seconds_left: heard.append(what)):
+    with listening(lambda *what, seconds_left: heard.append(what)):
         clsplat.view(run, out=tmp_path / "a.html")
     assert "browsers show 10 smoothly: --splats 10 keeps" in caplog.text
     assert heard == [("models read", i, 1) for i in (0, 1)] + [("models packed", i, 1) for i in (0, 1)]

@@ -11,7 +11,7 @@ import pytest
 from jinja2 import UndefinedError
 
 import clsplat as package
-from clsplat.core.page import TEMPLATES, charts, duration, embedded, render, require_end
+from clsplat.core.page import TEMPLATES, data_url, duration_text, render, require_complete, safe_charts
 from clsplat.viewer.charts import Line, curve
 from tests.support.commands import clsplat
 from tests.support.html_page import HOSTILE, Page
@@ -105,7 +105,7 @@ def test_every_template_file_is_part_of_a_page():
 def test_values_are_escaped_and_charts_are_not():
     values = {"state": "ready", "verdict": HOSTILE, "findings": [], "figures": {HOSTILE: HOSTILE}, "space": None}
     chart = curve(HOSTILE, [Line([(0.0, 0.0), (1.0, 1.0)])])
-    seen = charts([chart, ""]), [(HOSTILE, 3)]
+    seen = safe_charts([chart, ""]), [(HOSTILE, 3)]
     page = Page(render("inspect.html.j2", title=HOSTILE, subtitle=HOSTILE, seen=seen, lists=[], **values))
     assert page.elements["script"] == 1
     assert page.elements["svg"] == 1
@@ -149,13 +149,13 @@ def test_name_that_is_not_unicode_shows_a_question_mark():
     (0.4, "0 s"), (59.4, "59 s"), (60, "1 min 0 s"), (3599, "59 min 59 s"), (3600, "1 h 0 min"), (7322, "2 h 2 min"),
 ])  # fmt: skip
 def test_durations(seconds, words):
-    assert duration(seconds) == words
+    assert duration_text(seconds) == words
 
 
 def test_embedded_images_name_their_format():
     image = np.zeros((2, 3, 3), np.uint8)
-    assert embedded(image).startswith("data:image/jpeg;base64,/9j/")
-    assert embedded(image, ".png").startswith("data:image/png;base64,iVBOR")
+    assert data_url(image).startswith("data:image/jpeg;base64,/9j/")
+    assert data_url(image, ".png").startswith("data:image/png;base64,iVBOR")
 
 
 def hostile_scene(tiny_scene: Path, folder: Path) -> Path:
@@ -187,6 +187,6 @@ def test_the_report_of_a_scene_with_markup_in_its_names(tiny_scene, tmp_path):
 @pytest.mark.parametrize("text", ["", "<html>", "<html></html", "<html></html><p>"])
 def test_a_page_that_has_lost_its_end_is_refused(text, tmp_path):
     (tmp_path / "a.html").write_text(text)
-    assert refusal(require_end, tmp_path / "a.html") == f"{tmp_path / 'a.html'}: ends before its end"
+    assert refusal(require_complete, tmp_path / "a.html") == f"{tmp_path / 'a.html'}: ends before its end"
     (tmp_path / "a.html").write_text("<html></html>\n")
-    require_end(tmp_path / "a.html")
+    require_complete(tmp_path / "a.html")

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat.cli import app
-from clsplat.core.errors import ClsplatError, ConfigError, DataError, NoneInsideError
-from clsplat.core.schedule import values_of
+from clsplat.core.errors import ClsplatError, ConfigError, DataError, EmptyRegionError
+from clsplat.core.schedule import schedule_values
 from clsplat.data_tools.multiscale import write_multiscale
 from clsplat.density.control import Box
 from clsplat.pipeline.loading import load
@@ -104,7 +104,7 @@ def test_a_number_of_gaussians_is_shared_by_pairs(most, tiny_scene, few_steps, t
     for block in found["blocks"]:
         settings = load(str(tmp_path / "out" / block["name"] / "pipeline.yaml")).settings
         (densify,) = [stage for stage in settings.training.during if stage.stage == "densify"]
-        assert max(values_of(densify.max_gaussians)) == pytest.approx(block["pairs"] * 16_000)
+        assert max(schedule_values(densify.max_gaussians)) == pytest.approx(block["pairs"] * 16_000)
 
 
 def test_the_merged_run_is_measured_with_all_views(trained):
@@ -177,7 +177,7 @@ def test_a_block_without_gaussians_at_its_end_is_left_out(
 ):
     def empty(pipeline, folder, *options):
         if folder.name == "block_01":
-            raise NoneInsideError("crop: none lies inside")
+            raise EmptyRegionError("crop: none lies inside")
         return finetune.trained(pipeline, folder, *options)
 
     out = tmp_path / "out"
@@ -193,7 +193,7 @@ def test_a_box_without_gaussians_is_told_apart(few_steps, tiny_scene, tmp_path):
     file = tmp_path / "x.yaml"
     stages = [{"init": {"source": "model", "file": str(few_steps)}}, {"crop": {"inside": {"low": [99, 99, 99]}}}]
     file.write_text(json.dumps({"name": "x", "stages": stages}))
-    with pytest.raises(NoneInsideError):
+    with pytest.raises(EmptyRegionError):
         clsplat.run(file, tiny_scene, tmp_path / "out")
 
 

@@ -211,7 +211,7 @@ def test_a_search_does_not_go_on_with_other_photographs(few_steps, tiny_scene, t
 
 
 def test_one_process_searches_in_a_folder_at_a_time(few_steps, tmp_path):
-    with lock.held(tmp_path), pytest.raises(OutputError, match="is in use by this process"):
+    with lock.lock_folder(tmp_path), pytest.raises(OutputError, match="is in use by this process"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
     assert list(tmp_path.iterdir()) == []
 

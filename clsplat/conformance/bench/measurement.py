@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from clsplat.conformance.bench.cases import SIZES, BenchResult, Peaks, case, measure_peaks, real_case, run_bench
-from clsplat.core.errors import ConfigError, quoted
+from clsplat.core.errors import ConfigError, quote
 from clsplat.core.reading import read_json
 from clsplat.core.text_table import text_table
 from clsplat.opencl.device import Device, open_device
@@ -58,7 +58,7 @@ def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
         place = ".".join(map(str, first["loc"])) or "the file"
         raise ConfigError(f"{path}: {place}: {first['msg']}; expected {EXPECTED}: make it again") from error
     if found.pipeline != name:
-        raise ConfigError(f"{path}: expected the pipeline '{name}', it has {quoted(found.pipeline)}")
+        raise ConfigError(f"{path}: expected the pipeline '{name}', it has {quote(found.pipeline)}")
     return {key: value for key, value in data.items() if key != "against"}  # that of one still earlier
 
 
@@ -71,7 +71,7 @@ def beside(now: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
     """Return lines about what the `data` of two measurements do not share, for whoever compares their times."""
     lines = [f"earlier: {peaks_text(earlier['peaks'])}"]
     if earlier["device"] != now["device"]:
-        lines.append(f"  of another device: {quoted(earlier['device'])}")
+        lines.append(f"  of another device: {quote(earlier['device'])}")
     ratios = {unit: now["peaks"][key] / earlier["peaks"][key] for key, unit in UNITS.items() if earlier["peaks"][key]}
     if any(not 1 / ALIKE <= ratio <= ALIKE for ratio in ratios.values()):
         told = ", ".join(f"{ratio:.2f} of its {unit}" for unit, ratio in ratios.items())

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
-from clsplat.core.progress import counted, kept, only
+from clsplat.core.progress import captured_log, counted, log_level
 from clsplat.prepare.gather import list_photographs, why_unreadable
 from clsplat.scene.camera import BORDER_POINTS, Lens
 from clsplat.scene.detect import read_scene, reader_of
@@ -379,7 +379,7 @@ LOG = logging.getLogger("clsplat")
 def read_parts(path: Path) -> Parts:
     """Read a dataset as read_scene does, but every piece on its own.  Raises DataError when there is no such folder."""
     parts = Parts(path)
-    with only(logging.ERROR):
+    with log_level(logging.ERROR):
         try:
             parts.scene = read_scene(path)
             if parts.scene.points:
@@ -409,7 +409,7 @@ def read_parts(path: Path) -> Parts:
 def _list_photographs(parts: Parts) -> None:
     """List the photographs of a folder without cameras, and what their preparation would say of them."""
     parts.on_disk = list(image_files(parts.path, deep=True))
-    with kept(logging.WARNING) as parts.left_out:
+    with captured_log(logging.WARNING) as parts.left_out:
         try:
             list_photographs(parts.path)
         except DataError as error:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from clsplat.core.errors import amount, in_shell, shortened
+from clsplat.core.errors import pluralize, shell_quote, shorten
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS, left_out
 from clsplat.prepare.gather import remedy as remedy_of
 from clsplat.prepare.inspect.facts import MAX_DISTANCE, MIN_SEEN, CameraFacts, Facts, PointFacts, read_parts, survey
@@ -44,12 +44,12 @@ def unprepared(facts: Facts) -> Iterator[Finding]:
     count, damaged = facts.on_disk, facts.looks.unreadable
     if facts.kind != "none" or not (count or facts.left_out):
         return
-    held = f"{amount(count, 'photograph')} but" if count else "no photographs that can be read, and"
+    held = f"{pluralize(count, 'photograph')} but" if count else "no photographs that can be read, and"
     readable = count - len(damaged)
     if count < MIN_PHOTOGRAPHS:  # told with the files that are left out
         remedy, texts = facts.refusal.removeprefix(f"{facts.path}: "), []
     else:
-        remedy, texts = f"`clsplat run photos --scene {in_shell(facts.path)}` finds the cameras", facts.left_out
+        remedy, texts = f"`clsplat run photos --scene {shell_quote(facts.path)}` finds the cameras", facts.left_out
         if readable < MIN_PHOTOGRAPHS:
             remedy = f"only {readable} of {count} photographs can be read; {remedy_of(damaged)}"
     yield Finding("error", f"{facts.path} holds {held} no camera poses", remedy)
@@ -96,14 +96,14 @@ def verdict(found: Sequence[Finding]) -> str:
     worst, start = (errors, "cannot train: ") if errors else (warnings, "trains, but ")
     if not worst:
         return "ready to train"
-    more = f" (and {amount(len(worst) - 1, 'more ' + ('error' if errors else 'warning'))})" if len(worst) > 1 else ""
+    more = f" (and {pluralize(len(worst) - 1, 'more ' + ('error' if errors else 'warning'))})" if len(worst) > 1 else ""
     return f"{start}{worst[0]}{more}"
 
 
 def _unreadable(facts: Facts) -> Iterator[Finding]:
     yield from (Finding("error", fault) for fault in facts.faults[:MAX_NAMES])
     if len(facts.faults) > MAX_NAMES:
-        more = f"{amount(len(facts.faults) - MAX_NAMES, 'more part')} of the dataset cannot be read"
+        more = f"{pluralize(len(facts.faults) - MAX_NAMES, 'more part')} of the dataset cannot be read"
         yield Finding("error", more, "fix the first ones and inspect again")
 
 
@@ -115,10 +115,10 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         yield Finding("error", f"{fault} ({_listed(facts.missing)})", remedy)
     if photographs.unreadable:
         unreadable, reason = _listed(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
-        fault = f"{amount(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
+        fault = f"{pluralize(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
         yield Finding("error", fault, f"{reason.partition(';')[0]}; copy or export them again")
     if photographs.cut:
-        fault = f"the end is missing from {amount(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
+        fault = f"the end is missing from {pluralize(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
         yield Finding("error", fault, "copy them again")
     if photographs.misfits:
         sizes = [f"{name} is {size}" for name, size in photographs.misfits.items()]
@@ -147,7 +147,7 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         fault = f"{_are(len(photographs.larger), 'image file')} larger than the camera"
         yield Finding("note", fault, "clsplat reduces them when it reads them; smaller copies load faster")
     for names in facts.same_but_case[:MAX_NAMES]:
-        fault = f"{' and '.join(map(shortened, names))} differ only in upper and lower case"
+        fault = f"{' and '.join(map(shorten, names))} differ only in upper and lower case"
         yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
     if colmap and facts.same_base:
         fault = f"{_are(facts.same_base, 'file name')} in several folders"
@@ -163,7 +163,7 @@ def _looks(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", f"{_listed(names)} look the same", "one of them is enough")
     if jumps:
         named = _listed([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
-        fault = f"the exposure jumps by more than a stop {amount(len(jumps), 'time')} ({named})"
+        fault = f"the exposure jumps by more than a stop {pluralize(len(jumps), 'time')} ({named})"
         yield Finding("note", fault, "--set optimize.modules.exposure={} gives each photograph its own")
     if steps := facts.looks.steps:
         named = _listed([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
@@ -178,7 +178,7 @@ def _cameras(facts: Facts) -> Iterator[Finding]:
         remedy = "this is allowed; a larger view takes more time in a step"
         yield Finding("note", f"the photographs have {len(sizes)} sizes", remedy)
     for camera in facts.cameras:
-        name = f"the {_camera_name(camera)} of {amount(camera.views, 'view')}"
+        name = f"the {_camera_name(camera)} of {pluralize(camera.views, 'view')}"
         if not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
             fault = f"{name} has a focal length of {camera.focal[0]:.4g} px, which is not plausible"
             yield Finding("warning", fault, "calibrate it again, or find the poses with the right focal length")
@@ -214,7 +214,7 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", fault, "training counts copies of a photograph twice; keep one of them")
     if facts.few_seen:
         counted = [f"{name}: {facts.seen[name]}" for name in facts.few_seen]
-        fault = f"fewer than {MIN_SEEN} points are seen by {amount(len(counted), 'view')} ({_listed(counted)})"
+        fault = f"fewer than {MIN_SEEN} points are seen by {pluralize(len(counted), 'view')} ({_listed(counted)})"
         yield Finding("warning", fault, "their poses are unreliable; look at their renders, or remove these images")
 
 
@@ -262,11 +262,11 @@ def _camera_name(camera: CameraFacts) -> str:
 def _are(count: int, word: str, before: str = "") -> str:
     """Return a count with its verb: `3 views are`, or with words before the count `are only 3 views`."""
     verb = "is" if count == 1 else "are"
-    return f"{verb} {before}{amount(count, word)}" if before else f"{amount(count, word)} {verb}"
+    return f"{verb} {before}{pluralize(count, word)}" if before else f"{pluralize(count, word)} {verb}"
 
 
 def _listed(names: Sequence[str], limit: int = MAX_NAMES) -> str:
-    return ", ".join(map(shortened, names[:limit])) + (", …" if len(names) > limit else "")
+    return ", ".join(map(shorten, names[:limit])) + (", …" if len(names) > limit else "")
 
 
 # One look at a dataset: pieces, facts, findings and the verdict.
@@ -316,9 +316,9 @@ def figures(facts: Facts) -> dict[str, str]:
     if facts.train is not None:
         lines["views"] = f"{facts.train} for training, {facts.test} for testing"
     if facts.moments:
-        lines["times"] = f"{amount(facts.moments, 'moment')}, seen from {amount(facts.stations, 'place')}"
+        lines["times"] = f"{pluralize(facts.moments, 'moment')}, seen from {pluralize(facts.stations, 'place')}"
     if len(facts.submodels) > 1:
-        lines["models"] = ", ".join(f"{name} ({amount(count, 'image')})" for name, count in facts.submodels.items())
+        lines["models"] = ", ".join(f"{name} ({pluralize(count, 'image')})" for name, count in facts.submodels.items())
     for i, camera in enumerate(facts.cameras[:MAX_CAMERAS]):
         lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_line(camera)
     if facts.extent is not None:
@@ -345,9 +345,8 @@ def camera_line(camera: CameraFacts) -> str:
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
     bent = "without bounds" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
     lens = f", distortion {bent}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
-    return (
-        f"{camera.model} {camera.width}x{camera.height}, focal length {focal} px{lens}; {amount(camera.views, 'view')}"
-    )
+    size = f"{camera.width}x{camera.height}"
+    return f"{camera.model} {size}, focal length {focal} px{lens}; {pluralize(camera.views, 'view')}"
 
 
 def _images(facts: Facts) -> str:

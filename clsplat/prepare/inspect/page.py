@@ -8,7 +8,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from clsplat.core.files import write_text
-from clsplat.core.page import charts, render
+from clsplat.core.page import render, safe_charts
 from clsplat.prepare.inspect.findings import Inspection, figures
 from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.view import View
@@ -143,7 +143,7 @@ def _seen(inspection: Inspection) -> tuple[list[Markup], list[tuple[str, int]]] 
     if not seen:
         return None
     fewest = sorted(seen.items(), key=lambda item: item[1])[:MAX_VIEWS]
-    return charts([histogram("views by their number of points", list(seen.values()))]), fewest
+    return safe_charts([histogram("views by their number of points", list(seen.values()))]), fewest
 
 
 def _lists(inspection: Inspection) -> list[tuple[str, list[str], int]]:

@@ -11,9 +11,9 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from clsplat.core.errors import ConfigError, DataError, amount
+from clsplat.core.errors import ConfigError, DataError, pluralize
 from clsplat.core.files import write_text
-from clsplat.core.page import charts, duration, embedded, render
+from clsplat.core.page import data_url, duration_text, render, safe_charts
 from clsplat.pipeline.file import SceneSettings
 from clsplat.runs.results import Points, RunFolder, RunMetrics
 from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing
@@ -80,7 +80,9 @@ def main_table(rows: Sequence[VariantRow]) -> MetricTable:
         *_cost(rows, "Gaussians", lambda metrics: metrics.gaussians),
         *_cost(rows, "parameters", lambda metrics: metrics.parameters),
         Column("steps", _cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
-        Column("training", [TableCell(duration(fmean(run.metrics.train_seconds for run in row.runs))) for row in rows]),
+        Column(
+            "training", [TableCell(duration_text(fmean(run.metrics.train_seconds for run in row.runs))) for row in rows]
+        ),
         *_cost(rows, "CPU seconds", lambda metrics: metrics.cpu_seconds),
         *_cost(rows, "device memory, MB", lambda metrics: metrics.device_memory and metrics.device_memory / 1e6),
     ]
@@ -231,7 +233,7 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
         curve(f"training PSNR over steps, mean of {VIEWS} views, dB{means}", lines(trained)),
         curve(f"Gaussians over steps{means}", lines(lambda run: run.points("train", "gaussians"))),
     ]
-    return charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
+    return safe_charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
 
 
 def _mean(lines: Sequence[Points]) -> Points:
@@ -305,8 +307,8 @@ def comparison_page(
     device = f"device: {devices.pop()}" if len(devices) == 1 else "several devices"
     return render(
         "compare.html.j2",
-        title=f"{title}: {amount(len(runs), 'run')}",
-        subtitle=f"{amount(len(variants), 'variant')} on {amount(len(scenes), 'scene')}; {device}",
+        title=f"{title}: {pluralize(len(runs), 'run')}",
+        subtitle=f"{pluralize(len(variants), 'variant')} on {pluralize(len(scenes), 'scene')}; {device}",
         remarks=remarks,
         means=means_over_scenes(comparison) if len(scenes) > 1 else None,
         scenes=[_section(name, rows) for name, rows in scenes.items()],
@@ -372,9 +374,9 @@ def _figure(crop: ImageCrop) -> dict[str, Any]:
     """The crop for the page, with images as data URLs; PNG keeps every bit of its squares."""
     return dict(
         view=crop.view,
-        overview=embedded(crop.overview),
+        overview=data_url(crop.overview),
         frame=crop.frame,
-        photograph=embedded(crop.photograph, ".png"),
-        renders=[embedded(image, ".png") for image in crop.renders],
+        photograph=data_url(crop.photograph, ".png"),
+        renders=[data_url(image, ".png") for image in crop.renders],
         psnrs=crop.psnrs,
     )

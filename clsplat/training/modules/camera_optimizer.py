@@ -13,10 +13,10 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.core.errors import DataError, PoseError, amount, quoted
+from clsplat.core.errors import DataError, PoseError, pluralize, quote
 from clsplat.core.files import write_text
 from clsplat.core.reading import read_json
-from clsplat.core.schedule import Decay, NonNegative, Schedule, at_step, explained
+from clsplat.core.schedule import Decay, NonNegative, Schedule, at_step, explain_schedule
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import ViewTable, adam_step
@@ -71,12 +71,12 @@ class CameraOptimizer(TrainingModule):
     side_files: ClassVar[Mapping[str, str]] = {VIEW_POSES: "poses"}
 
     type: Literal["camera_optimizer"] = "camera_optimizer"
-    turn: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = "auto"
+    turn: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
     """Learning rate of the rotations in rad, by step; auto: 0.3 times the automatic one of the shifts."""
-    shift: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = "auto"
+    shift: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
     """Learning rate of the shifts as a share of that depth, by step; auto: 2e-4 to 2e-6, where photographs are seldom
     visited as large as a shift of 0.01 needs, up to 2e-3."""
-    focal: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = 0.0
+    focal: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = 0.0
     """Learning rate of the logarithms of focal lengths, by step; 0: they stay.  auto: 1e-4 to 1e-6, where cameras are
     seldom visited so large that the rates of a camera's visits add up to 0.2, up to 1e-3."""
     start: Annotated[int, Field(ge=0)] = 500
@@ -86,7 +86,7 @@ class CameraOptimizer(TrainingModule):
         """Return the learning rates by step of rotations and shifts, of a training up to a step of so many
         photographs."""
         shift = self._falling(last, photographs, REACH, (RATE, MOST))
-        turn = shift.divided(1 / TURN_SHARE)
+        turn = shift.divide(1 / TURN_SHARE)
         return (turn if self.turn == "auto" else self.turn), (shift if self.shift == "auto" else self.shift)
 
     def focal_rate(self, last: int, cameras: int) -> Schedule:
@@ -304,7 +304,7 @@ class CameraState(ModuleState):
         if cameras:
             factors = [self.factor(camera) for camera in cameras]
             LOG.info(
-                "focal lengths of %s: times %s", amount(len(cameras), "camera"), _range(min(factors), max(factors))
+                "focal lengths of %s: times %s", pluralize(len(cameras), "camera"), _range(min(factors), max(factors))
             )
 
 
@@ -313,7 +313,7 @@ def require_zoom(scene: Scene) -> None:
     for view in scene.views:
         if view.lens is not None and not zooms(view.lens):
             raise DataError(
-                f"{scene.path}: camera_optimizer.focal: the lens of {quoted(view.name)}, {view.lens.model}, cannot be "
+                f"{scene.path}: camera_optimizer.focal: the lens of {quote(view.name)}, {view.lens.model}, cannot be "
                 "written with another focal length; `clsplat data undistort` first, or leave out camera_optimizer.focal"
             )
 
@@ -363,6 +363,6 @@ def _with_pose(path: Path, view: View, row: Any) -> View:
         return replace(view, world_to_camera=np.array(row["world_to_camera"], np.float64), camera=camera)
     except (AttributeError, KeyError, TypeError, ValueError, PoseError) as error:
         raise DataError(
-            f"{path}: {quoted(view.name)} has no pose of 3 rows of 4 numbers with a rotation, or no two focal lengths "
+            f"{path}: {quote(view.name)} has no pose of 3 rows of 4 numbers with a rotation, or no two focal lengths "
             f"within {MOST_ZOOM:g} times those of its camera; train again, or remove the file"
         ) from error

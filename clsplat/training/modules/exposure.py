@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
-from clsplat.core.errors import DataError, NumericError, quoted
-from clsplat.core.files import atomic, write_text
+from clsplat.core.errors import DataError, NumericError, quote
+from clsplat.core.files import open_atomic, write_text
 from clsplat.core.reading import read_json
-from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, explained
+from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, explain_schedule
 from clsplat.core.settings import OneOf, Settings, variants
 from clsplat.losses.base import LossValue
 from clsplat.metrics.views import Gains
@@ -43,7 +43,7 @@ NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' argum
 FEW_VISITS = 400  # of a photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
 MOST = 5e-2  # learning rate
 Rate = Annotated[Schedule, AfterValidator(Bounded(0, most=0.5))]  # Adam's steps are as long: a gain of 1.6 in each
-RateOrAuto = Annotated[Literal["auto"] | Rate, explained(", or auto")]
+RateOrAuto = Annotated[Literal["auto"] | Rate, explain_schedule(", or auto")]
 SPREAD = 0.03  # of the exposures: smaller ones are within what tracks measure
 # Of the differences: 17 to 31 % in three captures as they are, 40 to 71 % in the same with exposures changed by 25 %.
 EXPLAINED = 1 / 3
@@ -144,7 +144,7 @@ class Appearance(TrainingModule):
         name = data.get("type") if isinstance(data, dict) else None
         if not isinstance(name, str) or name not in known:
             names = ", ".join(known)
-            raise DataError(f"{path}: the type of colors is {quoted(name)}; expected one of {names}: write it again")
+            raise DataError(f"{path}: the type of colors is {quote(name)}; expected one of {names}: write it again")
         facts = {key: data[key] for key in ("model",) if key in data}
         return known[name].model_validate(facts).fit if known[name] is cls else None
 
@@ -294,11 +294,11 @@ class ColorState(ModuleState):
         found = self.written()
         if wrong := next((view for view, matrix in found.matrices.items() if not np.isfinite(matrix).all()), None):
             raise NumericError(
-                f"the colors of {quoted(wrong)} are not finite; lower optimize.modules.{self.settings.type}.rate"
+                f"the colors of {quote(wrong)} are not finite; lower optimize.modules.{self.settings.type}.rate"
             )
         write_text(run.out / VIEW_COLORS, json.dumps(found.facts, indent=1) + "\n")
         for name, array in found.arrays.items():
-            with atomic(run.out / name) as file:
+            with open_atomic(run.out / name) as file:
                 np.save(file, array, allow_pickle=False)
         greens = [matrix[1, 1] for matrix in found.matrices.values()]
         LOG.info(

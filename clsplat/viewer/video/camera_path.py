@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from clsplat.core.errors import ConfigError, DataError, quoted
+from clsplat.core.errors import ConfigError, DataError, quote
 from clsplat.core.files import write_text
 from clsplat.core.reading import read_json
 from clsplat.formats.splats import is_moment
@@ -64,7 +64,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
     if (kind := table.get("camera_type", "perspective")) != "perspective":
-        raise DataError(f"{path}: camera_type is {quoted(kind)}; expected perspective: export the path again")
+        raise DataError(f"{path}: camera_type is {quote(kind)}; expected perspective: export the path again")
     size, rate = _size_and_rate(JsonFrame(path.parent, str(path), table))
     move = _world(path, scene, known=table.get("world") == "scene")
     views = []
@@ -72,7 +72,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", own)
         fov = frame.number("fov")
         if fov is None or not 0.01 <= fov < 179:
-            raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0.01 to 179")
+            raise DataError(f"{frame.where}: fov is {quote(fov)}; expected degrees from 0.01 to 179")
         matrix = {"transform_matrix": _rows(own.get("camera_to_world"))}
         pose = np.linalg.inv(camera_to_world_of(JsonFrame(path.parent, frame.where, matrix)))[:3]
         time = frame.number("render_time")
@@ -221,7 +221,7 @@ def _affine(file: Path) -> tuple[Floats, float]:
     frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
     matrix, scale = _rigid(frame, "transform"), frame.number("scale")
     if scale is None or not scale > 0:
-        raise DataError(f"{file}: scale is {quoted(scale)}; expected a number above 0: export the file again")
+        raise DataError(f"{file}: scale is {quote(scale)}; expected a number above 0: export the file again")
     return matrix, scale
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, OutputError
-from clsplat.core.files import atomic_name, check_result
+from clsplat.core.files import atomic_path, check_result_path
 from clsplat.metrics.images import to_8_bits
 from clsplat.viewer.video.paths import Size, checked_rate, checked_size
 
@@ -69,7 +69,7 @@ WITHOUT = "or write pictures alone, into --out DIR, which any encoder reads"
 def check_file(path: Path) -> None:
     """Raise ConfigError where no video of this name can be written: its suffix, its encoder, or a file of a run."""
     check_encoder(path)
-    check_result(path, path.suffix.lower())
+    check_result_path(path, path.suffix.lower())
 
 
 def check_encoder(path: Path) -> None:
@@ -88,7 +88,7 @@ def opened(path: Path, size: Size, fps: float) -> Iterator[Write]:
     size: of a picture, even numbers.  Raises OutputError; an earlier file then stays.
     """
     suffix, count = path.suffix.lower(), 0
-    with atomic_name(path, suffix) as temporary:
+    with atomic_path(path, suffix) as temporary:
         with WRITERS[suffix](temporary, size, fps) as write:
 
             def counted(image: Image) -> None:

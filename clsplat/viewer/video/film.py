@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.core.errors import ConfigError, quoted
-from clsplat.core.files import check_result
+from clsplat.core.errors import ConfigError, quote
+from clsplat.core.files import check_result_path
 from clsplat.formats.splats import is_moment
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
@@ -48,7 +48,7 @@ def times_of(given: "str | float | Sequence[float] | None") -> Times | None:
     except (ValueError, TypeError):
         found = []
     if len(found) not in (1, 2) or not all(map(is_moment, found)):
-        raise ConfigError(f"the time {quoted(given)}: {EXPECTED}")
+        raise ConfigError(f"the time {quote(given)}: {EXPECTED}")
     return found[0], found[-1]
 
 
@@ -103,9 +103,9 @@ class Wish:
     ) -> "Wish":
         """Check what can be checked without a scene.  Raises ConfigError."""
         if path.partition(FROM)[0] not in PATHS and not path.lower().endswith(".json"):
-            raise ConfigError(f"no path {quoted(path)}; there are {', '.join(PATHS)}, and files of nerfstudio (.json)")
+            raise ConfigError(f"no path {quote(path)}; there are {', '.join(PATHS)}, and files of nerfstudio (.json)")
         if FROM in path and path.partition(FROM)[0] in PATHS and not path.startswith(f"fixed{FROM}"):
-            raise ConfigError(f"no path {quoted(path)}; only `fixed{FROM}NAME` names a view")
+            raise ConfigError(f"no path {quote(path)}; only `fixed{FROM}NAME` names a view")
         return cls(
             path,
             None if frames is None else checked_frames(frames),
@@ -206,4 +206,4 @@ def still(view: View, size: Size | None = None) -> View:
 
 def check_path_file(path: Path) -> None:
     """Raise ConfigError where no camera path can be written."""
-    check_result(path, ".json")
+    check_result_path(path, ".json")

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from clsplat.core.errors import ConfigError, DataError, quoted
+from clsplat.core.errors import ConfigError, DataError, quote
 from clsplat.scene.camera import Camera
 from clsplat.scene.scene import strayed
 from clsplat.scene.view import View
@@ -214,7 +214,7 @@ def checked_size(size: str | Size) -> Size:
         pair = (size[0], size[1]) if len(size) == 2 and all(isinstance(side, int) for side in size) else None
     if pair is None or not SIDES[0] <= min(pair) <= max(pair) <= SIDES[1] or pair[0] % 2 or pair[1] % 2:
         raise ConfigError(
-            f"size {quoted(size)}: expected WIDTHxHEIGHT in even numbers from {SIDES[0]} to {SIDES[1]}, such as 640x480"
+            f"size {quote(size)}: expected WIDTHxHEIGHT in even numbers from {SIDES[0]} to {SIDES[1]}, such as 640x480"
         )
     return pair
 
@@ -231,14 +231,14 @@ def size_of(text: str) -> str:
 def checked_frames(frames: int) -> int:
     """Return a number of frames.  Raises ConfigError where it is out of bounds."""
     if isinstance(frames, bool) or not isinstance(frames, int) or not 1 <= frames <= MAX_FRAMES:
-        raise ConfigError(f"frames {quoted(frames)}: expected a whole number from 1 to {MAX_FRAMES}")
+        raise ConfigError(f"frames {quote(frames)}: expected a whole number from 1 to {MAX_FRAMES}")
     return frames
 
 
 def checked_rate(fps: float) -> float:
     """Return a number of frames a second.  Raises ConfigError where it is out of bounds."""
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not RATES[0] <= fps <= RATES[1]:
-        raise ConfigError(f"fps {quoted(fps)}: expected frames a second from {RATES[0]} to {RATES[1]}")
+        raise ConfigError(f"fps {quote(fps)}: expected frames a second from {RATES[0]} to {RATES[1]}")
     return fps
 
 
