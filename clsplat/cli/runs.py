@@ -295,9 +295,7 @@ def blocks(
     if plan:
         terminal.print_message(f"{out}/partition.json: the plan; the same command without --plan trains the blocks")
     else:
-        terminal.print_message(
-            f"`clsplat view {shell_quote(found['run'])}` shows {found['metrics']['gaussians']:,} Gaussians"
-        )
+        terminal.print_message(f"`clsplat view {shell_quote(found['run'])}` shows the merged model")
 
 
 # Commands about the cells of a sweep.

@@ -24,7 +24,7 @@ METHODS = {"read_text", "read_bytes", "file_digest"}
 FUNCTIONS = {"json.load", "np.load", "np.fromfile", "cv2.imread", "cv2.VideoCapture", "os.open", "tarfile.open"}
 FUNCTIONS |= {"zipfile.ZipFile"}
 ALLOWED = {  # module and function -> why it reads by itself
-    "clsplat/core/reading.py:regular": "the place where files are opened",
+    "clsplat/core/reading.py:open_regular": "the place where files are opened",
     "clsplat/core/reading.py:sha256": "the place where they are hashed",
     "clsplat/core/signals.py": "opens the null device",
     "clsplat/core/files.py:_sync": "syncs what was written",

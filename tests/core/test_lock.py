@@ -35,7 +35,7 @@ def holder(folder: Path) -> subprocess.Popen:
     """A process that holds a folder until it is killed."""
     code = (
         "import sys, time; from pathlib import Path; from clsplat.core import lock\n"
-        "with lock.held(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
+        "with lock.lock_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "held\n"
@@ -69,7 +69,7 @@ def test_a_lock_ends_with_its_process_however_it_ends(tmp_path):
 def test_children_do_not_hold_the_lock_of_a_killed_parent(tmp_path):
     code = (
         "import subprocess, sys, time; from pathlib import Path; from clsplat.core import lock\n"
-        "with lock.held(Path(sys.argv[1])):\n"
+        "with lock.lock_folder(Path(sys.argv[1])):\n"
         "    child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
         "    print(child.pid, flush=True); time.sleep(600)"
     )
@@ -117,7 +117,7 @@ def test_of_many_that_want_a_folder_at_once_one_has_it(before, tmp_path):
         "folder, n = Path(sys.argv[1]), 0\n"
         "for _ in range(60):\n"
         "    try:\n"
-        "        with lock.held(folder):\n"
+        "        with lock.lock_folder(folder):\n"
         "            (folder / 'inside').mkdir(); time.sleep(0.001); (folder / 'inside').rmdir(); n += 1\n"
         "    except OutputError: time.sleep(0.001)\n"
         "print(n)"
