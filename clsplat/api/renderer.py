@@ -1,9 +1,10 @@
 """Rendering and its derivatives with NumPy in and out."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, wraps
+from typing import Any, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.render.tiles import Sort
 from clsplat.scene.view import View, color_of
 
+Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
 Color = float | Sequence[float]
 _OPENING = threading.Lock()
@@ -100,11 +102,21 @@ class Picture:
         return self.png()
 
 
+def serialized(method: Method) -> Method:
+    """Let one thread at a time into the methods of an object that are decorated so; it has a `_lock`."""
+
+    @wraps(method)
+    def locked(self: Any, *arguments: Any, **options: Any) -> Any:
+        with self._lock:
+            return method(self, *arguments, **options)
+
+    return cast(Method, locked)
+
+
 class Renderer:
     """A model on a device.
 
-    A renderer serves one thread, for it renders one picture at a time.  Renderers on one device do not disturb each
-    other, in one thread or in several.
+    Threads may share a renderer, which renders one image at a time.  Renderers on one device do not disturb each other.
     """
 
     def __init__(self, model: Model, device: str | Device | None = None) -> None:
@@ -112,14 +124,17 @@ class Renderer:
 
         Raises DeviceError when there is none, or when it computes wrongly.
         """
+        self._lock = threading.RLock()
         self.device = proved(device)
         self.rasterizer = Rasterizer(self.device)
         self.update(model)
 
+    @serialized
     def update(self, model: Model) -> None:
         """Take another model, or the same after its arrays were changed in place."""
         self.model, self._model = model, model.upload(self.device)
 
+    @serialized
     def render(self, view: View, background: Color | None = None, depth: bool = False) -> Picture:
         """Render a view; of a moving model, the moment of the view's time.
 
@@ -135,6 +150,7 @@ class Renderer:
             require_finite(values, view)
         return Picture(found.image, found.alpha, found.depth, view, color, model, self)
 
+    @serialized
     def backward(self, picture: Picture, image: Floats | None, alpha: Floats | None) -> Gradients:
         """Return the gradients of a loss, as Picture.backward does."""
         camera = upload_camera(self.device, picture.view)
@@ -186,16 +202,18 @@ def _checked(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:
 
 
 class FieldRenderer:
-    """A field on a device, which serves one thread."""
+    """A field on a device.  Threads may share it; it renders one image at a time."""
 
     def __init__(self, model: FieldModel, device: str | Device | None = None) -> None:
         """Copy a field to a device, or to one by its name; by default `default_device()`.
 
         Raises DeviceError when there is none, or when it computes wrongly.
         """
+        self._lock = threading.RLock()
         self.model, self.device = model, proved(device)
         self._field = model.upload(self.device)
 
+    @serialized
     def render(self, view: View, depth: bool = False) -> Layers:
         """Return `image` [height, width, 3] before the field's background, `alpha` and `depth` [height, width].
 

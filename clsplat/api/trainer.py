@@ -2,6 +2,7 @@
 
 import shutil
 import tempfile
+import threading
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, nullcontext, suppress
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, overrides
-from clsplat.api.renderer import proved
+from clsplat.api.renderer import proved, serialized
 from clsplat.core import lock
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
 from clsplat.core.files import CHECKSUMS, END_STATES
@@ -62,7 +63,7 @@ class Trainer:
 
     Stages before the training are run at once, and those that change the model right behind it with its last step; the
     others, such as `evaluate` and `export`, are not run at all: use `evaluate` and `model`.  Ctrl-C lets a step finish,
-    and training can go on; a trainer serves one thread.
+    and training can go on.  Threads may share a trainer; one at a time is inside of it.
     """
 
     def __init__(
@@ -84,6 +85,7 @@ class Trainer:
         is let go.
         Raises ConfigError, DataError and DeviceError.
         """
+        self._lock = threading.RLock()
         load_plugins()
         folder = scene.path if isinstance(scene, Scene) else Path(scene)
         place = [f"scene.path={as_setting(folder)}"] if folder.is_dir() else []
@@ -119,6 +121,7 @@ class Trainer:
         self._state: Literal["open", "done", "failed", "closed"] = "open"
         self._record_end()
 
+    @serialized
     def close(self) -> None:
         """Leave the run folder to others.  Training does not go on after it; what is left in `out` can be resumed.
 
@@ -130,6 +133,7 @@ class Trainer:
         self._steps = iter(())
         self._holding.close()
 
+    @serialized
     def step(self) -> Report:
         """Train one step.  Raises StopIteration when the pipeline's steps are done.
 
@@ -184,10 +188,12 @@ class Trainer:
         return report
 
     @property
+    @serialized
     def model(self) -> Model:
         """A copy of the model as it is now; `model.baked()` makes a world filter part of its scales, as a run does."""
         return host_model(self._run)
 
+    @serialized
     def add_loss(self, function: HostFunction, weight: Schedule = 1.0) -> None:
         """Minimize also `function(image, photograph) -> (value, derivative by the image)`, in NumPy, from now on.
 
@@ -198,6 +204,7 @@ class Trainer:
         """
         self._run.losses.append(HostLoss(function, weight))
 
+    @serialized
     def evaluate(self, split: str = "test") -> dict[str, Any]:
         """Return the metrics of a split at the size that is trained on, with the keys of metrics.json.
 
@@ -209,6 +216,7 @@ class Trainer:
             return {"views": 0}
         return mean(measure(run.painter(), views, run.photographs.fresh(), trained=run.scene.split("train")))
 
+    @serialized
     def checkpoint(self) -> Path:
         """Save all that training needs to go on to the same bits, but for losses that were added; return the file.
 

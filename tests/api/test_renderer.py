@@ -154,6 +154,26 @@ def test_renderers_on_one_device_do_not_disturb_each_other(device, rng):
 
 
 @on_one_setting
+def test_threads_may_share_a_renderer(device, rng):
+    case = random_case(rng, 60, *SIZE)
+    renderer = Renderer(model_of(case), device)
+    turns = [
+        replace(case.view, name=str(i), world_to_camera=case.view.world_to_camera + [0, 0, 0, i / 50]) for i in range(8)
+    ]
+    planes = np.ones((SIZE[1], SIZE[0], 3))
+
+    def result(view):
+        picture = renderer.render(view)
+        return picture.image, picture.backward(image=planes).means
+
+    expected = [result(view) for view in turns]
+    with ThreadPoolExecutor(4) as pool:
+        for ours, theirs in zip(pool.map(result, turns), expected, strict=True):
+            for one, other in zip(ours, theirs, strict=True):
+                np.testing.assert_array_equal(one, other)
+
+
+@on_one_setting
 def test_threads_sharing_a_device_keep_their_kernel_arguments(device, monkeypatch):
     enqueue = program.cl.enqueue_nd_range_kernel
 

@@ -4,6 +4,7 @@ import gc
 import inspect
 import json
 import textwrap
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,6 +48,15 @@ def test_a_trainer_gives_the_bits_of_the_command(name, tiny_scene, tmp_path):
     assert (last.step, last.gaussians) == (metrics["steps"], metrics["gaussians"])
     assert repr(last) == f"Report(step {last.step}, {last.gaussians:,} Gaussians)"
     assert repr(trainer) == f"Trainer({name} on tiny, step {last.step})"
+
+
+def test_threads_may_share_a_trainer(tiny_scene, tmp_path):
+    expected = clsplat.Trainer(tiny_scene, "smoke")
+    expected.run(12)
+    trainer = clsplat.Trainer(tiny_scene, "smoke")
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(lambda _: trainer.step(), range(12)))
+    assert equal(trainer.model, expected.model)
 
 
 def test_the_bits_with_a_world_filter_are_those_of_the_raw_file(tiny_scene, tmp_path):
