@@ -157,9 +157,7 @@ def test_renderers_on_one_device_do_not_disturb_each_other(device, rng):
 def test_threads_may_share_a_renderer(device, rng):
     case = random_case(rng, 60, *SIZE)
     renderer = Renderer(model_of(case), device)
-    turns = [
-        replace(case.view, name=str(i), world_to_camera=case.view.world_to_camera + [0, 0, 0, i / 50]) for i in range(8)
-    ]
+    turns = [case.view.shifted(np.array([i / 50, 0, 0])) for i in range(8)]
     planes = np.ones((SIZE[1], SIZE[0], 3))
 
     def result(view):
