@@ -1,4 +1,4 @@
-"""Methods of papers, a file each: density rules, losses and stages that only that method has."""
+"""Methods from papers, one file each: the density rules, losses and stages that only one method uses."""
 
 from clsplat.core.settings import import_modules
 

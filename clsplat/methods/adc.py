@@ -1,4 +1,4 @@
-"""The rules of adaptive density control: clone, split and prune (Kerbl et al. 2023, section 5)."""
+"""Clone, split and prune Gaussians: adaptive density control (Kerbl et al. 2023, section 5)."""
 
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -11,9 +11,9 @@ from clsplat.density.statistics import Statistic, StatisticName
 
 
 class Grow(Rule):
-    """Base of rules that make several Gaussians of one whose mean of a statistic is large.
+    """Base of rules that turn one Gaussian into several where the mean of a statistic is large.
 
-    With `as_many_as`, the rule chooses as many Gaussians by `statistic` as reach `gradient_above` in that other
+    With `as_many_as`, the rule selects by `statistic` as many Gaussians as reach `gradient_above` in that other
     statistic (Gaussian Opacity Fields, Yu et al. 2024).
     """
 
@@ -22,18 +22,19 @@ class Grow(Rule):
     statistic: StatisticName = "screen_grad"
     """Column whose mean is compared."""
     gradient_above: Positive = 2.0e-4
-    """Lowest mean of the statistic, in its unit; by step."""
+    """Lowest mean of the statistic that grows, in its unit."""
     as_many_as: StatisticName | None = None
     """Column in which Gaussians are counted at `gradient_above`; that number sets the threshold of `statistic`."""
 
     opacity: Literal["copied", "shared"] = "copied"
-    """`shared`: what one becomes is together as opaque as it was, 1 − (1 − o)^(1/n) each (Rota Bulò et al. 2024)."""
+    """`copied`: each result has the same opacity; `shared`: together they are as opaque as the Gaussian was,
+    1 − (1 − o)^(1/n) each (Rota Bulò et al. 2024)."""
 
     @model_validator(mode="after")
     def _with_a_threshold_of_its_unit(self) -> "Grow":
         name = self.as_many_as or self.statistic
         if variants(Statistic)[name].is_total and "gradient_above" not in self.model_fields_set:
-            raise ValueError(f"'gradient_above' is needed with '{name}', whose unit is another; try 200")
+            raise ValueError(f"'{name}' has another unit than the default of 'gradient_above'; set it, such as to 200")
         return self
 
     @property
@@ -41,7 +42,7 @@ class Grow(Rule):
         return {self.statistic, self.as_many_as or self.statistic}
 
     def condition(self, edit: Edit) -> dict[str, Any]:
-        """Return the arguments of Edit.mark that hold the rule's condition, and whether opacity is shared."""
+        """Return the rule's condition, and whether opacity is shared, as arguments of `Edit.mark`."""
         above = edit.at(self.gradient_above)
         if self.as_many_as:
             above = edit.matching(self.statistic, self.as_many_as, above)
@@ -49,26 +50,26 @@ class Grow(Rule):
 
 
 class Clone(Grow):
-    """Copy small Gaussians whose statistic is large; the copy starts at the same place."""
+    """Copy small Gaussians whose statistic is large; the copy starts at the same position."""
 
     type: Literal["clone"] = "clone"
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_below"})
 
     size_below: Positive = 0.01
-    """Largest size, the largest standard deviation as a share of the scene's extent; by step."""
+    """Largest size that is cloned: largest standard deviation as a fraction of the scene extent."""
 
     def mark(self, edit: Edit) -> None:
         edit.mark(copies=2, kept=1, size_below=edit.at(self.size_below), **self.condition(edit))
 
 
 class SplitLarge(Grow):
-    """Replace large Gaussians whose statistic is large by smaller ones, drawn from their own distribution."""
+    """Replace large Gaussians whose statistic is large by smaller ones, sampled from the Gaussian itself."""
 
     type: Literal["split"] = "split"
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_above", "children", "shrink"})
 
     size_above: Positive = 0.01
-    """Smallest size, the largest standard deviation as a share of the scene's extent; by step."""
+    """Smallest size that is split: largest standard deviation as a fraction of the scene extent."""
     children: Annotated[int, Field(ge=2, le=8)] = 2
     """Number of Gaussians that replace one."""
     shrink: Annotated[float, Field(ge=1)] = 1.6
@@ -92,7 +93,7 @@ class PruneFaint(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"opacity_below"})
 
     opacity_below: Positive = 0.005
-    """Opacity below which a Gaussian is removed; by step."""
+    """Opacity below which a Gaussian is removed."""
 
     def mark(self, edit: Edit) -> None:
         edit.mark(copies=0, kept=0, opacity_below=edit.at(self.opacity_below))
@@ -106,7 +107,7 @@ class PruneLarge(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_above"})
 
     size_above: Positive = 0.1
-    """Size above which a Gaussian is removed: largest standard deviation as a share of the extent; by step."""
+    """Size above which a Gaussian is removed: largest standard deviation as a fraction of the scene extent."""
 
     def mark(self, edit: Edit) -> None:
         edit.mark(copies=0, kept=0, size_above=edit.at(self.size_above))

@@ -1,4 +1,4 @@
-"""Opacities that fall a little between steps (Binocular3DGS, Han et al. 2024)."""
+"""Decay opacities between steps, as Binocular3DGS does (Han et al. 2024)."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -11,11 +11,11 @@ from clsplat.training.stage import Scheduled
 
 
 class DecayOpacity(Scheduled):
-    """Lower all opacities a little, in the place of a reset; training raises those of needed Gaussians (Binocular3DGS,
-    Han et al. 2024).
+    """Lower all opacities a little, instead of a reset; training raises those of needed Gaussians (Binocular3DGS, Han
+    et al. 2024).
 
-    Published is a factor of 0.995 at each step, for 3 to 8 photographs.  Ours is one for each pass over the training
-    photographs: among many a Gaussian is seen as often, not more rarely, while its opacity falls as much.
+    The published factor is 0.995 per step, for 3 to 8 images.  Ours applies to a pass over the training images: with
+    many images, a Gaussian is seen less often per step, and its opacity falls as much between two views of it.
     """
 
     stage: Literal["decay_opacity"] = "decay_opacity"
@@ -24,7 +24,7 @@ class DecayOpacity(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"per_pass"})
 
     per_pass: Annotated[Positive, AfterValidator(Bounded(0, most=1))] = 0.975
-    """Factor of the opacities in as many steps as there are training photographs; 1 changes nothing; by step."""
+    """Factor of the opacities over as many steps as there are training images; 1 changes nothing."""
 
     def run(self, run: Run) -> None:
         factor = at_step(self.per_pass, run.step) ** ((self.every or 1) / len(run.scene.split("train")))

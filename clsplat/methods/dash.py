@@ -1,4 +1,7 @@
-"""Fewer Gaussians for smaller photographs (DashGaussian, Chen et al. 2025); photos/detail.py has their sizes."""
+"""Limit the Gaussians while images are small, as DashGaussian does (Chen et al. 2025).
+
+`photos/detail.py` chooses the sizes of the images.
+"""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -10,32 +13,32 @@ from clsplat.density.edit import Edit
 
 
 class Momentum(Budget):
-    """Fewer Gaussians for smaller photographs, up to a number that growth itself finds (DashGaussian, Chen et al.
-    2025).
+    """Allow fewer Gaussians while images are small, up to a number that growth itself determines (DashGaussian, Chen
+    et al. 2025).
 
-    The number at the end is that of the start and a sum, which begins with `begin` times it.  At every edit the sum
-    becomes `keep` of itself and the number of Gaussians that could grow, where that is more.  On the way, what is added
-    is divided by the divisor of the photographs' size to the power 2 - t, with t the share of the steps that are done.
-    An edit that has reached its number replaces what is pruned.
+    The final number is the initial number plus a momentum, which starts at `initial_momentum` times the initial number.
+    Each edit sets the momentum to `keep` times itself plus the number of Gaussians that could grow, if that is larger.
+    During training, the increase is divided by d^(2 - t), with d the divisor of the image size and t the fraction of
+    the steps that are done.  An edit that has reached its number replaces pruned Gaussians.
     """
 
     type: Literal["momentum"] = "momentum"
     training_keys: ClassVar[frozenset[str]] = frozenset(
-        {"gaussians", "begin", "keep", "gradient_above", "most", "growth"}
+        {"gaussians", "initial_momentum", "keep", "gradient_above", "max_added", "growth"}
     )
 
     gaussians: Annotated[int, Field(gt=0)] | None = None
-    """Number at the end; without it, the one that growth finds."""
-    begin: Annotated[float, Field(gt=0, le=1e6)] = 5.0
-    """First value of the sum, as a multiple of the Gaussians at the start."""
+    """Final number; default: the momentum determines it."""
+    initial_momentum: Annotated[float, Field(gt=0, le=1e6)] = 5.0
+    """First value of the momentum, as a multiple of the initial number of Gaussians."""
     keep: Annotated[float, Field(ge=0, lt=1)] = 0.98
-    """Share of the sum that stays from edit to edit."""
+    """Factor of the momentum from one edit to the next."""
     gradient_above: Positive = 2.0e-4
-    """Lowest mean of `screen_grad` of a Gaussian that could grow; by step."""
-    most: Annotated[int, Field(gt=0)] = 1_000_000
-    """Largest number of Gaussians that one edit adds to the sum."""
+    """Lowest mean of `screen_grad` of a Gaussian that could grow."""
+    max_added: Annotated[int, Field(gt=0)] = 1_000_000
+    """Largest number of Gaussians that one edit adds to the momentum."""
     growth: Annotated[float, Field(gt=0)] = 0.2
-    """Largest share of the Gaussians that one edit adds."""
+    """Largest increase by one edit, as a fraction of the Gaussians."""
 
     @property
     def statistics(self) -> set[str]:
@@ -43,10 +46,10 @@ class Momentum(Budget):
 
     def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
         count = edit.gaussians.count
-        begin = numbers.setdefault("momentum/start", count)
-        momentum = numbers.setdefault("momentum/sum", self.begin * begin)
-        end = self.gaussians or begin + momentum
-        target = end if context.edits == 1 else begin + (end - begin) / context.divisor ** (2 - context.share)
-        eager = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
-        numbers["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.most, eager))))
+        initial = numbers.setdefault("momentum/start", count)
+        momentum = numbers.setdefault("momentum/sum", self.initial_momentum * initial)
+        end = self.gaussians or initial + momentum
+        target = end if context.edits == 1 else initial + (end - initial) / context.divisor ** (2 - context.share)
+        growing = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
+        numbers["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.max_added, growing))))
         return min(max(count, int(target)), int(count * (1 + self.growth)))

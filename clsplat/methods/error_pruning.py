@@ -1,4 +1,4 @@
-"""Pruning by what the training views lose without the Gaussians (ours)."""
+"""Prune by the rise of the error in training views, and measure how much error a Gaussian can remove (ours)."""
 
 from collections.abc import Callable
 from typing import Annotated, ClassVar, Literal
@@ -14,17 +14,17 @@ from clsplat.density.survey import Survey
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import ViewGradients
 from clsplat.losses.image import view_error
-from clsplat.methods.mini_splatting import drawn_weights
+from clsplat.methods.mini_splatting import sampled_weights
 from clsplat.opencl.device import Array
 from clsplat.render.painter import inside
 from clsplat.scene.view import View
 
-HIDDEN = -40.0  # logit of an opacity that no pixel shows
-FRACTION = 256  # the number is found to one part in so many
+HIDDEN = -40.0  # logit of an invisible opacity
+RESOLUTION = 256  # the search for the number to prune is accurate to 1/256 of the Gaussians
 
 
 def squared_error(survey: Survey, views: list[View]) -> float:
-    """Return the squared differences of images and photographs, summed over the pixels that count."""
+    """Return the squared error of the renders, summed over unmasked pixels."""
     total = 0.0
     for look in survey.render(views):
         difference = inside(look.frame, look.frame.image.get()) - look.photograph.image() / np.float32(255)
@@ -33,20 +33,20 @@ def squared_error(survey: Survey, views: list[View]) -> float:
 
 
 def without(gaussians: Gaussians, rows: NDArray[np.intp], function: Callable[[], float]) -> float:
-    """Return what a function says while the Gaussians of some rows are not shown; they are as before then."""
-    held = gaussians.get("logit_opacity")
-    hidden = held.copy()
+    """Return `function()` evaluated while the Gaussians of some rows are invisible; restores them afterwards."""
+    logits = gaussians.get("logit_opacity")
+    hidden = logits.copy()
     hidden[rows] = HIDDEN
     gaussians.set("logit_opacity", hidden)
     try:
         return function()
     finally:
-        gaussians.set("logit_opacity", held)
+        gaussians.set("logit_opacity", logits)
 
 
-def most(allowed: Callable[[int], bool], count: int) -> int:
-    """Return a number, 0 to `count`, that is allowed, by halving: the next one, a 256th of `count` above, is not."""
-    low, high, step = 0, count + 1, max(1, count // FRACTION)
+def largest_allowed(allowed: Callable[[int], bool], count: int) -> int:
+    """Return an allowed number from 0 to `count`, by bisection: `count` / RESOLUTION more is not allowed."""
+    low, high, step = 0, count + 1, max(1, count // RESOLUTION)
     while high - low > step:
         middle = (low + high) // 2
         low, high = (middle, high) if allowed(middle) else (low, middle)
@@ -54,10 +54,10 @@ def most(allowed: Callable[[int], bool], count: int) -> int:
 
 
 class PruneRedundant(Rule):
-    """Remove the Gaussians with the least weight in the training views: as many as raise the views' squared error by
-    at most a share of it.
+    """Remove the Gaussians with the smallest weight in the training views, while the squared error rises little.
 
-    How many that are is found by rendering some of the views without them.  Training goes on to make up for the rise.
+    The rule renders some views without the candidates to find how many it can remove.  Training then compensates for
+    the rise.
     """
 
     type: Literal["prune_redundant"] = "prune_redundant"
@@ -65,13 +65,13 @@ class PruneRedundant(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"error_rise", "views"})
 
     error_rise: Positive = 0.01
-    """Largest rise of the squared error, a share of it: 0.01 is 0.04 dB; by step."""
+    """Largest relative rise of the squared error: 0.01 is 0.04 dB."""
     views: Annotated[int, Field(ge=1)] = 10
-    """Number of training views that it is measured on, drawn by seed and step; all where there are no more."""
+    """Number of training views on which the error is measured, sampled by seed and step; all if there are fewer."""
 
     def mark(self, edit: Edit) -> None:
         survey, gaussians = edit.survey, edit.gaussians
-        order = np.argsort(survey.cached(drawn_weights).total, kind="stable")
+        order = np.argsort(survey.cached(sampled_weights).total, kind="stable")
         views = survey.sample_views(self.views)
         limit = (1 + edit.at(self.error_rise)) * squared_error(survey, views)
 
@@ -79,18 +79,15 @@ class PruneRedundant(Rule):
             return without(gaussians, order[:number], lambda: squared_error(survey, views)) <= limit
 
         chosen = np.zeros(len(order), bool)
-        chosen[order[: most(allowed, len(order))]] = True
+        chosen[order[: largest_allowed(allowed, len(order))]] = True
         edit.choose(chosen, copies=0, kept=0)
 
 
-# What a Gaussian promises to take away of the error, in a unit that all scenes share (ours).
-
-
 class ErrorGain(Statistic):
-    """How many pixels' errors a Gaussian promises to take away: those of mean pixels, over all training views (ours).
+    """Error that a Gaussian can remove, in mean errors of a pixel, over all training views (ours).
 
-    It is what the loss changes by a shift of one standard deviation on the screen, whatever the photographs' exposure,
-    size and number and the losses' weights.
+    It is the change of the loss when the Gaussian moves by one standard deviation on the screen.  The unit does not
+    depend on the exposure, size and number of the images, nor on the weights of the losses.
     """
 
     type: Literal["gain"] = "gain"
@@ -112,7 +109,7 @@ class ErrorGain(Statistic):
 
 
 class ViewError(Statistic):
-    """The error of the views in the losses' own measure, of those that do not see the Gaussian too."""
+    """Error of all views, also of those that do not see the Gaussian, as the losses measure it."""
 
     type: Literal["view_error"] = "view_error"
 

@@ -1,5 +1,4 @@
-"""Rules that ask in how many pixels of some training views a Gaussian takes part that are drawn wrongly (FastGS, Ren et
-al. 2025)."""
+"""Grow and prune by the wrong pixels that each Gaussian contributes to, as FastGS does (Ren et al. 2025)."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
@@ -18,58 +17,58 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Wrong:
-    """What each Gaussian has to do with wrong pixels."""
+class WrongPixels:
+    """The wrong pixels that each Gaussian contributes to."""
 
-    pixels: NDArray[np.int64]  # [N] in a view, the mean rounded down
-    score: Floats  # [N] their number times the loss of their view, summed; 0 for the least of all Gaussians, 1 the most
+    pixels: NDArray[np.int64]  # [N] mean number in a view, rounded down
+    score: Floats  # [N] number times the loss of the view, summed over views, scaled to [0, 1]
 
 
-def wrong_pixels(survey: Survey, views: int, error_above: float) -> Wrong:
-    """Count the wrong pixels in which each Gaussian is blended, over `views` training views."""
+def wrong_pixels(survey: Survey, views: int, error_above: float) -> WrongPixels:
+    """Count the wrong pixels that each Gaussian contributes to, over `views` training views."""
     drawn = survey.sample_views(views)
     total, weighted = np.zeros(survey.count, np.int64), np.zeros(survey.count)
     for look in survey.render(drawn):
         error, counted = look.error().astype(np.float64), look.counted()
         wrong = counted & (normalize(error, counted) > error_above)
-        pixels = look.sum(BLENDED, wrong).astype(np.int64)  # whole numbers below 2^24: exact
+        pixels = look.sum(BLENDED, wrong).astype(np.int64)  # integers below 2^24: exact in float32
         total += pixels
         weighted += look.loss(LOSSES) * pixels
-    return Wrong(total // max(len(drawn), 1), normalize(weighted, np.ones(len(weighted), bool)))
+    return WrongPixels(total // max(len(drawn), 1), normalize(weighted, np.ones(len(weighted), bool)))
 
 
 class ByWrongPixels(Rule):
-    """Base of rules that ask for wrong pixels; rules with the same `views` and `error_above` share the answer."""
+    """Base of rules that count wrong pixels; rules with the same `views` and `error_above` share the counts."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"views", "error_above"})
 
     views: Annotated[int, Field(ge=1)] = 10
-    """Number of training views, drawn by seed and step; all where there are no more."""
+    """Number of training views, sampled by seed and step; all if there are fewer."""
     error_above: Share = 0.1
-    """Error of a wrong pixel: mean over the channels, 0 for the least of its view and 1 for the largest."""
+    """Error above which a pixel is wrong: mean over the channels, scaled to [0, 1] in each view."""
 
-    def wrong(self, edit: Edit) -> Wrong:
-        """Return what is asked for, of the Gaussians before the edit."""
+    def wrong(self, edit: Edit) -> WrongPixels:
+        """Return the counts for the Gaussians before the edit."""
         return edit.survey.cached(wrong_pixels, self.views, self.error_above)
 
 
 class RevertGrowth(ByWrongPixels):
-    """Undo the growth, by the rules before this one, of Gaussians that take part in few wrong pixels."""
+    """Undo the growth, by earlier rules, of Gaussians that contribute to few wrong pixels."""
 
     type: Literal["revert_growth"] = "revert_growth"
     training_keys: ClassVar[frozenset[str]] = frozenset({"pixels_above"})
 
     pixels_above: NonNegative = 5
-    """Wrong pixels in a view, the mean rounded down, above which a Gaussian grows; by step."""
+    """Mean number of wrong pixels in a view, rounded down, above which a Gaussian may grow."""
 
     def mark(self, edit: Edit) -> None:
         edit.undo_growth(self.wrong(edit).pixels <= edit.at(self.pixels_above))
 
 
 class PruneSampled(SampledPruning, ByWrongPixels):
-    """Remove a share of the faint and the large Gaussians, drawn by 1 / (1 - score).
+    """Remove a fraction of the faint and of the large Gaussians, sampled by 1 / (1 - score).
 
-    The score is the number of wrong pixels times the loss of their view, summed over the views, and scaled to [0, 1].
+    The score is the number of wrong pixels times the loss of the view, summed over views and scaled to [0, 1].
     """
 
     type: Literal["prune_sampled"] = "prune_sampled"
@@ -80,7 +79,7 @@ class PruneSampled(SampledPruning, ByWrongPixels):
 
 
 class PruneInaccurate(ByWrongPixels):
-    """Remove Gaussians with a large score, that of `prune_sampled`."""
+    """Remove Gaussians with a large score, as defined for `prune_sampled`."""
 
     type: Literal["prune_inaccurate"] = "prune_inaccurate"
     grows: ClassVar[bool] = False

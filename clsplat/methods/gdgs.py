@@ -1,4 +1,4 @@
-"""More Gaussians where those with a large gradient crowd (our reading of GDGS, Wang & Shan 2025)."""
+"""Add Gaussians in dense regions with large gradients (our reading of GDGS, Wang & Shan 2025)."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -11,15 +11,15 @@ from clsplat.core.schedule import NonNegative, Positive
 from clsplat.density.edit import Edit, Rule
 
 Floats = NDArray[np.float64]
-CENTRAL = (0.01, 0.99)  # quantiles of the means between which the grid lies, along each axis
+CENTRAL = (0.01, 0.99)  # the grid spans these quantiles of the means along each axis
 
 
 class CloneDense(Rule):
-    """Copy small Gaussians with a large gradient twice where such Gaussians crowd: in place, and moved at random.
+    """Copy small Gaussians with a large gradient twice where they are dense: once in place, once with jitter.
 
-    A grid of `cells`³ covers the central 98 % of the means.  The rule acts where the fullest `extremes` cells hold
-    `ratio_above` times as many Gaussians with a large gradient as the emptiest, and there in the fullest.  Put it
-    before `clone`, which then takes the others.
+    A grid of `cells`³ covers the central 98 % of the means.  The rule acts if the `extremes` fullest cells together
+    hold `ratio_above` times as many Gaussians with a large gradient as the `extremes` emptiest, and only in the fullest
+    cells.  Put it before `clone`, which then takes the other Gaussians.
     """
 
     type: Literal["clone_dense"] = "clone_dense"
@@ -28,17 +28,17 @@ class CloneDense(Rule):
     )
 
     gradient_above: Positive = 2.0e-4
-    """Lowest mean of `screen_grad`; by step."""
+    """Lowest mean of `screen_grad`."""
     size_below: Positive = 0.01
-    """Largest size, the largest standard deviation as a share of the scene's extent; by step."""
+    """Largest size, the largest standard deviation as a fraction of the scene extent."""
     ratio_above: NonNegative = 400.0
-    """Smallest ratio of the numbers in the fullest and in the emptiest cells; by step."""
+    """Smallest ratio of the counts in the fullest cells to those in the emptiest."""
     jitter: NonNegative = 0.5
-    """Deviation of the moved copies in standard deviations of the Gaussian along its axes; by step."""
+    """Standard deviation of the jitter, in standard deviations of the Gaussian along its axes."""
     cells: Annotated[int, Field(ge=1, le=256)] = 4
     """Cells of the grid along each axis."""
     extremes: Annotated[int, Field(ge=1)] = 20
-    """Number of the fullest cells, and of the emptiest."""
+    """Number of fullest cells, and of emptiest cells, that are compared."""
 
     @property
     def statistics(self) -> set[str]:
@@ -62,13 +62,13 @@ class CloneDense(Rule):
         rows = np.flatnonzero(chosen)
         quats = gaussians.get("quats")[rows].astype(np.float64)
         axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T) * scales[rows, None, :]
-        way = edit.at(self.jitter) * np.einsum("nij,nj->ni", axes, edit.random().standard_normal((len(rows), 3)))
+        offset = edit.at(self.jitter) * np.einsum("nij,nj->ni", axes, edit.random().standard_normal((len(rows), 3)))
         edit.choose(chosen, copies=3, kept=1)
-        edit.set_children("means", rows, np.stack([means[rows], means[rows], means[rows] + way], axis=1))
+        edit.set_children("means", rows, np.stack([means[rows], means[rows], means[rows] + offset], axis=1))
 
 
 def cells_of(means: Floats, cells: int) -> NDArray[np.int64]:
-    """Return the cell of each mean in a grid over the central ones, [N]; -1 outside it."""
+    """Return the index of the grid cell of each mean, [N], or -1 outside the grid."""
     finite = np.isfinite(means).all(axis=1)
     if not finite.any():
         return np.full(len(means), -1)

@@ -1,4 +1,4 @@
-"""3DGS-MCMC (Kheradmand et al. 2024): relocation of faint Gaussians, and noise on the means."""
+"""Relocate faint Gaussians and add noise to the means, as 3DGS-MCMC does (Kheradmand et al. 2024)."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -13,83 +13,78 @@ from clsplat.gaussians.gaussians import Gaussians
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled
 
-MOST = 50  # rows in one place that eqs. 8 and 9 are applied for, as published
-WEIGHTS = 2**24  # steps of an opacity as a weight: whole numbers, whose sums are exact
+MAX_COPIES = 50  # of one Gaussian in eqs. 8 and 9, as published
+WEIGHT_STEPS = 2**24  # opacities become integer weights, whose sums are exact
 
 
 class Relocate(Rule):
-    """Move faint Gaussians to opaque ones, drawn by opacity; those that share a place keep its opacity (eqs. 8 and 9).
+    """Move faint Gaussians onto opaque ones, sampled by opacity, and keep the opacity there (eqs. 8 and 9).
 
-    As many more are drawn as the growth asks for, up to the limit of the edit (`max_gaussians`, `budget`, memory).
+    `growth` adds Gaussians in the same way, up to the limit of the edit (`max_gaussians`, `budget`, memory).
     """
 
     type: Literal["relocate"] = "relocate"
     training_keys: ClassVar[frozenset[str]] = frozenset({"opacity_below", "growth"})
 
     opacity_below: Positive = 0.005
-    """Opacity of Gaussians that are moved; by step."""
+    """Opacity below which a Gaussian is moved."""
     growth: Annotated[float, Field(ge=1)] = 1.05
-    """Number of Gaussians after an edit by the number before."""
+    """Number of Gaussians after an edit, divided by the number before."""
 
     def mark(self, edit: Edit) -> None:
         gaussians, rows = edit.gaussians, edit.rows()
         logit, log_scales = (gaussians.get(name).astype(np.float64) for name in ("logit_opacity", "log_scales"))
         opacity = np.minimum(1 / (1 + np.exp(-logit[:, 0])), 1 - 1e-7)
         faint = opacity < edit.at(self.opacity_below)
-        weights = np.where(faint | (rows != 1), 0, opacity * WEIGHTS).astype(np.uint64)
+        weights = np.where(faint | (rows != 1), 0, opacity * WEIGHT_STEPS).astype(np.uint64)
         if not weights.any():
             return
         more = min(int(self.growth * len(rows)) - len(rows), np.inf if edit.room is None else edit.room)
         drawn = systematic(weights, max(0, int(more) + int(rows[faint].sum())), edit.random())
         sources = np.flatnonzero(drawn)
-        opacities, factors = divided(
-            opacity[sources], np.minimum(drawn[sources] + 1, MOST), edit.at(self.opacity_below)
-        )
-        logits, log_scales = (
-            np.log(opacities / (1 - opacities))[:, None],
-            log_scales[sources] + np.log(factors)[:, None],
-        )
-        for copies in np.unique(drawn[sources] + 1):  # not where a later rule or the limit lets a source stay alone
-            alike = drawn[sources] + 1 == copies
+        copies = drawn[sources] + 1
+        opacities, factors = divide(opacity[sources], np.minimum(copies, MAX_COPIES), edit.at(self.opacity_below))
+        logits = np.log(opacities / (1 - opacities))[:, None]
+        log_scales = log_scales[sources] + np.log(factors)[:, None]
+        for number in np.unique(copies):  # children: no effect where a later rule or the limit refuses the growth
+            same = copies == number
             for name, values in (("logit_opacity", logits), ("log_scales", log_scales)):
-                edit.set_children(name, sources[alike], np.repeat(values[alike, None], copies, axis=1))
+                edit.set_children(name, sources[same], np.repeat(values[same, None], number, axis=1))
         edit.zero_moments(sources)
         edit.choose(faint | (drawn > 0), copies=np.where(faint, 0, drawn + 1), kept=1)
 
 
 def systematic(weights: NDArray[np.uint64], draws: int, random: np.random.Generator) -> NDArray[np.int64]:
-    """Return how often each item is drawn, [N]: the expected number, to the next whole one below or above.
+    """Return how often systematic sampling draws each item, [N]: its expected number, rounded down or up.
 
-    Places at equal distances, moved by one random number, on the line of all weights, in whole numbers.
+    Equidistant points, shifted by one random number, on the cumulative weights; in integers, so exact.
     """
     ends = np.cumsum(weights)
     total = int(ends[-1])
     step, rest = divmod(total, max(draws, 1))
     index, start = np.arange(draws, dtype=np.uint64), np.uint64(random.integers(0, total))
-    places = index * np.uint64(step) + (index * np.uint64(rest) + start) // np.uint64(max(draws, 1))
-    return np.diff(np.searchsorted(places, ends, side="left"), prepend=0)
+    points = index * np.uint64(step) + (index * np.uint64(rest) + start) // np.uint64(max(draws, 1))
+    return np.diff(np.searchsorted(points, ends, side="left"), prepend=0)
 
 
-def divided(
+def divide(
     opacity: NDArray[np.float64], rows: NDArray[np.integer], lowest: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the opacity of each of so many equal Gaussians in one place, and the factor of their scales (eqs. 8, 9).
+    """Return the opacity of each of `rows` equal Gaussians at one mean, and the factor of their scales (eqs. 8, 9).
 
-    Together they have the opacity of one at its center, and its integral along a line.
+    Together they have the opacity of the original at its center, and its integral along a line.
     """
     new = np.clip(1 - (1 - opacity) ** (1 / rows), lowest, 1 - 1e-6)
-    series = sum(scipy.special.comb(rows, j) * (-1.0) ** (j - 1) * new**j / np.sqrt(j) for j in range(1, MOST + 1))
+    orders = range(1, MAX_COPIES + 1)
+    series = sum(scipy.special.comb(rows, j) * (-1.0) ** (j - 1) * new**j / np.sqrt(j) for j in orders)
     return new, opacity / series
 
 
-# Noise on the means (3DGS-MCMC, Kheradmand et al. 2024).
-
-
 class AddNoise(Scheduled):
-    """Move each mean at random along the axes of its Gaussian, by their variances; opaque Gaussians stay.
+    """Add noise to the means, proportional to each Gaussian's covariance; opaque Gaussians do not move.
 
-    The noise is rate / (1 + exp(-100 (opacity_below - opacity))) Σ n / extent, with n three normal numbers, and none
-    0.1 above that opacity.  The division by the extent makes it the same in every unit of length.
+    The noise is rate / (1 + exp(-100 (opacity_below - opacity))) Σ n / extent, with n three standard normal numbers; it
+    is zero 0.1 above that opacity.  Dividing by the extent makes the rate independent of the unit of length.
     """
 
     stage: Literal["add_noise"] = "add_noise"
@@ -98,9 +93,9 @@ class AddNoise(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "opacity_below"})
 
     rate: NonNegative = 80.0
-    """Size of the noise; published: 5e5 times the rate of the means; by step."""
+    """Scale of the noise; published: 5e5 times the learning rate of the means."""
     opacity_below: Positive = 0.005
-    """Opacity at which the noise is half as large; by step."""
+    """Opacity at which the noise is half as strong."""
 
     def run(self, run: Run) -> None:
         rate, below = at_step(self.rate, run.step) / run.scene.extent, at_step(self.opacity_below, run.step)
@@ -108,9 +103,7 @@ class AddNoise(Scheduled):
 
 
 def add_noise(gaussians: Gaussians, rate: float, opacity_below: float, seed: int, step: int) -> None:
-    """Move each mean by rate / (1 + exp(-100 (opacity_below - opacity))) Σ n, n three normal numbers (Kheradmand et
-    al. 2024).  rate: scene units⁻¹.
-    """
+    """Add rate / (1 + exp(-100 (opacity_below - opacity))) Σ n to each mean; rate: scene units⁻¹."""
     gaussians.device.program("noise.cl").add_noise(
         items=gaussians.count,
         means=gaussians["means"],

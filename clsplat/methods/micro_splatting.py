@@ -1,6 +1,6 @@
-"""Rules that split Gaussians where the photographs have detail, or when they are too large (Lee et al. 2025).
+"""Split, prune and merge Gaussians as Micro-splatting does (Lee et al. 2025).
 
-Both rules choose on the host, from tables and statistics: comparing Gaussians with each other is a line of NumPy there.
+All rules select Gaussians on the host: comparing Gaussians with each other is a line of NumPy there.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
 
 
 class RenderedTexture(Statistic):
-    """The rendered image's gradient magnitude at the projected mean, per px (Micro-splatting, Lee et al. 2025)."""
+    """Gradient magnitude of the rendered image at the projected mean, px⁻¹ (Micro-splatting, Lee et al. 2025)."""
 
     type: Literal["rendered_texture"] = "rendered_texture"
 
@@ -48,7 +48,7 @@ class RenderedTexture(Statistic):
 
 
 class Subdivide(Rule):
-    """Base of rules that replace Gaussians by smaller ones, a limited share of them at a time."""
+    """Base of rules that replace a limited fraction of the Gaussians by smaller ones."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"children", "beta", "max_fraction", "radius_above"})
 
@@ -57,16 +57,19 @@ class Subdivide(Rule):
     beta: Annotated[float, Field(gt=0, le=1)] = BETA
     """A child's covariance divided by its parent's."""
     max_fraction: Share = 0.05
-    """Largest share of all Gaussians that one edit splits; those with the largest score come first."""
+    """Largest fraction of all Gaussians that one edit splits, starting with the largest scores."""
     radius_above: Annotated[float, Field(ge=0)] = 2.0
-    """Smallest mean radius on the screen, three standard deviations, px."""
+    """Smallest mean radius on the screen that is split: three standard deviations, px."""
 
     @property
     def statistics(self) -> set[str]:
         return {"screen_radius"}
 
     def subdivide(self, edit: Edit, candidates: NDArray[np.bool_], score: NDArray[np.float32]) -> None:
-        """Split the candidates, [N], with the largest scores; those of earlier rules and small ones are left out."""
+        """Split the candidates, [N], with the largest scores.
+
+        Skips Gaussians that are small on the screen or that an earlier rule has selected.
+        """
         candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
         chosen = largest(score, int(self.max_fraction * len(candidates)), candidates)
         edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
@@ -75,8 +78,8 @@ class Subdivide(Rule):
 class SplitTextured(Subdivide):
     """Split Gaussians where the photographs are textured.
 
-    With `gradient_above` 0, texture alone decides.  Above 0, the mean of `screen_grad` must reach it too; choose a
-    threshold below that of the other rules.
+    With `gradient_above: 0`, only the texture decides.  Above 0, the mean of `screen_grad` must reach it too; choose a
+    threshold below those of the other rules.
     """
 
     type: Literal["split_textured"] = "split_textured"
@@ -85,9 +88,9 @@ class SplitTextured(Subdivide):
     texture: StatisticName = "texture"
     """Column whose mean is the texture."""
     texture_above: Threshold = PixelQuantile(quantile=0.8, of="pixels")
-    """Lowest texture: a number by step, or a quantile."""
+    """Lowest texture that is split: a number, or a quantile."""
     gradient_above: NonNegative = 1.0e-4
-    """Lowest mean of `screen_grad`; by step."""
+    """Lowest mean of `screen_grad` that is split."""
 
     @property
     def statistics(self) -> set[str]:
@@ -104,17 +107,17 @@ class SplitTextured(Subdivide):
 class SplitOversized(Subdivide):
     """Split Gaussians whose covariance trace is larger than τ = 3 s².
 
-    s is `rms_above` as a share of the extent, or a quantile of the rms scales, or, with `pixels`, the length of so many
-    pixels at the nearest training view.
+    s is `rms_above`, as a fraction of the scene extent or as a quantile of the rms scales.  With `pixels`, s is the
+    length of that many pixels in the nearest training view.
     """
 
     type: Literal["split_oversized"] = "split_oversized"
     training_keys: ClassVar[frozenset[str]] = frozenset({"rms_above"})
 
     rms_above: Annotated[Quantile | Positive, explain_schedule(", or {quantile}")] = 0.01
-    """Smallest rms scale, a share of the scene's extent by step, or a quantile of all rms scales."""
+    """Smallest rms scale that is split, as a fraction of the scene extent or as a quantile of all rms scales."""
     pixels: Annotated[float, Field(gt=0)] | None = None
-    """Smallest rms scale in px of the nearest training view; replaces `rms_above`."""
+    """Smallest rms scale that is split, px in the nearest training view; replaces `rms_above`."""
 
     @property
     def tables(self) -> set[str]:
@@ -134,20 +137,20 @@ class SplitOversized(Subdivide):
         self.subdivide(edit, rms > bound, rms / np.maximum(bound, 1e-30))
 
 
-# Rules that reduce the number of Gaussians (the refinement of Micro-splatting's second version, Lee et al.
+# Rules that reduce the number of Gaussians: the refinement in the second version of Micro-splatting.
 
 Floats = NDArray[np.float64]
 
 
 class PruneUnimportant(Rule):
-    """Remove a share of all Gaussians: those with the smallest opacity times geometric mean scale."""
+    """Remove the fraction of Gaussians with the smallest opacity times geometric mean scale."""
 
     type: Literal["prune_unimportant"] = "prune_unimportant"
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
 
     share: Share = 0.05
-    """Share of all Gaussians that is removed."""
+    """Fraction of all Gaussians to remove."""
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
@@ -159,11 +162,11 @@ class PruneUnimportant(Rule):
 
 
 class MergeNeighbors(Rule):
-    """Replace two mutual nearest neighbors, close and of like color, by one Gaussian.
+    """Merge two mutual nearest neighbors that are close and similar in color into one Gaussian.
 
-    It has the mean and covariance of their mixture and the mean of their colors, weighted by opacity times volume, and
-    the opacity that keeps the sum of these weights.  The row of the heavier one stays, with its statistics and Adam's
-    moments, except those of scales and rotation.
+    The result has the mean, covariance and color of their mixture, weighted by opacity times volume, and the opacity
+    that preserves the sum of these weights.  It replaces the heavier Gaussian and keeps its statistics and Adam
+    moments, except the moments of scales and rotation.
     """
 
     type: Literal["merge_neighbors"] = "merge_neighbors"
@@ -173,41 +176,41 @@ class MergeNeighbors(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "color_below"})
 
     distance_below: Positive = 0.5
-    """Largest distance, a share of the sum of their mean scales; by step."""
+    """Largest distance that is merged, as a fraction of the sum of the two mean scales."""
     color_below: Positive = 0.05
-    """Largest difference of a channel of the base colors, in [0, 1]; by step."""
+    """Largest difference in any channel of the base colors, in [0, 1]."""
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
         names = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
         tables = {name: gaussians.get(name).astype(np.float64) for name in names}
         first, second = self._pairs(edit, tables)
-        alone = edit.rows() == 1
-        usable = alone[first] & alone[second]
+        unchanged = edit.rows() == 1
+        usable = unchanged[first] & unchanged[second]
         first, second = first[usable], second[usable]
         if not len(first):
             return
         for name, values in merge(tables, first, second).items():
             edit.set_rows(name, first, values)
-        edit.zero_moments(first, ("log_scales", "quats"))  # which belong to other axes
+        edit.zero_moments(first, ("log_scales", "quats"))  # the merged Gaussian has other axes
         absorbed = np.zeros(gaussians.count, bool)
         absorbed[second] = True
         edit.choose(absorbed, copies=0, kept=0)
 
     def _pairs(self, edit: Edit, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of mutual nearest neighbors that may merge, the heavier one first."""
+        """Return the rows of mutual nearest neighbors to merge, the heavier one of each pair first."""
         means, mass = tables["means"], mass_of(tables)
-        if len(means) < 2 or not np.isfinite(means).all():  # the next report ends the training
+        if len(means) < 2 or not np.isfinite(means).all():  # training stops at its next report
             return np.empty(0, np.int64), np.empty(0, np.int64)
         rows = np.arange(len(means))
-        distances, found = scipy.spatial.cKDTree(means).query(means, k=2)
-        other = np.where(found[:, 0] == rows, 1, 0)  # of two in one place, the row itself may come second
-        distance, nearest = distances[rows, other], found[rows, other]
+        distances, neighbors = scipy.spatial.cKDTree(means).query(means, k=2)
+        other = np.where(neighbors[:, 0] == rows, 1, 0)  # with equal means, a row may be its own second neighbor
+        distance, nearest = distances[rows, other], neighbors[rows, other]
         mutual = (nearest[nearest] == rows) & (rows < nearest)
         size = np.exp(tables["log_scales"].mean(axis=1))
         close = distance < edit.at(self.distance_below) * (size + size[nearest])
         color = SH_C0 * np.abs(tables["sh_base"] - tables["sh_base"][nearest]).max(axis=1)
-        one = rows[mutual & close & (color < edit.at(self.color_below))]
-        two = nearest[one]
-        heavier = mass[one] >= mass[two]
-        return np.where(heavier, one, two), np.where(heavier, two, one)
+        first = rows[mutual & close & (color < edit.at(self.color_below))]
+        second = nearest[first]
+        is_heavier = mass[first] >= mass[second]
+        return np.where(is_heavier, first, second), np.where(is_heavier, second, first)

@@ -1,5 +1,7 @@
-"""Importance by blend weights, view by view, and new Gaussians from depths (Mini-Splatting and Mini-Splatting2, Fang
-and Wang 2024)."""
+"""Prune and hide Gaussians by their blend weights in each view, and reinitialize them from depth.
+
+From Mini-Splatting and Mini-Splatting2 (Fang and Wang 2024).
+"""
 
 import logging
 from collections.abc import Mapping
@@ -31,12 +33,12 @@ LOG = logging.getLogger("clsplat")
 Floats = NDArray[np.float64]
 
 
-def drawn_weights(survey: Survey, weight_per_view: float | None = None, drawn: int | None = None) -> Weights:
+def sampled_weights(survey: Survey, weight_per_view: float | None = None, number: int | None = None) -> Weights:
     """Return the weights in training views.
 
-    weight_per_view: as in `weights`.  drawn: the number of views; None: all.
+    weight_per_view: as in `weights`.  number: of sampled views; None: all views.
     """
-    views = survey.views if drawn is None else survey.sample_views(drawn)
+    views = survey.views if number is None else survey.sample_views(number)
     return weights(survey.render(views), survey.count, weight_per_view)
 
 
@@ -45,16 +47,17 @@ def useless(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
 
     It needs the heaviest, which add up to the share `weight_per_view` of its weight.
     """
-    found = np.zeros((len(survey.views), survey.count), bool)
-    for here, look in zip(found, survey.render(survey.views), strict=True):
-        here[:] = (look.radius() > 0) & ~heaviest(look.sum(WEIGHT).astype(np.float64), weight_per_view)
-    return found
+    hidden = np.zeros((len(survey.views), survey.count), bool)
+    for row, look in zip(hidden, survey.render(survey.views), strict=True):
+        row[:] = (look.radius() > 0) & ~heaviest(look.sum(WEIGHT).astype(np.float64), weight_per_view)
+    return hidden
 
 
 class PruneUseless(Rule):
-    """Remove Gaussians that are useful in few training views, and those that together have little weight.
+    """Remove Gaussians that are useful in few training views, and the Gaussians with the smallest weights.
 
-    In a view those are useful that make most of its weight, alpha T over all pixels, the largest first.
+    The weight of a Gaussian in a view is the sum of alpha T over the pixels.  The heaviest ones that together make up
+    `weight_per_view` of the view's weight are useful in it.
     """
 
     type: Literal["prune_useless"] = "prune_useless"
@@ -62,26 +65,27 @@ class PruneUseless(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight_per_view", "weight_total", "views", "views_below"})
 
     weight_per_view: Share = 0.99
-    """Share of a view's weight that is made by what is useful in it."""
+    """Fraction of a view's weight that its useful Gaussians make up."""
     views: Annotated[int, Field(ge=1)] | None = None
-    """Number of training views, drawn by seed and step; all of them without a number, or where there are no more."""
+    """Number of training views, sampled by seed and step; default: all."""
     views_below: Annotated[int, Field(ge=0)] = 2
-    """Number of views below which a Gaussian is removed."""
+    """A Gaussian that is useful in fewer views is removed."""
     weight_total: Share = 0.999
-    """Share of the weight in all views that stays; the smallest weights go."""
+    """Fraction of the weight in all views that is kept; the smallest weights are removed."""
 
     def mark(self, edit: Edit) -> None:
-        found = edit.survey.cached(drawn_weights, self.weight_per_view, self.views)
-        kept = heaviest(found.total, self.weight_total) & (found.views >= self.views_below)
+        weights = edit.survey.cached(sampled_weights, self.weight_per_view, self.views)
+        kept = heaviest(weights.total, self.weight_total) & (weights.views >= self.views_below)
         edit.choose(~kept, copies=0, kept=0)
 
 
 class HideUseless(Scheduled):
-    """Leave out of the steps on each training view the Gaussians that make little of it, which saves time
+    """Skip, in the steps on each training view, the Gaussians that contribute little to it, to save time
     (Mini-Splatting2, Fang and Wang 2024).
 
-    Useful in a view are those that make most of its weight, alpha T over all pixels, the largest first.  What is new
-    later is hidden where its source was.  All are drawn in other pictures, and in all after the training.
+    The heaviest Gaussians that together make up `weight_per_view` of a view's weight, alpha T over all pixels, stay.
+    New Gaussians are hidden in the views in which their source was.  Other renders, and all renders after the training,
+    show every Gaussian.
     """
 
     stage: Literal["hide_useless"] = "hide_useless"
@@ -90,7 +94,7 @@ class HideUseless(Scheduled):
     edits: ClassVar[bool] = True
 
     weight_per_view: Share = 0.99
-    """Share of a view's weight that is made by what it shows."""
+    """Fraction of a view's weight that its visible Gaussians make up."""
 
     def attach(self, run: Run) -> None:
         if HIDDEN not in run.model.gaussians.tables:
@@ -103,30 +107,28 @@ class HideUseless(Scheduled):
 # New Gaussians on the surfaces that a model shows (Mini-Splatting2).
 
 
-class Drawn(NamedTuple):
-    """What was drawn of one photograph."""
+class SampledPixels(NamedTuple):
+    """Sampled pixels of one image, as points in the scene."""
 
     positions: Floats  # [n, 3] scene units
     colors: Floats  # [n, 3] in [0, 1]
     pixel: Floats  # [n] side of a pixel at its depth, scene units
-    apart: Floats  # [n] distance to the next that was drawn, about, scene units
+    spacing: Floats  # [n] approximate distance to the next sampled pixel, scene units
 
 
 class ReinitFromDepth(Stage):
-    """Replace all Gaussians by new ones on the surfaces that the training photographs show, between two trainings
-    (Mini-Splatting2, Fang and Wang 2024).  Clusters become even, and floaters behind and before surfaces go.
+    """Replace all Gaussians by new ones on the surfaces that the training images show, between two trainings
+    (Mini-Splatting2, Fang and Wang 2024).  This evens out clusters and removes floaters.
 
-    Each photograph has the same number of them, at pixels that are drawn, none twice, by the share alpha of a pixel
-    that the model covers: what nothing covers has no depth.  That is what is published as 1 − accum_alpha, an array
-    that holds the transmittance, 1 − alpha, as in the code of 3DGS.  Pixels that a mask leaves out are not drawn.
+    Each image contributes the same number of distinct pixels, sampled by their alpha; masked pixels are not sampled.
+    The paper calls this weight 1 − accum_alpha, where accum_alpha is the transmittance, as in the code of 3DGS.
 
-    A Gaussian lies at the mean depth of what covers its pixel, weighted by alpha T, which at an edge falls between
-    two surfaces; published is the middle of the ray's way through the Gaussian of the largest weight. It has the
-    photograph's color; where photographs have learned colors of their own, that of the model's picture, which has
-    none of them. A learned camera counts where it was learned to be. The Gaussian's standard deviation is the mean
-    distance to the three nearest neighbors, as `init` has it, but at least a pixel and at most the distance to the
-    next drawn pixel. Adam's moments, statistics and averages begin anew; the active degree of the harmonics stays,
-    with zeros.
+    A new Gaussian is at the mean depth of its pixel, weighted by alpha T; at an edge this is between two surfaces.  The
+    paper uses the middle of the ray's segment in the Gaussian with the largest weight.  The color is that of the
+    image, or of the render where training learns exposures.  Poses are the optimized ones.  The standard deviation is
+    the mean distance to the three nearest neighbors, as in `init`, but at least one pixel and at most the distance to
+    the next sampled pixel.  Adam's moments, statistics and averages are reset; the active SH degree stays, with zero
+    coefficients.
     """
 
     stage: Literal["reinit_from_depth"] = "reinit_from_depth"
@@ -134,11 +136,10 @@ class ReinitFromDepth(Stage):
     takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette", "metrics"})
     edits: ClassVar[bool] = True
     changes_last: ClassVar[bool] = True
-    conflicts: ClassVar[Mapping[str, str]] = {"motion": "a depth is of one moment; leave the stage or model.time out"}
+    conflicts: ClassVar[Mapping[str, str]] = {"motion": "depths are of one timestamp; remove the stage or model.time"}
 
     count: Annotated[int, Field(gt=0)] | None = None
-    """Number of new Gaussians, at most; without it, as many as there are.  Photographs of which little is
-    covered give fewer."""
+    """Largest number of new Gaussians; default: the current number.  Images with few covered pixels give fewer."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the new Gaussians."""
     scale: Annotated[float, Field(gt=0)] = 1.0
@@ -148,63 +149,63 @@ class ReinitFromDepth(Stage):
         before, degree, width = run.model.gaussians.count, run.model.degree, run.model.gaussians.sh_degree
         count = self.count or before
         run.memory_plan(first_tables(width), last_place(run.harmonics, run.device.info)).check(count, more_room(run))
-        drawn = self._drawn(run, count)
-        positions, colors, pixel, apart = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        samples = self._sample(run, count)
+        positions, colors, pixel, spacing = (np.concatenate(parts) for parts in zip(*samples, strict=True))
         if not len(positions):
             raise NumericError(
-                "reinit_from_depth: the model covers no pixel of the training photographs; train longer before it"
+                "reinit_from_depth: the model covers no pixel of the training images; train longer before this stage"
             )
         points = PointCloud(positions.astype(np.float32), colors.astype(np.float32))
         parameters = from_points(points, self.opacity, width)
-        size = np.clip(np.exp(parameters["log_scales"][:, 0].astype(np.float64)), pixel, apart)
+        size = np.clip(np.exp(parameters["log_scales"][:, 0].astype(np.float64)), pixel, spacing)
         parameters["log_scales"][:] = np.log(self.scale * size)[:, None]
         model = run.model_settings.model(Gaussians(run.device, parameters), degree)
         with run.changing():
-            run.adam, run.stats, run.metrics = None, None, {}  # which were of the earlier model
+            run.adam, run.stats, run.metrics = None, None, {}  # they belong to the earlier model
             run.model = model
             run.refresh_filter()
         change = Change(before, len(points), {self.stage: before}, {})
         run.records.add(run.step, "densify", **asdict(change))
-        LOG.info("%s Gaussians from depths in the place of %s", f"{change.after:,}", f"{before:,}")
+        LOG.info("%s Gaussians from depth replace %s", f"{change.after:,}", f"{before:,}")
 
     @staticmethod
-    def _drawn(run: Run, count: int) -> list[Drawn]:
-        """What is drawn of each training photograph; random numbers are of the seed, the step and its place."""
+    def _sample(run: Run, count: int) -> list[SampledPixels]:
+        """Sample pixels of each training image; random numbers depend on the seed, the step and the image's index."""
         views = learned_scene(run).downscaled(run.downscale).split("train")
-        painter, found, own_colors = run.painter(), list[Drawn](), color_model(run) is not None
+        painter, samples, has_exposures = run.painter(), list[SampledPixels](), color_model(run) is not None
         for number, view in enumerate(run.status.counted(views, "photographs", len(views))):
             photograph = run.photographs.get(view)
             layers = painter.layers(photograph.camera, depth=True)
-            assert layers.depth is not None  # as it was asked for
-            mask, own = photograph.counted(), count // len(views) + (number < count % len(views))
+            assert layers.depth is not None  # since depth=True
+            mask, pixels = photograph.counted(), count // len(views) + (number < count % len(views))
             alpha = np.where(layers.depth > 0, layers.alpha, 0) * (1 if mask is None else mask)
             random = np.random.default_rng([run.seed, run.step, number])
-            image = to_8_bits(layers.image) if own_colors else photograph.image()
-            found.append(drawn_of(view, alpha, layers.depth, image, own, random))
-        return found
+            image = to_8_bits(layers.image) if has_exposures else photograph.image()
+            samples.append(sample_pixels(view, alpha, layers.depth, image, pixels, random))
+        return samples
 
 
-def drawn_of(
+def sample_pixels(
     view: View,
     alpha: NDArray[np.floating],
     depth: NDArray[np.floating],
     image: NDArray[np.uint8],
     count: int,
     random: np.random.Generator,
-) -> Drawn:
-    """Draw `count` pixels of a view by alpha, none twice, and return what lies there; all where fewer have any.
+) -> SampledPixels:
+    """Sample `count` distinct pixels of a view by alpha, or all covered ones if there are fewer.
 
     alpha, depth: [height, width], in [0, 1] and in scene units along the axis; image: [height, width, 3].
     """
-    chances = alpha.astype(np.float64).ravel()
-    places = np.sort(sampling_order(chances > 0, chances, random)[:count])
-    camera, (rows, columns) = view.camera, np.divmod(places, alpha.shape[1])
+    weights = alpha.astype(np.float64).ravel()
+    pixels = np.sort(sampling_order(weights > 0, weights, random)[:count])
+    camera, (rows, columns) = view.camera, np.divmod(pixels, alpha.shape[1])
     z = depth[rows, columns].astype(np.float64)
     rays = np.stack(
         [(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(z))], axis=1
     )
     rotation, translation = view.world_to_camera[:, :3], view.world_to_camera[:, 3]
     pixel = z / np.sqrt(camera.fx * camera.fy)
-    share = np.minimum(1, len(places) * chances[places] / (chances.sum() or 1))  # of the pixels there that are drawn
+    fraction = np.minimum(1, len(pixels) * weights[pixels] / (weights.sum() or 1))  # of pixels sampled around this one
     positions = (rays * z[:, None] - translation) @ rotation
-    return Drawn(positions, image[rows, columns] / 255.0, pixel, pixel / np.sqrt(share))
+    return SampledPixels(positions, image[rows, columns] / 255.0, pixel, pixel / np.sqrt(fraction))

@@ -1,4 +1,4 @@
-"""AutoOpti3DGS: a photograph without its finest details, which a filter that is learned lets return."""
+"""Train on images whose finest details return as a wavelet filter is learned (AutoOpti3DGS, Nguyen et al. 2025)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -21,28 +21,28 @@ NAMES = {"filter": ("haar/scale", "haar/leak"), "scale": ("haar/scale",)}
 
 
 class Haar(TrainingModule):
-    """Take the photograph's finest details away, and let them return as a filter is learned (AutoOpti3DGS, Nguyen et
-    al. 2025).
+    """Remove the finest details of the photo and restore them as a filter is learned (AutoOpti3DGS, Nguyen et al.
+    2025).
 
-    The photograph passes one level of the Haar transform and back.  The high-pass filter of the way there is
-    h = s (1, -1) / √2 + l (1, 1) / √2 with scale s and leak l, which are learned and begin at zero: squares of 2 x 2 px
-    are their mean.  They follow the losses on images, and one of their own, weight · 2 ((1 - s)² + l²), which pulls h
-    to Haar's, where the photograph is as it was.  Pixels that a mask leaves out are the mean of those of their square
-    that count.  All losses on images must be the same with image and photograph exchanged.
+    The photo passes through one level of the Haar transform and its inverse.  The high-pass analysis filter is
+    h = s (1, -1) / √2 + l (1, 1) / √2 with learned scale s and leak l.  Both start at zero, which averages squares of
+    2 x 2 px.  The losses on images train them, and the loss weight · 2 ((1 - s)² + l²) pulls h to Haar's filter, which
+    leaves the photo unchanged.  A masked pixel becomes the mean of the unmasked ones in its square.  All losses on
+    images must be symmetric in render and photo.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
     rate_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
-    order: ClassVar[int] = 10  # before what compares the photograph with the image
-    device_planes: ClassVar[int] = 6  # the photograph that is changed, and its gradient
+    order: ClassVar[int] = 10  # before the modules that compare the photo with the render
+    device_planes: ClassVar[int] = 6  # the filtered photo, and its gradient
 
     type: Literal["haar"] = "haar"
     learn: Literal["filter", "scale"] = "filter"
-    """Scale and leak, which is every filter of two taps, or the scale alone."""
+    """`filter`: scale and leak, which together are any filter with two taps; `scale`: only the scale."""
     rate: NonNegative = 1.0e-4
-    """Learning rate of the filter, by Adam; it decides how fast details return; by step."""
+    """Learning rate of the filter (Adam); it determines how fast details return."""
     weight: NonNegative = 0.05
-    """Factor of the loss that pulls the filter to Haar's; by step."""
+    """Weight of the loss that pulls the filter to Haar's."""
 
     def create_state(self, run: Run) -> "HaarState":
         return HaarState(self)
@@ -52,20 +52,20 @@ class Haar(TrainingModule):
             if isinstance(loss, ImageLoss) and loss.reads_photograph and not loss.symmetric:
                 name = getattr(loss, "type", getattr(loss, "name", type(loss).__name__))
                 raise ConfigError(
-                    f"the loss '{name}', where '{self.type}' learns: expected losses that are the same with image and "
-                    "photograph exchanged, such as l1, l2 and dssim; the class of one says `symmetric = True`"
+                    f"the loss '{name}' is not symmetric in render and photo, as '{self.type}' requires; use l1, l2 or "
+                    "dssim, or set `symmetric = True` in the class of a loss that is"
                 )
 
     def penalty(self, scalars: Scalars, step: int) -> tuple[float, ByNumber]:
-        """Return the loss of the filter alone, and its derivatives."""
+        """Return the loss that pulls the filter to Haar's, and its derivatives."""
         weight = at_step(self.weight, step)
-        away = {name: value - (name == "haar/scale") for name, value in scalars.items()}
-        value = weight * 2 * sum(one**2 for one in away.values())
-        return value, {name: 4 * weight * one for name, one in away.items()}
+        offsets = {name: value - (name == "haar/scale") for name, value in scalars.items()}
+        value = weight * 2 * sum(offset**2 for offset in offsets.values())
+        return value, {name: 4 * weight * offset for name, offset in offsets.items()}
 
 
 class HaarState(ModuleState):
-    """The filter, and its Adam."""
+    """The filter and its Adam moments."""
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
@@ -75,7 +75,7 @@ class HaarState(ModuleState):
 
     @property
     def filter(self) -> ByNumber:
-        """What is learned, by name."""
+        """The learned parameters by name."""
         return {name: self.scalars.get(name, 0.0) for name in NAMES[self.settings.learn]}
 
     def after_render(self, step: TrainingStep) -> None:
@@ -83,7 +83,7 @@ class HaarState(ModuleState):
         step.planes = apply_filter(step.planes, self.filter)
 
     def before_losses(self, step: TrainingStep) -> None:
-        """A loss keeps the sums of its last call, so that the gradient by the photograph comes before its value."""
+        """Compute the gradient with respect to the photo first: a loss keeps the sums of its last call."""
         self.settings.check_losses(step.loss_settings)
         gradient = gradient_by_photograph(step.loss_settings, step.comparison)
         if step.planes.mask is not None:
@@ -96,30 +96,31 @@ class HaarState(ModuleState):
     def update(self, step: TrainingStep) -> None:
         of_images, of_filter = step.saved(self)
         by_images = of_images()
-        self.learn({name: by_images[name] + own for name, own in of_filter.items()}, step.number)
+        self.learn({name: by_images[name] + gradient for name, gradient in of_filter.items()}, step.number)
 
     def learn(self, gradients: ByNumber, step: int) -> None:
-        """Change the filter by Adam."""
+        """Update the filter with Adam."""
         adam_step(self.scalars, self.filter, gradients, at_step(self.settings.rate, step))
 
 
 def apply_filter(planes: Planes, scalars: ByNumber) -> Planes:
-    """Return a photograph after the transform; the colors of `planes` stay as they are."""
+    """Return the photo after the transform; the colors of `planes` do not change."""
     camera, workspace = planes.camera, planes.workspace
-    found = workspace.array("haar", planes.colors.shape)
+    filtered = workspace.array("haar", planes.colors.shape)
     workspace.device.program("haar.cl").haar_forward(
         items=(camera.stride // 2, camera.rows // 2),
         image=planes.colors,
-        found=found,
-        **_arguments(planes, scalars, found),
+        found=filtered,
+        **_arguments(planes, scalars, filtered),
     )
-    return replace(planes, colors=found)
+    return replace(planes, colors=filtered)
 
 
 def filter_gradients(planes: Planes, scalars: ByNumber, gradient: Array) -> Callable[[], ByNumber]:
-    """Begin the derivatives by scale and leak of what `apply_filter` returned of `planes`; the result waits for them.
+    """Start computing the gradient of the filter; the returned function waits for it.
 
-    gradient: by those colors, [3, rows, stride], zero outside the image and where the mask is.
+    planes: the arguments of `apply_filter`.  gradient: with respect to the filtered colors, [3, rows, stride], zero
+    outside the image and where masked.
     """
     columns, strips = planes.camera.stride // 2, -(-planes.camera.rows // (2 * STRIP))
     sums = planes.workspace.array("haar sums", (2, strips, columns))
@@ -140,14 +141,17 @@ def filter_gradients(planes: Planes, scalars: ByNumber, gradient: Array) -> Call
 
 
 def _arguments(planes: Planes, scalars: ByNumber, unread: Array) -> dict[str, Any]:
-    """Arguments of both kernels; `unread` stands in the place of a mask."""
+    """Return arguments of both kernels; `unread` is passed instead of a mask where there is none."""
     scale, leak = scalars["haar/scale"], scalars.get("haar/leak", 0.0)
     masked, sizes = int(planes.mask is not None), planes.camera.plane_arguments()
     return {"mask": planes.mask or unread, "masked": masked, "u": leak + scale, "v": leak - scale, **sizes}
 
 
 def gradient_by_photograph(losses: Sequence[Loss], comparison: Comparison) -> Array:
-    """Return the gradient of symmetric losses by the photograph, [3, rows, stride]; the image's is left as it is."""
+    """Return the gradient of symmetric losses with respect to the photo, [3, rows, stride].
+
+    The gradient with respect to the render is not touched.
+    """
     gradient = comparison.workspace.array("grad_photograph", comparison.photograph.shape)
     image, photograph = comparison.photograph, comparison.image
     exchanged = replace(comparison, image=image, photograph=photograph, gradient=gradient, accumulate=False)

@@ -1,8 +1,8 @@
-"""Splitting where it lowers the loss at once: where the splitting matrix has a negative eigenvalue (SteepGS, Wang et
-al. 2025).
+"""Split Gaussians where a split lowers the loss at once, as SteepGS does (Wang et al. 2025).
 
-Where a Gaussian's weight in the pixels is replaced by the mean of two, moved by ±ε v, the loss changes by
-ε²/2 vᵀ S v + O(ε⁴).  Two Gaussians of a share of its opacity are such a mean up to the product of their alphas.
+That is where the splitting matrix S has a negative eigenvalue.  If a Gaussian's weight in the pixels is replaced by the
+mean of two copies moved by ±ε v, the loss changes by ε²/2 vᵀ S v + O(ε⁴).  Two Gaussians with part of its opacity are
+such a mean, up to the product of their alphas.
 """
 
 from typing import Annotated, ClassVar, Literal
@@ -21,11 +21,14 @@ from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array
 
 Floats = NDArray[np.float64]
-UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # places of a symmetric matrix in the six columns
+UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # column of each element of the symmetric matrix
 
 
 class Splitting(Statistic):
-    """The splitting matrix, Σ ∂L/∂alpha ∇²alpha over pixels, by the mean: xx, xy, xz, yy, yz, zz in scene units⁻²."""
+    """The splitting matrix with respect to the mean, Σ ∂L/∂alpha ∇²alpha over pixels.
+
+    Columns xx, xy, xz, yy, yz, zz, scene units⁻².
+    """
 
     type: Literal["splitting"] = "splitting"
     components = 6
@@ -45,11 +48,11 @@ class Splitting(Statistic):
 
 
 class SplitSteepest(Rule):
-    """Replace a Gaussian by two, moved apart in the direction in which that lowers the loss most.
+    """Replace a Gaussian by two, moved apart in the direction that lowers the loss most.
 
-    It is split where the least eigenvalue of its splitting matrix, the mean over views, is low enough; the children
-    move along its eigenvector.  Those with the lowest eigenvalues come first below the limit of the edit
-    (`max_gaussians`, `budget`, memory).
+    A Gaussian splits where the smallest eigenvalue of its splitting matrix, averaged over views, is low enough; the
+    children move along the eigenvector.  If the edit has a limit (`max_gaussians`, `budget`, memory), the lowest
+    eigenvalues come first.
     """
 
     type: Literal["split_steepest"] = "split_steepest"
@@ -58,15 +61,17 @@ class SplitSteepest(Rule):
     )
 
     eigenvalue_below: Schedule = -1.0e-6
-    """Largest eigenvalue that splits, in extents⁻²; by step."""
+    """Largest eigenvalue that splits, extents⁻²."""
     gradient_above: NonNegative = 2.0e-4
-    """Lowest mean of `screen_grad`; by step.  Almost all matrices have a negative eigenvalue, so that 0 splits most."""
+    """Lowest mean of `screen_grad` that splits.  Almost all matrices have a negative eigenvalue: 0 splits most of
+    them."""
     distance: Positive = 0.5
-    """Way of each child, in standard deviations of the Gaussian in that direction; by step."""
+    """Offset of each child, in standard deviations of the Gaussian in that direction."""
     shrink: Annotated[float, Field(ge=1)] = 1.6
     """Divisor of the children's scales."""
     opacity: Literal["halved", "shared"] = "halved"
-    """`halved`: the sum stays; `shared`: both together are as opaque as it was, 1 − √(1 − o) each."""
+    """`halved`: each child has half the opacity; `shared`: both together are as opaque as the Gaussian was,
+    1 − √(1 − o) each."""
 
     @property
     def statistics(self) -> set[str]:
@@ -86,19 +91,19 @@ class SplitSteepest(Rule):
         }
         covariance = covariance_of(tables["quats"], tables["log_scales"])
         deviation = np.sqrt(np.einsum("ni,nij,nj->n", axes, covariance, axes))
-        way = edit.at(self.distance) * deviation[:, None] * axes
+        offset = edit.at(self.distance) * deviation[:, None] * axes
         chosen = np.zeros(gaussians.count, bool)
         chosen[rows] = True
         edit.choose(chosen, copies=2, kept=0, shrink=1 / self.shrink)
-        edit.set_children("means", rows, np.stack([tables["means"] + way, tables["means"] - way], axis=1))
+        edit.set_children("means", rows, np.stack([tables["means"] + offset, tables["means"] - offset], axis=1))
         logits = divided_logits(tables["logit_opacity"], self.opacity)
         edit.set_children("logit_opacity", rows, np.stack([logits, logits], axis=1))
 
 
 def least_axes(columns: Floats) -> tuple[Floats, Floats]:
-    """Return the least eigenvalue of symmetric matrices, [N], and its unit eigenvector, [N, 3], from six columns.
+    """Return the smallest eigenvalue of symmetric matrices, [N], and its unit eigenvector, [N, 3], from [N, 6] columns.
 
-    The component that is largest in size is positive.  Where a column is not finite, the eigenvalue is 0.
+    The component of the eigenvector with the largest magnitude is positive.  Rows that are not finite give 0.
     """
     finite = np.isfinite(columns).all(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.where(finite, columns, 0)[:, UPPER])
@@ -108,7 +113,7 @@ def least_axes(columns: Floats) -> tuple[Floats, Floats]:
 
 
 def divided_logits(logits: Floats, opacity: Literal["halved", "shared"]) -> Floats:
-    """Return the logits of the opacities of each of two, from that of the one, without overflow."""
+    """Return the logit of the opacity of each of two children, given their parent's, without overflow."""
     if opacity == "halved":  # o/2 = 1 / (2 + 2 e^-l) has the logit -log(1 + 2 e^-l)
         return np.asarray(-np.logaddexp(0, np.log(2) - logits))
     rest = np.logaddexp(0, logits) / 2  # -log of the transmittance of each

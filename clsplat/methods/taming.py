@@ -1,5 +1,4 @@
-"""Growth within a budget and pruning, drawn by a score of what a Gaussian is and does in some views (Taming 3DGS,
-Mallick et al. 2024)."""
+"""Grow within a budget and prune by a score of each Gaussian, as Taming 3DGS does (Mallick et al. 2024)."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -18,22 +17,23 @@ Floats = NDArray[np.float64]
 
 
 def by_median(values: NDArray[np.floating]) -> Floats:
-    """Return values over the median of the positive ones; 0 where there are none."""
+    """Return values divided by the median of the positive ones, or zeros if none is positive."""
     positive = values[values > 0]
     return np.asarray(values / np.median(positive), np.float64) if len(positive) else np.zeros(len(values))
 
 
 def pixel_weights(look: RenderedView) -> Floats:
-    """Return the error of a view's pixels and the edges of its photograph, each from 0 to 1, added, [height, width]."""
+    """Return the error of a view's pixels plus the edges of its image, each scaled to [0, 1], [height, width]."""
     counted = look.counted()
     edges = np.abs(scipy.ndimage.laplace(look.photograph.image().mean(axis=2), mode="nearest"))
     return normalize(look.error().astype(np.float64), counted) + normalize(edges, counted)
 
 
 def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
-    """Return for each Gaussian, [N], the sums of the losses of views that see it, and of its terms times the loss.
+    """Return for each Gaussian, [N], the sum of the losses of the views that see it, and of its terms times the loss.
 
-    The terms: depth, radius, and over the pixels where it is blended their weights, their number and its own weight.
+    The terms are its depth, its radius, and, over the pixels where it is blended, their weights, their number and its
+    blend weight.
     """
     losses, terms = np.zeros(survey.count), np.zeros(survey.count)
     drawn = survey.sample_views(views)
@@ -50,12 +50,12 @@ def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
 
 
 class ByScore(Rule):
-    """Base of rules that draw by score; rules with the same `views` share it."""
+    """Base of rules that sample Gaussians by score; rules with the same `views` share the score."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"views"})
 
     views: Annotated[int, Field(ge=1)] = 10
-    """Number of training views, drawn by seed and step; all where there are no more."""
+    """Number of training views, sampled by seed and step; all if there are fewer."""
 
     @property
     def statistics(self) -> set[str]:
@@ -67,15 +67,14 @@ class ByScore(Rule):
         opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         volume = np.exp(gaussians.get("log_scales").astype(np.float64).sum(axis=1))
         values = (25, edit.stats.mean("screen_grad")), (100, opacity), (25, volume)
-        found: Floats = terms + losses * sum(factor * by_median(value) for factor, value in values)
-        return found
+        score: Floats = terms + losses * sum(factor * by_median(value) for factor, value in values)
+        return score
 
 
 class GrowScored(ByScore):
-    """Of the Gaussians that the rules before this one make several of, grow as many as the limit of the edit allows
-    (`max_gaussians`, `budget`, memory).
+    """Keep as much of the growth by earlier rules as the edit's limit allows (`max_gaussians`, `budget`, memory).
 
-    They are drawn by score; those that are kept and those that are replaced have shares of the room by their numbers.
+    Gaussians are sampled by score.  Clones and splits share the limit in proportion to their numbers.
     """
 
     type: Literal["grow_scored"] = "grow_scored"
@@ -89,6 +88,7 @@ class GrowScored(ByScore):
             return
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
         score, random = self.score(edit), edit.random()
+        # first the clones, which keep the original, with their part of the room; then the splits with the rest
         for kind, part in ((kept, (refused & kept).sum() / refused.sum()), (~kept, 1.0)):
             order = sampling_order((rows > 1) & kind, score, random)
             added = np.cumsum(rows[order] - 1)
@@ -99,7 +99,7 @@ class GrowScored(ByScore):
 
 
 class PruneScored(SampledPruning, ByScore):
-    """Remove a share of the faint and the large Gaussians, drawn by 1 / score."""
+    """Remove a fraction of the faint and of the large Gaussians, sampled by 1 / score."""
 
     type: Literal["prune_scored"] = "prune_scored"
 
@@ -109,18 +109,18 @@ class PruneScored(SampledPruning, ByScore):
 
 
 class Parabola(Budget):
-    """Growth to a number, steep at first: P0 + (B - P0) (2x/S - x²/S²) after x of S edits (Taming 3DGS, Mallick et al.
-    2024).
+    """Grow to a given number, fast at first: P0 + (B - P0) (2x/S - x²/S²) after x of S edits (Taming 3DGS, Mallick et
+    al. 2024).
 
-    It is planned anew at every edit from the number that there is, so that it needs no P0 and makes up for what was
-    pruned.
+    Each edit plans the rest of the parabola from the current number, so that no P0 is needed and pruned Gaussians are
+    replaced.
     """
 
     type: Literal["parabola"] = "parabola"
     training_keys: ClassVar[frozenset[str]] = frozenset({"gaussians"})
 
     gaussians: Annotated[int, Field(ge=1)]
-    """The number B, to which the last edit may grow."""
+    """The number B that the last edit may reach."""
 
     def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
         missing = self.gaussians - edit.gaussians.count

@@ -138,7 +138,7 @@ def test_moving_model_starts_only_a_training_of_the_same_motion(finished, scene,
 
 
 def test_penalties_and_rules_of_motion_need_one(tiny_scene, tmp_path):
-    with pytest.raises(ConfigError, match=r"the loss 'motion_l2': expected Gaussians that move"):
+    with pytest.raises(ConfigError, match=r"'motion_l2' needs Gaussians that move"):
         train_overridden(tiny_scene, tmp_path / "run", "optimize.losses=[l1, motion_l2]", "optimize.steps=2")
 
 

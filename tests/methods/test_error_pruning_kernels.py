@@ -14,8 +14,8 @@ from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
 from clsplat.formats.splats import SH_C0
-from clsplat.methods.error_pruning import PruneRedundant, most, squared_error
-from clsplat.methods.mini_splatting import drawn_weights
+from clsplat.methods.error_pruning import PruneRedundant, largest_allowed, squared_error
+from clsplat.methods.mini_splatting import sampled_weights
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
@@ -76,8 +76,8 @@ def test_as_many_go_as_the_views_allow(device, rng, count, width, height):
     photographs = photographs_like(rng, case, 2)
     survey = survey_of(device, case, photographs, masks)
     weight = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
-    np.testing.assert_allclose(drawn_weights(survey).total, weight, rtol=1e-4, atol=1e-5)
-    order = np.argsort(drawn_weights(survey).total, kind="stable")
+    np.testing.assert_allclose(sampled_weights(survey).total, weight, rtol=1e-4, atol=1e-5)
+    order = np.argsort(sampled_weights(survey).total, kind="stable")
     before = error_of(case, np.arange(count), photographs, masks)
     assert squared_error(survey, survey.views) == pytest.approx(before, rel=1e-3)
     for rise in (0.02, 0.3, 3.0):
@@ -112,7 +112,7 @@ def test_a_picture_without_error_keeps_what_is_seen(device, rng):
     case.parameters["means"][::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
     photographs = photographs_like(rng, case, 1)
     survey = survey_of(device, case, photographs, [None])
-    unseen = np.flatnonzero(drawn_weights(survey).total == 0)
+    unseen = np.flatnonzero(sampled_weights(survey).total == 0)
     assert 5 <= len(unseen) < 20
     assert set(unseen) <= set(pruned(survey, PruneRedundant(error_rise=1e-12)))
 
@@ -120,7 +120,7 @@ def test_a_picture_without_error_keeps_what_is_seen(device, rng):
 @pytest.mark.parametrize(("count", "limit"), [(0, 0), (1, 0), (1, 1), (7, 3), (255, 255), (1000, 600), (10**6, 123456)])
 def test_the_number_is_found_to_one_part_in_256(count, limit):
     asked = []
-    found = most(lambda number: asked.append(number) or number <= limit, count)
+    found = largest_allowed(lambda number: asked.append(number) or number <= limit, count)
     assert found <= limit
     assert limit - found < max(1, count // 256)
     assert len(asked) <= 10

@@ -16,7 +16,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey, normalize
 from clsplat.density.thresholds import SceneScale
 from clsplat.methods.adc import Clone, SplitLarge
-from clsplat.methods.fastgs import PruneInaccurate, PruneSampled, RevertGrowth, Wrong, wrong_pixels
+from clsplat.methods.fastgs import PruneInaccurate, PruneSampled, RevertGrowth, WrongPixels, wrong_pixels
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
@@ -117,7 +117,7 @@ def test_draws_are_by_weight(rng):
     np.testing.assert_allclose(last / draws, expected, atol=0.015)
 
 
-def edit_of(device: Device, rng, count: int, wrong: Wrong, sizes=0.01, opacity=0.5) -> Edit:
+def edit_of(device: Device, rng, count: int, wrong: WrongPixels, sizes=0.01, opacity=0.5) -> Edit:
     """An edit in which the survey finds what is given; every Gaussian is seen and pulled."""
     case = random_case(rng, count)
     case.parameters["log_scales"][:] = np.log(np.broadcast_to(sizes, count))[:, None]
@@ -133,7 +133,7 @@ def edit_of(device: Device, rng, count: int, wrong: Wrong, sizes=0.01, opacity=0
 
 @on_one_setting
 def test_growth_needs_wrong_pixels(device, rng):
-    wrong = Wrong(np.array([0, 5, 6, 100, 5, 6]), np.zeros(6))
+    wrong = WrongPixels(np.array([0, 5, 6, 100, 5, 6]), np.zeros(6))
     edit = edit_of(device, rng, 6, wrong, sizes=np.repeat([0.001, 0.1], 3))
     rules = [Clone(size_below=0.01, opacity="shared"), SplitLarge(size_above=0.01), RevertGrowth(pixels_above=5)]
     logits, scales = edit.gaussians.get("logit_opacity"), edit.gaussians.get("log_scales")
@@ -147,7 +147,7 @@ def test_growth_needs_wrong_pixels(device, rng):
 @on_one_setting
 def test_ungrown_gaussians_keep_their_size_for_later_rules(device, rng):
     """Split and undone: its own size counts for the removal of large ones, not that of its children."""
-    edit = edit_of(device, rng, 2, Wrong(np.array([0, 9]), np.zeros(2)), sizes=0.12)
+    edit = edit_of(device, rng, 2, WrongPixels(np.array([0, 9]), np.zeros(2)), sizes=0.12)
     prune = PruneSampled(share=1.0, size_above=0.1)
     densify(edit, [SplitLarge(size_above=0.01), RevertGrowth(), prune], Rasterizer(device, "radix").tiler)
     assert edit.gaussians.count == 2, "of 0.12, which goes, and of 0.12 / 1.6, twice"
@@ -157,13 +157,13 @@ def test_ungrown_gaussians_keep_their_size_for_later_rules(device, rng):
 def test_so_many_of_the_faint_and_large_are_removed(device, rng, faint):
     opacity = np.where(np.arange(40) < faint, 0.001, 0.5)
     sizes = np.where(np.arange(40) >= 35, 0.2, 0.01)  # five large ones
-    edit = edit_of(device, rng, 40, Wrong(np.zeros(40, int), rng.random(40)), sizes, opacity)
+    edit = edit_of(device, rng, 40, WrongPixels(np.zeros(40, int), rng.random(40)), sizes, opacity)
     edit.rule = 2
     PruneSampled(share=0.5).mark(edit)
     removed = edit.rows() == 0
     assert removed.sum() == (faint + 5) // 2
     assert not removed[faint:35].any()
-    again = edit_of(device, np.random.default_rng(0), 40, Wrong(np.zeros(40, int), np.zeros(40)), sizes, opacity)
+    again = edit_of(device, np.random.default_rng(0), 40, WrongPixels(np.zeros(40, int), np.zeros(40)), sizes, opacity)
     again.rule = 2
     PruneSampled(share=1.0).mark(again)
     assert (again.rows() == 0).sum() == faint + 5
@@ -174,20 +174,20 @@ def test_those_with_wrong_pixels_are_removed_sooner(device, rng):
     """Of two, one goes: weights 1 and 4, and the one with the largest score always."""
     counts = np.zeros(2)
     for seed in range(400):
-        edit = edit_of(device, rng, 2, Wrong(np.zeros(2, int), np.array([0.0, 0.75])), opacity=0.001)
+        edit = edit_of(device, rng, 2, WrongPixels(np.zeros(2, int), np.array([0.0, 0.75])), opacity=0.001)
         edit.seed = seed
         PruneSampled(share=0.5).mark(edit)
         counts += edit.rows() == 0
     assert counts.sum() == 400
     assert counts[1] / 400 == pytest.approx(0.8, abs=0.06)
-    edit = edit_of(device, rng, 3, Wrong(np.zeros(3, int), np.array([0.99, 1.0, 0.99])), opacity=0.001)
+    edit = edit_of(device, rng, 3, WrongPixels(np.zeros(3, int), np.array([0.99, 1.0, 0.99])), opacity=0.001)
     PruneSampled(share=0.34).mark(edit)
     assert edit.rows().tolist() == [1, 0, 1]
 
 
 @on_one_setting
 def test_a_large_score_is_removed_late(device, rng):
-    edit = edit_of(device, rng, 4, Wrong(np.zeros(4, int), np.array([0.0, 0.9, 0.91, 1.0])))
+    edit = edit_of(device, rng, 4, WrongPixels(np.zeros(4, int), np.array([0.0, 0.9, 0.91, 1.0])))
     PruneInaccurate(score_above=0.9).mark(edit)
     assert edit.rows().tolist() == [1, 1, 0, 0]
 

@@ -14,7 +14,7 @@ from clsplat.density.importance import Weights, heaviest
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
-from clsplat.methods.mini_splatting import PruneUseless, drawn_weights, useless
+from clsplat.methods.mini_splatting import PruneUseless, sampled_weights, useless
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.devices import on_devices, on_one_setting
 
@@ -26,7 +26,7 @@ def test_weights_are_those_of_the_reference(device, rng, count, width, height):
     masks = [rng.random((height, width)) < share for share in (0.9, 0.2)]
     held = [photograph_of(device, case, mask) for mask in masks]
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
-    found = drawn_weights(Survey(Rasterizer(device, "radix"), case.model(device), source, range(2), 0, 0), 0.9)
+    found = sampled_weights(Survey(Rasterizer(device, "radix"), case.model(device), source, range(2), 0, 0), 0.9)
     expected = [ref.contribution(case.project(), width, height, mask) for mask in masks]
     np.testing.assert_allclose(found.total, sum(expected), rtol=1e-4, atol=1e-5)
     views = np.zeros(count, int)
@@ -47,12 +47,12 @@ def test_some_views_are_drawn(device, rng):
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
     survey = Survey(Rasterizer(device, "radix"), case.model(device), source, range(5), 3, 600)
     places = survey.sample_views(2)
-    of_two = drawn_weights(survey, 0.9, 2)
+    of_two = sampled_weights(survey, 0.9, 2)
     alone = Survey(Rasterizer(device, "radix"), case.model(device), source, places, 3, 600)
-    expected = drawn_weights(alone, 0.9)
+    expected = sampled_weights(alone, 0.9)
     np.testing.assert_array_equal(of_two.total, expected.total)
     np.testing.assert_array_equal(of_two.views, expected.views)
-    np.testing.assert_array_equal(drawn_weights(survey, 0.9, 9).total, drawn_weights(survey, 0.9).total)
+    np.testing.assert_array_equal(sampled_weights(survey, 0.9, 9).total, sampled_weights(survey, 0.9).total)
 
 
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])

@@ -9,7 +9,7 @@ import pytest
 from clsplat.core.errors import ConfigError, Interrupted, NumericError
 from clsplat.core.progress import Progress
 from clsplat.gaussians.model import Model
-from clsplat.methods.mini_splatting import ReinitFromDepth, drawn_of
+from clsplat.methods.mini_splatting import ReinitFromDepth, sample_pixels
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner
 from clsplat.scene.camera import Camera
@@ -118,7 +118,7 @@ def test_pixel_is_drawn_once_with_its_position_and_color(rng):
     alpha = np.where(np.arange(30) < 15, 0.9, 0.1) * (np.arange(20)[:, None] > 3)
     depth = rng.uniform(1, 5, (20, 30)).astype(np.float32)
     image = rng.integers(0, 256, (20, 30, 3)).astype(np.uint8)
-    found = drawn_of(view, alpha, depth, image, 200, np.random.default_rng(0))
+    found = sample_pixels(view, alpha, depth, image, 200, np.random.default_rng(0))
     seen = found.positions @ view.world_to_camera[:, :3].T + view.world_to_camera[:, 3]
     at = seen[:, :2] / seen[:, 2:] * [25, 27] + [14, 11]
     columns, rows = np.floor(at).astype(int).T
@@ -129,15 +129,15 @@ def test_pixel_is_drawn_once_with_its_position_and_color(rng):
     assert rows.min() == 4
     assert (columns < 15).sum() > 5 * (columns >= 15).sum()
     np.testing.assert_allclose(found.pixel, depth[rows, columns] / np.sqrt(25 * 27))
-    ratio = (found.apart / found.pixel) ** -2  # the share of pixels that is drawn, more where more is covered
+    ratio = (found.spacing / found.pixel) ** -2  # the share of pixels that is drawn, more where more is covered
     np.testing.assert_allclose(ratio, np.minimum(1, 200 * alpha[rows, columns] / alpha.sum()))
-    every = drawn_of(view, alpha, depth, image, 9999, np.random.default_rng(0))
+    every = sample_pixels(view, alpha, depth, image, 9999, np.random.default_rng(0))
     assert len(every.positions) == 16 * 30
 
 
 def test_a_model_that_covers_nothing_is_refused(tiny_scene, tmp_path):
     run = opened(tiny_scene, np.full((3, 3), 1e4), tmp_path / "run")
-    with pytest.raises(NumericError, match="covers no pixel of the training photographs; train longer before it"):
+    with pytest.raises(NumericError, match="covers no pixel of the training images; train longer before"):
         ReinitFromDepth(stage="reinit_from_depth").act(run)
     assert run.model.gaussians.count == 3
     assert run.whole, "so that it can be saved"

@@ -163,9 +163,9 @@ MINI = {
 }
 LEAST = ("prune_least", "prune_least~2")
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
-MOMENTUM = (".gradient_above", ".growth", ".keep", ".most")
+MOMENTUM = (".gradient_above", ".growth", ".keep", ".max_added")
 DASH = {
-    *(f"densify.budget{key}" for key in ("", ".begin", ".gaussians", *MOMENTUM)),
+    *(f"densify.budget{key}" for key in ("", ".initial_momentum", ".gaussians", *MOMENTUM)),
     *(f"views.resolution{key}" for key in ("", ".every", ".follows", ".largest", ".start", ".until")),
     *(f"rates.means.{key}" for key in ("over", "start", "until")),
     *(f"densify.rules.prune_large{key}" for key in ("", ".size_above", ".start")),
