@@ -1,4 +1,4 @@
-"""The part of docs/performance.md that the figures make."""
+"""The part of docs/results/compilers.md that the figures make."""
 
 from collections.abc import Iterable, Mapping
 from itertools import zip_longest
@@ -7,7 +7,7 @@ from tests.targets import accepted
 from tests.targets.builds import KERNELS
 from tests.targets.figures import MAX_GROUP, MAX_LOCAL, Figures, Place, Table
 
-PAGE = KERNELS.parent / "docs" / "performance.md"
+PAGE = KERNELS.parent / "docs" / "results" / "compilers.md"
 BEGIN, END = "<!-- figures: begin (python -m tests.targets --write) -->", "<!-- figures: end -->"
 TITLES = {"amd": "AMD", "nvidia": "NVIDIA", "intel": "Intel"}
 CELLS = {
@@ -28,12 +28,12 @@ Row = tuple[str, str]  # kernel, variant
 
 
 def write(table: Table, versions: Mapping[str, str], vendor_of: Mapping[str, str]) -> None:
-    """Replace the figures of docs/performance.md."""
+    """Replace the figures of docs/results/compilers.md."""
     PAGE.write_text(_with(text(table, versions, vendor_of)), encoding="utf-8")
 
 
 def faults(table: Table, versions: Mapping[str, str], vendor_of: Mapping[str, str]) -> list[str]:
-    """Return a sentence where docs/performance.md shows other figures than these, with the first line that differs."""
+    """Return a sentence where docs/results/compilers.md shows other figures than these, with the first line that differs."""
     shown, fresh = PAGE.read_text(encoding="utf-8"), _with(text(table, versions, vendor_of))
     if shown == fresh:
         return []

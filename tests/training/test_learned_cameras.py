@@ -44,6 +44,6 @@ def test_both_cameras_are_trained_on_afresh_and_compared_alike(rng, tmp_path, mo
 
 def test_the_page_has_the_commands_of_the_file():
     commands = re.findall(r"^#   (clsplat .*)$", RECIPE.read_text(), re.M)
-    page = (ROOT / "docs" / "photographs.md").read_text()
+    page = (ROOT / "docs" / "difficult_captures.md").read_text()
     assert len(commands) == 3
     assert [line for line in commands if line not in page] == []
