@@ -1,4 +1,4 @@
-"""Collect the pages of the site in build/docs: those that are written, in docs/, and those made from the code."""
+"""Collect the pages of the site in build/docs: the written ones from docs/, and the ones generated from the code."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The pages about commands, shipped pipelines and Python names, and those that show a file of the repository."""
+"""Make the pages about commands, shipped pipelines, and Python names, and those from files of the repository."""
 
 import functools
 import re

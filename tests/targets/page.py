@@ -33,7 +33,7 @@ def write(table: Table, versions: Mapping[str, str], vendor_of: Mapping[str, str
 
 
 def faults(table: Table, versions: Mapping[str, str], vendor_of: Mapping[str, str]) -> list[str]:
-    """Return a sentence where docs/results/compilers.md shows other figures than these, with the first line that differs."""
+    """Return the first line of docs/results/compilers.md that differs from these figures, as a sentence; or nothing."""
     shown, fresh = PAGE.read_text(encoding="utf-8"), _with(text(table, versions, vendor_of))
     if shown == fresh:
         return []
