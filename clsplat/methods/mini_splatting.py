@@ -135,7 +135,7 @@ class ReinitFromDepth(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     takes: ClassVar[frozenset[str]] = frozenset({"adam", "stats", "average", "palette", "metrics"})
     edits: ClassVar[bool] = True
-    changes_last: ClassVar[bool] = True
+    edits_last: ClassVar[bool] = True
     conflicts: ClassVar[Mapping[str, str]] = {"motion": "depths are of one timestamp; remove the stage or model.time"}
 
     count: Annotated[int, Field(gt=0)] | None = None
@@ -160,7 +160,7 @@ class ReinitFromDepth(Stage):
         size = np.clip(np.exp(parameters["log_scales"][:, 0].astype(np.float64)), pixel, spacing)
         parameters["log_scales"][:] = np.log(self.scale * size)[:, None]
         model = run.model_settings.model(Gaussians(run.device, parameters), degree)
-        with run.changing():
+        with run.editing_tables():
             run.adam, run.stats, run.metrics = None, None, {}  # they belong to the earlier model
             run.model = model
             run.refresh_filter()

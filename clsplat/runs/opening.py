@@ -116,7 +116,7 @@ def open_run(
         folder = prepare(planned, folder, root, status.stage)
         with status.stage(READ_SCENE):
             run = make_run(pipeline, read(pipeline.settings.scene, folder), opened, out, status)
-    run.prepared, run.found = note(planned) if planned else None, facts(planned)
+    run.prepared, run.preparation = note(planned) if planned else None, facts(planned)
     return run
 
 
@@ -234,7 +234,7 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         status=status,
         model_settings=settings.model,
         identity=scene.identity,
-        read=contents(pipeline),
+        file_hashes=contents(pipeline),
     )
 
 

@@ -50,7 +50,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "seconds": {name: round(seconds, 3) for name, seconds in spent.items()},
         "scene": str(run.scene.path.resolve()),
         "files": {name: path.relative_to(run.out).as_posix() for name, path in files.items()},
-        **({"preparation": run.found} if run.found else {}),
+        **({"preparation": run.preparation} if run.preparation else {}),
         **({"changes": run.changes} if run.changes else {}),
     }
     write_text(run.out / METRICS, json.dumps(metrics, indent=1) + "\n")
@@ -64,8 +64,8 @@ def sums_before(pipeline: Pipeline, run: Run) -> dict[str, str]:
     """
     sums = read_sums(run.out)
     if sums is None:
-        sums = run.written if run.status.was_done else {}
-    stages = pipeline.stages[run.cursor :]
+        sums = run.model_hashes if run.status.was_done else {}
+    stages = pipeline.stages[run.stage_index :]
     trained = [path for stage in stages if isinstance(stage, Training) for path in stage.outputs(run.out)]
     written = [path for stage in stages if not isinstance(stage, Training) for path in stage.outputs(run.out)]
     written += [run.out / name for name in (PIPELINE, METRICS)]
@@ -139,7 +139,7 @@ def check_outputs(pipeline: Pipeline, run: Run, lost: Collection[str] = ()) -> N
     Raises OutputError where one is missing, or a model is not as it was written.
     """
     places = [path for stage in pipeline.stages for path in stage.outputs(run.out)]
-    models = {name: value for name, value in run.written.items() if is_below(run.out / name, places)}
+    models = {name: value for name, value in run.model_hashes.items() if is_below(run.out / name, places)}
     faults = {name for name in (METRICS, PIPELINE, *declared(pipeline)) if not (run.out / name).is_file()}
     if faults := (faults | {*not_whole(run.out, models)}) - {*lost}:
         what = "is missing or differs from what was written"

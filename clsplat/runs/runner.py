@@ -46,10 +46,10 @@ def begin_if_due(run: Run) -> None:
     LOG.info(
         "refit: all %d training photographs, for %d steps",
         len(run.original.train) + len(run.original.validation),
-        run.best.found.step,
+        run.best.measured.step,
     )
     run.records.set_aside()
-    run.begin_again(run.best.model_copy(update={"refit": "begun"}))
+    run.restart_for_refit(run.best.model_copy(update={"refit": "begun"}))
 
 
 def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
@@ -65,7 +65,7 @@ def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
         if stage.keep != "best":
             return stage
         during = [_as_grown(inner, best) if isinstance(inner, Densify) else inner for inner in stage.during]
-        return stage.model_copy(update={"steps": best.found.step, "during": during, **WITHOUT})
+        return stage.model_copy(update={"steps": best.measured.step, "during": during, **WITHOUT})
 
     return replace(pipeline, settings=of_trainings(pipeline.settings, Optimize, refitted))
 
@@ -136,7 +136,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
 
     The caller records a failure.
     """
-    run.show = show
+    run.on_progress = show
     before = begin(pipeline, run, start)
     with finishing_on_interrupt(run), saved_on_failure(run):
         run_stages(pipeline, run)
@@ -179,7 +179,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
 
 def check_run(pipeline: Pipeline, run: Run) -> None:
     """Raise what stages that are still to run can know of the run before any of them; nothing is written."""
-    for stage in pipeline.stages[run.cursor :]:
+    for stage in pipeline.stages[run.stage_index :]:
         stage.check_run(run)
 
 
@@ -198,7 +198,7 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
     taken, remarks = checkpoint.restore(run)
     if taken:
         require_same_inputs(run.scene.path, run.identity, run.out, run.inputs_before)
-        stage = pipeline.stages[run.cursor] if run.cursor < len(pipeline.stages) else None
+        stage = pipeline.stages[run.stage_index] if run.stage_index < len(pipeline.stages) else None
         if isinstance(stage, Training) and stage.steps < run.stage_step:
             raise ConfigError(
                 f"{taken}: already at step {run.step}; {stage.stage}.steps={stage.steps} would end before it: give "
@@ -217,10 +217,10 @@ def run_stages(pipeline: Pipeline, run: Run) -> None:
     """
     begin_if_due(run)
     for cursor, stage in enumerate(as_trained(pipeline, run).stages):
-        if cursor < run.cursor:
+        if cursor < run.stage_index:
             continue
         changes = stage.edits or isinstance(stage, Training)
-        if changes and cursor > run.cursor:
+        if changes and cursor > run.stage_index:
             run.next_stage(cursor)
         with suppress(Stopped):
             stage.act(run)

@@ -15,8 +15,8 @@ def run_until_training(pipeline: Pipeline, run: Run) -> None:
     for cursor, stage in enumerate(pipeline.stages):
         if isinstance(stage, Optimize):
             return
-        if cursor >= run.cursor:
-            run.cursor = cursor
+        if cursor >= run.stage_index:
+            run.stage_index = cursor
             stage.act(run)
 
 
@@ -31,8 +31,8 @@ def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
     if begins:
         run_until_training(pipeline, run)
     first, last = _training_stages(pipeline)
-    for cursor in range(max(first, run.cursor), last + 1):
-        if cursor > run.cursor:
+    for cursor in range(max(first, run.stage_index), last + 1):
+        if cursor > run.stage_index:
             run.next_stage(cursor)
         stage = pipeline.stages[cursor]
         if isinstance(stage, Optimize):
@@ -52,8 +52,8 @@ def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
 
 def _edit_behind(pipeline: Pipeline, run: Run) -> None:
     """Run the stages that change the model right behind the training, as part of its last step."""
-    for stage in takewhile(lambda stage: stage.edits, pipeline.stages[run.cursor + 1 :]):
-        run.next_stage(run.cursor + 1)
+    for stage in takewhile(lambda stage: stage.edits, pipeline.stages[run.stage_index + 1 :]):
+        run.next_stage(run.stage_index + 1)
         stage.act(run)
 
 
@@ -61,8 +61,8 @@ def is_trained(pipeline: Pipeline, run: Run) -> bool:
     """Return whether no step of the training is left."""
     _, last = _training_stages(pipeline)
     stage = as_trained(pipeline, run).stages[last]
-    in_its_end = isinstance(stage, Optimize) and run.cursor == last and stage.has_ended(run)
-    return (run.cursor > last or in_its_end) and not is_due(run)
+    in_its_end = isinstance(stage, Optimize) and run.stage_index == last and stage.has_ended(run)
+    return (run.stage_index > last or in_its_end) and not is_due(run)
 
 
 def _training_stages(pipeline: Pipeline) -> tuple[int, int]:

@@ -171,12 +171,12 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: fl
 
     run.status.note(seconds_left=None)
     with scratch_folder(run.out / "rehearsal") as out, log_level(logging.WARNING), run.status.stage("rehearse"):
-        one = new_run(run, short_pipeline, out=out, status=StatusFile(out), show=show, between=look)
+        one = new_run(run, short_pipeline, out=out, status=StatusFile(out), on_progress=show, on_step=look)
         one.records.start()
         try:
             run_stages(short_pipeline, one)
         except _Enough:
-            one.next_stage(one.cursor + 1)
+            one.next_stage(one.stage_index + 1)
             run_stages(short_pipeline, one)
     trained, done, _ = reports[-1]
     course = [seconds for _, _, seconds in reports]
@@ -193,7 +193,14 @@ def fewest(pipeline: Pipeline) -> int:
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
     """Return a run of the pipeline as this one was before its first step, with its device, scene and photographs."""
-    own: dict[str, Any] = {"best": None, "best_tables": {}, "numbers": {}, "written": {}, "metrics": {}, "changes": []}
+    own: dict[str, Any] = {
+        "best": None,
+        "best_tables": {},
+        "scalars": {},
+        "model_hashes": {},
+        "metrics": {},
+        "changes": [],
+    }
     return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved(), **own, **changes)
 
 

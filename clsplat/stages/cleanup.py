@@ -37,7 +37,7 @@ class Cleanup(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     takes: ClassVar[frozenset[str]] = frozenset({"stats"})
     edits: ClassVar[bool] = True
-    changes_last: ClassVar[bool] = True
+    edits_last: ClassVar[bool] = True
 
     rules: list[OneOf[Rule]] = Field(
         [PruneFaint(opacity_below=0.02), PruneFar(), PruneUseless(views_below=0)], min_length=1
@@ -74,7 +74,7 @@ class Cleanup(Stage):
                 "cleanup: its rules would remove every Gaussian; weaken them, as with a smaller "
                 "prune_faint.opacity_below, or remove the stage"
             )
-        with run.changing():
+        with run.editing_tables():
             apply_marks(edit, run.rasterizer.tiler)
             run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))

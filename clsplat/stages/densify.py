@@ -120,9 +120,9 @@ class Densify(Scheduled):
         best = run.best
         if self.patience is None or best is None or run.is_refit:  # whose pipeline says the step
             return False
-        if best.growth_ended is None and best.since >= self.patience:
+        if best.growth_ended is None and best.since_best >= self.patience:
             best = run.best = best.model_copy(update={"growth_ended": run.step, "since": 0})
-            LOG.info("step %d: growth ends: the model was best at step %d", run.step, best.found.step)
+            LOG.info("step %d: growth ends: the model was best at step %d", run.step, best.measured.step)
         return best.growth_ended is not None
 
     def _outside(self, edit: Edit) -> int:
@@ -143,5 +143,5 @@ class Densify(Scheduled):
             yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._outside(edit)
         if self.budget and self.every and self.stop:
             left = len(fire_steps(self.every, run.step - 1, self.stop))
-            context = BudgetContext(run.step / self.stop, left, run.divisor)
+            context = BudgetContext(run.step / self.stop, left, run.image_downscale)
             yield self.budget.limit(edit, context, run.scalars)

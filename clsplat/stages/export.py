@@ -63,23 +63,23 @@ class Export(Scheduled):
                 LOG.warning("export.sky: splats changes nothing: the model has no sky; model.background gives it one")
             model = with_sky_splats(model)
         path, raw, behind = self.outputs(run.out)
-        if _name(behind, run) not in run.written:
+        if _name(behind, run) not in run.model_hashes:
             behind.unlink(missing_ok=True)
         files = {path: model.baked()}
         if model.filter_variance is not None:
             files[raw] = model
         options = Writing(quality=self.quality)
         for file, one in files.items():
-            run.written[_name(file, run)] = one.save(file, options)
+            run.model_hashes[_name(file, run)] = one.save(file, options)
             try:
                 if for_writing(file).read:
                     load(file, Reading(quiet=True))
             except DataError as error:
                 raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
             LOG.info("%s Gaussians written to %s", f"{len(one):,}", file)
-        run.written.pop(_name(behind, run), None)
+        run.model_hashes.pop(_name(behind, run), None)
         if behind.is_file():
-            run.written[_name(behind, run)] = sha256(behind)
+            run.model_hashes[_name(behind, run)] = sha256(behind)
         if model.sky:
             LOG.info("their sky written to %s; `export: {sky: splats}` makes Gaussians of it", behind)
 

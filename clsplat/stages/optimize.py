@@ -139,21 +139,21 @@ class Keeping(Training):
         if train is None or validation is None:  # at another size, or masks leave out all
             return
         best, now = run.best, Measured(step=run.step, train=train, validation=validation)
-        if best is not None and not validation > best.found.validation:
+        if best is not None and not validation > best.measured.validation:
             run.best = best.after(now)
             return
-        apart = (best and best.apart) or (now if now.is_apart else None)
+        first_overfit = (best and best.first_overfit) or (now if now.is_overfit else None)
         tables, evaluations = copied_of(run), best.evaluations + 1 if best else 1
         copied = {split: dict(one) for split, one in averages.items()}
         run.best = Best(
-            found=now,
+            measured=now,
             degree=run.model.degree,
             metrics=copied,
             scalars=dict(run.scalars),
             modules={name: dict(one.scalars) for name, one in run.modules.items() if one.after_training != "dropped"},
             evaluations=evaluations,
-            since=0,
-            apart=apart,
+            since_best=0,
+            first_overfit=first_overfit,
             last=now,
             growth_ended=best.growth_ended if best else None,
         )
@@ -162,23 +162,23 @@ class Keeping(Training):
     def has_ended(self, run: Run) -> bool:
         """Whether no step of the training is left."""
         best = run.best if self.keep == "best" and run.stage_step else None
-        ended = best is not None and self.patience is not None and best.since >= self.patience
+        ended = best is not None and self.patience is not None and best.since_best >= self.patience
         return ended or run.stage_step >= self.steps
 
     def leave(self, run: Run) -> None:
         """At the end of the training, put the best model into the place of the last one."""
         best = run.best
-        if self.keep == "last" or best is None or best.taken is not None:
+        if self.keep == "last" or best is None or best.ended is not None:
             return
-        with run.changing():
-            if best.found.step != run.step:
+        with run.editing_tables():
+            if best.measured.step != run.step:
                 put_back(run, run.best_tables, best)
                 run.adam = run.stats = None
                 run.scalars.update(best.scalars)
             run.metrics.update(best.metrics)
-            run.best = best.model_copy(update={"taken": run.step, "refit": "due" if self.refit else "none"})
+            run.best = best.model_copy(update={"ended": run.step, "refit": "due" if self.refit else "none"})
             run.best_tables = {}
-        LOG.info("%s", run.best.told())
+        LOG.info("%s", run.best.text())
 
 
 def compared(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
@@ -216,7 +216,7 @@ def report(
     forecast.add(run.step, psnr, count or 1, fmean(seconds))
     left, known = forecast.seconds_left, forecast.growth_known
     run.status.note(gaussians=count, seconds_left=round(left, 1))
-    run.show(Progress(run.step, forecast.last_step, loss, forecast.psnr, count, ms, left, known))
+    run.on_progress(Progress(run.step, forecast.last_step, loss, forecast.psnr, count, ms, left, known))
 
 
 DISTRIBUTION_INTERVAL, READ_AHEAD = 5, 4  # reports; photographs
@@ -351,8 +351,8 @@ class Optimize(Keeping):
         """Run the edits that were due at the step before."""
         if run.stage_step == 0 or run.edited:
             return
-        run.divisor = views.divisor(run.step)
-        with run.changing():
+        run.image_downscale = views.divisor(run.step)
+        with run.editing_tables():
             for stage in (stage for stage in self.during if stage.edits and stage.due(run.step)):
                 stage.act(run)
             run.edited = True
@@ -367,9 +367,9 @@ class Optimize(Keeping):
             run.step, run.stage_step = run.step - 1, run.stage_step - 1
             run.device.timings.sampling = False
             raise
-        with run.changing():
+        with run.editing_tables():
             trainer.update(view, stale)
-            run.acted, run.edited = 0, False
+            run.during_index, run.edited = 0, False
         run.device.timings.sampling = False
         run.status.note(step=run.step)
         return view

@@ -267,18 +267,18 @@ REMEDY = (
 def overfitting_note(run: Run) -> str:
     """Return how good the model is where it was trained and elsewhere; "" where that is not known, or unremarkable."""
     if run.best:
-        return run.best.told()
+        return run.best.text()
     split, now = _psnr_elsewhere(run)
     if now is None:
         return ""
-    text = now.told(split)
-    return f"{text} {REMEDY}" if now.is_apart else text if split == "validation" else ""
+    text = now.text(split)
+    return f"{text} {REMEDY}" if now.is_overfit else text if split == "validation" else ""
 
 
 def is_overfit(run: Run) -> bool:
     """Return whether the model of a run has learned its photographs by heart, as far as that is known."""
-    now = run.best.found if run.best else _psnr_elsewhere(run)[1]
-    return now is not None and now.is_apart
+    now = run.best.measured if run.best else _psnr_elsewhere(run)[1]
+    return now is not None and now.is_overfit
 
 
 def _psnr_elsewhere(run: Run) -> tuple[str, Measured | None]:
@@ -409,7 +409,7 @@ class HtmlReport(Stage):
             main=_main(run),
             overfitting_note=overfitting_note(run),
             advice=advised,
-            photographs=photographs_text(run.found) or f"{pluralize(len(run.original.views), 'photograph')}",
+            photographs=photographs_text(run.preparation) or f"{pluralize(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
             models=_addresses(run, "export", run.out / self.file),
             views=views(run),
@@ -457,7 +457,7 @@ def _figures(run: Run) -> dict[str, str]:
                     values[f"{split} {name}{suffix}{some}"] = f"{averages[key]:.2f} {unit}"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     if run.is_refit and run.best:
-        found = run.best.found
+        found = run.best.measured
         values["validation PSNR before the refit"] = f"{found.validation:.2f} dB"
         values["training PSNR before the refit"] = f"{found.train:.2f} dB"
     number, _, what = _size(run).partition(" ")

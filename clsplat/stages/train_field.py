@@ -116,11 +116,11 @@ class TrainField(Training):
         step = run.step + 1
         run.device.timings.sampling = step % self.log_every == self.log_every // 2
         shown = list(self._shown(run, pool, step))
-        with run.changing():
+        with run.editing_tables():
             run.step, run.stage_step = step, run.stage_step + 1
             field.step(shown, self.coarse_weight, AdamStep(self.rate_at(step), self.epsilon), run.seed, step)
             run.device.finish()  # the one wait of a step
-            run.acted = 0
+            run.during_index = 0
         run.device.timings.sampling = False
         run.status.note(step=run.step)
 
@@ -166,7 +166,7 @@ class ExportField(Stage):
         assert isinstance(run.learned_field, LearnedField)
         field, file = run.learned_field.field, run.out / self.file
         rendering = Rendering(background=run.photographs.background_name, alpha=run.original.views[0].alpha)
-        run.written[self.file] = FieldModel(field.shape, field.parameters.get(), rendering).save(file)
+        run.model_hashes[self.file] = FieldModel(field.shape, field.parameters.get(), rendering).save(file)
         try:
             load_field(file)
         except DataError as error:

@@ -61,31 +61,31 @@ class State(BaseModel):
     format: int
     version: str
     step: Count
-    cursor: Count
+    stage_index: Count
     stage_step: Count
-    acted: Count
+    during_index: Count
     edited: bool
     field: dict[str, Any] | None  # kind, shape and parameters of the field that is trained instead of Gaussians
     degree: Annotated[int, Field(ge=0, le=3)]
     zero_fresh: list[str]
     updates: dict[str, Count]
-    scalars: dict[str, float]  # that parts of the run keep
-    modules: dict[str, dict[str, float]]  # the same of its modules, by name
-    best: Best | None  # what validation has found
+    scalars: dict[str, float]  # of rules and budgets
+    modules: dict[str, dict[str, float]]  # scalars of training modules, by type
+    best: Best | None  # the best model by validation
     train_seconds: float
     cpu_seconds: float  # in the same time
     metrics: dict[str, dict[str, Any]]
     records: Count  # lines of metrics.jsonl
-    written: dict[str, str]  # models, by path in the run folder, with their SHA-256
+    model_hashes: dict[str, str]  # SHA-256 of model files, by path in the run folder
     changes: list[str]
     device: str
     inputs: str  # identity of the scene
-    read: dict[str, str]  # hashes of the files that settings name, by their text
+    file_hashes: dict[str, str]  # of the files that settings name, by path
     pipeline: dict[str, Any]
 
     def is_trained(self, pipeline: dict[str, Any]) -> bool:
         """Whether all the steps that a resolved pipeline gives the training in progress are done."""
-        (stage,) = pipeline["stages"][self.cursor].values()
+        (stage,) = pipeline["stages"][self.stage_index].values()
         return bool(stage.get("steps") == self.stage_step)
 
 
@@ -245,11 +245,11 @@ def lower_rate(run: Run, broken: Collection[str]) -> str:
     The value is a tenth of the present one, or the default where that is smaller.  A field has one rate.
     """
     if run.learned_field:
-        (stage,) = run.pipeline["stages"][run.cursor]
+        (stage,) = run.pipeline["stages"][run.stage_index]
         return f"{stage}.rate={LOWER * run.learned_field.rate:.2g}"
     stages, default = run.pipeline["stages"], Rates()
     trains = [(i, name) for i, stage in enumerate(stages) for name, fields in stage.items() if "rates" in fields]
-    place, stage = next((found for found in reversed(trains) if found[0] <= run.cursor), (0, "optimize"))
+    place, stage = next((found for found in reversed(trains) if found[0] <= run.stage_index), (0, "optimize"))
     present = Rates.model_validate(stages[place].get(stage, {}).get("rates", {}))
 
     def rate(rates: Rates, name: str) -> float:
@@ -272,7 +272,7 @@ def save(run: Run, keep: int | None = None) -> Path:
     Raises NotFiniteError, after writing failed_N.npz, where the model is not finite; then nothing is removed.  Raises
     ClsplatError where a step or an edit is half done.
     """
-    if not run.whole:
+    if not run.is_consistent:
         raise ClsplatError(f"{run.out}: step {run.step} is half done, so it is not saved; resume the run to go on")
     if broken := run.not_finite():
         raise NotFiniteError(f"step {run.step}: {set_aside(run, broken)}")
@@ -325,8 +325,8 @@ def load(path: Path) -> tuple[State, Arrays]:
     except ValidationError as error:
         first = error.errors()[0]
         raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
-    if state.cursor > len(state.pipeline.get("stages", ())):  # equal to it: all stages have ended
-        raise DataError(f"it has no stage {state.cursor}")
+    if state.stage_index > len(state.pipeline.get("stages", ())):  # equal to it: all stages have ended
+        raise DataError(f"it has no stage {state.stage_index}")
     check_run_tables(state, tables)
     return state, tables
 
@@ -391,9 +391,9 @@ def _write(run: Run, kind: str) -> Path:
         format=FORMAT,
         version=full_version(),
         step=run.step,
-        cursor=run.cursor,
+        stage_index=run.stage_index,
         stage_step=run.stage_step,
-        acted=run.acted,
+        during_index=run.during_index,
         edited=run.edited,
         field=_field_of(run),
         degree=0 if run.learned_field else run.model.degree,
@@ -406,11 +406,11 @@ def _write(run: Run, kind: str) -> Path:
         cpu_seconds=run.cpu_seconds,
         metrics=run.metrics,
         records=run.records.lines if run.stage_step else run.records.settled,
-        written=run.written,
+        model_hashes=run.model_hashes,
         changes=run.changes,
         device=run.device.text,
         inputs=run.inputs,
-        read=run.read,
+        file_hashes=run.file_hashes,
         pipeline=run.pipeline,
     )
     path = run.out / CHECKPOINTS / f"{kind}_{run.step:06d}.npz"
@@ -431,16 +431,16 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
     if run.inputs and state.inputs == run.inputs:  # the same scene, wherever it lies now
         before = {**before, "scene": {**before["scene"], "path": run.pipeline["scene"]["path"]}}
     for difference in differences(before, run.pipeline, run.settings):
-        if difference.kind == "output" or difference.is_of_place(state.read, run.read):
+        if difference.kind == "output" or difference.is_of_place(state.file_hashes, run.file_hashes):
             continue
         if difference.kind is None:
             raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")
-        if difference.stage is not None and difference.stage < state.cursor:
+        if difference.stage is not None and difference.stage < state.stage_index:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
         if state.best and state.best.refit == "begun" and difference.place.endswith((".steps", ".patience")):
             raise ConfigError(f"{path} is of a refit, whose steps validation has found: {difference}; {remedy}")
         is_end = difference.place.endswith(".steps")  # an end before the one that was planned
-        if difference.stage == state.cursor and state.is_trained(run.pipeline) and not is_end:
+        if difference.stage == state.stage_index and state.is_trained(run.pipeline) and not is_end:
             more = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` with that setting trains on"
             raise ConfigError(f"{path}: no step is left to train, at step {state.step}: {difference}; {more}")
         changed.append(f"step {state.step}: {difference}")
@@ -449,14 +449,14 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
 
 
 def _restore(run: Run, state: State, tables: Arrays) -> None:
-    run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
-    run.acted, run.edited, run.whole, run.scalars = state.acted, state.edited, True, state.scalars
+    run.step, run.stage_index, run.stage_step = state.step, state.stage_index, state.stage_step
+    run.during_index, run.edited, run.is_consistent, run.scalars = state.during_index, state.edited, True, state.scalars
     run.best = state.best
     if run.is_refit:
-        run.divide(run.original.with_fold())
+        run.use_split(run.original.with_fold())
     restore_tables(run, state, tables)
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
-    run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
+    run.records.lines, run.inputs_before, run.model_hashes = state.records, state.inputs, state.model_hashes
 
 
 # Save the state of a run that fails.
@@ -490,9 +490,9 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
 def _rescue(run: Run) -> str:
     """Save the state where it is whole; return a sentence about it."""
     try:
-        if run.whole and not run.not_finite() and run.gaussians != 0:
+        if run.is_consistent and not run.not_finite() and run.gaussians != 0:
             return f"the state of step {run.step} is saved in {save(run)}; `clsplat resume` goes on from it"
-        why = "the step that failed was not whole" if not run.whole else "the model is not finite"
+        why = "the step that failed was not whole" if not run.is_consistent else "the model is not finite"
     except Exception as error:  # the failure itself is what the user must see
         why = f"the state could not be saved ({one_line(error)})"
     files = saved(run.out)

@@ -1,4 +1,4 @@
-"""The state of a pipeline while it runs."""
+"""Hold the state of a pipeline while it runs."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -37,50 +37,50 @@ Item = TypeVar("Item")
 
 @dataclass
 class Run:
-    """The mutable state of a pipeline; stages read and change it."""
+    """The mutable state of a pipeline run; stages read and change it."""
 
     device: Device
-    scene: Scene  # as trained on: at one size or several
-    original: Scene  # as read
+    scene: Scene  # as trained on, at one size or several
+    original: Scene  # as read, at full size
     out: Path
     name: str
     seed: int
     settings: Settings  # of the pipeline
-    pipeline: dict[str, Any]  # the same, resolved, as written to pipeline.yaml
+    pipeline: dict[str, Any]  # its resolved keys, as written to pipeline.yaml
     rasterizer: Rasterizer
     photographs: Photographs
     status: StatusFile
     model_settings: ModelSettings
-    harmonics: Harmonics = "device"  # the memory in which those above band 0 lie while they are trained
+    harmonics: Harmonics = "device"  # memory for the bands above 0 in training
     identity: Identity | None = None  # of the original scene and its photographs
-    read: dict[str, str] = field(default_factory=dict)  # hashes of the files that settings name, by their text
+    file_hashes: dict[str, str] = field(default_factory=dict)  # of the files that settings name, by path
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
-    found: dict[str, dict[str, Any]] = field(default_factory=dict)  # by the steps of `prepare:`
-    losses: list[Loss] = field(default_factory=list)  # added from Python, beside those of the pipeline
+    preparation: dict[str, dict[str, Any]] = field(default_factory=dict)  # results of the steps of `prepare:`
+    losses: list[Loss] = field(default_factory=list)  # added from Python to those of the pipeline
     adam: Adam | None = None
     stats: SplatStats | None = None
-    modules: dict[str, Any] = field(default_factory=dict)  # states of its trainings' modules, by name
-    learned_field: TrainedField | None = None  # in the place of a model
-    step: int = 0  # updates done, or in progress
-    cursor: int = 0  # stage in progress
-    stage_step: int = 0  # steps done in it
-    acted: int = 0  # stages of its `during` that have acted since that step
-    edited: bool = False  # whether those that edit the model have too
-    whole: bool = True  # False after a failure in the middle of a change of the tables
-    changes: list[str] = field(default_factory=list)  # of settings, with which the run went on
-    divisor: float = 1.0  # of the photographs' size at the step before an edit
-    inputs_before: str = ""  # `inputs` of the checkpoint that the run goes on from
-    scalars: dict[str, float] = field(default_factory=dict)  # that parts of it keep from step to step, by name
-    best: Best | None = None  # what validation has found in the training
-    best_tables: Tables = field(default_factory=dict)  # of that model, on the host, as long as the training goes on
-    measured: dict[Any, Any] = field(default_factory=dict)  # what modules have measured once, by keys of their choice
+    modules: dict[str, Any] = field(default_factory=dict)  # states of training modules, by type
+    learned_field: TrainedField | None = None  # instead of a model
+    step: int = 0  # global: updates done, or in progress
+    stage_index: int = 0  # current stage
+    stage_step: int = 0  # steps done in that stage
+    during_index: int = 0  # stages of its `during` done since that step
+    edited: bool = False  # whether the edits due at that step are done
+    is_consistent: bool = True  # False after a failure in the middle of an edit of the tables
+    changes: list[str] = field(default_factory=list)  # of settings, made on resume
+    image_downscale: float = 1.0  # of the photographs at the step before an edit
+    inputs_before: str = ""  # `inputs` of the checkpoint that the run resumed from
+    scalars: dict[str, float] = field(default_factory=dict)  # state of rules and budgets, by name
+    best: Best | None = None  # the best model by validation
+    best_tables: Tables = field(default_factory=dict)  # of that model, on the host, during the training
+    cache: dict[Any, Any] = field(default_factory=dict)  # measurements of modules, by keys of their choice
     train_seconds: float = 0.0
     cpu_seconds: float = 0.0  # of all threads of the process, in the same time
-    written: dict[str, str] = field(default_factory=dict)  # models: path in the run folder -> SHA-256
+    model_hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 of model files, by path in the run folder
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
-    show: Callable[[Progress], None] = lambda progress: None
-    between: Callable[[], None] = lambda: None  # between two steps, or items of a long stage; it reads, and may wait
+    on_progress: Callable[[Progress], None] = lambda progress: None
+    on_step: Callable[[], None] = lambda: None  # called between steps, or items of a long stage; reads, and may wait
 
     def __post_init__(self) -> None:
         self.records = Records(self.out, self.status.require_held)
@@ -102,69 +102,69 @@ class Run:
         self._model, self.learned_field = model, None
 
     def painter(self, rasterizer: Rasterizer | None = None) -> Painter:
-        """Return what renders views, with another rasterizer than the training's.  Raises ConfigError as `model`."""
+        """Return what renders views.  rasterizer: None for that of training.  Raises ConfigError like `model`."""
         if self.learned_field:
             return self.learned_field.painter
         return SplatPainter(rasterizer or self.rasterizer, self.model, self.photographs.background)
 
     @property
     def gaussians(self) -> int | None:
-        """The number of Gaussians; None where a field is trained."""
+        """The number of Gaussians; None if a field is trained."""
         return None if self.learned_field else self.model.gaussians.count
 
     def not_finite(self) -> list[str]:
-        """Return the names of what is trained that holds NaN or infinity."""
+        """Return the names of trained tables with NaN or infinity."""
         return self.learned_field.not_finite() if self.learned_field else self.model.gaussians.not_finite()
 
-    def next_stage(self, cursor: int) -> None:
-        """Come to the beginning of a stage."""
-        self.cursor, self.stage_step, self.acted, self.edited = cursor, 0, 0, False
+    def next_stage(self, index: int) -> None:
+        """Go to the start of a stage."""
+        self.stage_index, self.stage_step, self.during_index, self.edited = index, 0, 0, False
         self.records.settled = self.records.lines
         self.modules = {name: one for name, one in self.modules.items() if one.after_training != "dropped"}
         if self._model is not None:
-            self.model.gaussians.tables.pop(HIDDEN, None)  # which a training has for itself
+            self.model.gaussians.tables.pop(HIDDEN, None)  # valid only within one training
 
     @property
     def model_step(self) -> int:
-        """The global step whose model this is."""
-        is_kept = self.best is not None and self.best.taken == self.step and self.best.refit != "begun"
-        return self.best.found.step if self.best and is_kept else self.step
+        """The global step after which the model was last trained; before `step` if an earlier model was the best."""
+        is_kept = self.best is not None and self.best.ended == self.step and self.best.refit != "begun"
+        return self.best.measured.step if self.best and is_kept else self.step
 
     @property
     def is_refit(self) -> bool:
-        """Whether all training photographs are trained on, those for validation too, for the steps that were best."""
+        """Whether the run trains again, on validation views too, for the number of steps that was best."""
         return self.best is not None and self.best.refit == "begun"
 
-    def begin_again(self, best: Best) -> None:
-        """Come to the beginning of the pipeline, to train again for the steps of the best model."""
+    def restart_for_refit(self, best: Best) -> None:
+        """Return to the start of the pipeline, to train again for as many steps as the best model had."""
         self._model = None
         self.adam = self.stats = None
         self.modules = {}
         self.scalars = {}
         self.metrics = {}
-        self.written = {}
-        self.whole = True
+        self.model_hashes = {}
+        self.is_consistent = True
         self.step = 0
-        self.divisor = 1.0
+        self.image_downscale = 1.0
         self.best = best
         self.best_tables = {}
         self.next_stage(0)
-        self.divide(self.original.with_fold())
+        self.use_split(self.original.with_fold())
 
-    def divide(self, original: Scene) -> None:
-        """Take the scene, as it was read, with another split of its views."""
+    def use_split(self, original: Scene) -> None:
+        """Replace the original scene by one with another split of its views."""
         self.original, self.scene = original, original.downscaled(*self.scene.downscales)
         self._filter_views, self._texture_quantiles = None, {}
 
     @contextmanager
-    def changing(self) -> Iterator[None]:
-        """Change the tables in the block: where it fails they are neither those before nor those after it."""
-        before, self.whole = self.whole, False
+    def editing_tables(self) -> Iterator[None]:
+        """Mark the run as inconsistent while the block edits its tables, and after it if it fails."""
+        before, self.is_consistent = self.is_consistent, False
         yield
-        self.whole = before
+        self.is_consistent = before
 
     def add_training_time(self, start: tuple[float, float]) -> float:
-        """Count what the clocks show since `start` as training; return the seconds of the first."""
+        """Add the time since `start` to the training time; return the wall-clock seconds."""
         spent, cpu = (now - then for now, then in zip(clocks(), start, strict=True))
         self.train_seconds += spent
         self.cpu_seconds += cpu
@@ -172,30 +172,30 @@ class Run:
 
     @property
     def scene_name(self) -> str:
-        """What pages call the scene."""
+        """The name of the scene on pages."""
         return scene_name(self.pipeline["scene"]["path"] or self.scene.path)
 
     @property
     def inputs(self) -> str:
-        """A hash of the photographs, cameras and points; "" where they were not looked at."""
+        """A hash of the photographs, cameras and points; "" if they were not hashed."""
         return self.identity.digest if self.identity else ""
 
     @property
     def has_model(self) -> bool:
-        """Whether there is a model or a field, which a checkpoint can hold."""
+        """Whether there is a model or a field to save."""
         return self._model is not None or self.learned_field is not None
 
     def until_interrupted(self, items: Iterable[Item]) -> Iterator[Item]:
-        """Yield the items of a long stage; raise Stopped between two of them when the run is to stop."""
+        """Yield the items of a long stage; raise Stopped between two of them if the run is interrupted."""
         for item in items:
             if self.interrupted:
                 raise Stopped("stopped")
-            self.between()
+            self.on_step()
             yield item
 
     @property
     def downscale(self) -> float:
-        """The smallest divisor of the photographs' size in training."""
+        """The smallest factor by which photographs are downscaled in training."""
         return self.scene.downscales[0]
 
     def memory_plan(
@@ -204,9 +204,9 @@ class Run:
         harmonics: Where | None = None,
         seen: float = SEEN_SHARE,
     ) -> MemoryPlan:
-        """Return the plan of the device's memory for training with the present tables, or those of `components`.
+        """Plan the device memory for training with the current tables, or those in `components`.
 
-        harmonics: where they lie; None: where they are now; seen: as for `plan`.
+        harmonics: the memory of the bands above 0; None: where they are now; seen: as in `plan`.
         """
         if harmonics is None:
             harmonics = "host" if self.model.gaussians.on_host else "device"
@@ -219,7 +219,7 @@ class Run:
         return plan(self.device.info, components, bytes_held, pixels, pixel_sums, harmonics, seen)
 
     def refresh_filter(self) -> None:
-        """Update the world filter and the sampling intervals to the present Gaussians."""
+        """Recompute the world filter and the sampling intervals for the current Gaussians."""
         if self._filter_views is None:
             self._filter_views = FilterViews(self.device, self.scene.split("train"))
         model, views = self.model, self._filter_views
@@ -232,7 +232,7 @@ class Run:
         return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"), self.seed, self.step)
 
     def texture_quantile(self, share: float) -> float:
-        """Return the gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""
+        """Return the quantile `share` of the gradient magnitude, per px, over all training photographs."""
         if share not in self._texture_quantiles:
             photographs = (self.photographs.get(view) for view in self.scene.split("train"))
             self._texture_quantiles[share] = texture_quantile(self.rasterizer.workspace, photographs, share)
@@ -245,13 +245,13 @@ class Run:
             yield self.photographs.get(view).image()
 
 
-# The model of a run as it goes into files: its tables on the host, and how it was rendered in training.
+# The model of a run for files: its tables on the host, and how it was rendered in training.
 
 
 def host_model(run: Run) -> Model:
-    """Copy the model to the host, as it is trained: with a world filter that is not part of its scales.
+    """Copy the model to the host, with its world filter as a separate table, not in the scales.
 
-    Raises ConfigError when no stage has made one.
+    Raises ConfigError if no stage has made one.
     """
     model, gaussians = run.model, run.model.gaussians
     tables = {name: gaussians.get(name) for name in (*gaussians.trained, "filter_variance")}
@@ -262,9 +262,9 @@ def host_model(run: Run) -> Model:
 
 
 def _rendering(run: Run) -> dict[str, Any]:
-    """The numbers for rendering a model file as in training."""
+    """Return the settings with which viewers render the model file as in training."""
     model = run.model
-    found: dict[str, Any] = {
+    rendering: dict[str, Any] = {
         "near": model.near,
         "screen_variance": model.screen_variance,
         "compensate": model.compensate,
@@ -272,7 +272,7 @@ def _rendering(run: Run) -> dict[str, Any]:
         "alpha": run.original.views[0].alpha,
     }
     if model.pixel_box:
-        found["pixel_box"] = model.pixel_box
+        rendering["pixel_box"] = model.pixel_box
     if model.sky:
-        found["sky"] = "directions"
-    return found
+        rendering["sky"] = "directions"
+    return rendering

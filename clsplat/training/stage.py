@@ -54,7 +54,7 @@ class Stage(Settings):
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
     takes: ClassVar[frozenset[str]] = frozenset()  # parts that do not exist afterwards
     edits: ClassVar[bool] = False  # changes the model; inside `during` it acts between two steps
-    changes_last: ClassVar[bool] = False  # says by run.changing() where its edit begins; else all of it is an edit
+    edits_last: ClassVar[bool] = False  # says by run.editing_tables() where its edit begins; else all of it is an edit
 
     stage: str
     """Name of the stage."""
@@ -85,7 +85,7 @@ class Stage(Settings):
 
         A stage that fails is repeated from its beginning when the run goes on, so that its records do not stay.
         """
-        changing = run.changing() if self.edits and not self.changes_last else nullcontext()
+        changing = run.editing_tables() if self.edits and not self.edits_last else nullcontext()
         with run.status.stage(self.stage), changing, run.records.of_a_stage():
             self.run(run)
 
@@ -225,21 +225,21 @@ class Training(Stage):
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
         for place, stage in enumerate(self.inner):
             due = run.stage_step > 0 and (stage.due(run.step, self.has_ended(run)) or stage.is_overdue(run))
-            if place < run.acted or stage.edits or not due:
+            if place < run.during_index or stage.edits or not due:
                 continue
-            run.acted = place + 1  # a checkpoint is of the state after it
+            run.during_index = place + 1  # a checkpoint is of the state after it
             try:
                 stage.act(run)
                 self.judge(run, stage)
             except BaseException:
-                run.acted = place
+                run.during_index = place
                 raise
 
     def end_step(self, run: Run) -> None:
         """Act after a step; save the state, and raise Interrupted, where the run is to stop."""
         with suppress(Stopped):
             self.act_between(run)
-        run.between()
+        run.on_step()
         if run.interrupted:
             told = f"saved in {checkpoint.save(run)}; `clsplat resume {shell_quote(run.out)}` goes on from it"
             raise Interrupted(f"stopped at step {run.step}, {told}")

@@ -120,7 +120,7 @@ def test_a_model_of_which_nothing_would_be_left_is_refused(tiny_scene, spoilt, t
     with pytest.raises(NumericError, match="cleanup: its rules would remove every Gaussian; weaken them"):
         Cleanup(stage="cleanup", rules=[PruneFaint(opacity_below=0.9)]).act(run)
     np.testing.assert_array_equal(run.model.gaussians.get("means"), before)
-    assert run.whole
+    assert run.is_consistent
 
 
 def test_undeclared_rewriting_rule_leaves_the_model_as_it_was(tiny_scene, spoilt, tmp_path, monkeypatch):
@@ -131,7 +131,7 @@ def test_undeclared_rewriting_rule_leaves_the_model_as_it_was(tiny_scene, spoilt
         Cleanup(stage="cleanup", rules=[MergeNeighbors()]).act(run)
     for name, table in before.items():
         np.testing.assert_array_equal(run.model.gaussians.get(name), table)
-    assert run.whole
+    assert run.is_consistent
 
 
 @pytest.fixture(scope="module")

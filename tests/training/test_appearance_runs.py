@@ -108,7 +108,7 @@ def test_the_best_model_is_left_with_the_colors_of_its_step(tiny_scene, tmp_path
         "optimize.evaluate.every=4",
     )
     run = train(tiny_scene, tmp_path / "run", *GAIN, *kept, wild)
-    assert run.best.found.step == 8, "the last steps ruin it"
+    assert run.best.measured.step == 8, "the last steps ruin it"
     then, _ = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
     assert run.modules["exposure"].scalars == then.modules["exposure"]
     (row, *_) = json.loads((tmp_path / "run" / "view_colors.json").read_text())["photographs"].items()

@@ -178,7 +178,16 @@ def test_growth_ends_where_validation_finds_no_better_model(tiny_scene, tmp_path
 def test_a_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
     pipeline = load(pipeline, ["densify.patience=1", "optimize.refit=true"])
     found = Measured(step=30, train=20, validation=20)
-    best = Best(found=found, degree=0, metrics={}, evaluations=9, since=2, apart=None, last=found, growth_ended=20)
+    best = Best(
+        measured=found,
+        degree=0,
+        metrics={},
+        evaluations=9,
+        since_best=2,
+        first_overfit=None,
+        last=found,
+        growth_ended=20,
+    )
     run = SimpleNamespace(best=best.model_copy(update={"refit": "begun"}), is_refit=True)
     training = as_trained(pipeline, run).settings.training
     density = next(stage for stage in training.during if stage.stage == "densify")
@@ -216,7 +225,7 @@ def test_measurements_of_a_later_training_count_from_its_start(tmp_path):
 def test_measurement_at_another_size_is_not_used_to_choose(tiny_scene, tmp_path, pipeline):
     during = "optimize.during=[evaluate: {every: 4, split: validation, downscales: [2]}]"
     run = train(tiny_scene, tmp_path / "run", during, pipeline=pipeline)
-    assert run.best.evaluations + run.best.since == 1, "after the last step"
+    assert run.best.evaluations + run.best.since_best == 1, "after the last step"
 
 
 def test_training_ended_by_patience_has_a_final_checkpoint(tiny_scene, tmp_path, pipeline):
@@ -357,14 +366,14 @@ def test_a_trainer_needs_a_scene_with_validation_views(tiny_scene, pipeline):
 
 
 NOW = Measured(step=8, train=30.0, validation=20.0)
-FOUND = Best(found=NOW, degree=0, metrics={}, evaluations=1, since=0, apart=None, last=NOW)
+FOUND = Best(measured=NOW, degree=0, metrics={}, evaluations=1, since_best=0, first_overfit=None, last=NOW)
 
 
 def test_a_checkpoint_without_its_best_model_is_damaged(best):
     state, tables = checkpoint.load(best / "checkpoints" / "step_000014.npz")
     own, _ = split(tables, best_model.FOLDER)
     assert state.best is not None
-    assert state.best.found.step == BEST
+    assert state.best.measured.step == BEST
     best_model.check(state.best, own)
     for wrong in (
         {name: table for name, table in own.items() if name != "means"},
@@ -373,7 +382,7 @@ def test_a_checkpoint_without_its_best_model_is_damaged(best):
     ):
         with pytest.raises(DataError, match="best model"):
             best_model.check(state.best, wrong)
-    with pytest.raises(DataError, match="says nothing of"):
+    with pytest.raises(DataError, match="no record of one"):
         best_model.check(None, own)
     assert split(checkpoint.load(best / "checkpoints" / "step_000002.npz")[1], best_model.FOLDER)[0] == {}
 
@@ -385,11 +394,11 @@ def test_a_checkpoint_without_its_best_model_is_damaged(best):
     ("train_", "validation", "expected"),
     [
         (26.0, 20.0, "At step 8 the model has 26.0 dB at training views and 20.0 dB at validation views."),
-        (26.1, 20.0, "20.0 dB at validation views, more than 6 dB apart: the photographs are learned by heart."),
+        (26.1, 20.0, "20.0 dB at validation views, more than 6 dB apart: the model overfits."),
     ],
 )
-def test_six_decibels_apart_are_learned_by_heart(train_, validation, expected):
-    assert expected in Measured(step=8, train=train_, validation=validation).told("validation")
+def test_six_decibels_apart_is_overfit(train_, validation, expected):
+    assert expected in Measured(step=8, train=train_, validation=validation).text("validation")
 
 
 def test_run_without_validation_is_told_when_it_overfits(tiny_scene, tmp_path, pipeline):
@@ -400,6 +409,6 @@ def test_run_without_validation_is_told_when_it_overfits(tiny_scene, tmp_path, p
     run.records.add(8, "evaluate", split="train", downscale=1, psnr=40.0, ssim=1.0)
     run.records.write()
     assert "40.0 dB at training views" in overfitting_note(run)
-    assert "dB at test views, more than 6 dB apart: the photographs are learned by heart" in overfitting_note(run)
+    assert "dB at test views, more than 6 dB apart: the model overfits" in overfitting_note(run)
     assert "`scene.validation: auto` with `optimize.keep: best`" in overfitting_note(run)
     assert is_overfit(run)

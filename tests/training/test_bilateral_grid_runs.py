@@ -152,7 +152,7 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
     wild = "optimize.rates.means=[[8, 1.0e-3], [9, 0.9]]"
     kept = ("scene.validation=2", "optimize.keep=best", "optimize.evaluate.split=validation")
     run = train(tiny_scene, tmp_path / "run", *GRID, *kept, "optimize.evaluate.every=4", wild)
-    assert run.best.found.step == 8, "the last steps ruin it"
+    assert run.best.measured.step == 8, "the last steps ruin it"
     _, tables = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
     own, _ = archive.split(tables, "modules/bilateral_grid/")
     expected = own["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)

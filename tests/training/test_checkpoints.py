@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 
 CRAFTED = {
-    "cursor": lambda notes, arrays: notes.update(cursor=99),
+    "stage": lambda notes, arrays: notes.update(stage_index=99),
     "a negative step": lambda notes, arrays: notes.update(step=-1),
     "no step": lambda notes, arrays: notes.pop("step"),
     "a word": lambda notes, arrays: notes.update(stage_step="4"),

@@ -18,14 +18,14 @@ pytestmark = pytest.mark.slow
 
 def breaks_at(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the means not finite in a step."""
-    train_one = Run.changing
+    train_one = Run.editing_tables
     run_step = {}
 
-    def changing(run: Run):
+    def editing_tables(run: Run):
         run_step["run"] = run
         return train_one(run)
 
-    monkeypatch.setattr(Run, "changing", changing)
+    monkeypatch.setattr(Run, "editing_tables", editing_tables)
     add = SplatStats.add
 
     def add_and_break(stats, *arguments):
@@ -89,7 +89,7 @@ def test_the_advice_names_the_stage_that_trains(tiny_scene, tmp_path, few_steps)
     stages = run.pipeline["stages"]
     run.pipeline = {**run.pipeline, "stages": [*stages[:2], *stages[1:]]}
     assert lower_rate(run, []).startswith("stages.2.rates.")
-    run.cursor = 1
+    run.stage_index = 1
     assert lower_rate(run, ["sh_rest"]) == "stages.1.rates.sh_rest=5e-05"
     run.pipeline = {**run.pipeline, "stages": [stages[0], stages[-1]]}
     assert lower_rate(run, ["means"]) == "optimize.rates.means=1.6e-05"

@@ -198,7 +198,7 @@ def test_the_best_model_is_left_with_the_sky_of_its_step(tiny_scene, tmp_path):
         "optimize.evaluate.every=4",
     )
     run = train(tiny_scene, tmp_path / "run", *FEW, *kept, wild)
-    assert run.best.found.step == 8, "the last steps ruin it"
+    assert run.best.measured.step == 8, "the last steps ruin it"
     _, then = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
     np.testing.assert_array_equal(sky_beside(tmp_path / "run" / "point_cloud.ply").texels, then["modules/sky/texels"])
 

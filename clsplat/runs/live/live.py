@@ -77,7 +77,7 @@ class Live:
         try:
             yield
         finally:
-            run.between = lambda: None
+            run.on_step = lambda: None
             self._leave()
 
     def reporting(self, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
@@ -103,7 +103,7 @@ class Live:
         desk.step, desk.fault = 0, ""
         desk.shown = ShownRun(number, title, scene.views, data, pictures, Curves([]))
         self._preview = Preview(run)
-        run.between = lambda: self._between(run)
+        run.on_step = lambda: self._on_step(run)
         desk.budget.skip()
 
     def _leave(self) -> None:
@@ -112,10 +112,10 @@ class Live:
         while order := self.desk.orders.first():
             self.desk.orders.deliver(order, None)
 
-    def _between(self, run: Run) -> None:
+    def _on_step(self, run: Run) -> None:
         """Draw what is asked for, if there is time for it; wait while the page says so."""
         desk, preview = self.desk, self._preview
-        if preview is None or not (run.has_model and run.whole):
+        if preview is None or not (run.has_model and run.is_consistent):
             return
         desk.step = max(run.step, 1)
         if desk.orders:

@@ -250,7 +250,7 @@ def attach_modules(modules: Sequence[TrainingModule], run: Run, last: int) -> li
 
 def modules_so_far(run: Run) -> dict[str, TrainingModule]:
     """Return the modules of a run's trainings up to its current stage, by type: the last of each."""
-    stages = getattr(run.settings, "stages", ())[: run.cursor + 1]
+    stages = getattr(run.settings, "stages", ())[: run.stage_index + 1]
     listed = (module for stage in stages for module in getattr(stage, "modules", ()))
     return {module.type: module for module in (*listed, *implied_modules(run)) if module.is_active(run.scene)}
 
@@ -258,7 +258,7 @@ def modules_so_far(run: Run) -> dict[str, TrainingModule]:
 def implied_modules(run: Run, stage: Any = None) -> list[TrainingModule]:
     """Return the modules that the model and the losses of a stage imply; None: of the current stage."""
     stages = getattr(run.settings, "stages", ())
-    stage = stages[run.cursor] if stage is None and run.cursor < len(stages) else stage
+    stage = stages[run.stage_index] if stage is None and run.stage_index < len(stages) else stage
     return [module for kind in implicit_modules().values() if (module := kind.implied(run, stage))]
 
 

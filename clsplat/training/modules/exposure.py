@@ -371,7 +371,7 @@ def exposures_of(run: Run) -> Exposures:
     views = run.scene.split("train")
     names = tuple(view.name for view in views)
     key = TABLE, names
-    if key not in run.measured:
+    if key not in run.cache:
 
         def read(view: View) -> tuple[NDArray[np.uint8], Mask | None]:
             photograph = run.photographs.get(view)
@@ -380,8 +380,8 @@ def exposures_of(run: Run) -> Exposures:
         counted = run.status.counted(views, "photographs", len(views))
         shown = measured(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
         told = len(shown.log_gains) == len(set(names))
-        run.measured[key] = shown if told else with_noted(shown, noted(views))
-    exposures: Exposures = run.measured[key]
+        run.cache[key] = shown if told else with_noted(shown, noted(views))
+    exposures: Exposures = run.cache[key]
     return exposures
 
 
