@@ -1,7 +1,7 @@
-"""What a pipeline file can name, found in the code: nothing is listed by hand.
+"""Find in the code what a pipeline file can name.
 
-Whatever has a name is a class below `Settings` with a `type` or a `stage`; its fields are its keys.  All such classes
-below one base are a family.
+Everything with a name is a subclass of `Settings` with a `type` or a `stage`; its fields are its keys.  All such
+subclasses of one base are a family.
 """
 
 import functools
@@ -21,11 +21,11 @@ from clsplat.pipeline.matrix import Matrix
 
 ROOT = Path(__file__).resolve().parents[1]
 Kind = type[Settings]
-NOTATIONS = (Points, Decay, Every)  # of a number that changes: on a page of their own
+NOTATIONS = (Points, Decay, Every)  # of schedules, which have a separate page
 
 
 class Family(NamedTuple):
-    """Where the classes below a base are described, and how a pipeline file holds them."""
+    """The page that describes the subclasses of a base, and the key that holds them in a pipeline file."""
 
     page: str
     title: str
@@ -33,15 +33,20 @@ class Family(NamedTuple):
     listed: bool = True
 
 
-FAMILIES = {  # by the name of the base; any other family gets a page of its own
+FAMILIES = {  # by the name of the base; any other family gets a separate page
     "Stage": Family("stages", "stage", "stages"),
     "Scheduled": Family("stages", "scheduled stage", "during"),
+    "Training": Family("stages", "training stage", "stages"),
+    "Keeping": Family("stages", "training stage with validation", "stages"),
     "Loss": Family("losses", "loss", "losses"),
     "ImageLoss": Family("losses", "loss on images", "losses"),
     "Penalty": Family("losses", "penalty", "losses"),
     "Rule": Family("rules", "density rule", "rules"),
     "Grow": Family("rules", "growing rule", "rules"),
     "Subdivide": Family("rules", "dividing rule", "rules"),
+    "SampledPruning": Family("rules", "pruning rule with sampled views", "rules"),
+    "ByWrongPixels": Family("rules", "rule by wrong pixels", "rules"),
+    "ByScore": Family("rules", "rule by score", "rules"),
     "Statistic": Family("statistics", "statistic", "statistic", listed=False),
     "Budget": Family("rules", "budget of Gaussians", "budget", listed=False),
     "Order": Family("views", "order", "order", listed=False),
@@ -58,7 +63,7 @@ FAMILIES = {  # by the name of the base; any other family gets a page of its own
 
 
 def below(base: type) -> Iterator[type]:
-    """Yield all classes of the package below a base."""
+    """Yield all subclasses of a base in the package."""
     for kind in base.__subclasses__():
         if kind.__module__.startswith("clsplat."):
             yield kind
@@ -66,27 +71,27 @@ def below(base: type) -> Iterator[type]:
 
 
 def tag(kind: Kind) -> str:
-    """Return the name of a class in pipeline files; "" for those without."""
+    """Return the name of a class in pipeline files, or "" if it has none."""
     defaults = [kind.model_fields[field].default for field in ("stage", "type") if field in kind.model_fields]
     return next((value for value in defaults if isinstance(value, str)), "")
 
 
 @functools.cache
 def families() -> dict[Kind, list[Kind]]:
-    """Return every base, with all that a pipeline file can name of it."""
+    """Return every base with the subclasses that a pipeline file can name."""
     bases = [kind for kind in below(Settings) if Settings in kind.__bases__]
     named = {base: sorted({kind for kind in below(base) if tag(kind)}, key=tag) for base in bases}
     return {base: kinds for base, kinds in named.items() if kinds}
 
 
 def family(base: Kind) -> Family:
-    """Return where a family is described."""
+    """Return the entry of a family."""
     name = base.__name__
     return FAMILIES.get(name, Family(name.lower(), name, name.lower()))
 
 
 def groups(base: Kind) -> list[Kind]:
-    """Return a base and the classes without a name between it and what a pipeline file can name."""
+    """Return a base and its subclasses without a name that are bases of named ones."""
     named = families()[base]
     return [
         base,
@@ -96,7 +101,7 @@ def groups(base: Kind) -> list[Kind]:
 
 @functools.cache
 def unnamed() -> dict[Kind, str]:
-    """Return the settings without a name of their own, each with the key that a reader of a file meets first."""
+    """Return the settings without a name, each with the first key under which a pipeline file can hold it."""
     intermediate = {Curve, *(group for base in families() for group in groups(base))}
     found: dict[Kind, str] = {}
     waiting: list[tuple[Kind, str]] = [(PipelineFile, ""), (Matrix, "matrix")]
@@ -117,12 +122,12 @@ def unnamed() -> dict[Kind, str]:
 
 
 def models(field: FieldInfo) -> list[Kind]:
-    """Return the settings that the annotation of a field mentions."""
+    """Return the settings classes in the annotation of a field."""
     return [part for part in parts(field) if isinstance(part, type) and issubclass(part, Settings)]
 
 
 def parts(field: FieldInfo) -> list[Any]:
-    """Return all that the annotation of a field is made of, its marks included."""
+    """Return all parts of the annotation of a field, with its metadata."""
 
     def inside(annotation: Any) -> Iterator[Any]:
         yield annotation

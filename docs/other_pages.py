@@ -20,7 +20,7 @@ OTHER_CODES = {0: "Done.", 1: "Internal error, a defect of clsplat: `--debug` sh
 def command_page() -> str:
     """Return every command with its options, and the exit codes."""
     group = typer.main.get_command(app)
-    text = f"# Command line\n\n{group.help} These options stand before the command:\n\n{option_table(group, 'clsplat')}"
+    text = f"# Command line\n\n{group.help} Options before the command:\n\n{option_table(group, 'clsplat')}"
     names = [name for name in group.list_commands(None) if name != "data"]
     text += "".join(section(group.get_command(None, name), f"clsplat {name}") for name in names)
     data = typer.main.get_command(tools)
@@ -28,7 +28,7 @@ def command_page() -> str:
     codes = OTHER_CODES | {kind.exit_code: summary(kind) for kind in errors.ClsplatError.__subclasses__()}
     rows = "".join(f"| {code} | {meaning} |\n" for code, meaning in sorted(codes.items()))
     return (
-        f"{text}\n## Exit codes\n\nAn error is one line: what is wrong, where, what was expected and what to do.\n\n"
+        f"{text}\n## Exit codes\n\nAn error is one line: where, what is wrong, what was expected, and what to do.\n\n"
         f"| code | meaning |\n|---|---|\n{rows}"
     )
 
@@ -56,12 +56,12 @@ def option_table(command: Any, name: str) -> str:
 
 
 def option(text: str) -> str:
-    """Return an option and the value that it takes, without names of Python types."""
+    """Return an option and its value, without names of Python types."""
     return re.sub(r" <(?:path|str|list\[\w+\])>", "", " ".join(text.split())).replace("|", "/")
 
 
 def cell(text: str) -> str:
-    """Return a text that does not break a table."""
+    """Return text for a cell of a table."""
     return " ".join(text.split()).replace("|", "\\|")
 
 
@@ -70,8 +70,9 @@ def summary(kind: type) -> str:
 
 
 def pipelines_page() -> str:
-    """Return the shipped pipelines: what their headers say, and the files."""
-    text = "# Shipped pipelines\n\n`clsplat run NAME --scene DIR` runs one. Copy a file to make your own variant.\n\n"
+    """Return the shipped pipelines: their headers and their files."""
+    text = "# Shipped pipelines\n\nRun one with `clsplat run NAME --scene DIR`. To make a variant, copy a file with "
+    text += "`clsplat pipelines NAME --copy FILE`.\n\n"
     for name, file in shipped().items():
         lines = read_pipeline(file).splitlines()
         count = next(i for i, line in enumerate(lines) if not line.startswith("#"))
@@ -82,7 +83,7 @@ def pipelines_page() -> str:
 
 
 def repository_page(file: str) -> str:
-    """Return a file of the repository, with links that hold in the site."""
+    """Return a file of the repository, with its links changed for the site."""
     return (ROOT / file).read_text("utf-8").replace("](docs/", "](")
 
 

@@ -1,4 +1,4 @@
-"""The pages about keys: one for each family of what a pipeline file can name, one for all other settings."""
+"""Make the reference pages about keys: one for each family, one for all other settings."""
 
 import functools
 from typing import Any
@@ -22,19 +22,19 @@ HEADINGS = {
     "filters": "Filters and backgrounds",
 }
 INTRODUCTIONS = {
-    "stages": "A pipeline is a list of stages. Those that can stand in `during` run every so many steps of training.",
+    "stages": "A pipeline is a list of stages. Scheduled stages can also run inside a training, in `optimize.during`.",
     "losses": "`optimize.losses` is a list; training minimizes the weighted sum.",
-    "rules": "`densify.rules` is a list. All rules act as one rearrangement of the Gaussians.",
-    "statistics": "A [growing rule](rules.md#grow) acts where the mean of its `statistic` is large. Only the "
-    "statistics that a rule names are summed and cost time.",
-    "modules": "`optimize.modules` is a list: what takes part in a training step next to the Gaussians, each once, in "
-    "the order of the forward pass. `--set` addresses one by its type: `optimize.modules.TYPE.KEY=…`; "
-    "`optimize.modules.TYPE={}` adds it at its place, `optimize.modules.TYPE=null` removes it.",
-    "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`.",
-    "filters": "Keys of `model`: the two low-pass filters, one in the scene and one on the screen, and the background.",
-    "adaptations": "`adapt` names what decides "
-    "[settings by the photographs](../pipelines.md#settings-that-follow-from-the-photographs).",
-    "prepare": "`prepare` is a list: what makes a scene of photographs, once, on the host.",
+    "rules": "`densify.rules` is a list. All rules act at once, in one rearrangement of the Gaussians.",
+    "statistics": "A [growing rule](rules.md#grow) acts on Gaussians with a large mean `statistic`. Only statistics "
+    "that a rule names are computed.",
+    "modules": "`optimize.modules` lists what takes part in a training step besides the Gaussians, in the order of the "
+    "forward pass; each type at most once. `--set` addresses a module by its type: `optimize.modules.TYPE.KEY=…` "
+    "changes a key, `optimize.modules.TYPE={}` adds the module, `optimize.modules.TYPE=null` removes it.",
+    "views": "How a training step picks and changes its photo: the keys `order` and `transforms` of `optimize.views`.",
+    "filters": "Keys of `model`: the two low-pass filters, in the scene and on the screen, and the background.",
+    "adaptations": "`adapt` names a class that derives "
+    "[settings from the photographs](../pipelines.md#settings-that-follow-from-the-photographs).",
+    "prepare": "`prepare` lists the steps that turn photographs into a scene, once, on the host.",
 }
 WORDS = {"integer": "whole number", "string": "text", "boolean": "true or false", "null": "none", "object": "keys"}
 BOUNDS = {"exclusiveMinimum": "> ", "minimum": "≥ ", "exclusiveMaximum": "< ", "maximum": "≤ "}
@@ -43,14 +43,14 @@ TABLE = "| key | takes | default | meaning and unit |\n|---|---|---|---|\n"
 
 @functools.cache
 def reference_pages() -> dict[str, str]:
-    """Return every page that is made from settings, by its path in the site."""
+    """Return every page made from settings, by its path in the site."""
     pages = {page: family_page(page) for page in dict.fromkeys(family(base).page for base in families())}
     pages |= {"settings": settings_page(), "schedules": schedule_page(key_table), "readers": readers_page()}
     return {f"reference/{name}.md": text for name, text in pages.items()}
 
 
 def family_page(page: str) -> str:
-    """Return all families of a page: the keys that members of a group share, then each member."""
+    """Return a page: for each of its families, the shared keys of each group, then each member."""
     text = f"# {HEADINGS.get(page, page.capitalize())}\n\n{INTRODUCTIONS.get(page, '')}\n\n"
     for base, kinds in families().items():
         if family(base).page == page:
@@ -60,7 +60,7 @@ def family_page(page: str) -> str:
 
 
 def group_section(group: Kind) -> str:
-    """Return what the members of a group share; they are plug-ins' bases, too."""
+    """Return the docstring and the shared keys of a group, which is also a base class for plug-ins."""
     parent = group.__bases__[0]
     shared = tuple(parent.model_fields) if any(parent in groups(base) for base in families()) else ()
     heading = f"## Every {family(group).title} {{: #{group.__name__.lower()} }}\n\n"
@@ -68,7 +68,7 @@ def group_section(group: Kind) -> str:
 
 
 def section(base: Kind, kind: Kind) -> str:
-    """Return the manual, the keys and an example of what a pipeline file can name."""
+    """Return the docstring, the keys, and an example of a class that a pipeline file can name."""
     sample, file = example(base, kind)
     title = f' title="{file}"' if file else ""
     group = next(one for one in kind.__mro__ if one in groups(base))
@@ -78,7 +78,7 @@ def section(base: Kind, kind: Kind) -> str:
 
 
 def settings_page() -> str:
-    """Return the settings without a name of their own."""
+    """Return the page about settings without a name."""
     text = "# Settings of a pipeline file\n\n"
     for kind, key in unnamed().items():
         title = f"`{key}`" if key else "The file"
@@ -87,15 +87,17 @@ def settings_page() -> str:
 
 
 def readers_page() -> str:
-    """Return the dataset formats, in the order in which they are looked for."""
-    text = "# Dataset readers\n\nThe first reader that recognizes a folder reads it: [datasets](../datasets.md).\n\n"
+    """Return the page about dataset readers, in the order in which they are tried."""
+    text = (
+        "# Dataset readers\n\nThe first reader that recognizes a folder reads it; see [datasets](../datasets.md).\n\n"
+    )
     for reader in readers():
         text += f"## {reader.name}\n\n{manual(type(reader))}It looks for {reader.expects}.\n\n"
     return text
 
 
 def key_table(kind: Kind, without: tuple[str, ...] = ()) -> str:
-    """Return a table of the keys of a class, but those named in `without` that it has from its base."""
+    """Return a table of the keys of a class, except inherited ones that are in `without`."""
     schema, texts, rows = kind.model_json_schema(), descriptions(kind), ""
     for name, field in kind.model_fields.items():
         if name in ("type", "stage") or (name in without and name not in kind.__annotations__):
@@ -111,11 +113,11 @@ def key_table(kind: Kind, without: tuple[str, ...] = ()) -> str:
     return f"{TABLE}{rows}\n" if rows else ""
 
 
-BY_STEP = "[number by step](schedules.md)"
+BY_STEP = "[number or schedule](schedules.md)"
 
 
 def expected(node: Node) -> str:
-    """Return what a key takes, in words, from its JSON schema."""
+    """Return in words what a key takes, from its JSON schema."""
     if "$ref" in node:
         return link(node["$ref"].rpartition("/")[2])
     if "const" in node:
@@ -137,7 +139,7 @@ def expected(node: Node) -> str:
 
 
 def either(nodes: list[Node]) -> str:
-    """Return what a union takes: all members of a family are one link, and so are the notations of a number."""
+    """Return what a union takes: the members of a family become one link, and so do the notations of a schedule."""
     flat = [inner for node in nodes for inner in (node.get("anyOf") or [node])]
     names = [node.get("$ref", "").rpartition("/")[2] for node in flat]
     if {kind.__name__ for kind in NOTATIONS} <= set(names):
@@ -167,7 +169,7 @@ def link(name: str) -> str:
 
 
 def shown(value: Any) -> str:
-    """Return a default as a pipeline file would have it."""
+    """Return a default as a pipeline file writes it."""
     text = flow(value)
     return "none" if value is None else f"`{text}`" if len(text) <= 40 else "its defaults"
 

@@ -1,4 +1,4 @@
-"""The page about numbers that change over training: their notations, and the keys that take them."""
+"""Make the page about schedules: their notations, and the keys that take them."""
 
 from collections.abc import Callable
 
@@ -6,11 +6,11 @@ from families import NOTATIONS, Kind, families, family, models, tag, unnamed
 
 from clsplat.core.schedule import Curve, Decay, Every, Points
 
-EXAMPLES = {  # notation: what it means, and how a file writes it
+EXAMPLES = {  # notation: meaning, and how a file writes it
     "A constant": ("The same at every step.", "weight: 0.8"),
     "Points": (
-        "Values at global steps, with straight lines between them. Before the first point and after the last one the "
-        "value stays as it is there.",
+        "Values at global steps, with linear interpolation. The value is constant before the first and after the last "
+        "point.",
         "weight: [[4000, 0.0], [5000, 4.0]]      # 0 until step 4000, 4 from step 5000 on",
     ),
 }
@@ -19,32 +19,30 @@ SAMPLES = {
     Every: "sh_rest: {every: 4, value: 5.0e-4}",
     Decay: "means: {initial: 1.6e-4, final: 1.6e-6, over: 30000}",
 }
-TITLES = {Points: "Points with keys", Decay: "Exponential decay", Every: "Every so many steps"}
+TITLES = {Points: "Points with keys", Decay: "Exponential decay", Every: "At intervals"}
 
 
 def schedule_page(key_table: Callable[[Kind], str]) -> str:
     """Return the page; `key_table` makes the table of a class."""
-    text = "# Numbers by step\n\nWhere a key takes a *number by step*, the number may change over training. "
-    text += (
-        "There is one notation for all of them. Steps are global: they are counted over the whole pipeline, from 1.\n\n"
-    )
+    text = "# Schedules\n\nA key that takes a *number or schedule* can change over training. "
+    text += "All of them share these notations. Steps are global: they count over the whole pipeline, from 1.\n\n"
     for title, (meaning, sample) in EXAMPLES.items():
         text += f"## {title}\n\n{meaning}\n\n```yaml\n{sample}\n```\n\n"
     for kind in NOTATIONS:
         manual = " ".join((kind.__doc__ or "").split())
         text += f"## {TITLES[kind]} {{: #{kind.__name__.lower()} }}\n\n{manual}\n\n{key_table(kind)}"
         text += f"```yaml\n{SAMPLES[kind]}\n```\n\n"
-    return f"{text}## Keys that take them\n\n{users()}"
+    return f"{text}## Keys that take a schedule\n\n{users()}"
 
 
 def users() -> str:
-    """Return a list of all keys that take a number by step."""
+    """Return a table of all keys that take a schedule."""
     named = [
         (f"[`{tag(kind)}`]({family(base).page}.md#{tag(kind)})", kind) for base, ks in families().items() for kind in ks
     ]
     others = [(f"[`{key}`](settings.md#{kind.__name__.lower()})", kind) for kind, key in unnamed().items()]
     rows = ""
-    for place, kind in [*others, *named]:
+    for title, kind in [*others, *named]:
         keys = [f"`{name}`" for name, field in kind.model_fields.items() if Curve in models(field)]
-        rows += f"| {place} | {', '.join(keys)} |\n" if keys else ""
-    return f"| of | keys |\n|---|---|\n{rows}\n"
+        rows += f"| {title} | {', '.join(keys)} |\n" if keys else ""
+    return f"| part of a pipeline | keys |\n|---|---|\n{rows}\n"

@@ -1,8 +1,8 @@
-"""Draw test PSNR over CPU seconds of training, a chart for each scene: docs/time.svg.
+"""Draw test PSNR over CPU seconds of training, one chart for each scene: docs/time.svg.
 
     python docs/time_chart.py NAME=RUN,RUN … > docs/time.svg
 
-NAME is the scene in words; each RUN is a run folder, which need not be finished, with an `evaluate` in its training.
+NAME is a title for the scene. Each RUN is a run folder with an `evaluate` in its training; it need not be finished.
 """
 
 import sys
@@ -15,11 +15,11 @@ from clsplat.runs.results import read_settings
 from clsplat.training.records import Records
 from clsplat.viewer.charts import HEIGHT, WIDTH, Line, curve
 
-LONGEST = 130  # CPU seconds that are shown
+LONGEST = 130  # CPU seconds shown
 
 
 def line(run: Path) -> Line:
-    """The test PSNR of a run, at the CPU seconds of its steps."""
+    """Return the test PSNR of a run over its CPU seconds."""
     records = Records(run).read()
     trained = [(0.0, 0.0), *((r["step"], r["cpu_seconds"]) for r in records if r["kind"] == "train")]
     tested = [(r["step"], r["psnr"]) for r in records if r["kind"] == "evaluate" and r["split"] == "test"]
@@ -29,7 +29,7 @@ def line(run: Path) -> Line:
 
 
 def drawing(charts: list[str]) -> str:
-    """Charts in two columns, as one SVG."""
+    """Return charts in two columns as one SVG."""
     rows = -(-len(charts) // 2)
     places = ((WIDTH * (i % 2), HEIGHT * (i // 2)) for i in range(len(charts)))
     inner = (

@@ -1,4 +1,4 @@
-"""Examples of what a pipeline file can name: from a shipped file or a page where one has it, else with all keys."""
+"""Find an example of each class that a pipeline file can name: in a shipped file, on a page, or with all its keys."""
 
 import functools
 import io
@@ -10,12 +10,12 @@ from families import ROOT, Kind, family, tag
 from ruamel.yaml import YAML
 
 Node = dict[str, Any]
-MAX_EXAMPLE = 10  # lines that are read at a glance
-MAX_WIDTH = 88  # characters that a page shows without scrolling
+MAX_EXAMPLE = 10  # lines
+MAX_WIDTH = 88  # characters that fit on a page without scrolling
 
 
 def example(base: Kind, kind: Kind) -> tuple[str, str]:
-    """Return how a pipeline file says it, and the shipped file that does ("" where only a page or none does)."""
+    """Return an example, and the shipped file that has it, or "" if none does."""
     found = [
         (block(base, item), file)
         for file, item in shipped_items()
@@ -33,7 +33,7 @@ def example(base: Kind, kind: Kind) -> tuple[str, str]:
 
 @functools.cache
 def shipped_items() -> list[tuple[str, Node]]:
-    """Return all mappings of shipped files, plain 3DGS first, each with the name of its file, and of the page."""
+    """Return all mappings in shipped files, plain 3DGS first, and on the page about pipelines, with file names."""
     files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (not file.name.startswith("splat"), file.name))
     texts = [(file.name, file.read_text("utf-8")) for file in files]
     page = (ROOT / "docs" / "pipelines.md").read_text("utf-8")
@@ -42,7 +42,7 @@ def shipped_items() -> list[tuple[str, Node]]:
 
 
 def items(node: Any) -> Iterator[Node]:
-    """Yield all mappings of a document, and every name in a list as a stage without keys."""
+    """Yield all mappings in a document, and each plain name in a list as a stage without keys."""
     if isinstance(node, dict):
         yield node
     for inner in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
@@ -61,7 +61,7 @@ def fields_of(item: Node) -> Node:
 
 
 def block(base: Kind, item: Node) -> str:
-    """Return an item as YAML, below the key that holds it."""
+    """Return an item as YAML, under the key that holds it."""
     fields = fields_of(item)
     key = "during" if "every" in fields else family(base).key
     one = item if fields.keys() - {"type"} else kind_of_item(item)

@@ -78,18 +78,18 @@ def test_a_table_of_keys_says_what_each_takes():
     assert row.startswith("| `children` | whole number ≥ 2 and ≤ 8 | `2` |")
 
 
-def test_a_table_of_keys_names_numbers_by_step_and_their_bounds():
+def test_a_table_of_keys_names_schedules_and_their_bounds():
     (blur,) = [kind for _, kind in NAMED if tag(kind) == "blur"]
-    assert "| `sigma` | [number by step](schedules.md) ≥ 0 | required |" in key_table(blur)
+    assert "| `sigma` | [number or schedule](schedules.md) ≥ 0 | required |" in key_table(blur)
     (rule,) = [kind for _, kind in NAMED if tag(kind) == "prune_faint"]
-    assert "| `opacity_below` | [number by step](schedules.md) > 0 | `0.005` |" in key_table(rule)
+    assert "| `opacity_below` | [number or schedule](schedules.md) > 0 | `0.005` |" in key_table(rule)
 
 
 def test_every_key_has_a_description():
     assert undescribed() == []
 
 
-def test_reference_lists_every_reader_and_number_notation():
+def test_reference_lists_every_reader_and_schedule_notation():
     pages = reference_pages()
     for reader in readers():
         assert f"## {reader.name}\n" in pages["reference/readers.md"]
@@ -99,7 +99,7 @@ def test_reference_lists_every_reader_and_number_notation():
     assert "| [`optimize.rates`](settings.md#rates) | `means`" in pages["reference/schedules.md"]
 
 
-def test_examples_of_numbers_by_step_are_valid():
+def test_examples_of_schedules_are_valid():
     for _, sample in (*EXAMPLES.values(), *(("", text) for text in SAMPLES.values())):
         ((name, value),) = YAML(typ="safe").load(sample).items()
         (kind,) = [one for one in (Loss, Rates, ViewSettings) if name in one.model_fields]
