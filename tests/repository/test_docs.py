@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -15,16 +16,20 @@ from ruamel.yaml import YAML
 import clsplat
 from clsplat.cli import app
 from clsplat.cli.data import app as tools
+from clsplat.density.statistics import Statistic
+from clsplat.formats.splats import PARAMETERS
 from clsplat.losses.base import Loss
 from clsplat.photos.sampling import ViewSettings
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import readers
 from clsplat.training.adam import Rates
+from clsplat.training.modules.base import TrainingModule
+from clsplat.training.modules.sky import SKY
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs"))
 
-from families import families, tag, undescribed  # noqa: E402
+from families import families, tag, undescribed, unnamed  # noqa: E402
 from other_pages import other_pages  # noqa: E402
 from python_pages import FOLDER  # noqa: E402
 from reference_pages import key_table, reference_pages  # noqa: E402
@@ -215,6 +220,26 @@ def test_the_glossary_is_in_order():
     words = re.findall(r"^\*\*(.+?)\*\* —", text_of(ROOT / "docs" / "glossary.md"), re.M)
     assert len(words) >= 20
     assert words == sorted(words)
+
+
+def test_names_in_the_glossary_exist(few_steps):
+    """Keys, classes, tables, and checkpoint entries of the table "One concept, one name"."""
+    classes = [*unnamed(), *(kind for base, kinds in families().items() for kind in (base, *kinds))]
+    keys = {name for kind in classes for name in (tag(kind), *kind.model_fields)}
+    by_name = {kind.__name__: kind for kind in [*classes, clsplat.Model, clsplat.Scene, clsplat.View]}
+    tables = {*PARAMETERS, "filter_variance", *(tag(kind) for kind in families()[Statistic])}
+    checkpoint = zipfile.ZipFile(few_steps / "checkpoints" / "step_000012.npz").namelist()
+    saved = {name.removesuffix(".npy") for name in checkpoint} | {f"stats/{name}" for name in tables}
+    saved |= {f"modules/{name}" for name in (*(tag(kind) for kind in families()[TrainingModule]), SKY)}
+    rows = re.findall(r"^\| [^|]+\|(.*)\|(.*)\|(.*)\|(.*)\|[^|]*\|$", text_of(ROOT / "docs" / "glossary.md"), re.M)
+    assert len(rows) > 10
+    for row in rows:
+        yaml, python, table, entry = (re.findall(r"`(.+?)`", cell) for cell in row)
+        assert {part for name in yaml for part in re.split(r"[.:] ?", name)} <= keys, row
+        for kind, _, field in (name.partition(".") for name in python):
+            assert not field or hasattr(by_name[kind], field) or field in by_name[kind].__annotations__, row
+        assert set(table) <= tables, row
+        assert set(entry) <= saved, row
 
 
 def test_all_files_name_the_same_version():
