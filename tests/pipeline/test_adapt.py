@@ -15,7 +15,6 @@ from clsplat.runs.describe import describe
 from clsplat.runs.state import RunState
 from clsplat.scene.quality import Measures
 from clsplat.stages.densify import Densify
-from clsplat.sweeps.compare.comparison import flat
 from tests.support.outdoor_scene import Yard
 from tests.support.runs import FEW, digest, train
 
@@ -171,7 +170,3 @@ def test_a_run_looks_for_a_sky_where_it_decides(tmp_path, rng, monkeypatch, coun
 def test_transparent_photographs_say_nothing_of_a_sky(tiny_scene, tmp_path):
     text = describe(load("photos", [f"scene.path='{tiny_scene}'"]), RunState.read(tmp_path / "run"), None, "new")
     assert "8 training photographs; the dataset does not say whether they show a sky" in text
-
-
-def test_decisions_are_named_by_their_keys_in_a_comparison():
-    assert flat(decided("smoke", ADAPT).resolved())["adapt.decisions.model.sh_degree"] == "9 photographs"

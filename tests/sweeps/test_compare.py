@@ -76,7 +76,7 @@ def test_seeds_are_one_row_with_mean_and_deviation(make_run, tmp_path):
     (rows,) = comparison.scenes.values()
     assert [len(row.runs) for row in rows] == [3, 1]
     assert [row.variant.letter for row in rows] == ["A", "B"]
-    assert [row.variant.name for row in rows] == ["smoke, opacity 0.1", "smoke, opacity 0.3"]
+    assert [row.variant.name for row in rows] == ["smoke, init opacity 0.1", "smoke, init opacity 0.3"]
     page = page_of(tmp_path, *seeds, other)
     assert "<td>21.00 <small>± 1.00</small>" in page  # of 20, 21, 22
     assert '<td class="best">24.00</td>' in page, "the best is bold, one run has no deviation"
@@ -128,12 +128,15 @@ def test_published_figures_stand_apart_with_their_source(make_run, tmp_path):
     [
         ("a: 1", "unknown key 'a'"),
         ("tables: []", "tables: expected a list of at least 1"),
-        ("- 1", "expected the key tables"),
+        ("- 1", "expected the key 'tables'"),
         (
             "tables: [{title: a, source: b, protocol: c, columns: [d], rows: {e: [1.0, 2.0]}}]",
-            "expected 1 figures of 'e'",
+            "expected 1 values of 'e'",
         ),
-        ("tables: [{title: a, source: b, protocol: c, columns: [d], rows: {e: [null]}}]", "expected a figure"),
+        (
+            "tables: [{title: a, source: b, protocol: c, columns: [d], rows: {e: [null]}}]",
+            "expected at least one value",
+        ),
         ("tables: [{title: a, protocol: c, columns: [d], rows: {e: [1.0]}}]", "'source' is missing"),
     ],
 )
@@ -144,9 +147,9 @@ def test_a_file_of_published_figures_that_is_wrong_is_refused(text, complaint, t
 
 
 def test_what_sizes_mean_is_said_where_the_training_saw_others(make_run, tmp_path):
-    assert "sizes are shares" not in page_of(tmp_path, make_run("whole"))
+    assert "sizes are relative" not in page_of(tmp_path, make_run("whole"))
     halves = make_run("halves", "scene.downscale=2", "scene.levels=2")
-    assert "sizes are shares of the photographs&#39; own; trained at 1/2, 1/4" in page_of(tmp_path, halves)
+    assert "sizes are relative to the original photographs; trained at 1/2, 1/4" in page_of(tmp_path, halves)
 
 
 def test_curves_of_runs_with_one_seed_are_named_by_folder(make_run, tmp_path):
@@ -171,7 +174,7 @@ def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):
     assert list(comparison.scenes) == ["tiny", "second", "tiny at 1/2"]
     assert len(comparison.variants) == 1, "the scene does not make a variant"
     page = page_of(tmp_path, one, two, half)
-    assert '<h2>Mean of 3 scenes</h2>\n<p class="sub">test views, at the size trained on</p>' in page
+    assert '<h2>Mean of 3 scenes</h2>\n<p class="sub">test views, at the training size</p>' in page
     assert "<td>30.00" in page[: page.index("<h2>tiny</h2>")]
     assert page.count("No crops: ") == 1, "only the run without renders has none"
 
@@ -191,9 +194,43 @@ def test_differing_settings_are_found_by_name_not_by_place():
 
 def test_the_page_shows_the_differing_settings_only(make_run, tmp_path):
     page = page_of(tmp_path, make_run("a"), make_run("b", "optimize.densify.every=20"))
-    table = page[page.index("Settings that differ") : page.index("<h2>Runs")]
+    table = page[page.index("Settings that differ (1)") : page.index("<h2>Runs")]
     rows = re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td>", table)
     assert rows == [("optimize.densify.every", "10", "20")]
+
+
+def names_of(*folders: Path) -> list[tuple[str, str]]:
+    return [(variant.name, variant.folders) for variant in RunComparison.read(folders).variants]
+
+
+def test_variants_are_named_in_words_and_by_folder(make_run):
+    base, seed = make_run("base"), make_run("seed", "seed=1")
+    without = make_run("without", "optimize.densify.rules=[clone, split]")
+    names = names_of(base, seed, without)
+    assert names == [
+        ("smoke, with densify prune faint", "base, seed"),
+        ("smoke, without densify prune faint", "without"),
+    ]
+    many = [make_run(f"run{i}", f"optimize.densify.every={10 + i}", f"init.opacity=0.{i + 1}") for i in range(2)]
+    assert names_of(*many) == [
+        ("smoke, init opacity 0.1, densify every 10", "run0"),
+        ("smoke, init opacity 0.2, densify every 11", "run1"),
+    ]
+
+
+def test_decisions_about_photos_make_no_variant(make_run):
+    """The same recipe on two scenes, whose photos lead to other settings."""
+    decision = "{{key: optimize.during.1.every, value: {value}, reason: {value} photos}}"
+    folders = []
+    for value in (10, 20):
+        folder = make_run(f"of{value}", f"optimize.densify.every={value}")
+        file = folder / "pipeline.yaml"
+        adapt = f"adapt: {{type: photos, decisions: [{decision.format(value=value)}]}}\n"
+        file.write_text(file.read_text() + adapt)
+        folders.append(folder)
+    assert names_of(*folders) == [("smoke", "of10, of20")]
+    other = make_run("other", "optimize.densify.every=30")
+    assert len(names_of(*folders, other)) == 2
 
 
 def crops_of(*folders: Path) -> list[crops.ImageCrop]:
@@ -280,7 +317,7 @@ def test_markup_in_names_is_shown_as_text(make_run, tmp_path):
     assert page.elements["script"] == 1, "that of the sliders"
     assert f"{HOSTILE} pipeline" in page.text
     assert str(folder) in page.text
-    assert f"{HOSTILE}, opacity 0.3" in page.text, "a variant's name"
+    assert f"{HOSTILE}, init opacity 0.3" in page.text, "a variant's name"
     assert f"{HOSTILE} device" in page.text, "among the settings that differ"
 
 
@@ -302,7 +339,7 @@ def test_lpips_of_different_ranges_is_marked(make_run, tmp_path):
     one, two = make_run("one", test=averages("0..1")), make_run("two", "init.opacity=0.3", test=averages("-1..1"))
     page = page_of(tmp_path, one, two)
     assert "0.2500" in page
-    assert "The input range of LPIPS is not the same in all runs (-1..1, 0..1)." in page
+    assert "The input range of LPIPS differs between runs (-1..1, 0..1)." in page
 
 
 @pytest.mark.parametrize(("size", "words"), [("1", "test views"), ("2", "test views at 1/2")])
@@ -313,9 +350,9 @@ def test_means_over_other_numbers_of_views_are_marked(make_run, tmp_path, size, 
     few = {"psnr_color": 30.0, "psnr_color_views": 1, "psnr_color_reason": "why"}
     one, two = make_run("one", test=averages(size, **few)), make_run("two", "init.opacity=0.3", test=averages(size))
     three = make_run("three", "init.opacity=0.4", test=averages(size, psnr_color=25.0))
-    said = f"The number of {words} with a PSNR in the photographs' colors is not the same in all runs (1, 7)."
+    said = f"The number of {words} with a PSNR in the photographs' colors differs between runs (1, 7)."
     assert said in html.unescape(page_of(tmp_path, one, two, three))
-    assert "not the same" not in page_of(tmp_path, two, three), "what has no figure is not compared"
+    assert "differs between runs" not in page_of(tmp_path, two, three), "what has no figure is not compared"
 
 
 def broken(make_run, how: str) -> Path:

@@ -1,7 +1,7 @@
-"""Runs, sorted into variants and rows.
+"""Group runs into variants and rows.
 
-Runs with the same settings are one variant, whatever their scene and seed.  Runs of a variant on one scene are one row:
-their mean, and the deviation between seeds.
+Runs with the same settings form a variant, whatever their scene and seed.  The runs of a variant on one scene form a
+row: their mean, and the standard deviation over seeds.
 """
 
 import json
@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from clsplat.core.errors import ConfigError, DataError
+from clsplat.core.errors import ConfigError, DataError, shorten
 from clsplat.core.files import PIPELINE
 from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.yaml_file import read_yaml
@@ -26,67 +26,69 @@ from clsplat.viewer.charts import COLORS
 
 
 def flat(settings: dict[str, Any]) -> dict[str, str]:
-    """Return place -> value as text, in the order of the file.
+    """Return key path -> value as text, in the order of the file.
 
-    A stage's place is its name and a strategy's its type, so that pipelines with different stages can be compared:
-    `optimize.densify.clone.gradient_above`.  The second item of a name has `#2`.
+    A stage appears by its name and a strategy by its type, so that pipelines with different stages can be compared:
+    `optimize.densify.clone.gradient_above`.  The second item with the same name gets `#2`.
     """
-    found: dict[str, str] = {}
+    flattened: dict[str, str] = {}
     for key, value in settings.items():
-        _add(found, "" if key == "stages" else str(key), value)
-    return found
+        _add(flattened, "" if key == "stages" else str(key), value)
+    return flattened
 
 
 def differing(settings: Sequence[dict[str, str]]) -> list[str]:
-    """Return the places at which some of flat settings differ from the first."""
+    """Return the key paths at which flat settings differ from the first ones."""
     first, *others = settings
     return list(dict.fromkeys(one.place for other in others for one in differences(first, other)))
 
 
-def _add(found: dict[str, str], place: str, value: Any) -> None:
+def _add(flattened: dict[str, str], key_path: str, value: Any) -> None:
     if isinstance(value, dict):
         for key, inner in value.items():
-            _add(found, _joined(place, str(key)), inner)
+            _add(flattened, _join(key_path, str(key)), inner)
         if not value:
-            found[place] = "yes"
+            flattened[key_path] = "yes"
     elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
         names: dict[str, int] = {}
         for item in value:
             name, inner = _named(item)
             names[name] = names.get(name, 0) + 1
             label = name if names[name] == 1 else f"{name}#{names[name]}"
-            parent = place.removesuffix("during").removesuffix("rules").removesuffix("losses").rstrip(".")
-            _add(found, _joined(parent, label), inner)
+            parent = key_path.removesuffix("during").removesuffix("rules").removesuffix("losses").rstrip(".")
+            _add(flattened, _join(parent, label), inner)
     else:
-        found[place] = value if isinstance(value, str) else json.dumps(value)
+        flattened[key_path] = value if isinstance(value, str) else json.dumps(value)
 
 
 def _named(item: Any) -> tuple[str, Any]:
-    """The name of a list's item, and the item without it."""
+    """Return the name of a list's item, and the item without it."""
     if isinstance(item, dict) and "type" in item:
         return str(item["type"]), {key: value for key, value in item.items() if key != "type"}
-    if isinstance(item, dict) and {"key", "reason"} <= item.keys():  # a decision, whose value stands at its place
-        return str(item["key"]), item["reason"]
+
     if isinstance(item, dict) and len(item) == 1:
         return next(iter(item.items()))
     return (str(item), {}) if not isinstance(item, dict) else ("item", item)
 
 
-def _joined(place: str, name: str) -> str:
-    return f"{place}.{name}" if place else name
+def _join(key_path: str, name: str) -> str:
+    return f"{key_path}.{name}" if key_path else name
 
 
-MAX_SETTINGS = 3  # differing ones in a variant's name
+MAX_DIFFERENCES = 3  # in the name of a variant
+MAX_FOLDERS = 3  # that a variant lists
+MAX_VALUE = 40  # letters of a value in a name
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Settings with a letter and a color, which are the same on the whole page."""
+    """Settings that runs share, with a letter and a color that identify them on the whole page."""
 
     letter: str
     name: str
     color: str
-    settings: dict[str, str]  # place -> value, without scene and seed; with the device
+    settings: dict[str, str]  # key path -> value, without scene and seed, with the device
+    folders: str  # names of the folders of its runs
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class VariantRow:
 
     @property
     def downscale(self) -> str:
-        """The divisor of the size of the largest photographs in training."""
+        """Divisor of the image size: the largest images of the training."""
         return f"{self.runs[0].scene.downscale:g}"
 
     def downscales(self, split: str) -> set[str]:
@@ -107,51 +109,54 @@ class VariantRow:
         return set.intersection(*measured)
 
     def figures(self, split: str, downscale: str, metric: str) -> list[float]:
-        """Return a metric of the runs; an empty list when a run lacks it."""
+        """Return a metric of the runs, or an empty list if a run lacks it."""
         averages = [getattr(run.metrics, split).get(downscale) for run in self.runs]
-        values = [found.figure(metric) if found else None for found in averages]
+        values = [average.figure(metric) if average else None for average in averages]
         present = [value for value in values if value is not None]
         return present if len(present) == len(values) else []
 
 
 @dataclass(frozen=True)
 class RunComparison:
-    """All runs, sorted into variants and rows."""
+    """All runs, grouped into variants and rows."""
 
     runs: list[RunFolder]
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> "RunComparison":
-        """Read run folders; the folder of a matrix means its finished cells.
+        """Read run folders; the folder of a matrix stands for its finished cells.
 
-        Raises DataError for a folder that is missing, unfinished or damaged, ConfigError for none, for one given twice
-        or a pipeline.yaml that cannot be read.
+        Raises DataError if a folder is missing, unfinished or damaged, and ConfigError if there is no folder, a folder
+        is given twice, or a pipeline.yaml cannot be read.
         """
         if not paths:
-            raise ConfigError("no runs to compare; expected the folder of at least one")
+            raise ConfigError("no runs to compare; give the folder of at least one run")
         runs = [RunFolder.read(folder) for path in paths for folder in _cells(path)]
         seen: set[Path] = set()
         for run in runs:
             if run.path.resolve() in seen:
-                raise ConfigError(f"{run.path}: given twice; name each run once")
+                raise ConfigError(f"{run.path}: the run is given twice; give each run once")
             seen.add(run.path.resolve())
         return cls(runs)
 
     @cached_property
     def variants(self) -> list[Variant]:
         """Variants in the order of the runs."""
+        by_run = [_settings(run) for run in self.runs]
         distinct: list[dict[str, str]] = []
-        for run in self.runs:
-            if (settings := _settings(run)) not in distinct:
+        for settings in by_run:
+            if settings not in distinct:
                 distinct.append(settings)
-        return [
-            Variant(_letter(i), _name(settings, distinct), COLORS[i % len(COLORS)], settings)
-            for i, settings in enumerate(distinct)
-        ]
+        variants = []
+        for i, settings in enumerate(distinct):
+            runs = [run for run, own in zip(self.runs, by_run, strict=True) if own == settings]
+            color = COLORS[i % len(COLORS)]
+            variants.append(Variant(_letter(i), _name(settings, distinct), color, settings, _folders(runs)))
+        return variants
 
     @cached_property
     def scenes(self) -> dict[str, list[VariantRow]]:
-        """Rows by the scene's name, in the order of the runs."""
+        """Rows by the name of the scene, in the order of the runs."""
         grouped: dict[str, list[RunFolder]] = {}
         for run in self.runs:
             grouped.setdefault(run.scene.model_dump_json(), []).append(run)
@@ -164,34 +169,73 @@ class RunComparison:
 
     def _rows(self, runs: Sequence[RunFolder]) -> Iterator[VariantRow]:
         for variant in self.variants:
-            if own := [run for run in runs if self.variant(run) is variant]:
-                yield VariantRow(variant, sorted(own, key=lambda run: run.metrics.seed))
+            if of_variant := [run for run in runs if self.variant(run) is variant]:
+                yield VariantRow(variant, sorted(of_variant, key=lambda run: run.metrics.seed))
 
 
 def _cells(path: Path) -> list[Path]:
-    """The finished runs below the folder of a matrix; another folder stays as it is."""
+    """Return the finished runs in the folder of a matrix, or else the folder itself."""
     if not (path / PIPELINE).is_file() or "matrix" not in read_settings(path):
         return [path]
     cells = sorted(file.parent for file in path.glob("*/metrics.json"))
     if not cells:
-        raise DataError(f"{path}: no cell of this matrix has finished; continue with --resume")
+        raise DataError(f"{path}: no cell of this matrix has finished; continue it with --resume")
     return cells
 
 
 def _settings(run: RunFolder) -> dict[str, str]:
-    settings = {key: value for key, value in run.settings.items() if key not in ("scene", "seed")}
-    return {**flat(settings), "device": run.metrics.device}
+    """Return the settings that identify a variant.
+
+    Settings that `adapt` derived from the photos are left out: they differ between scenes, not between variants.
+    """
+    settings = {key: value for key, value in run.settings.items() if key not in ("scene", "seed", "adapt")}
+    adapt = run.settings.get("adapt") or {}
+    decided = [decision["key"] for decision in adapt.get("decisions") or ()]
+    kept = {path: value for path, value in flat(settings).items() if not any(_is_below(path, key) for key in decided)}
+    return {**kept, **({"adapt": adapt["type"]} if adapt else {}), "device": run.metrics.device}
+
+
+def _is_below(key_path: str, key: str) -> bool:
+    """Return whether a flat key path is a key as `--set` writes it, or below it.
+
+    `optimize.during.0.per_pixel` is `optimize.densify.per_pixel`: lists of stages have numbers there and names here.
+    """
+    parts = iter(key_path.split("."))
+    return all(part in parts for part in key.split(".") if part != "during" and not part.isdigit())
 
 
 def _name(settings: dict[str, str], distinct: Sequence[dict[str, str]]) -> str:
-    """The pipeline's name, and the settings in which variants of the same name differ."""
-    places = differing([other for other in distinct if other.get("name") == settings.get("name")])
-    parts = [f"{place.rpartition('.')[2]} {settings.get(place, 'unset')}" for place in places[:MAX_SETTINGS]]
-    return ", ".join([settings.get("name", "unnamed"), *parts, *(["…"] if len(places) > MAX_SETTINGS else [])])
+    """Return the pipeline's name, and in words the settings in which variants of that pipeline differ."""
+    alike = [other for other in distinct if other.get("name") == settings.get("name")]
+    words = list(dict.fromkeys(_in_words(key_path, settings, alike) for key_path in differing(alike)))
+    more = [f"and {len(words) - MAX_DIFFERENCES} more"] if len(words) > MAX_DIFFERENCES else []
+    return ", ".join([settings.get("name", "unnamed"), *words[:MAX_DIFFERENCES], *more])
+
+
+def _in_words(key_path: str, settings: dict[str, str], alike: Sequence[dict[str, str]]) -> str:
+    """Return a setting in words: "init opacity 0.3"; "with prune large" or "without" it if some variants lack it."""
+    parts = key_path.split(".")
+    for depth in range(1, len(parts) + 1):
+        prefix = ".".join(parts[:depth])
+        below = [{path: v for path, v in one.items() if f"{path}.".startswith(f"{prefix}.")} for one in alike]
+        if not all(below):  # a stage, rule or key that only some variants have
+            words = " ".join(parts[:depth][-2:]).replace("_", " ")
+            if not any(f"{path}.".startswith(f"{prefix}.") for path in settings):
+                return f"without {words}"
+            if all(one == next(filter(None, below)) for one in below if one):
+                return f"with {words}"
+            break
+    return f"{' '.join(parts[-2:]).replace('_', ' ')} {shorten(settings.get(key_path, 'unset'), MAX_VALUE)}"
+
+
+def _folders(runs: Sequence[RunFolder]) -> str:
+    names = list(dict.fromkeys(run.path.resolve().name for run in runs))
+    more = f" and {len(names) - MAX_FOLDERS} more" if len(names) > MAX_FOLDERS else ""
+    return ", ".join(names[:MAX_FOLDERS]) + more
 
 
 def _scene_names(runs: Sequence[RunFolder]) -> list[str]:
-    """The folder's name and the size of images; where several scenes share both, all their settings too."""
+    """Return the folder's name and the image size, and all scene settings if several scenes share both."""
     names = []
     for run in runs:
         size = f" at 1/{run.scene.downscale:g}" if run.scene.downscale != 1 else ""
@@ -206,38 +250,39 @@ def _letter(index: int) -> str:
     return (_letter(index // 26 - 1) if index >= 26 else "") + chr(ord("A") + index % 26)
 
 
-# Published figures beside measured ones: a file of tables, each with its source and its protocol.
+# Published results, shown next to measured ones: a file of tables, each with its source and protocol.
 
 Text = Annotated[str, Field(min_length=1, max_length=2000)]
 
 
 class PublishedTable(BaseModel):
-    """One table of a publication."""
+    """A table of a publication."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     title: Text
-    source: Text  # the publication, and how the figures came from there
+    source: Text  # the publication, and how the values were taken from it
     protocol: Text  # data, sizes, steps
     columns: Annotated[list[Text], Field(min_length=1)]
-    rows: Annotated[dict[Text, list[float | None]], Field(min_length=1)]  # method -> figure of each column; null: none
+    rows: Annotated[dict[Text, list[float | None]], Field(min_length=1)]  # method -> value of each column; null: none
 
     @model_validator(mode="after")
     def _whole(self) -> "PublishedTable":
-        for name, figures in self.rows.items():
-            if len(figures) != len(self.columns):
-                raise ValueError(f"expected {len(self.columns)} figures of '{name}', one a column; got {len(figures)}")
-        if all(one is None for figures in self.rows.values() for one in figures):
-            raise ValueError("expected a figure")
+        for name, values in self.rows.items():
+            if len(values) != len(self.columns):
+                raise ValueError(f"expected {len(self.columns)} values of '{name}', one per column; got {len(values)}")
+        if all(value is None for values in self.rows.values() for value in values):
+            raise ValueError("expected at least one value that is not null")
         return self
 
     @property
     def shown(self) -> dict[str, list[str]]:
-        """The figures of each method as text, all with as many digits as the one that has most."""
-        digits = max(
-            len(f"{one:.10g}".partition(".")[2]) for row in self.rows.values() for one in row if one is not None
-        )
-        return {name: ["–" if one is None else f"{one:.{digits}f}" for one in row] for name, row in self.rows.items()}
+        """The values of each method as text, all with the same number of digits."""
+        values = [value for row in self.rows.values() for value in row if value is not None]
+        digits = max(len(f"{value:.10g}".partition(".")[2]) for value in values)
+        return {
+            name: ["–" if value is None else f"{value:.{digits}f}" for value in row] for name, row in self.rows.items()
+        }
 
 
 class Published(BaseModel):
@@ -249,10 +294,10 @@ class Published(BaseModel):
 
 
 def read_published(path: Path) -> list[PublishedTable]:
-    """Read the tables of a YAML file.  Raises ConfigError with its line where it holds something else."""
+    """Read published tables from a YAML file.  Raises ConfigError, with the line, for any other content."""
     document = read_yaml(path)
     if not isinstance(document.data, dict):
-        raise ConfigError(f"{path}:1: expected the key tables")
+        raise ConfigError(f"{path}:1: expected the key 'tables'")
     try:
         return Published.model_validate(document.data).tables
     except ValidationError as error:

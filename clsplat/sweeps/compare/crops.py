@@ -1,4 +1,4 @@
-"""Crops of the views that all runs rendered, where the runs differ most, beside the photograph."""
+"""Find crops where runs differ most, in the views that all of them rendered."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +15,8 @@ from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import View, load_image
 from clsplat.stages.render import image_path
 
-MIN_SIDE, MAX_SIDE = 48, 192  # px, of a crop: a third of the image within these limits
-MAX_CROPS = 4  # of a scene, each of another view
+MIN_SIDE, MAX_SIDE = 48, 192  # px; a crop is a third of the image within these limits
+MAX_CROPS = 4  # per scene, each from another view
 OVERVIEW_WIDTH = 340  # px
 
 
@@ -34,7 +34,7 @@ class ImageCrop:
 
     @property
     def photograph(self) -> Image:
-        """The square of the photograph."""
+        """The square of the photo."""
         return self._of(self.whole_photograph)
 
     @property
@@ -61,7 +61,7 @@ class ImageCrop:
 
     @property
     def overview(self) -> Image:
-        """The whole photograph, OVERVIEW_WIDTH wide."""
+        """The whole photo, OVERVIEW_WIDTH wide."""
         height, width = self.whole_photograph.shape[:2]
         size = (OVERVIEW_WIDTH, max(1, round(OVERVIEW_WIDTH * height / width)))
         return cv2.resize(self.whole_photograph, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
@@ -71,14 +71,14 @@ class ImageCrop:
 
 
 def find_crops(runs: Sequence[RunFolder], scene: Scene, background: Background) -> list[ImageCrop]:
-    """Return crops of the views that all runs of one scene rendered, where the renders differ most.
+    """Return crops where the renders of a scene differ most, of the views that all runs rendered.
 
-    Raises DataError when a render or a photograph is damaged.
+    Raises DataError if a render or a photo is damaged.
     """
     rendered = [view for view in scene.views if all(_file(run, view).is_file() for run in runs)]
-    chosen: list[ImageCrop] = []  # these and one more view are in memory at a time
+    chosen: list[ImageCrop] = []  # keep only these and one more view in memory
     for view in rendered:
-        renders = [load_image(replace(view, image_path=_file(run, view), lens=None)) for run in runs]  # a pinhole's
+        renders = [load_image(replace(view, image_path=_file(run, view), lens=None)) for run in runs]  # undistorted
         chosen.append(_crop(view.name, load_image(view, BACKGROUNDS[background]), renders))
         chosen = sorted(chosen, key=lambda crop: -crop.difference)[:MAX_CROPS]
     return chosen
@@ -89,7 +89,7 @@ def _file(run: RunFolder, view: View) -> Path:
 
 
 def _crop(view: str, photograph: Image, renders: list[Image]) -> ImageCrop:
-    """The crop in which the renders differ most from each other, or a single one from the photograph."""
+    """Return the crop in which renders differ most from each other, or a single render from the photo."""
     images = np.stack(renders if len(renders) > 1 else [*renders, photograph])
     difference = (images.max(axis=0) - images.min(axis=0)).mean(axis=2, dtype=np.float32)
     height, width = photograph.shape[:2]

@@ -1,4 +1,4 @@
-"""Runs side by side, as one page that opens offline: metrics, curves, crops, differing settings."""
+"""Write runs side by side as a page that opens offline: metrics, curves, crops, differing settings."""
 
 import logging
 import os
@@ -21,7 +21,7 @@ from clsplat.sweeps.compare.crops import ImageCrop, find_crops
 from clsplat.training.records import VIEWS, over_views
 from clsplat.viewer.charts import COLORS, Line, curve
 
-# The tables of a comparison: metrics and costs, means over scenes, differing settings.
+# The tables: metrics and costs, means over scenes, differing settings.
 
 METRICS = {  # name -> heading, digits, function that returns the better one
     "psnr": ("PSNR ↑", 2, max),
@@ -37,12 +37,12 @@ METRICS = {  # name -> heading, digits, function that returns the better one
     "lpips": ("LPIPS ↓", 4, min),
 }
 CONDITIONS = {"lpips_input": "input range of LPIPS", "lpips_model": "LPIPS network"}
-MAX_SEEDS = 3  # named one by one
+MAX_SEEDS = 3  # that are listed
 
 
 @dataclass(frozen=True)
 class TableCell:
-    """A mean as text, with the standard deviation where there are several runs."""
+    """A mean as text, with the standard deviation if there are several runs."""
 
     text: str
     deviation: str = ""
@@ -51,7 +51,7 @@ class TableCell:
 
 @dataclass(frozen=True)
 class Column:
-    """A figure of each row."""
+    """One value per row."""
 
     heading: str
     cells: list[TableCell]
@@ -59,7 +59,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Group:
-    """Columns under a common title."""
+    """Columns with a common title."""
 
     title: str
     columns: list[Column]
@@ -67,7 +67,7 @@ class Group:
 
 @dataclass(frozen=True)
 class MetricTable:
-    """A row for each variant."""
+    """One row per variant."""
 
     variants: list[Variant]
     groups: list[Group]
@@ -75,41 +75,46 @@ class MetricTable:
 
 
 def main_table(rows: Sequence[VariantRow]) -> MetricTable:
-    """Return test metrics at the training size, and the costs."""
+    """Return the test metrics at the training size, and the costs."""
     costs = [
         *_cost(rows, "Gaussians", lambda metrics: metrics.gaussians),
         *_cost(rows, "parameters", lambda metrics: metrics.parameters),
         Column("steps", _cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
-        Column(
-            "training", [TableCell(duration_text(fmean(run.metrics.train_seconds for run in row.runs))) for row in rows]
-        ),
+        Column("training", [TableCell(duration_text(_train_seconds(row))) for row in rows]),
         *_cost(rows, "CPU seconds", lambda metrics: metrics.cpu_seconds),
         *_cost(rows, "device memory, MB", lambda metrics: metrics.device_memory and metrics.device_memory / 1e6),
     ]
     return _table(rows, [*_trained_on(rows), Group("", costs)])
 
 
+def _train_seconds(row: VariantRow) -> float:
+    return fmean(run.metrics.train_seconds for run in row.runs)
+
+
 def _cost(rows: Sequence[VariantRow], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
-    """A column of what not all runs note; none where no run does."""
-    found = [[cost(run.metrics) for run in row.runs] for row in rows]
-    values = [[value for value in row if value is not None] for row in found]
+    """Return a column of a cost that not all runs record, or none if no run does."""
+    costs = [[cost(run.metrics) for run in row.runs] for row in rows]
+    values = [[value for value in row if value is not None] for row in costs]
     return [Column(heading, _cells(values, 0))] if any(values) else []
 
 
-def other_table(rows: Sequence[VariantRow]) -> MetricTable | None:
-    """Return the metrics of all other sizes and views; None when there are none."""
-    groups = [_group(rows, *one) for one in _measured(rows) if one != ("test", rows[0].downscale)]
-    return _table(rows, groups) if groups else None
+def other_tables(rows: Sequence[VariantRow]) -> list[MetricTable]:
+    """Return the metrics of all other sizes and views, a table per split, so that each fits on the page."""
+    by_split: dict[str, list[Group]] = {}
+    for split, downscale in _measured(rows):
+        if (split, downscale) != ("test", rows[0].downscale):
+            by_split.setdefault(split, []).append(_group(rows, split, downscale))
+    return [_table(rows, groups) for groups in by_split.values()]
 
 
 def downscales(rows: Sequence[VariantRow], split: str) -> list[str]:
-    """Return the divisors of the image sizes that any row was measured at, from full size down."""
-    found = {downscale for row in rows for downscale in row.downscales(split)}
-    return sorted(found, key=lambda text: (float(text), text))
+    """Return the divisors of the image sizes at which any row was measured, from full size down."""
+    divisors = {downscale for row in rows for downscale in row.downscales(split)}
+    return sorted(divisors, key=lambda text: (float(text), text))
 
 
 def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
-    """Return means over the scenes, for variants that ran on all of them; None when there is no such figure."""
+    """Return means over the scenes of variants that ran on all of them, or None if no metric has any."""
     scenes = list(comparison.scenes.values())
     everywhere = [[row for rows in scenes for row in rows if row.variant is v] for v in comparison.variants]
     complete = [rows for rows in everywhere if len(rows) == len(scenes)]
@@ -124,34 +129,34 @@ def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
 
 
 def differing_settings(variants: Sequence[Variant]) -> dict[str, list[str]]:
-    """Return the settings that are not the same in all variants: place -> values by variant."""
-    places = differing([variant.settings for variant in variants])
-    return {place: [variant.settings.get(place, "–") for variant in variants] for place in places}
+    """Return the settings that differ between variants: key path -> values by variant."""
+    key_paths = differing([variant.settings for variant in variants])
+    return {key_path: [variant.settings.get(key_path, "–") for variant in variants] for key_path in key_paths}
 
 
 def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
-    """Yield sentences about conditions that differ, so that figures of a column are not comparable."""
+    """Yield sentences about conditions that differ between runs, which makes the values of a column incomparable."""
     splits = [split for row in rows for run in row.runs for split in (run.metrics.test, run.metrics.train)]
     averages = [one for split in splits for one in split.values()]
     for key, name in CONDITIONS.items():
         values = {str(value) for one in averages if (value := getattr(one, key, None)) is not None}
         if len(values) > 1:
-            yield f"The {name} is not the same in all runs ({', '.join(sorted(values))})."
+            yield f"The {name} differs between runs ({', '.join(sorted(values))})."
     for split, downscale in _measured(rows):
-        found = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
-        counts = {one.color_views for one in found if one is not None and one.figure("psnr_color") is not None}
+        measured = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
+        counts = {one.color_views for one in measured if one is not None and one.figure("psnr_color") is not None}
         if len(counts) > 1:
             name = f"number of {_title(rows, split, downscale)} with a PSNR in the photographs' colors"
-            yield f"The {name} is not the same in all runs ({', '.join(map(str, sorted(counts)))})."
+            yield f"The {name} differs between runs ({', '.join(map(str, sorted(counts)))})."
 
 
 def _measured(rows: Sequence[VariantRow]) -> list[tuple[str, str]]:
-    """The splits and the divisors of the image sizes that any row was measured at."""
+    """Return the splits and size divisors at which any row was measured."""
     return [(split, downscale) for split in ("test", "train") for downscale in downscales(rows, split)]
 
 
 def _trained_on(rows: Sequence[VariantRow]) -> list[Group]:
-    """The test metrics at the training size, where they were measured."""
+    """Return the test metrics at the training size, if they were measured."""
     downscale = rows[0].downscale
     return [_group(rows, "test", downscale)] if downscale in downscales(rows, "test") else []
 
@@ -180,7 +185,7 @@ def _seeds(row: VariantRow) -> str:
 
 
 def _cells(values: Sequence[list[float]], digits: int, best: Callable[..., float] | None = None) -> list[TableCell]:
-    """A cell for each list of values; `best` of the means, as they are shown, is marked."""
+    """Return a cell per list of values; marks the best of the means, as rounded for display."""
     means = [round(fmean(row), digits) if row else None for row in values]
     present = [mean for mean in means if mean is not None]
     top = best(present) if best and len(present) > 1 else None
@@ -194,15 +199,15 @@ def _cell(values: list[float], mean: float | None, digits: int, best: bool) -> T
     return TableCell(f"{mean:,.{digits}f}", f"{deviation:,.{digits}f}" if deviation > 0 else "", best)
 
 
-# The charts of a comparison: quality and Gaussians over steps and CPU seconds, and quality over image sizes.
+# The charts: quality and Gaussians over steps and CPU seconds, and quality over image sizes.
 
-MOST_LINES = len(COLORS)  # that are told apart one by one
+MAX_LINES = len(COLORS)  # with more runs, a line per variant
 
 
 def curves(rows: Sequence[VariantRow]) -> list[Markup]:
-    """PSNR and Gaussians over steps, a line for each run, or, of many, for each variant; then quality over sizes."""
+    """Draw PSNR and Gaussians over steps, a line per run, or per variant if there are many runs; then over sizes."""
     downscale = rows[0].runs[0].scene.downscale
-    are_many = sum(len(row.runs) for row in rows) > MOST_LINES
+    are_many = sum(len(row.runs) for row in rows) > MAX_LINES
     means = " (means)" if are_many and any(len(row.runs) > 1 for row in rows) else ""
 
     def lines(points_of: Callable[[RunFolder], Points]) -> list[Line]:
@@ -217,7 +222,7 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
             Line(points, name, row.variant.color, i)
             for row in rows
             for i, (run, name) in enumerate(zip(row.runs, _names(row), strict=True))
-            if len(dict(points := points_of(run))) > 1  # steps: one is no line
+            if len(dict(points := points_of(run))) > 1  # a single step is no line
         ]
 
     def tested(run: RunFolder) -> Points:
@@ -237,12 +242,12 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
 
 
 def _mean(lines: Sequence[Points]) -> Points:
-    """The means of lines, point by point, as far as all go."""
+    """Return the mean of lines, point by point, up to the end of the shortest."""
     return [(fmean(x for x, _ in points), fmean(y for _, y in points)) for points in zip(*lines, strict=False)]
 
 
 def _names(row: VariantRow) -> list[str]:
-    """The names of a row's lines where it has several runs: their seeds, or the folders of runs with one seed."""
+    """Return names for the lines of a row with several runs: their seeds, or their folders if seeds repeat."""
     runs = row.runs
     if len(runs) == 1:
         return [""]
@@ -256,7 +261,7 @@ def _names(row: VariantRow) -> list[str]:
 
 
 def _size_charts(rows: Sequence[VariantRow], split: str) -> list[str]:
-    """PSNR and SSIM over image sizes, a line for each variant."""
+    """Draw PSNR and SSIM over image sizes, a line per variant."""
     sizes = downscales(rows, split)
     if len(sizes) < 2:
         return []
@@ -265,8 +270,8 @@ def _size_charts(rows: Sequence[VariantRow], split: str) -> list[str]:
     for metric, title in (("psnr", f"{split} PSNR by image size, dB"), ("ssim", f"{split} SSIM by image size")):
         lines = []
         for row in rows:
-            found = [(float(i), row.figures(split, size, metric)) for i, size in enumerate(sizes)]
-            lines.append(Line([(i, fmean(values)) for i, values in found if values], color=row.variant.color))
+            points = [(float(i), row.figures(split, size, metric)) for i, size in enumerate(sizes)]
+            lines.append(Line([(i, fmean(values)) for i, values in points if values], color=row.variant.color))
         drawings.append(curve(title, lines, ticks=ticks))
     return drawings
 
@@ -282,13 +287,12 @@ def write_comparison(
     remarks: Sequence[str] = (),
     published: Sequence[PublishedTable] = (),
 ) -> int:
-    """Write the page on some run folders; return the number of runs on it.  Raises what Comparison.read raises."""
+    """Write the page for run folders and return the number of runs.  Raises what `RunComparison.read` raises."""
     comparison = RunComparison.read(paths)
     faults = [fault for run in comparison.runs for fault in run.missing_plugins]
     for fault in faults:
         LOG.warning("%s", fault)
-    remarks = [*remarks, *faults]
-    write_text(out, comparison_page(comparison, title, remarks, out.parent, published))
+    write_text(out, comparison_page(comparison, title, [*remarks, *faults], out.parent, published))
     return len(comparison.runs)
 
 
@@ -299,7 +303,10 @@ def comparison_page(
     folder: Path,
     published: Sequence[PublishedTable] = (),
 ) -> str:
-    """Return the page for a folder; the default title is the names of the pipelines; `remarks` are at the top."""
+    """Return the page, with links relative to `folder` and `remarks` at the top.
+
+    title: by default the names of the pipelines.
+    """
     runs, scenes, variants = comparison.runs, comparison.scenes, comparison.variants
     names = list(dict.fromkeys(run.metrics.pipeline for run in runs))
     title = title or " · ".join([*names[:MAX_NAMES], *(["…"] if len(names) > MAX_NAMES else [])])
@@ -320,7 +327,7 @@ def comparison_page(
 
 
 def _links(run: RunFolder, folder: Path) -> dict[str, str]:
-    """The pages of a run, with their addresses from a folder."""
+    """Return the addresses of a run's pages, relative to a folder."""
     files = {stage: run.path / run.metrics.files.get(stage, "") for stage in ("report", "viewer")}
     return {
         stage: quote(Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix())
@@ -330,8 +337,8 @@ def _links(run: RunFolder, folder: Path) -> dict[str, str]:
 
 
 def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
-    """The section of the page about one scene."""
-    crops, no_crops = _pictures(rows)
+    """Return the values of the page's section about a scene."""
+    crops, no_crops = _crops(rows)
     several_seeds = any(len(row.runs) > 1 for row in rows)
     explanations = ["mean ± standard deviation over seeds"] if several_seeds else []
     return dict(
@@ -341,7 +348,7 @@ def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
         explanations=[*_sizes(rows[0].runs[0].scene), *explanations, *(["bold: the best"] if len(rows) > 1 else [])],
         remarks=list(differing_conditions(rows)),
         main=main_table(rows),
-        other=other_table(rows),
+        others=other_tables(rows),
         curves=curves(rows),
         crops=[_figure(crop) for crop in crops],
         no_crops=no_crops,
@@ -349,15 +356,15 @@ def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
 
 
 def _sizes(scene: SceneSettings) -> list[str]:
-    """What sizes mean, where the training did not see the photographs as they are, or saw several."""
+    """Explain image sizes if the training used others than full size, or several."""
     first, *more = (f"1/{downscale:g}" if downscale != 1 else "full size" for downscale in scene.downscales)
     if first == "full size" and not more:
         return []
-    return [f"sizes are shares of the photographs' own; trained at {', '.join([first, *more])}"]
+    return [f"sizes are relative to the original photographs; trained at {', '.join([first, *more])}"]
 
 
-def _pictures(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
-    """Crops of each row's first run, or why there are none, such as missing photographs."""
+def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
+    """Return crops of each row's first run, or the reason if there are none, such as missing photos."""
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene
     try:
@@ -367,11 +374,11 @@ def _pictures(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
         LOG.warning("no crops: %s", error)
         return [], str(error)
     crops = find_crops(runs, scene, background)
-    return crops, "" if crops else "there is no view that all runs rendered; add `- render` to the stages"
+    return crops, "" if crops else "no view was rendered by all runs; add `- render` to the stages"
 
 
 def _figure(crop: ImageCrop) -> dict[str, Any]:
-    """The crop for the page, with images as data URLs; PNG keeps every bit of its squares."""
+    """Return the crop for the page, with images as data URLs; the squares are PNG, which is lossless."""
     return dict(
         view=crop.view,
         overview=data_url(crop.overview),
