@@ -39,6 +39,20 @@ from yaml_examples import example, fields_of  # noqa: E402
 pytestmark = pytest.mark.slow
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+HOW_TO = (
+    *(
+        "photographs",
+        "difficult_captures",
+        "troubleshooting",
+        "install",
+        "runs",
+        "growth",
+        "compression",
+        "lod",
+        "blocks",
+    ),
+    *("formats", "viewer", "video", "live"),
+)
 NAMED = [(base, kind) for base, kinds in families().items() for kind in kinds]
 
 
@@ -119,6 +133,13 @@ def test_every_page_is_in_the_navigation():
     written = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
     assert set(shown) == written | reference_pages().keys() | other_pages().keys()
     assert len(shown) == len(set(shown))
+
+
+def test_how_to_pages_are_short_and_have_no_measurements():
+    for name in HOW_TO:
+        text = text_of(ROOT / "docs" / f"{name}.md")
+        assert len(text.split()) <= 900, f"{name}: {len(text.split())} words"
+        assert not re.findall(r"^\|.*\d dB.*$", text, re.M), f"{name}: measurements belong in docs/results"
 
 
 def test_the_navigation_has_at_most_seven_groups():
