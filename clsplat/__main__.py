@@ -1,11 +1,11 @@
 """The command `clsplat`, also as `python -m clsplat`."""
 
-from clsplat.core.signals import end_at_once_on_signals
+from clsplat.core.signals import exit_on_signals
 
 
 def main() -> None:
     """Run the command line; a signal that comes while it is imported ends it as one that comes later."""
-    end_at_once_on_signals()
+    exit_on_signals()
     from clsplat.cli import main as command_line
 
     command_line()

@@ -40,7 +40,7 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
     made = Manifest(target)
     for number, (view, source) in enumerate(zip(views, sources, strict=True), 1):
         path = target / Path(view.name).with_suffix(".png")
-        if made.is_due(path, hash_values(view.image_path, threshold) if source is None else hash_values(source)):
+        if made.needs_writing(path, hash_values(view.image_path, threshold) if source is None else hash_values(source)):
             white = _from_alpha(view, threshold) if source is None else _from_file(view, source)
             write_image(path, np.repeat(np.where(white, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
             written += 1

@@ -33,7 +33,11 @@ def system() -> dict[str, Any]:
 def code_variables() -> dict[str, str]:
     """Return the variables with which compilers and runtimes may make other code of the same kernels."""
     found = _variables(CODE)
-    return {name: value for name, value in found.items() if not name.startswith(CACHES) and name not in machine.LIMITS}
+    return {
+        name: value
+        for name, value in found.items()
+        if not name.startswith(CACHES) and name not in machine.THREAD_VARIABLES
+    }
 
 
 def _variables(prefixes: tuple[str, ...]) -> dict[str, str]:

@@ -33,7 +33,7 @@ _own: set[Path] = set()  # marks of this process
 
 def begin(records: Sequence[Path]) -> None:
     """Mark the records of a device as in use by this process, until it ends in an orderly way."""
-    folder, owner = records[0].parent.parent / FOLDER, Owner.this()
+    folder, owner = records[0].parent.parent / FOLDER, Owner.current()
     place = hashlib.sha256(repr(owner).encode()).hexdigest()[:8]  # containers with one cache have equal numbers
     mark = folder / f"{owner.process}-{place}-{records[0].name}.json"
     if mark not in _own:
@@ -50,7 +50,7 @@ def forget_after_sudden_ends(cache: Path) -> None:
             values = read_json(mark)
         except DataError:
             continue
-        owner = Owner.named_by(values) if isinstance(values, dict) else None
+        owner = Owner.from_record(values) if isinstance(values, dict) else None
         # the first process of every container has the same number
         if owner is not None and (owner.process == os.getpid() or owner.has_ended):
             with suppress(OSError):

@@ -28,58 +28,58 @@ from clsplat.core.reading import read_json
 # Who holds a folder: what the file of its lock says, and what is told of it.
 
 LOG = logging.getLogger("clsplat")
-BEHIND_THE_TEXT = 1 << 20  # bytes: Windows locks a byte for readers too, and this one is not read
+LOCK_OFFSET = 1 << 20  # bytes: Windows locks a byte for readers too, and this one is not read
 
 
-def own_text() -> str:
+def owner_record() -> str:
     """What the file says of this process."""
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    return json.dumps({**asdict(Owner.this()), "time": time.time(), "command": command})
+    return json.dumps({**asdict(Owner.current()), "time": time.time(), "command": command})
 
 
-def read(file: io.FileIO) -> dict[str, Any]:
+def read_owner(file: io.FileIO) -> dict[str, Any]:
     """Who the file names; nobody where it is empty or damaged."""
     try:
         file.seek(0)
-        owner = json.loads(file.read(BEHIND_THE_TEXT))
+        owner = json.loads(file.read(LOCK_OFFSET))
     except (OSError, ValueError, RecursionError):
         return {}
     return owner if isinstance(owner, dict) else {}
 
 
-def require_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
+def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
     """Who the file names, where that is a process of another machine, whose locks may not reach this one; else {}.
 
     Machines may have the same name: where the systems say which start they are of, that counts.
     Raises OutputError where the run's status beside the file shows that it goes on.
     """
-    owner = read(file)
-    named, this = Owner.named_by(owner), Owner.this()
+    owner = read_owner(file)
+    named, this = Owner.from_record(owner), Owner.current()
     if named is None or (named.boot == this.boot if owner.get("boot") and this.boot else named.host == this.host):
         return {}
     beat = _heartbeat(path)
     if beat is not None and (silent := time.time() - beat) < HEARTBEAT_TIMEOUT:
         raise OutputError(
-            f"{in_use(folder, owner)}; its heartbeat is {max(0, silent):.0f} s old, though the lock is free here: "
+            f"{in_use_message(folder, owner)}; its heartbeat is {max(0, silent):.0f} s old, though the lock is free here: "
             f"if that process has ended, wait for a minute, or remove {path}"
         )
     return owner
 
 
-def until_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Do as `require_silent`, but wait for the next heartbeat: where none comes in time, the process has ended.
+def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
+    """Do as `require_stale_heartbeat`, but wait for the next heartbeat: where none comes in time, the process has ended.
 
     That it comes counts, not its time: the clocks of two machines may differ.
     """
     beat, end, told = _heartbeat(path), time.monotonic() + HEARTBEAT_TIMEOUT, False
     while True:
         try:
-            return require_silent(file, path, folder)
+            return require_stale_heartbeat(file, path, folder)
         except OutputError:
             if _heartbeat(path) != beat:
                 raise
             if time.monotonic() >= end:
-                return read(file)
+                return read_owner(file)
             if not told:
                 told = True
                 LOG.info("%s: was in use elsewhere just now; waiting for its heartbeat, a minute at most", folder)
@@ -89,15 +89,15 @@ def until_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
 def _heartbeat(path: Path) -> float | None:
     """When the status beside a lock was written, in seconds since 1970; None where there is none, or the run ended."""
     with suppress(DataError, AttributeError, KeyError, TypeError, ValueError):
-        status = read_json(path.with_name(STATUS), limit=BEHIND_THE_TEXT)
+        status = read_json(path.with_name(STATUS), limit=LOCK_OFFSET)
         return None if status.get("state") in END_STATES else float(status["time"])
     return None
 
 
-def lost(path: Path, folder: Path) -> str:
+def lost_lock_message(path: Path, folder: Path) -> str:
     """What to tell of a lock whose file is no longer at its path."""
     try:
-        owner = read_json(path, limit=BEHIND_THE_TEXT)
+        owner = read_json(path, limit=LOCK_OFFSET)
         by = f", and process {owner['process']} on {owner['host']} holds it now"
     except (DataError, KeyError, TypeError):
         by = ""
@@ -107,7 +107,7 @@ def lost(path: Path, folder: Path) -> str:
     )
 
 
-def in_use(folder: Path, owner: dict[str, Any]) -> str:
+def in_use_message(folder: Path, owner: dict[str, Any]) -> str:
     if not owner:
         return f"{folder}: is in use by another process"
     try:
@@ -120,7 +120,7 @@ def in_use(folder: Path, owner: dict[str, Any]) -> str:
     )
 
 
-HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # what the systems answer for a lock that another holds
+LOCK_TAKEN = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # what the systems answer for a lock that another holds
 NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
 _held: set[Path] = set()  # by this process, or being locked by it
 _reserving = threading.Lock()
@@ -141,7 +141,7 @@ def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[],
         def require_held() -> None:
             with suppress(OSError):  # whoever writes there is told of that
                 if not file.closed and not _is_at(file, path):
-                    raise OutputError(lost(path, folder))
+                    raise OutputError(lost_lock_message(path, folder))
 
         try:
             yield require_held
@@ -176,14 +176,14 @@ def check_free(folder: Path) -> bool:
     with raising_output_error(path), suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
         try:
             if not _system_lock(file):
-                raise OutputError(in_use(folder, read(file)))
+                raise OutputError(in_use_message(folder, read_owner(file)))
         except OSError as error:
             if error.errno not in NO_LOCKS:
                 raise
             _ended_owner(file, path, folder)
             return True
         try:
-            require_silent(file, path, folder)
+            require_stale_heartbeat(file, path, folder)
         except OutputError:
             return False
     return True
@@ -213,7 +213,7 @@ def _locked(path: Path, folder: Path) -> io.FileIO:
             if _is_ours(file, is_new, path, folder):
                 file.seek(0)
                 file.truncate()
-                file.write(own_text().encode())
+                file.write(owner_record().encode())
                 return file
         except BaseException:
             file.close()
@@ -234,10 +234,10 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
     """Lock the file; False where it is no longer the one at its path.  Where there are no locks, its maker holds it."""
     try:
         if not _system_lock(file):
-            raise OutputError(in_use(folder, read(file)))
+            raise OutputError(in_use_message(folder, read_owner(file)))
         if not _is_at(file, path):
             return False
-        if not is_new and (owner := until_silent(file, path, folder)):
+        if not is_new and (owner := wait_for_stale_heartbeat(file, path, folder)):
             LOG.info("%s: taken over from process %s on %s", folder, owner.get("process"), owner.get("host"))
             with suppress(PermissionError):  # Windows renames no open file
                 _remove(file, path)  # so that the one before notices, where it goes on after all
@@ -257,10 +257,10 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
 
 def _ended_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
     """Who the file names, where there are no locks.  Raises OutputError unless that process has ended."""
-    owner = read(file)
-    if not _has_ended(Owner.named_by(owner)):
+    owner = read_owner(file)
+    if not _has_ended(Owner.from_record(owner)):
         raise OutputError(
-            f"{in_use(folder, owner)}; this file system knows no locks: if that process has ended, remove {path}"
+            f"{in_use_message(folder, owner)}; this file system knows no locks: if that process has ended, remove {path}"
         )
     return owner
 
@@ -284,7 +284,7 @@ def _system_lock(file: io.FileIO) -> bool:
         if os.name == "nt":
             import msvcrt
 
-            file.seek(BEHIND_THE_TEXT)
+            file.seek(LOCK_OFFSET)
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
         else:
             import fcntl
@@ -293,7 +293,7 @@ def _system_lock(file: io.FileIO) -> bool:
     except ImportError as error:
         raise OSError(errno.ENOSYS, "no locks") from error
     except OSError as error:
-        if error.errno not in HELD:
+        if error.errno not in LOCK_TAKEN:
             raise
         return False
     return True
@@ -308,4 +308,4 @@ def _is_at(file: io.FileIO, path: Path) -> bool:
 
 
 def _has_ended(owner: Owner | None) -> bool:
-    return owner is not None and (owner == Owner.this() or owner.has_ended)  # this process does not hold it
+    return owner is not None and (owner == Owner.current() or owner.has_ended)  # this process does not hold it

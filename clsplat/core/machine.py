@@ -101,7 +101,7 @@ def _private(folder: Path) -> bool:
 
 # The cores of this machine: which a process may use, and how another one is kept to some of them.
 
-LIMITS = (  # variables by which a runtime is told how many threads to start
+THREAD_VARIABLES = (  # variables by which a runtime is told how many threads to start
     "POCL_MAX_PTHREAD_COUNT",  # PoCL before 4
     "POCL_CPU_MAX_CU_COUNT",  # PoCL from 4 on
     "CL_CONFIG_CPU_TBB_NUM_WORKERS",  # Intel's
@@ -127,7 +127,7 @@ def split_cores(cores: Cores, processes: int) -> list[tuple[int, ...]]:
 
 def limited_environment(cores: Cores, variables: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Return the environment of a process that is kept to these cores: as many threads."""
-    return {**variables, **dict.fromkeys(LIMITS, str(len(cores)))}
+    return {**variables, **dict.fromkeys(THREAD_VARIABLES, str(len(cores)))}
 
 
 def pin_to_cores(cores: Cores, process: int = 0) -> None:
@@ -154,28 +154,28 @@ class Owner:
     boot: str | None  # of Linux: another after each start of the machine, and the same in all its containers
 
     @classmethod
-    def this(cls) -> "Owner":
+    def current(cls) -> "Owner":
         """Return this process."""
         return cls(os.getpid(), platform.node(), _pid_namespace(), _boot())
 
     @classmethod
-    def named_by(cls, values: Mapping[str, Any]) -> "Owner | None":
+    def from_record(cls, values: Mapping[str, Any]) -> "Owner | None":
         """Return the process that a file names, or None; what an older file does not say is as here."""
-        process, this = values.get("process"), cls.this()
+        process, this = values.get("process"), cls.current()
         if type(process) is not int or process <= 0:
             return None
         host, namespace = values.get("host", this.host), values.get("pid_namespace") or this.pid_namespace
         return cls(process, host, namespace, values.get("boot") or this.boot)
 
     @property
-    def host_word(self) -> str:
+    def host_slug(self) -> str:
         """The host as a part of a file's name."""
         return re.sub(r"[^0-9A-Za-z-]", "_", self.host) or "host"
 
     @property
-    def is_here(self) -> bool:
+    def is_local(self) -> bool:
         """Whether its number counts here."""
-        return replace(self, process=os.getpid()) == Owner.this()
+        return replace(self, process=os.getpid()) == Owner.current()
 
     @property
     def has_ended(self) -> bool:
@@ -183,9 +183,11 @@ class Owner:
 
         One of another boot has, where the host is a machine: containers of one name may be on two of them.
         """
-        if self.is_here:
+        if self.is_local:
             return not is_alive(self.process)
-        return replace(self, boot=_boot()).is_here and self.pid_namespace == FIRST_PID_NAMESPACE and _boot() is not None
+        return (
+            replace(self, boot=_boot()).is_local and self.pid_namespace == FIRST_PID_NAMESPACE and _boot() is not None
+        )
 
 
 def _pid_namespace() -> str | None:

@@ -8,7 +8,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.files import append, make_folder, write_error
 from clsplat.core.reading import read_file, sha256
 
-RECORD = ".made.jsonl"
+RECORD = ".manifest.jsonl"
 
 
 class Manifest:
@@ -28,11 +28,11 @@ class Manifest:
             except (ValueError, TypeError, KeyError):
                 continue  # cut short
 
-    def knows(self, path: Path) -> bool:
+    def lists(self, path: Path) -> bool:
         """Return whether a tool has made this file, or was about to."""
         return self._name(path) in self._sources
 
-    def is_due(self, path: Path, source: str, *beside: Path) -> bool:
+    def needs_writing(self, path: Path, source: str, *beside: Path) -> bool:
         """Return whether a file must be written: it is not there, or was made from something else.
 
         Then it is removed, with the files `beside` it that are written first, and noted.  A file that no tool has made
@@ -53,9 +53,9 @@ class Manifest:
         self._sources[name] = source
         return True
 
-    def require_own(self, path: Path) -> None:
+    def require_listed(self, path: Path) -> None:
         """Raise DataError when a file exists that no tool has made."""
-        if path.is_file() and not self.knows(path):
+        if path.is_file() and not self.lists(path):
             raise DataError(f"{path}: exists, and was not made from this scene; give another folder, or remove it")
 
     def _name(self, path: Path) -> str:

@@ -179,7 +179,7 @@ class Bounded:
 
 NonNegative = Annotated[Schedule, AfterValidator(Bounded(0))]
 Positive = Annotated[Schedule, AfterValidator(Bounded(0, above=True))]
-Probability = Annotated[Schedule, AfterValidator(Bounded(0, most=0.9))]
+Probability = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.9))]
 AtLeastOne = Annotated[Schedule, AfterValidator(Bounded(1))]
 
 

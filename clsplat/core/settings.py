@@ -51,7 +51,7 @@ class Settings(BaseModel):
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
         Settings.defined.append(cls)
 
-    def known_as(self) -> set[str]:
+    def conflict_names(self) -> set[str]:
         """Return the names by which the `conflicts` of others mean it."""
         return {self.family, *(str(getattr(self, tag)) for tag in TAGS if tag in type(self).model_fields)}
 
@@ -59,14 +59,14 @@ class Settings(BaseModel):
         """Return its `conflicts`, as its values make them."""
         return self.conflicts
 
-    def check_with(self, pipeline: Any) -> None:
+    def check_pipeline(self, pipeline: Any) -> None:
         """Raise ConfigError where the pipeline file around it (PipelineFile) lacks what it needs."""
 
     def parts(self) -> dict[str, Any]:
         """Return its values by key, without those that do not count."""
         return {key: getattr(self, key) for key in type(self).model_fields}
 
-    def place_of(self, key: str, scene: str | None) -> Path | None:
+    def input_path(self, key: str, scene: str | None) -> Path | None:
         """Return the file or folder that is read where a key names one, else None.  scene: folder of the dataset."""
         value = getattr(self, key)
         return Path(value) if isinstance(value, str) and is_input_path(type(self), key) else None

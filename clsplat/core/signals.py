@@ -34,7 +34,7 @@ class _Received:
 _received = _Received()
 
 
-def end_at_once_on_signals() -> None:
+def exit_on_signals() -> None:
     """Let a signal end the process with its sentence and code, from here on where no block says what else to do.
 
     It is for the start, before anything is written: the import of an extension turns KeyboardInterrupt into an abort,

@@ -27,7 +27,7 @@ ERRORS = Console(file=signals.STDERR, highlight=False, soft_wrap=True)  # type: 
 _bars: list[Live] = []  # that are drawn
 
 
-class WatchedStatus(Protocol):
+class StatusSource(Protocol):
     """The status of a run: `now` holds stage, progress (done, total, unit), step and steps."""
 
     @property
@@ -160,7 +160,7 @@ def device_text(device: dict[str, Any]) -> str:
 
 
 @contextmanager
-def progress_bar(status: WatchedStatus) -> Iterator[Callable[[TrainingProgress], None]]:
+def progress_bar(status: StatusSource) -> Iterator[Callable[[TrainingProgress], None]]:
     """Yield a function that shows reports; between them a terminal shows what `status` counts."""
     if not CONSOLE.is_terminal:
         yield lambda progress: LOG.info(progress_line(progress))
@@ -190,7 +190,7 @@ def counts_on_terminal() -> Iterator[None]:
 class _RunBar:
     """The bar of a run, made of its status as often as it is drawn: the training waits for nothing."""
 
-    def __init__(self, status: WatchedStatus) -> None:
+    def __init__(self, status: StatusSource) -> None:
         self.status, self.bar = status, _new_bar()
         self.task = self.bar.add_task("", total=None)
         self.last: tuple[float, TrainingProgress] | None = None  # report, and when

@@ -122,7 +122,7 @@ class RasterizerSettings(Settings):
     launch_tiles: Annotated[int, Field(ge=0)] = 0
     """Number of tiles of one launch, for devices whose display limits its time; 0: all."""
 
-    def known_as(self) -> set[str]:
+    def conflict_names(self) -> set[str]:
         return {ON_HOST} if self.harmonics == "host" else set()
 
     def budget(self) -> RenderLimits | None:
@@ -173,11 +173,11 @@ class PipelineFile(Settings):
         """Raise ConfigError for the first settings that do not go together, as their classes say."""
         found = list(iter_settings(self))
         for place, one in found:
-            one.check_with(self)
+            one.check_pipeline(self)
             for name, why in one.excluded().items():
                 for other, rival in found:
                     apart = other.startswith("stages[") and other.partition(".")[0] != place.partition(".")[0]
-                    if name in rival.known_as() and not apart:
+                    if name in rival.conflict_names() and not apart:
                         own = getattr(one, "type", getattr(one, "stage", place))
                         remedy = "" if ";" in why else "; leave one of them out"
                         raise ConfigError(f"{place}: '{own}' does not go together with {name} ({other}): {why}{remedy}")

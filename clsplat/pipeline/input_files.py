@@ -98,7 +98,7 @@ def _changed(value: Any, scene: str | None, change: Change) -> Any:
     if isinstance(value, Settings):
         changes = {}
         for key in type(value).model_fields:
-            before, place = getattr(value, key), value.place_of(key, scene)
+            before, place = getattr(value, key), value.input_path(key, scene)
             changes[key] = _changed(before, scene, change) if place is None else change(before, place)
         return value.model_copy(update=changes)
     if isinstance(value, list | tuple):

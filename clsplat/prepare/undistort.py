@@ -23,20 +23,20 @@ Blank = Literal["crop", "mask"]
 def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank: Blank = "crop") -> int:
     """Write a COLMAP scene of pinhole cameras into `out`; return the number of its images.
 
-    Photographs larger than `long_side` px are made smaller.  `blank: crop` keeps the largest part of a photograph
+    Photographs larger than `long_side` px are reduced.  `blank: crop` keeps the largest part of a photograph
     without blank pixels; `mask` keeps all of it, with masks of blank pixels.  Images that an earlier call has made of
     the same photographs with the same settings stay unchanged.
     Raises DataError when the scene cannot be read, or when an image in `out` has another origin.
     """
     scene = read_scene(source, holdout=0)
-    names, made = _png_names([view.name for view in scene.views]), Manifest(out)
+    names, manifest = _png_names([view.name for view in scene.views]), Manifest(out)
     for name in names:
-        made.require_own(out / "images" / name)
+        manifest.require_listed(out / "images" / name)
     views, count = [], Count("photographs undistorted", len(names))
     for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
         pinhole_view = replace(_sized(_shown(view, blank), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
-        if made.is_due(image, _source(pinhole_view), mask):
+        if manifest.needs_writing(image, _source(pinhole_view), mask):
             counts = load_mask(pinhole_view)
             if counts is not None and not counts.all():
                 write_image(mask, np.repeat(np.where(counts, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))

@@ -212,7 +212,7 @@ def undistorted_folder(out: Path) -> Path:
     tell processes of one host apart.
     """
     shared = out.absolute().parent / UNDISTORTED
-    return shared / Owner.this().host_word if shared.is_symlink() and shared.is_dir() else out / UNDISTORTED
+    return shared / Owner.current().host_slug if shared.is_symlink() and shared.is_dir() else out / UNDISTORTED
 
 
 def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:

@@ -120,7 +120,7 @@ def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path]
     folder = out.resolve()
     if outside := [path for path in files if not path.resolve().is_relative_to(folder)]:
         raise ConfigError(f"{outside[0]}: a link leads outside of the run folder; remove it, or choose another name")
-    own = EARLY_RUN_FILES if Owner.named_by(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
+    own = EARLY_RUN_FILES if Owner.from_record(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
     left = {out / name for name in own}  # by a run that has not begun
     for path in files if state.phase < Phase.BEGUN else ():
         if path not in left and (path.is_file() or (path.is_dir() and any(path.iterdir()))):

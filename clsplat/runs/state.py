@@ -55,7 +55,7 @@ class RunState:
     def phase(self) -> Phase:
         """How far the run is."""
         has_begun = PIPELINE in self.names or self.checkpoints or (self.status and self.sums is not None)
-        if self.status.get("state") == "done" and (has_begun or Owner.named_by(self.status)):
+        if self.status.get("state") == "done" and (has_begun or Owner.from_record(self.status)):
             return Phase.DONE
         if not has_begun:
             return Phase.PREPARING if STATUS in self.names else Phase.EMPTY
@@ -65,7 +65,7 @@ class RunState:
     @property
     def state_name(self) -> str:
         """The state as status.json names it; `killed` where its process has ended without a word."""
-        owner = Owner.named_by(self.status) if self.status.get("state") not in END_STATES else None
+        owner = Owner.from_record(self.status) if self.status.get("state") not in END_STATES else None
         return "killed" if owner and owner.has_ended else str(self.status.get("state", "unknown"))
 
     @cached_property

@@ -128,8 +128,8 @@ def _figures(values: dict[str, Any], names: tuple[str, ...]) -> str:
 
 
 def _place(status: dict[str, Any]) -> str:
-    owner = Owner.named_by(status)
-    elsewhere = owner is not None and not owner.is_here
+    owner = Owner.from_record(status)
+    elsewhere = owner is not None and not owner.is_local
     return f"; it runs on {status.get('host')}" if elsewhere else f"; process {status.get('process')}"
 
 

@@ -75,8 +75,8 @@ class Choice(Settings):
             raise ValueError(f"expected an offset below every, {self.every}")
         return self
 
-    def place_of(self, key: str, scene: str | None) -> Path | None:
-        place = super().place_of(key, scene)
+    def input_path(self, key: str, scene: str | None) -> Path | None:
+        place = super().input_path(key, scene)
         return place and Path(scene or "") / place
 
     def of(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:

@@ -107,7 +107,7 @@ class Keeping(Training):
         if run.stage_step == 0:
             run.best, run.best_tables = None, {}
 
-    def check_with(self, pipeline: Any) -> None:
+    def check_pipeline(self, pipeline: Any) -> None:
         if self.keep == "best" and pipeline.scene.validation == 0:
             raise ConfigError("optimize.keep: best chooses by validation views; expected scene.validation: auto")
         trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]

@@ -134,8 +134,8 @@ class Video(Stage):
     def _of_a_video(cls, size: str | None) -> str | None:
         return None if size is None else size_of(size)
 
-    def place_of(self, key: str, scene: str | None) -> Path | None:
-        return None if key == "path" and not self._wish().of_a_file else super().place_of(key, scene)
+    def input_path(self, key: str, scene: str | None) -> Path | None:
+        return None if key == "path" and not self._wish().of_a_file else super().input_path(key, scene)
 
     def _wish(self) -> Wish:
         return Wish.of(self.path, self.frames, self.fps, self.size, self.times)

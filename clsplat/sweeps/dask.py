@@ -267,7 +267,7 @@ def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
     """
     if execution.tls:
         require_certificates(execution.tls)  # before a device is proved, which takes a while
-    found = places(Owner.this().host, list(devices) if devices is not None else None)
+    found = places(Owner.current().host, list(devices) if devices is not None else None)
     for place in found:
         LOG.info("offers %s, bits:%s", place.text, place.bits)
     warn_of_open_port(execution)

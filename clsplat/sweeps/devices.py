@@ -112,7 +112,7 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 
     Raises DeviceError where it fails.
     """
-    key = hash_values(Owner.this().host, info.text, info.driver, code_digest(), shipped()[PIPELINE])
+    key = hash_values(Owner.current().host, info.text, info.driver, code_digest(), shipped()[PIPELINE])
     note = cache_folder() / "bits" / f"{key[:16]}.json"
     with suppress(DataError):
         found = read_json(note)

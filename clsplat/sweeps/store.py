@@ -120,7 +120,7 @@ class CellAttempt:
 
     def take_lease(self, worker: str, since: float) -> None:
         """Say who works here.  since: when its caller began, by the clock of the store.  Raises OutputError."""
-        self._values = {**asdict(Owner.this()), "worker": worker, "since": since, "begun": time.time()}
+        self._values = {**asdict(Owner.current()), "worker": worker, "since": since, "begun": time.time()}
         self._write()
 
     def beat(self) -> None:
@@ -407,8 +407,8 @@ class Store:
 
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
-        owner = Owner.this()
-        self._own = f"{owner.host_word}-{owner.process}"
+        owner = Owner.current()
+        self._own = f"{owner.host_slug}-{owner.process}"
 
     @classmethod
     def opened(cls, root: Path) -> "Store":

@@ -16,7 +16,7 @@ from clsplat.opencl.device import Array, constants
 LONGEST = 15.0  # log of a duration: nothing changes beyond it
 FAR = 3.0e38  # a bound beyond all values
 IN_EXTENTS = ("velocity", "acceleration", "jerk")
-Rate = Annotated[Schedule, AfterValidator(Bounded(0, most=100.0))]
+Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=100.0))]
 
 
 class MotionRates(Settings):

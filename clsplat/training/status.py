@@ -143,7 +143,7 @@ class StatusFile:
             format=FORMAT,
             state="starting",
             version=full_version(),
-            **asdict(Owner.this()),
+            **asdict(Owner.current()),
             started=now,
             changed=now,
             time=now,

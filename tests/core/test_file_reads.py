@@ -125,8 +125,8 @@ def test_a_pipe_is_refused_at_once(name, pipe):
 
 def test_records_of_ours_that_are_pipes_count_as_missing(pipe, tmp_path, monkeypatch, caplog):
     with failing("the reader waits", seconds=20):
-        pipe.rename(tmp_path / ".made.jsonl")
-        assert not Manifest(tmp_path).knows(tmp_path / "x.png")
+        pipe.rename(tmp_path / ".manifest.jsonl")
+        assert not Manifest(tmp_path).lists(tmp_path / "x.png")
         os.mkfifo(tmp_path / "known.txt")
         monkeypatch.setattr(identity, "cache_folder", lambda: tmp_path)
         (tmp_path / "decoded").mkdir()

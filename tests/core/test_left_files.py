@@ -179,10 +179,10 @@ def test_photograph_model_is_synced_before_it_is_renamed(tmp_path, calls):
 
 @has_proc
 def test_a_line_of_a_tool_is_on_the_disk_before_its_file_is_made(tmp_path, calls):
-    assert Manifest(tmp_path / "frames").is_due(tmp_path / "frames" / "a.png", "x")
+    assert Manifest(tmp_path / "frames").needs_writing(tmp_path / "frames" / "a.png", "x")
     assert calls == [("sync", tmp_path.name), ("sync", RECORD_OF_A_TOOL), ("sync", "frames")]
     calls.clear()
-    assert Manifest(tmp_path / "frames").is_due(tmp_path / "frames" / "b.png", "x")
+    assert Manifest(tmp_path / "frames").needs_writing(tmp_path / "frames" / "b.png", "x")
     assert calls == [("sync", RECORD_OF_A_TOOL)]
 
 

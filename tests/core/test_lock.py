@@ -240,7 +240,7 @@ def test_a_folder_that_another_thread_is_locking_is_held(tmp_path, monkeypatch):
 
 ELSEWHERE = {"process": 7, "host": "another", "boot": "of another", "time": 0.0, "command": "clsplat run"}
 FRESH = {"state": "running", "time": 2.0}
-known_boot = pytest.mark.skipif(Owner.this().boot is None, reason="the system does not say which start this is")
+known_boot = pytest.mark.skipif(Owner.current().boot is None, reason="the system does not say which start this is")
 
 
 @pytest.mark.parametrize(
@@ -298,7 +298,7 @@ def test_run_silent_for_a_minute_is_taken_over_by_any_clock(ahead, tmp_path, mon
         ({}, {"state": "running"}),
         ({}, ["running"]),
         ({}, None),
-        pytest.param({"boot": Owner.this().boot}, FRESH, marks=known_boot),
+        pytest.param({"boot": Owner.current().boot}, FRESH, marks=known_boot),
     ],
     ids=["ended", "silent", "without a time", "damaged", "no status", "in a container here"],
 )
@@ -319,9 +319,11 @@ def test_lock_of_a_run_that_ended_elsewhere_is_taken_over(owner, status, tmp_pat
 def test_a_run_that_was_silent_and_goes_on_notices_who_took_over(tmp_path, monkeypatch):
     """As one that was suspended for a minute, where locks count on each machine alone."""
     monkeypatch.setattr(lock, "_system_lock", lambda file: True)
-    own = lock.own_text
+    own = lock.owner_record
     with monkeypatch.context() as patch:
-        patch.setattr(lock, "own_text", lambda: json.dumps({**json.loads(own()), "host": "another", "boot": "another"}))
+        patch.setattr(
+            lock, "owner_record", lambda: json.dumps({**json.loads(own()), "host": "another", "boot": "another"})
+        )
         first = lock.lock_folder(tmp_path)
         require_held = first.__enter__()
     (tmp_path / "status.json").write_text(json.dumps({"state": "running", "time": time.time() - 61}))

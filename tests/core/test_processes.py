@@ -11,15 +11,15 @@ from clsplat.core.machine import Owner
 
 
 def test_a_number_counts_in_its_own_namespace(monkeypatch):
-    this = Owner.this()
-    assert this.is_here
+    this = Owner.current()
+    assert this.is_local
     assert not this.has_ended
-    assert Owner.named_by(asdict(this)) == this
-    assert Owner.named_by({"process": this.process}) == this, "an older file says no more"
+    assert Owner.from_record(asdict(this)) == this
+    assert Owner.from_record({"process": this.process}) == this, "an older file says no more"
     for elsewhere in ({"host": "another"}, {"pid_namespace": "pid:[1]"}):
         monkeypatch.setattr(machine, "is_alive", lambda process: False)
         other = replace(this, **elsewhere)
-        assert not other.is_here
+        assert not other.is_local
         assert not other.has_ended, "nothing is known of it"
     assert this.has_ended
 
@@ -31,21 +31,21 @@ def test_a_process_before_the_machine_started_again_has_ended(monkeypatch, tmp_p
     for namespace, ended in ((machine.FIRST_PID_NAMESPACE, True), ("pid:[4026532000]", False), (None, False)):
         monkeypatch.setattr(machine, "_pid_namespace", lambda namespace=namespace: namespace)
         boot.write_text("first\n")
-        before = Owner.this()
-        assert (before.boot, before.is_here, before.has_ended) == ("first", True, False)
+        before = Owner.current()
+        assert (before.boot, before.is_local, before.has_ended) == ("first", True, False)
         boot.write_text("second\n")
-        assert (before.is_here, before.has_ended) == (False, ended)
+        assert (before.is_local, before.has_ended) == (False, ended)
         assert not replace(before, host="another").has_ended
         older = {key: value for key, value in asdict(before).items() if key != "boot"}
-        assert Owner.named_by(older) == Owner.this(), "an older file does not say"
+        assert Owner.from_record(older) == Owner.current(), "an older file does not say"
         boot.unlink()
-        assert Owner.this().boot is None
+        assert Owner.current().boot is None
         assert not before.has_ended, "nothing is known of it"
 
 
 @pytest.mark.parametrize("process", [None, "7", 7.0, True, 0, -1])
 def test_a_file_that_names_no_process_has_no_owner(process):
-    assert Owner.named_by({"process": process, "host": "a"}) is None
+    assert Owner.from_record({"process": process, "host": "a"}) is None
 
 
 class Function:

@@ -74,8 +74,8 @@ def test_a_list_of_names_is_the_one_in_the_folder_of_the_dataset(tiny_scene, tmp
 def test_the_name_of_a_camera_path_is_no_file(tmp_path, monkeypatch):
     write(tmp_path / "ellipse", "a file of that name")
     monkeypatch.chdir(tmp_path)
-    assert Video().place_of("path", None) is None
-    assert Video(path="mine.json").place_of("path", None) == Path("mine.json")
+    assert Video().input_path("path", None) is None
+    assert Video(path="mine.json").input_path("path", None) == Path("mine.json")
 
 
 def test_a_sweep_names_its_cells_as_they_are_named_here(tiny_scene, store, tmp_path):

@@ -27,9 +27,9 @@ def test_cores_are_shared_in_equal_parts_of_neighbors():
 
 def test_threads_match_cores_and_devices_need_no_second_check(monkeypatch):
     found = machine.limited_environment((3, 4), {"a": "b"})
-    assert found == {"a": "b", **dict.fromkeys(machine.LIMITS, "2")}
+    assert found == {"a": "b", **dict.fromkeys(machine.THREAD_VARIABLES, "2")}
     before = code_variables()
-    for name in machine.LIMITS:
+    for name in machine.THREAD_VARIABLES:
         monkeypatch.setenv(name, "1")
     assert code_variables() == before
 

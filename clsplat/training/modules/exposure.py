@@ -42,7 +42,7 @@ SUMS = int(constants("colors.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
 FEW_VISITS = 400  # of a photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
 MOST = 5e-2  # learning rate
-Rate = Annotated[Schedule, AfterValidator(Bounded(0, most=0.5))]  # Adam's steps are as long: a gain of 1.6 in each
+Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.5))]  # Adam's steps are as long: a gain of 1.6 in each
 RateOrAuto = Annotated[Literal["auto"] | Rate, explain_schedule(", or auto")]
 SPREAD = 0.03  # of the exposures: smaller ones are within what tracks measure
 # Of the differences: 17 to 31 % in three captures as they are, 40 to 71 % in the same with exposures changed by 25 %.
