@@ -1,1 +1,1 @@
-"""What every room needs: errors, files, locks, signals, settings, schedules, the terminal, pages."""
+"""Errors, files, locks, signals, settings, schedules, terminal output, and HTML pages, used by every other package."""

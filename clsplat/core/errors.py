@@ -1,7 +1,7 @@
-"""All errors, each with its exit code.
+"""Define all errors, each with its exit code.
 
-A message is one line: the fault, its place, what was expected, the remedy.  The command line prints it without a
-traceback (`--debug` shows one).
+A message is one line: where, what is wrong, and what to do.  The command line prints it without a traceback unless
+`--debug` is given.
 """
 
 import errno
@@ -15,7 +15,7 @@ from itertools import islice
 
 MESSAGE_LIMIT = 1000  # characters
 QUOTE_LIMIT = 80  # characters of a value in a message
-NAMES_SHOWN = 8  # of a list, in a message
+NAMES_SHOWN = 8  # names of a list in a message
 PLUGIN_MARK = "__clsplat_plugin__"  # the name of the plug-in, a variable of its module
 
 
@@ -26,17 +26,17 @@ class ClsplatError(Exception):
 
 
 class InternalError(ClsplatError):
-    """A defect of clsplat, to be reported; `--debug` shows its traceback."""
+    """A bug in clsplat that should be reported; `--debug` shows its traceback."""
 
 
 class ConfigError(ClsplatError):
-    """A pipeline file, a setting or a command line is invalid."""
+    """A pipeline file, setting, or command line is invalid."""
 
     exit_code = 2
 
 
 class OverrideError(ConfigError):
-    """A value of `--set` does not fit the pipeline; `reason` is the fault."""
+    """A value given by `--set` is not valid in the pipeline; `reason` says why."""
 
     def __init__(self, override: str, reason: str) -> None:
         self.reason = shorten(" ".join(reason.split()), 500)
@@ -48,13 +48,13 @@ class PluginError(ConfigError):
 
 
 class DataError(ClsplatError):
-    """A dataset, image or model file is missing, damaged or not supported."""
+    """A dataset, image, or model file is missing, damaged, or not supported."""
 
     exit_code = 3
 
 
 class PoseError(DataError, ValueError):
-    """The pose of a view has another shape, is not finite or has no rotation."""
+    """The pose of a view has the wrong shape, is not finite, or has no valid rotation."""
 
 
 class DeviceError(ClsplatError):
@@ -64,27 +64,27 @@ class DeviceError(ClsplatError):
 
 
 class KernelError(DeviceError):
-    """A kernel does not build, or has wrong arguments."""
+    """A kernel does not build or was called with the wrong arguments."""
 
 
 class MemoryLimitError(ClsplatError):
-    """The memory of the device or the host is too small."""
+    """The device or the host has too little memory."""
 
     exit_code = 5
 
 
 class NumericError(ClsplatError):
-    """Values of training or of a picture are not finite, or no Gaussians are left."""
+    """Values in training or in a render are not finite, or no Gaussians are left."""
 
     exit_code = 6
 
 
 class NotFiniteError(NumericError):
-    """The state of a training is not finite; it was set aside, as failed_N.npz."""
+    """The training state is not finite; it was saved separately as failed_N.npz."""
 
 
 class EmptyRegionError(NumericError):
-    """No Gaussian lies in a part of space."""
+    """A region of space contains no Gaussians."""
 
 
 class OutputError(ClsplatError):
@@ -94,78 +94,80 @@ class OutputError(ClsplatError):
 
 
 class Interrupted(ClsplatError):
-    """Ctrl-C, SIGTERM or SIGHUP stopped the command; the state of a run is saved."""
+    """Ctrl-C, SIGTERM, or SIGHUP stopped the command; the state of a run is saved."""
 
     exit_code = 130
 
 
 def as_clsplat_error(error: BaseException) -> ClsplatError:
-    """Return the ClsplatError for any exception; a ClsplatError stays unchanged."""
-    if isinstance(error, RuntimeError) and isinstance(error.__cause__, StopIteration):  # what a generator makes of it
+    """Convert any exception to a ClsplatError; a ClsplatError is returned unchanged."""
+    if isinstance(error, RuntimeError) and isinstance(error.__cause__, StopIteration):  # raised inside a generator
         error = error.__cause__
     if isinstance(error, ClsplatError):
         return error
     if isinstance(error, KeyboardInterrupt):
-        return Interrupted("stopped at once; to go on, run it again, with --resume where a checkpoint was saved")
+        return Interrupted("stopped at once; to continue, run it again, with --resume if a checkpoint was saved")
     if isinstance(error, MemoryError):
-        return MemoryLimitError("out of memory; use fewer Gaussians, smaller images (scene.downscale) or fewer of them")
-    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:  # that of an output is an OutputError already
+        return MemoryLimitError("out of memory; use fewer Gaussians, or fewer or smaller images (scene.downscale)")
+    if (
+        isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
+    ):  # for outputs, write_error has already handled it
         return DataError(f"{error.filename}: cannot be read ({error.strerror}); expected the path of a file or folder")
     if isinstance(error, OSError) and error.strerror:
-        place = error.filename or "the output"
-        return OutputError(f"{place}: {error.strerror}; check the file, its folder and their space")
-    what = f"{type(error).__name__}: {one_line(error)}".removesuffix(": ")
-    if place := _plugin_place(error):
-        return PluginError(f"{place}: {what}")
-    return InternalError(f"internal error (a defect): {what}; run with --debug for the traceback, and report it")
+        name = error.filename or "the output"
+        return OutputError(f"{name}: {error.strerror}; check the file, its folder, and the free space")
+    message = f"{type(error).__name__}: {one_line(error)}".removesuffix(": ")
+    if location := _plugin_location(error):
+        return PluginError(f"{location}: {message}")
+    return InternalError(f"internal error (a bug): {message}; run with --debug for the traceback, and report it")
 
 
-def _plugin_place(error: BaseException) -> str | None:
-    """The innermost file and line of a plug-in that an exception passed, or None."""
+def _plugin_location(error: BaseException) -> str | None:
+    """Return the innermost file and line of plug-in code in the traceback, or None."""
     frames = reversed(list(traceback.walk_tb(error.__traceback__)))
     return next((f"{f.f_code.co_filename}:{line}" for f, line in frames if PLUGIN_MARK in f.f_globals), None)
 
 
 def one_line(error: BaseException | str) -> str:
-    """Return a message as one line of limited length, without characters that a terminal obeys."""
+    """Return a message as one line of limited length, with control characters escaped."""
     text = shorten(" ".join(str(error).split()), MESSAGE_LIMIT)
     return shorten("".join(c if c.isprintable() else ascii(c)[1:-1] for c in text), MESSAGE_LIMIT)
 
 
 def first_few(names: Sequence[str]) -> str:
-    """Return the first names of a list, and how many more there are, for a message."""
+    """Return the first names of a list and the number of the others, for a message."""
     more = f", and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
     return ", ".join(names[:NAMES_SHOWN]) + more
 
 
 def pluralize(count: int, word: str) -> str:
-    """Return a number with its noun: `1 view`, `2,000 views`."""
+    """Format a count with its noun: `1 view`, `2,000 views`."""
     return f"{count:,} {word}{'s' if count != 1 else ''}"
 
 
 def size_text(gaussians: int | None, parameters: int | None) -> str:
-    """Return how large what was trained is, in words."""
+    """Format the size of a trained model: its Gaussians, or the parameters of a field."""
     return f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
 
 
 def shell_quote(path: object) -> str:
-    """Return a path as a shell reads it, for a command in a message."""
+    """Quote a path for the shell, for a command in a message."""
     return subprocess.list2cmdline([str(path)]) if os.name == "nt" else shlex.quote(str(path))
 
 
 def shorten(text: str, limit: int = QUOTE_LIMIT) -> str:
-    """Return the text, cut in the middle where it is longer than `limit` characters."""
-    kept = limit - 3
-    return text if len(text) <= limit else f"{text[: kept - kept // 2]} … {text[-(kept // 2) :]}"
+    """Return the text; text longer than `limit` characters is cut in the middle."""
+    size = limit - 3
+    return text if len(text) <= limit else f"{text[: size - size // 2]} … {text[-(size // 2) :]}"
 
 
 def quote(value: object) -> str:
-    """Return a value of the input as a message shows it, in one line of QUOTE_LIMIT characters."""
+    """Return the repr of an input value for a message, as one line of at most QUOTE_LIMIT characters."""
     return shorten(" ".join(_QUOTES.repr(value).split()))
 
 
 class _Quotes(reprlib.Repr):
-    """The notation of Python, which takes no longer for a large value."""
+    """A repr whose cost does not grow with the size of the value."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -178,7 +180,7 @@ class _Quotes(reprlib.Repr):
         return f"a number of {x.bit_length()} bits" if x.bit_length() > 256 else repr(x)
 
     def repr_dict(self, x: dict[object, object], level: int) -> str:
-        """The first keys, in their own order."""
+        """Show the first keys in their order of insertion; `reprlib` would sort all of them."""
         if level <= 0:
             return f"{{{self.fillvalue}}}"
         shown = [f"{self.repr1(key, level - 1)}: {self.repr1(x[key], level - 1)}" for key in islice(x, self.maxdict)]

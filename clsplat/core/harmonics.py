@@ -1,10 +1,10 @@
-"""Real spherical harmonics, as in cl_kernels/harmonics.h, and their rotation."""
+"""Evaluate and rotate real spherical harmonics, as defined in cl_kernels/harmonics.h."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-DIRECTIONS = 64  # samples of a band's functions, of which it has at most 7; with their opposites, of all products
-DIGITS = 6  # of means of functions: further ones are the processor's
+DIRECTIONS = 64  # samples; more than the 7 functions of a band need, and, with their opposites, all products
+DIGITS = 6  # of means; further ones differ between processors
 
 
 def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -24,42 +24,45 @@ def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of Y(d), [K], over directions d of which `form`, [K, K], is as the mean of Y(d) Y(d)^T.
+    """Return the mean of Y(d), [K], over a distribution of directions d.
 
-    Products of functions of the bands 1 to 3 span each of these; of one band alone they tell nothing, which gives 0.
+    `form`, [K, K], is proportional to the mean of Y(d) Y(d)^T.  Products of functions of the bands 1 to 3 span each
+    function; those of a single band do not, and the result is then 0.
     """
     count, half = len(form), _directions()
     values = basis(np.concatenate([half, -half]))[:, :count]
     pairs = np.triu_indices(count)
     products = values[:, pairs[0]] * values[:, pairs[1]]
-    told = np.linalg.lstsq(products, values, rcond=1e-9)[0]
-    moments = form * (count / (4 * np.pi) / np.trace(form))  # of |Y|², K / 4 pi from everywhere
-    mean = moments[pairs] @ told
-    size = mean @ np.linalg.solve(moments, mean)  # of a distribution at most 1: a form that has none tells too much
+    from_products = np.linalg.lstsq(products, values, rcond=1e-9)[0]
+    moments = form * (count / (4 * np.pi) / np.trace(form))  # |Y|² = K / 4 pi in every direction
+    mean = moments[pairs] @ from_products
+    size = mean @ np.linalg.solve(moments, mean)  # at most 1 for a distribution; noise in `form` can exceed it
     return np.asarray(np.round(mean / np.sqrt(max(size, 1.0)), DIGITS))
 
 
 def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the coefficients [N, (K-1)*3], coefficient-major, of the same colors after a rotation [3, 3].
+    """Rotate coefficients [N, (K-1)*3], coefficient-major, by a rotation matrix [3, 3].
 
-    A rotation maps each band onto itself, so each band's matrix follows from values at a few directions.
+    A rotation maps each band onto itself, so each band's matrix follows from values in a few directions.
     """
     count, coefficients = len(sh_rest), sh_rest.shape[1] // 3
     directions = _directions()
-    before, after = basis(directions @ rotation), basis(directions)  # rows of d R are R^T d
+    before, after = basis(directions @ rotation), basis(directions)  # the rows of d R are R^T d
     table = sh_rest.astype(np.float64).reshape(count, coefficients, 3)
-    turned, first = np.empty_like(table), 0
+    result, first = np.empty_like(table), 0
     for size in (3, 5, 7):
         if first + size > coefficients:
             break
         band = slice(first, first + size)
-        matrix = np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[0]  # old functions by new ones
-        turned[:, band] = np.einsum("ij,njc->nic", matrix, table[:, band])
+        matrix = np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[
+            0
+        ]  # expresses the old functions by the new ones
+        result[:, band] = np.einsum("ij,njc->nic", matrix, table[:, band])
         first += size
-    return turned.reshape(count, 3 * coefficients)
+    return result.reshape(count, 3 * coefficients)
 
 
 def _directions() -> NDArray[np.float64]:
-    """Unit vectors, [DIRECTIONS, 3], the same each time."""
-    found = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+    """Return fixed pseudo-random unit vectors, [DIRECTIONS, 3]."""
+    vectors = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -1,9 +1,9 @@
-"""One process at a time in a folder.
+"""Lock folders, so that only one process at a time uses a folder.
 
-The system releases the lock when its holder ends, however it ends, so that it is never left behind.  The file
-`run.lock` tells who holds it.  Where a file system knows no locks, whoever makes that file holds the folder; one whose
-process has ended on this host is taken over.  Where locks count on each machine alone, as some mounts of NFS and sshfs
-have them, a run on another machine is noticed by its heartbeat.
+The system releases the lock when its owner exits for any reason, so no stale lock remains.  The file `run.lock` names
+the owner.  On a file system without locks, the process that creates this file owns the folder; a file whose process
+has exited on this host is taken over.  Where locks are local to each machine, as on some NFS and sshfs mounts, a run on
+another machine is detected by its heartbeat.
 """
 
 import errno
@@ -25,20 +25,20 @@ from clsplat.core.files import END_STATES, HEARTBEAT_TIMEOUT, LOCK, STATUS, rais
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json
 
-# Who holds a folder: what the file of its lock says, and what is told of it.
+# The owner of a folder, as its lock file names it, and messages about it.
 
 LOG = logging.getLogger("clsplat")
-LOCK_OFFSET = 1 << 20  # bytes: Windows locks a byte for readers too, and this one is not read
+LOCK_OFFSET = 1 << 20  # the locked byte; behind the text, because Windows blocks reads of a locked byte
 
 
 def owner_record() -> str:
-    """What the file says of this process."""
+    """Return the lock file's text for this process."""
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
     return json.dumps({**asdict(Owner.current()), "time": time.time(), "command": command})
 
 
 def read_owner(file: io.FileIO) -> dict[str, Any]:
-    """Who the file names; nobody where it is empty or damaged."""
+    """Return the owner that a lock file names, or {} if it is empty or damaged."""
     try:
         file.seek(0)
         owner = json.loads(file.read(LOCK_OFFSET))
@@ -48,30 +48,30 @@ def read_owner(file: io.FileIO) -> dict[str, Any]:
 
 
 def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Who the file names, where that is a process of another machine, whose locks may not reach this one; else {}.
+    """Return the owner that a lock file names if it is on another machine with invisible locks; else {}.
 
-    Machines may have the same name: where the systems say which start they are of, that counts.
-    Raises OutputError where the run's status beside the file shows that it goes on.
+    Machines may share a name, so boot IDs are compared where both are known.
+    Raises OutputError if the heartbeat in the run's status next to the file is recent.
     """
     owner = read_owner(file)
     named, this = Owner.from_record(owner), Owner.current()
     if named is None or (named.boot == this.boot if owner.get("boot") and this.boot else named.host == this.host):
         return {}
     beat = _heartbeat(path)
-    if beat is not None and (silent := time.time() - beat) < HEARTBEAT_TIMEOUT:
+    if beat is not None and (age := time.time() - beat) < HEARTBEAT_TIMEOUT:
         raise OutputError(
-            f"{in_use_message(folder, owner)}; its heartbeat is {max(0, silent):.0f} s old, though the lock is free here: "
-            f"if that process has ended, wait for a minute, or remove {path}"
+            f"{in_use_message(folder, owner)}; its heartbeat is {max(0, age):.0f} s old, but the lock is free here; "
+            f"if that process has exited, wait a minute or remove {path}"
         )
     return owner
 
 
 def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Do as `require_stale_heartbeat`, but wait for the next heartbeat: where none comes in time, the process has ended.
+    """Wait for the next heartbeat, and return as `require_stale_heartbeat` if none comes in time.
 
-    That it comes counts, not its time: the clocks of two machines may differ.
+    Only a change of the heartbeat counts, not its time: the clocks of two machines may differ.
     """
-    beat, end, told = _heartbeat(path), time.monotonic() + HEARTBEAT_TIMEOUT, False
+    beat, end, is_logged = _heartbeat(path), time.monotonic() + HEARTBEAT_TIMEOUT, False
     while True:
         try:
             return require_stale_heartbeat(file, path, folder)
@@ -80,14 +80,14 @@ def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[
                 raise
             if time.monotonic() >= end:
                 return read_owner(file)
-            if not told:
-                told = True
-                LOG.info("%s: was in use elsewhere just now; waiting for its heartbeat, a minute at most", folder)
+            if not is_logged:
+                is_logged = True
+                LOG.info("%s: was just in use on another machine; waiting up to a minute for its heartbeat", folder)
         time.sleep(1)
 
 
 def _heartbeat(path: Path) -> float | None:
-    """When the status beside a lock was written, in seconds since 1970; None where there is none, or the run ended."""
+    """Return the time of the status next to a lock in seconds since 1970; None if there is none or the run ended."""
     with suppress(DataError, AttributeError, KeyError, TypeError, ValueError):
         status = read_json(path.with_name(STATUS), limit=LOCK_OFFSET)
         return None if status.get("state") in END_STATES else float(status["time"])
@@ -95,7 +95,7 @@ def _heartbeat(path: Path) -> float | None:
 
 
 def lost_lock_message(path: Path, folder: Path) -> str:
-    """What to tell of a lock whose file is no longer at its path."""
+    """Return the message about a lock whose file was removed or replaced."""
     try:
         owner = read_json(path, limit=LOCK_OFFSET)
         by = f", and process {owner['process']} on {owner['host']} holds it now"
@@ -103,11 +103,12 @@ def lost_lock_message(path: Path, folder: Path) -> str:
         by = ""
     return (
         f"{folder}: {path.name} was removed or replaced while this process held it{by}; nothing more was written; "
-        "to go on, resume the run when no other process uses it"
+        "resume the run when no other process uses it"
     )
 
 
 def in_use_message(folder: Path, owner: dict[str, Any]) -> str:
+    """Return the message about a folder that another process uses."""
     if not owner:
         return f"{folder}: is in use by another process"
     try:
@@ -116,22 +117,22 @@ def in_use_message(folder: Path, owner: dict[str, Any]) -> str:
         since = "an unknown time"
     return (
         f"{folder}: is in use by process {owner.get('process')} on {owner.get('host')} since {since} "
-        f"({shorten(str(owner.get('command')))}); wait for it, or give another folder"
+        f"({shorten(str(owner.get('command')))}); wait for it, or use another folder"
     )
 
 
-LOCK_TAKEN = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # what the systems answer for a lock that another holds
+LOCK_TAKEN = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # error codes for a lock that another process holds
 NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
-_held: set[Path] = set()  # by this process, or being locked by it
+_held: set[Path] = set()  # locked, or being locked, by this process
 _reserving = threading.Lock()
 
 
 @contextmanager
 def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[], None]]:
-    """Hold the lock of a folder in the block: a file `path`, by default `run.lock` in it.
+    """Lock a folder during the block, with the lock file `path`, by default `run.lock` inside.
 
-    Yields a function that raises OutputError where that file was removed or replaced, so that another may hold the
-    folder.  Raises OutputError, with process and host where another holds it.
+    Yields a function that raises OutputError if that file was removed or replaced, so that another process may use the
+    folder.  Raises OutputError, with process and host, if another process holds the lock.
     """
     path = _path(folder, path or folder / LOCK)
     with _reserved(path, folder):
@@ -139,14 +140,14 @@ def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[],
             file = _locked(path, folder)
 
         def require_held() -> None:
-            with suppress(OSError):  # whoever writes there is told of that
+            with suppress(OSError):  # an unreadable folder: the next write reports that
                 if not file.closed and not _is_at(file, path):
                     raise OutputError(lost_lock_message(path, folder))
 
         try:
             yield require_held
         finally:
-            with suppress(OSError):  # Windows removes no open file
+            with suppress(OSError):  # Windows cannot remove an open file
                 if _is_at(file, path):
                     path.unlink()
             file.close()
@@ -168,9 +169,9 @@ def _reserved(path: Path, folder: Path) -> Iterator[None]:
 
 
 def check_free(folder: Path) -> bool:
-    """Raise OutputError where `lock_folder` would at once; nothing is written.
+    """Raise OutputError if `lock_folder` would do so at once; nothing is written.
 
-    Returns False where `lock_folder` would wait for the heartbeat of a run on another machine.
+    Returns False if `lock_folder` would wait for the heartbeat of a run on another machine.
     """
     path = _path(folder, folder / LOCK)
     with raising_output_error(path), suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
@@ -190,21 +191,23 @@ def check_free(folder: Path) -> bool:
 
 
 def _path(folder: Path, file: Path) -> Path:
-    """The one path of a lock's file that this process does not hold.  Raises OutputError."""
+    """Return the canonical path of a lock file.  Raises OutputError if this process holds it."""
     path = file.parent.resolve() / file.name
     _require_not_held(path, folder)
     if path.is_symlink():
-        raise OutputError(f"{file}: is a link, which is not followed; remove it")
+        raise OutputError(f"{file}: is a link, and lock files are not followed; remove it")
     return path
 
 
 def _require_not_held(path: Path, folder: Path) -> None:
     if path in _held:
-        raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
+        raise OutputError(
+            f"{folder}: is in use by this process; close that run or trainer first, or use another folder"
+        )
 
 
 def _locked(path: Path, folder: Path) -> io.FileIO:
-    """Open the file and lock it; write into it who holds it.  Raises OutputError and OSError."""
+    """Open and lock a lock file, and write this process into it.  Raises OutputError and OSError."""
     while True:
         file, is_new = _opened(path)
         if file is None:
@@ -222,7 +225,7 @@ def _locked(path: Path, folder: Path) -> io.FileIO:
 
 
 def _opened(path: Path) -> tuple[io.FileIO | None, bool]:
-    """Open the file, and tell whether this process made it; None where its holder removes it just now."""
+    """Open a lock file and return whether this process created it; None if its owner is just removing it."""
     with suppress(FileExistsError):
         return path.open("x+b", buffering=0), True
     with suppress(FileNotFoundError):
@@ -231,7 +234,7 @@ def _opened(path: Path) -> tuple[io.FileIO | None, bool]:
 
 
 def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
-    """Lock the file; False where it is no longer the one at its path.  Where there are no locks, its maker holds it."""
+    """Lock the file; return False if it is no longer at its path.  Without locks, the creator of the file owns it."""
     try:
         if not _system_lock(file):
             raise OutputError(in_use_message(folder, read_owner(file)))
@@ -239,8 +242,8 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
             return False
         if not is_new and (owner := wait_for_stale_heartbeat(file, path, folder)):
             LOG.info("%s: taken over from process %s on %s", folder, owner.get("process"), owner.get("host"))
-            with suppress(PermissionError):  # Windows renames no open file
-                _remove(file, path)  # so that the one before notices, where it goes on after all
+            with suppress(PermissionError):  # Windows cannot rename an open file
+                _remove(file, path)  # so that the previous owner notices, in case it still runs
                 return False
         return True
     except OSError as error:
@@ -248,38 +251,39 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
             raise
     if not is_new:
         owner = _ended_owner(file, path, folder)
-        LOG.info("%s: taken over from process %s, which has ended", folder, owner.get("process"))
+        LOG.info("%s: taken over from process %s, which has exited", folder, owner.get("process"))
         _remove(file, path)
         return False
-    LOG.warning("%s: its file system knows no locks; %s alone keeps other processes away", folder, path.name)
+    LOG.warning("%s: the file system does not support locks; only %s keeps other processes away", folder, path.name)
     return True
 
 
 def _ended_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Who the file names, where there are no locks.  Raises OutputError unless that process has ended."""
+    """Return the owner on a file system without locks.  Raises OutputError unless that process has exited."""
     owner = read_owner(file)
     if not _has_ended(Owner.from_record(owner)):
         raise OutputError(
-            f"{in_use_message(folder, owner)}; this file system knows no locks: if that process has ended, remove {path}"
+            f"{in_use_message(folder, owner)}; this file system does not support locks: "
+            f"if that process has exited, remove {path}"
         )
     return owner
 
 
 def _remove(file: io.FileIO, path: Path) -> None:
-    """Remove an open file from its path, but not another that was made there since."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}-0.partial")  # swept where this process is killed
+    """Remove an open file from its path, but not a newer file at the same path."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}-0.partial")  # cleaned up later if this process is killed
     with suppress(FileNotFoundError):
         os.replace(path, aside)
         if _is_at(file, aside):
             aside.unlink()
         else:
-            with suppress(FileExistsError):  # where a third process has made one since
+            with suppress(FileExistsError):  # a third process has created one
                 os.link(aside, path)
             aside.unlink()
 
 
 def _system_lock(file: io.FileIO) -> bool:
-    """Lock an open file; return False where another holds the lock.  Raises OSError where there are no locks."""
+    """Lock an open file; return False if another process holds the lock.  Raises OSError without lock support."""
     try:
         if os.name == "nt":
             import msvcrt
@@ -300,7 +304,7 @@ def _system_lock(file: io.FileIO) -> bool:
 
 
 def _is_at(file: io.FileIO, path: Path) -> bool:
-    """Whether an open file is still the one at a path."""
+    """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except (FileNotFoundError, NotADirectoryError):
@@ -308,4 +312,6 @@ def _is_at(file: io.FileIO, path: Path) -> bool:
 
 
 def _has_ended(owner: Owner | None) -> bool:
-    return owner is not None and (owner == Owner.current() or owner.has_ended)  # this process does not hold it
+    return owner is not None and (
+        owner == Owner.current() or owner.has_ended
+    )  # a lock of this process was ruled out before

@@ -1,4 +1,4 @@
-"""This machine: the cache folder, cores, processes and their memory."""
+"""Query this machine: the cache folder, CPU cores, processes, and memory."""
 
 import atexit
 import ctypes
@@ -23,43 +23,43 @@ from clsplat.core.errors import DataError, OutputError
 from clsplat.core.reading import read_text
 
 LOG = logging.getLogger("clsplat")
-LIBRARIES = ("pyopencl", "pytools", "pocl")  # keep caches beside ours, and fail where they cannot
+LIBRARIES = ("pyopencl", "pytools", "pocl")  # they keep caches next to ours and fail if they cannot
 
 
 @cache
 def cache_folder() -> Path:
-    """Return the folder of clsplat's caches: it exists, can be written, and is the user's own.
+    """Return the cache folder of clsplat, which exists, is writable, and belongs to the user.
 
-    Where the user's caches cannot be written, as in a container without a home, they move below the temporary folder,
-    those of the libraries too; a line says so.  Raises OutputError when that cannot be written either.
+    If the user's cache folders are not writable, as in a container without a home, all caches, those of the libraries
+    included, move to the temporary folder, with a warning.  Raises OutputError if that is not writable either.
     """
     try:
         folders = [Path(platformdirs.user_cache_dir(name, name)) for name in ("clsplat", *LIBRARIES)]
-    except RuntimeError:  # no HOME, and a user that the system does not know
+    except RuntimeError:  # no HOME, and a user unknown to the system
         fault = "there is no home folder"
     else:
         fault = next(filter(None, map(_fault, [*folders, *user_cache_folders()])), "")
         if not fault:
             return folders[0]
     moved = _temporary()
-    LOG.warning("%s; caches are in %s instead; XDG_CACHE_HOME can name a folder that lasts", fault, moved)
-    os.environ["XDG_CACHE_HOME"] = str(moved)  # what all libraries read, in this process and those that it starts
+    LOG.warning("%s; caches are in %s instead; set XDG_CACHE_HOME to a permanent folder", fault, moved)
+    os.environ["XDG_CACHE_HOME"] = str(moved)  # all libraries and child processes read it
     if user_cache_folders():
         os.environ["POCL_CACHE_DIR"] = str(moved / "pocl")
     ours = moved / "clsplat"
     if fault := _fault(ours):
-        raise OutputError(f"{fault}; free its space, or let TMPDIR name a folder that can be written")
+        raise OutputError(f"{fault}; free space, or set TMPDIR to a writable folder")
     return ours
 
 
 def user_cache_folders() -> list[Path]:
-    """The folder that PoCL was told to use, which stands before the folder of caches."""
+    """Return the folder in POCL_CACHE_DIR, which PoCL prefers to the cache folder."""
     return [Path(os.environ["POCL_CACHE_DIR"])] if os.environ.get("POCL_CACHE_DIR") else []
 
 
 def _fault(folder: Path) -> str:
-    """Make a folder and try to write in it; return why that fails, or ''."""
-    if not folder.is_absolute():  # of a HOME that is not
+    """Create a folder and try to write in it; return why that fails, or ''."""
+    if not folder.is_absolute():  # if HOME is relative
         return f"{folder}: is not an absolute path"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -71,9 +71,9 @@ def _fault(folder: Path) -> str:
 
 
 def _temporary() -> Path:
-    """A folder below the temporary one that nobody else can write: the same for all processes of a user, if possible.
+    """Return a private folder below the temporary one, the same for all processes of a user if possible.
 
-    Raises OutputError when there is no temporary folder.
+    Raises OutputError if there is no temporary folder.
     """
     try:
         base = Path(tempfile.gettempdir())
@@ -85,73 +85,73 @@ def _temporary() -> Path:
         folder = Path(tempfile.mkdtemp(prefix="clsplat-"))
     except OSError as error:
         raise OutputError(
-            f"no folder for caches can be written ({error.strerror or error}); let XDG_CACHE_HOME or TMPDIR name one"
+            f"no cache folder works ({error.strerror or error}); set XDG_CACHE_HOME or TMPDIR to a writable folder"
         ) from error
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
 
 def _private(folder: Path) -> bool:
-    """Whether a folder belongs to this user and nobody else can write or read in it; systems without users: True."""
-    if not hasattr(os, "getuid"):  # their temporary folder is the user's own
+    """Return whether only this user can read and write a folder; True on systems without user IDs."""
+    if not hasattr(os, "getuid"):  # on Windows the temporary folder belongs to the user
         return True
     state = folder.lstat()
     return stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o077
 
 
-# The cores of this machine: which a process may use, and how another one is kept to some of them.
+# CPU cores: which ones a process may use, and how to pin another process to some of them.
 
-THREAD_VARIABLES = (  # variables by which a runtime is told how many threads to start
+THREAD_VARIABLES = (  # environment variables that set the number of threads of a runtime
     "POCL_MAX_PTHREAD_COUNT",  # PoCL before 4
     "POCL_CPU_MAX_CU_COUNT",  # PoCL from 4 on
     "CL_CONFIG_CPU_TBB_NUM_WORKERS",  # Intel's
 )
-Cores = Sequence[int]  # numbers, as the system counts them
+Cores = Sequence[int]  # core numbers of the system
 
 
 def usable_cores() -> tuple[int, ...]:
-    """Return the cores that this process may use; where the system does not say, all of them."""
+    """Return the cores that this process may use, or all cores if the system does not say."""
     if hasattr(os, "sched_getaffinity"):
         return tuple(sorted(os.sched_getaffinity(0)))
     return tuple(range(os.cpu_count() or 1))
 
 
 def split_cores(cores: Cores, processes: int) -> list[tuple[int, ...]]:
-    """Return the cores of each process: equal parts of neighbors, which share caches and memory.
+    """Split cores into equal parts of neighboring cores, which share caches and memory.
 
-    Cores that are left over belong to nobody, so that all processes have as many.
+    Leftover cores stay unused, so that all processes have the same number.
     """
     each = len(cores) // processes
     return [tuple(cores[number * each : (number + 1) * each]) for number in range(processes)]
 
 
 def limited_environment(cores: Cores, variables: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return the environment of a process that is kept to these cores: as many threads."""
+    """Return an environment that limits a process to one thread per core."""
     return {**variables, **dict.fromkeys(THREAD_VARIABLES, str(len(cores)))}
 
 
 def pin_to_cores(cores: Cores, process: int = 0) -> None:
-    """Keep a process, 0 this one, and what it starts from now on, to these cores, where the system can."""
+    """Pin a process (0: this one) and its future children to these cores, if the system supports it."""
     if hasattr(os, "sched_setaffinity"):
-        with suppress(OSError):  # it has ended, or a container has other cores by now
+        with suppress(OSError):  # the process has exited, or the container's cores have changed
             os.sched_setaffinity(process, cores)
 
 
-# Who runs: processes, where their numbers count, and whether they are alive, on every system.
+# Processes: their identity across hosts and containers, and whether they are alive.
 
-FIRST_PID_NAMESPACE = "pid:[4026531836]"  # of Linux itself, outside of containers: PROC_PID_INIT_INO of its headers
+FIRST_PID_NAMESPACE = "pid:[4026531836]"  # of the host, outside containers: PROC_PID_INIT_INO in Linux
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-QUERY_LIMITED_INFORMATION, STILL_ACTIVE, ACCESS_DENIED = 0x1000, 259, 5  # of Windows
+QUERY_LIMITED_INFORMATION, STILL_ACTIVE, ACCESS_DENIED = 0x1000, 259, 5  # Windows constants
 
 
 @dataclass(frozen=True)
 class Owner:
-    """The process that holds or runs something: its number, and where that number counts."""
+    """A process that owns a folder or a run: its ID, and where that ID is valid."""
 
     process: int
-    host: str  # name of the machine, or of the container
-    pid_namespace: str | None  # of Linux, such as 'pid:[4026531836]'; containers on one machine have their own
-    boot: str | None  # of Linux: another after each start of the machine, and the same in all its containers
+    host: str  # name of the machine or container
+    pid_namespace: str | None  # on Linux, such as 'pid:[4026531836]'; each container has another
+    boot: str | None  # on Linux: changes with each boot, and is the same in all containers of a machine
 
     @classmethod
     def current(cls) -> "Owner":
@@ -160,7 +160,7 @@ class Owner:
 
     @classmethod
     def from_record(cls, values: Mapping[str, Any]) -> "Owner | None":
-        """Return the process that a file names, or None; what an older file does not say is as here."""
+        """Return the process that a file names, or None.  Missing values, in older files, default to those here."""
         process, this = values.get("process"), cls.current()
         if type(process) is not int or process <= 0:
             return None
@@ -169,19 +169,20 @@ class Owner:
 
     @property
     def host_slug(self) -> str:
-        """The host as a part of a file's name."""
+        """The host's name as part of a file name."""
         return re.sub(r"[^0-9A-Za-z-]", "_", self.host) or "host"
 
     @property
     def is_local(self) -> bool:
-        """Whether its number counts here."""
+        """Whether its process ID is valid here."""
         return replace(self, process=os.getpid()) == Owner.current()
 
     @property
     def has_ended(self) -> bool:
-        """Whether it is known to have ended; of a process elsewhere that is not known.
+        """Whether it is known to have exited; for a process elsewhere that is not known.
 
-        One of another boot has, where the host is a machine: containers of one name may be on two of them.
+        A process of an earlier boot has exited if it ran outside containers: containers on two machines may share a
+        name.
         """
         if self.is_local:
             return not is_alive(self.process)
@@ -191,7 +192,7 @@ class Owner:
 
 
 def _pid_namespace() -> str | None:
-    """Where process numbers count; None where the system does not say."""
+    """Return the PID namespace, or None if the system does not say."""
     try:
         return os.readlink("/proc/self/ns/pid")
     except (OSError, AttributeError):
@@ -199,7 +200,7 @@ def _pid_namespace() -> str | None:
 
 
 def _boot() -> str | None:
-    """Which start of the machine this is; None where the system does not say."""
+    """Return the boot ID, or None if the system does not say."""
     try:
         return read_text(BOOT_ID).strip() or None
     except DataError:
@@ -207,11 +208,11 @@ def _boot() -> str | None:
 
 
 def is_alive(process: int) -> bool:
-    """Return whether a process of this machine runs; True where the system does not say.
+    """Return whether a process of this machine is running; True if the system does not say.
 
-    A number may have been given to another process since.
+    A process ID may have been reused by another process.
     """
-    if sys.platform == "win32":  # where os.kill(process, 0) would end it
+    if sys.platform == "win32":  # os.kill(process, 0) would kill it there
         return _is_alive_on_windows(ctypes.WinDLL("kernel32", use_last_error=True), process)
     try:
         os.kill(process, 0)
@@ -233,21 +234,21 @@ def _is_alive_on_windows(kernel: Any, process: int) -> bool:
     return not known or code.value == STILL_ACTIVE
 
 
-# The memory that is free.
+# Free memory.
 
 CONTAINER = Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int | None:
-    """Return the bytes that the host can give without swapping, within a container's limit; None: not known."""
-    found: list[int] = []
+    """Return the free host memory in bytes, without swapping and within a container's limit; None if unknown."""
+    limits: list[int] = []
     with suppress(OSError, ValueError):
         lines = Path("/proc/meminfo").read_text("utf-8").splitlines()
-        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    with suppress(OSError, ValueError):  # where there is no container, or no limit ("max")
-        found.append(
+        limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    with suppress(OSError, ValueError):  # no container, or no limit ("max")
+        limits.append(
             int((CONTAINER / "memory.max").read_text("utf-8")) - int((CONTAINER / "memory.current").read_text("utf-8"))
         )
-    if not found and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
-        found.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return max(0, min(found)) if found else None
+    if not limits and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
+        limits.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    return max(0, min(limits)) if limits else None

@@ -1,4 +1,4 @@
-"""Which files of a folder a tool has made, and from what: an interrupted call goes on, and files of users stay."""
+"""Record which files in a folder a tool has written and from what, to resume calls and to keep the files of users."""
 
 import hashlib
 import json
@@ -12,11 +12,10 @@ RECORD = ".manifest.jsonl"
 
 
 class Manifest:
-    """The record of a folder: a line for each file, with a hash of what it is made from.
+    """The record of a folder: one line per written file, with a hash of its sources.
 
-    Files are written whole, after their line is on the disk; a file that was made from something else is removed before
-    its new line.
-    So a file that exists is complete, and made from what its last line says.
+    A file is written atomically after its line is on disk, and an outdated file is removed before its new line is
+    written.  So a file that exists is complete and made from the sources in its last line.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -26,27 +25,27 @@ class Manifest:
                 entry = json.loads(line)
                 self._sources[str(entry["file"])] = str(entry["from"])
             except (ValueError, TypeError, KeyError):
-                continue  # cut short
+                continue  # incomplete, after a crash
 
     def lists(self, path: Path) -> bool:
-        """Return whether a tool has made this file, or was about to."""
+        """Return whether a tool has written this file, or was about to."""
         return self._name(path) in self._sources
 
-    def needs_writing(self, path: Path, source: str, *beside: Path) -> bool:
-        """Return whether a file must be written: it is not there, or was made from something else.
+    def needs_writing(self, path: Path, source: str, *companions: Path) -> bool:
+        """Return whether a file must be written: it is missing, or was made from other sources.
 
-        Then it is removed, with the files `beside` it that are written first, and noted.  A file that no tool has made
-        is not due.  Raises OutputError.
+        If so, remove it and its `companions`, which the caller writes before it, and record its new source.  A file
+        that no tool has written is never replaced.  Raises OutputError.
         """
         name, exists = self._name(path), path.is_file()
         if exists and self._sources.get(name, source) == source:
             return False
         try:
-            for file in (path, *beside):
+            for file in (path, *companions):
                 file.unlink(missing_ok=True)
             if self._sources.get(name) != source:
                 make_folder(self.folder)
-                line = "\n" + json.dumps({"file": name, "from": source})  # behind a line cut short
+                line = "\n" + json.dumps({"file": name, "from": source})  # on a new line, after an incomplete one too
                 append(self.folder / RECORD, line.encode())
         except OSError as error:
             raise write_error(path, error) from error
@@ -54,16 +53,16 @@ class Manifest:
         return True
 
     def require_listed(self, path: Path) -> None:
-        """Raise DataError when a file exists that no tool has made."""
+        """Raise DataError if a file exists that no tool has written."""
         if path.is_file() and not self.lists(path):
-            raise DataError(f"{path}: exists, and was not made from this scene; give another folder, or remove it")
+            raise DataError(f"{path}: exists and was not made from this scene; give another folder, or remove the file")
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix()
 
 
 def hash_values(*parts: object) -> str:
-    """Return a hash of values; a path stands for the content of its file.  Raises DataError."""
+    """Return a hash of values; a path is hashed by the content of its file.  Raises DataError."""
     state = hashlib.sha256()
     for part in parts:
         content = sha256(part) if isinstance(part, Path) else repr(part)

@@ -1,7 +1,7 @@
-"""Pages that open offline: one file of HTML with its style, charts and images inside.
+"""Write HTML pages that open offline: one file with its style, charts, and images inside.
 
-Templates, style and scripts lie in `templates/`.  They escape every value but the charts of `clsplat.viewer.charts` and
-the scripts and styles of the package.
+Templates, styles, and scripts are in `templates/`.  Templates escape every value except charts of
+`clsplat.viewer.charts` and the package's own scripts and styles.
 """
 
 import base64
@@ -32,34 +32,34 @@ JPEG_QUALITY = 92
 
 
 def render(template: str, **values: Any) -> str:
-    """Fill a template of `templates/`; return the page.  Invalid Unicode becomes `?`."""
+    """Render a template of `templates/` and return the page.  Invalid Unicode becomes `?`."""
     text = TEMPLATES.get_template(template).render(**values)
     return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def require_complete(path: Path) -> None:
-    """Raise DataError where the file of a page cannot be read, or has lost its end."""
+    """Raise DataError if the file of a page cannot be read or is truncated."""
     if not read_file(path).rstrip().endswith(b"</html>"):
-        raise DataError(f"{path}: ends before its end")
+        raise DataError(f"{path}: is truncated; make the page again")
 
 
 def safe_charts(drawings: Iterable[str]) -> list[Markup]:
-    """Mark SVG drawings as safe and drop empty ones; templates escape all other values."""
+    """Mark SVG drawings as safe for templates, and drop empty ones."""
     return [_safe(drawing) for drawing in drawings if drawing]
 
 
 @dataclass(frozen=True)
 class Inline:
-    """A script or style of the package, and the hash with which a page's policy admits it and no other."""
+    """A script or style of the package, and the hash by which a page's content security policy allows it."""
 
     text: Markup
     hash: str
 
 
 def inline(text: str) -> Inline:
-    """Mark a script or style of the package as safe.  Raises ValueError where it would end its own element."""
+    """Mark a script or style of the package as safe.  Raises ValueError if it would close its own element."""
     if "</" in text:
-        raise ValueError("a script or style holds '</', which ends its element")
+        raise ValueError("a script or style contains '</', which closes its element")
     digest = hashlib.sha256(text.encode()).digest()
     return Inline(_safe(text), f"sha256-{base64.b64encode(digest).decode()}")
 
@@ -69,7 +69,7 @@ def _safe(text: str) -> Markup:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a time in words: `1 h 2 min`, `3 min 4 s`, `5 s`."""
+    """Format a duration: `1 h 2 min`, `3 min 4 s`, `5 s`."""
     minutes, rest = divmod(round(seconds), 60)
     if minutes >= 60:
         return f"{minutes // 60} h {minutes % 60} min"
@@ -77,7 +77,7 @@ def duration_text(seconds: float) -> str:
 
 
 def data_url(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
-    """Return an RGB image, [height, width, 3], as a data URL: .jpg, or .png, which keeps every bit."""
+    """Encode an RGB image, [height, width, 3], as a data URL: .jpg, or lossless .png."""
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix == ".jpg" else []
     _, data = cv2.imencode(suffix, image[..., ::-1], options)
     kind = "jpeg" if suffix == ".jpg" else "png"
@@ -85,7 +85,7 @@ def data_url(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
 
 
 def shrink(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
-    """Return an image whose longer side is at most `longest` px, with its aspect."""
+    """Downscale an image so that its longer side is at most `longest` px."""
     height, width = image.shape[:2]
     factor = longest / max(width, height)
     if factor >= 1:
@@ -94,12 +94,12 @@ def shrink(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-# How models and scenes show themselves in a notebook.
+# Summaries of models and scenes in notebooks.
 
-THUMBNAIL = 160  # px, the larger side
+THUMBNAIL = 160  # px, the longer side
 
 
 def summary(rows: Mapping[str, str], images: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> str:
-    """Return a table of names and values, and images, [height, width, 3], with their names, as a piece of HTML."""
+    """Return a table of names and values, and named images, [height, width, 3], as an HTML fragment."""
     thumbnails = [(name, data_url(shrink(image, THUMBNAIL))) for name, image in images]
     return render("notebook.html.j2", rows=rows, thumbnails=thumbnails)

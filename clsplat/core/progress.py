@@ -1,4 +1,4 @@
-"""How far a piece of work on the host is: a line of the log now and then, and whoever else listens."""
+"""Report the progress of work on the host: a log line every few seconds, and calls of listeners."""
 
 import contextvars
 import logging
@@ -14,24 +14,24 @@ from clsplat.core.errors import Interrupted
 
 LOG = logging.getLogger("clsplat")
 Item = TypeVar("Item")
-INTERVAL = 5.0  # seconds between lines of the log
-WATCH, SLOWEST = 0.5, 5.0  # seconds between two looks at work that does not count by itself: at first, and at most
-LOOKS = 40  # in the time that has passed, at most, for a look may cost a process
+INTERVAL = 5.0  # seconds between log lines
+FIRST_POLL, SLOWEST_POLL = 0.5, 5.0  # seconds between two polls, at first and at most
+MAX_POLLS = 40  # of the elapsed time, for a poll may start a process
 
 
 class Listener(Protocol):
-    """Hears what is counted, how many are done, how many there are, and the time left, where that is known."""
+    """Called with what is counted, how many are done, the total, and the time left, if known."""
 
     def __call__(self, what: str, done: int, total: int, /, *, seconds_left: float | None) -> None: ...
 
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
-_level: ContextVar[int] = ContextVar("level", default=logging.INFO)  # of the lines of counts
+_level: ContextVar[int] = ContextVar("level", default=logging.INFO)  # of log lines about counts
 
 
 @contextmanager
 def log_level(level: int) -> Iterator[None]:
-    """Leave out what the block tells below a level of `logging`: who calls it says the same in other words."""
+    """Drop log messages of the block below a level, because the caller reports the same in its own words."""
     before = LOG.level
     LOG.setLevel(level)
     try:
@@ -42,32 +42,32 @@ def log_level(level: int) -> Iterator[None]:
 
 @contextmanager
 def captured_log(level: int) -> Iterator[list[str]]:
-    """Collect what the block tells from a level of `logging` on, in the place of telling it: it is shown elsewhere."""
-    told: list[str] = []
+    """Collect log messages of the block at or above a level instead of logging them."""
+    messages: list[str] = []
 
-    def keep(record: logging.LogRecord) -> bool:
-        told.append(record.getMessage())
+    def capture(record: logging.LogRecord) -> bool:
+        messages.append(record.getMessage())
         return False
 
     with log_level(level):
-        LOG.addFilter(keep)
+        LOG.addFilter(capture)
         try:
-            yield told
+            yield messages
         finally:
-            LOG.removeFilter(keep)
+            LOG.removeFilter(capture)
 
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Call `listener` for each step of the work in this block, beside those of blocks around it.
+    """Call `listener`, and the listeners of enclosing blocks, for each step of the work in this block.
 
-    It is called from the thread of the block, or of a `polled` one.
+    It is called from the thread of the block, or from that of `polled`.
     """
-    around = _listener.get()
+    outer = _listener.get()
 
     def both(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
-        for one in filter(None, (around, listener)):
-            one(what, done, total, seconds_left=seconds_left)
+        for call in filter(None, (outer, listener)):
+            call(what, done, total, seconds_left=seconds_left)
 
     token = _listener.set(both)
     try:
@@ -78,7 +78,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def counts_as_debug() -> Iterator[None]:
-    """Log the counts of the block as details: something else shows them."""
+    """Log the counts of the block as debug lines, because something else shows them."""
     token = _level.set(logging.DEBUG)
     try:
         yield
@@ -87,41 +87,41 @@ def counts_as_debug() -> Iterator[None]:
 
 
 class Count:
-    """Counts the pieces of some work: `what` is what is done, such as 'photographs decoded'."""
+    """A counter of finished items; `what` describes them, such as 'photographs decoded'."""
 
     def __init__(self, what: str, total: int, is_even: bool = True) -> None:
-        """is_even: whether pieces take about the same time, so that the time left follows from those done."""
+        """is_even: whether items take about the same time, so that the time left can be estimated."""
         self.what, self.total, self.done, self.is_even = what, total, 0, is_even
-        self._began: tuple[float, int] | None = None  # when, and with how many done by an earlier call
+        self._start: tuple[float, int] | None = None  # time, and items that an earlier call had done
         self._logged = time.monotonic()
         self.reach(0)
 
     @property
     def seconds_left(self) -> float | None:
-        """The time that the other pieces take at the speed of those done so far; None before the first."""
-        if not self.is_even or self._began is None or self.done <= self._began[1]:
+        """The estimated time for the remaining items; None before the first is done."""
+        if not self.is_even or self._start is None or self.done <= self._start[1]:
             return None
-        began, before = self._began
-        return (time.monotonic() - began) / (self.done - before) * (self.total - self.done)
+        start, before = self._start
+        return (time.monotonic() - start) / (self.done - before) * (self.total - self.done)
 
     def reach(self, done: int) -> None:
-        """Note how many pieces are done; nobody hears of nothing."""
+        """Record and report how many items are done; a count of 0 items is not reported."""
         self.done = done
         if not self.total:
             return
-        if self._began is None or self.done < self._began[1]:
-            self._began = time.monotonic(), done
+        if self._start is None or self.done < self._start[1]:
+            self._start = time.monotonic(), done
         left = self.seconds_left
         if listener := _listener.get():
             listener(self.what, done, self.total, seconds_left=left)
         if done and time.monotonic() - self._logged >= INTERVAL:
             self._logged = time.monotonic()
-            told = f", {clock(left)} left" if left else ""
-            LOG.log(_level.get(), "%s: %d of %d%s", self.what, done, self.total, told)
+            remaining = f", {clock(left)} left" if left else ""
+            LOG.log(_level.get(), "%s: %d of %d%s", self.what, done, self.total, remaining)
 
 
 def counted(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
-    """Yield the items and count them; what was yielded is done when the next is asked for."""
+    """Yield the items and count them; an item is done when the next one is requested."""
     count = Count(what, total)
     for number, item in enumerate(items, 1):
         yield item
@@ -129,14 +129,14 @@ def counted(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
 
 
 @contextmanager
-def polled(count: Count, look: Callable[[], int]) -> Iterator[None]:
-    """Count work that does not count by itself: a thread looks now and then how many pieces are done."""
+def polled(count: Count, poll: Callable[[], int]) -> Iterator[None]:
+    """Report progress of the block from a thread that polls how many items are done."""
     ended, context = threading.Event(), contextvars.copy_context()
 
     def watch() -> None:
-        began = time.monotonic()
-        while not ended.wait(min(max(WATCH, (time.monotonic() - began) / LOOKS), SLOWEST)):
-            done = look()
+        start = time.monotonic()
+        while not ended.wait(min(max(FIRST_POLL, (time.monotonic() - start) / MAX_POLLS), SLOWEST_POLL)):
+            done = poll()
             if done > count.done:
                 count.reach(min(done, count.total))
 
@@ -150,25 +150,25 @@ def polled(count: Count, look: Callable[[], int]) -> Iterator[None]:
 
 
 def clock(seconds: float) -> str:
-    """Return a time as h:mm:ss, or m:ss."""
+    """Format a duration as h:mm:ss or m:ss."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 class Stopped(Interrupted):
-    """A stage has ended before its end, since the run is to stop; it is repeated when the run goes on."""
+    """A stage stopped early because the run is stopping; it is repeated when the run resumes."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """The state of training, for the terminal."""
+    """The state of training, for display."""
 
     step: int
     steps: int
     loss: float
-    psnr: float  # dB, the mean over the training views of the last reports, before 8 bits
-    gaussians: int | None  # None: what is trained are none
+    psnr: float  # dB, mean over recent training views, before 8-bit rounding
+    gaussians: int | None  # None when training a field
     milliseconds: float  # per step
     seconds_left: float
-    growth_known: bool = True  # False: rules will make steps slower, and it is not known yet how much
+    growth_known: bool = True  # False: densification will slow steps by an unknown amount

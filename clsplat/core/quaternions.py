@@ -1,4 +1,4 @@
-"""Quaternions (w, x, y, z) and rotation matrices on the host."""
+"""Convert and multiply quaternions (w, x, y, z) on the host."""
 
 import numpy as np
 import scipy
@@ -8,7 +8,7 @@ Floats = NDArray[np.float64]
 
 
 def rotation_matrix(w: ArrayLike, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Floats:
-    """Return the rotation matrices [..., 3, 3] of unit quaternions whose parts have the shape [...]."""
+    """Return the rotation matrices [..., 3, 3] of unit quaternions whose components have the shape [...]."""
     w, x, y, z = (np.asarray(part, np.float64) for part in (w, x, y, z))
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -25,7 +25,7 @@ def unit_quaternions(rotations: NDArray[np.floating]) -> Floats:
 
 
 def multiply(left: Floats, right: Floats) -> Floats:
-    """Return the products of quaternions, [N, 4]; one of both may be [4]."""
+    """Multiply quaternions, [N, 4]; one of the two may be [4]."""
     (w, x, y, z), (a, b, c, d) = left.T, right.T
     parts = [
         w * a - x * b - y * c - z * d,

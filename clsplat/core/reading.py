@@ -1,4 +1,4 @@
-"""Read files: regular ones alone, because a pipe or a device may have no end, and no more bytes than are expected."""
+"""Read regular files of limited size; pipes and devices are refused, because they may never end."""
 
 import errno
 import hashlib
@@ -29,7 +29,7 @@ def open_file(
 ) -> Iterator[BufferedReader]:
     """Open a regular file of at most `limit` bytes for reading.
 
-    Raises an error of this `kind` when that fails, or when the block cannot read.
+    Raises an error of type `kind` when opening fails or when the block fails to read.
     """
     try:
         with open_regular(path, limit) as file:
@@ -49,7 +49,7 @@ def read_file(
 def read_text(
     path: Path, expected: str = "a text file", kind: type[ClsplatError] = DataError, limit: int | None = None
 ) -> str:
-    """Return the UTF-8 text of a regular file.  Raises DataError, or another `kind`, with the line of what is none."""
+    """Return the UTF-8 text of a regular file.  Raises DataError, or `kind`, with the line of invalid bytes."""
     try:
         return read_file(path, expected, kind, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -66,7 +66,7 @@ def sha256(path: Path, expected: str = "a file", kind: type[ClsplatError] = Data
 def read_json(
     path: Path, expected: str = "a JSON file", kind: type[ClsplatError] = DataError, limit: int = MAX_JSON
 ) -> Any:
-    """Return what a JSON file holds.  Raises DataError, or another `kind`, as `open_file` does, and for other text."""
+    """Return the content of a JSON file.  Raises DataError, or another `kind`, if it cannot be read or parsed."""
     data = read_file(path, expected, kind, limit)
     try:
         return json.loads(data)
@@ -79,8 +79,8 @@ def open_regular(path: Path, limit: int | None = None) -> BufferedReader:
     """Open a regular file of at most `limit` bytes, as `open_file` does, but raise OSError."""
     try:
         state = os.stat(path)
-    except ValueError as error:  # a NUL in the name, or text that no file system can hold
-        raise OSError(errno.EINVAL, "no file has such a name") from error
+    except ValueError as error:  # a NUL in the name, or text that cannot be encoded
+        raise OSError(errno.EINVAL, "not a valid file name") from error
     if not stat.S_ISREG(state.st_mode):
         raise OSError(errno.EINVAL, f"it is {KINDS.get(stat.S_IFMT(state.st_mode), 'not a open_regular file')}")
     if limit is not None and state.st_size > limit:

@@ -1,4 +1,4 @@
-"""Where the files of this program are, and its version, with what tells it from other programs of the same version."""
+"""Locate the package's files and compute its version, with a commit or digest for development versions."""
 
 import hashlib
 import subprocess
@@ -14,16 +14,16 @@ CODE = ("clsplat", "cl_kernels", "data_tools", "pipelines")  # folders of a chec
 
 
 def resource_dir(name: str) -> Path:
-    """Return the folder `cl_kernels` or `pipelines`: a wheel carries it inside the package, a checkout beside it."""
+    """Return the folder `cl_kernels` or `pipelines`: inside the package in a wheel, next to it in a checkout."""
     for base in (PACKAGE, PACKAGE.parent):
         if (base / name).is_dir():
             return base / name
-    raise FileNotFoundError(f"{name}/ is missing beside {PACKAGE}")
+    raise FileNotFoundError(f"{name}/ is missing next to {PACKAGE}")
 
 
 @cache
 def full_version() -> str:
-    """Return the version; that of a development version ends in the commit, or in a digest of the code.
+    """Return the version; a development version ends with the commit or a digest of the code.
 
     `0.2.0.dev0+g1a2b3c4` is a checkout at that commit without changes; `0.2.0.dev0+d5e6f7a8b` is anything else.
     """
@@ -34,7 +34,7 @@ def full_version() -> str:
 
 
 def list_sources() -> list[str]:
-    """Return names and hashes of the files that decide what the program computes: Python and kernels."""
+    """Return names and hashes of all Python files and kernels, which decide what the program computes."""
     tools = PACKAGE / "data_tools"  # in a wheel; a checkout has it next to the package
     python = [path for path in PACKAGE.rglob("*.py") if not path.is_relative_to(tools)]
     kernels = resource_dir("cl_kernels")
@@ -47,7 +47,7 @@ def list_sources() -> list[str]:
 
 
 def _files_of_code() -> list[str]:
-    """Names and hashes of all files of a program: recipes, page templates and made scenes too."""
+    """Return names and hashes of all files of the program, including pipelines, page templates, and data tools."""
     folders = [PACKAGE if name == "clsplat" else resource_dir(name) for name in CODE]
     return [
         f"{folder.name}/{path.relative_to(folder).as_posix()} {sha256(path)}"
@@ -58,14 +58,14 @@ def _files_of_code() -> list[str]:
 
 
 def _commit(root: Path) -> str:
-    """The commit of a checkout whose code has no changes, else ""."""
+    """Return the commit of a checkout with unchanged code, else ""."""
     if not (root / ".git").exists() or _git(root, "status", "--porcelain", "--", *CODE) != "":
         return ""
     return _git(root, "rev-parse", "--short=7", "HEAD") or ""
 
 
 def _git(root: Path, *words: str) -> str | None:
-    """What git prints, None where it fails or is not installed."""
+    """Return the output of git, or None if it fails or is not installed."""
     try:
         done = subprocess.run(
             ["git", "--no-optional-locks", "-C", str(root), *words], capture_output=True, timeout=10, check=True

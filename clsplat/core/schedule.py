@@ -1,10 +1,10 @@
-"""Numbers that may change over training, in one notation for weights, rates, sizes, blur and thresholds.
+"""Define schedules: numbers that may change over training, such as weights, learning rates, and thresholds.
 
-0.8                                                     the same at every step
-[[0, 4.0], [1000, 1.0]]                                 points (global step, value), straight lines between
-{points: [[0, 4.0], [1000, 1.0]], between: steps}       each value from its step on, until the next
-{initial: 1.6e-4, final: 1.6e-6, over: 30000, start: 0} exponential decay over a number of steps from a step on
-{every: 4, value: 5.0e-4}                               at every so many steps, else 0
+0.8                                                     constant
+[[0, 4.0], [1000, 1.0]]                                 points (global step, value), linearly interpolated
+{points: [[0, 4.0], [1000, 1.0]], between: steps}       piecewise constant: each value from its step on
+{initial: 1.6e-4, final: 1.6e-6, over: 30000, start: 0} exponential decay over a number of steps
+{every: 4, value: 5.0e-4}                               the value at every 4th step, else 0
 """
 
 import inspect
@@ -26,7 +26,7 @@ Point = Annotated[list[float], Field(min_length=2, max_length=2)]  # global step
 def _in_order(points: list[Point]) -> list[Point]:
     steps = [step for step, _ in points]
     if not points or steps != sorted(set(steps)):
-        raise ValueError("expected points [step, value] with growing steps")
+        raise ValueError("expected points [step, value] with increasing steps")
     return points
 
 
@@ -45,7 +45,7 @@ PointList = Annotated[list[Point], AfterValidator(_in_order)]
 
 
 class Curve(Settings):
-    """A value by step, given by keys of its own; a schedule takes any subclass."""
+    """A schedule given as a mapping; a `Schedule` field accepts any subclass, plug-ins included."""
 
     @abstractmethod
     def at(self, step: int) -> float:
@@ -54,15 +54,17 @@ class Curve(Settings):
     @property
     @abstractmethod
     def values(self) -> list[float]:
-        """The values that bounds are checked on: the smallest must be among them."""
+        """The values that bounds are checked on, including the smallest and the largest."""
 
     def divide(self, factor: float) -> "Curve":
-        """Return the curve with its values divided by a factor.  Raises ConfigError where it has no such values."""
-        raise ConfigError(f"{type(self).__name__}: cannot follow the number of steps; expected a number or points")
+        """Return the curve with its values divided by a factor.  Raises ConfigError if it does not support that."""
+        raise ConfigError(
+            f"{type(self).__name__}: cannot be rescaled to another number of steps; use a number or points"
+        )
 
 
 class _Curves:
-    """Marks a field that takes any curve, told apart by its keys."""
+    """Marks a field that accepts any curve, recognized by its keys."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         kinds = [kind for kind in Settings.defined if issubclass(kind, Curve) and not inspect.isabstract(kind)]
@@ -73,9 +75,9 @@ class Points(Curve):
     """Values at steps; constant before the first point and after the last."""
 
     points: PointList
-    """[global step, value], with growing steps."""
+    """[global step, value], with increasing steps."""
     between: Literal["linear", "steps"] = "linear"
-    """Values between two points: on a straight line, or that of the point before."""
+    """Values between two points: `linear` interpolates, `steps` keeps the earlier value."""
 
     def at(self, step: int) -> float:
         return _between(self.points, step, linear=self.between == "linear")
@@ -89,7 +91,7 @@ class Points(Curve):
 
 
 class Decay(Curve):
-    """A value that falls or grows exponentially (Kerbl et al. 2023)."""
+    """A value that decays or grows exponentially, as the learning rates of Kerbl et al. 2023."""
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"over", "start"})
 
@@ -98,9 +100,9 @@ class Decay(Curve):
     final: Annotated[float, Field(gt=0)]
     """The value from `start + over` on."""
     over: Annotated[int, Field(gt=0)]
-    """Steps from the one value to the other."""
+    """Number of steps from `initial` to `final`."""
     start: Annotated[int, Field(ge=0)] = 0
-    """Global step at which the decay begins."""
+    """Global step at which the decay starts."""
 
     def at(self, step: int) -> float:
         share = min(max(step - self.start, 0) / self.over, 1.0)
@@ -115,10 +117,10 @@ class Decay(Curve):
 
 
 class Every(Curve):
-    """A value at every so many steps, and 0 at the others (such as the rate of what may change rarely)."""
+    """A value at every N-th step and 0 at the others, such as a learning rate of rare updates."""
 
     every: Annotated[int, Field(gt=0)]
-    """Steps from one value to the next."""
+    """Interval in steps."""
     value: float
     """The value at global steps that are multiples of `every`."""
 
@@ -134,13 +136,13 @@ class Every(Curve):
 
 
 NOTATIONS = (
-    "expected a number, points [[step, value], …] with growing steps, {points, between}, {initial, final, over, start} "
-    "or {every, value}"
+    "expected a number, points [[step, value], …] with increasing steps, {points, between}, "
+    "{initial, final, over, start} or {every, value}"
 )
 
 
 def explain_schedule(more: str = "") -> WrapValidator:
-    """Make one sentence of the errors of all notations; `more` names other values that the field accepts."""
+    """Report errors of all notations as one sentence; `more` names further values that the field accepts."""
     return in_one_sentence(NOTATIONS + more)
 
 
@@ -148,7 +150,7 @@ Schedule = Annotated[float | PointList | Annotated[Curve, _Curves()], explain_sc
 
 
 def schedule_values(schedule: Schedule) -> list[float]:
-    """Return all values of a schedule's notation."""
+    """Return all values in a schedule's notation."""
     if isinstance(schedule, list):
         return [value for _, value in schedule]
     return schedule.values if isinstance(schedule, Curve) else [schedule]
@@ -162,23 +164,23 @@ def divide(schedule: Schedule, factor: float) -> Schedule:
 
 
 class Bounded:
-    """Requires every value of a schedule to be at least `lowest`, or, where `above`, larger; and at most `most`."""
+    """Requires the values of a schedule to be from `minimum` (excluded if `exclusive`) to `maximum`."""
 
-    def __init__(self, lowest: float, above: bool = False, most: float = math.inf) -> None:
-        self.lowest, self.above, self.most = lowest, above, most
+    def __init__(self, minimum: float, exclusive: bool = False, maximum: float = math.inf) -> None:
+        self.minimum, self.exclusive, self.maximum = minimum, exclusive, maximum
 
     def __call__(self, schedule: Any) -> Any:
         lowest = min(schedule_values(schedule))
-        if lowest < self.lowest or (self.above and lowest == self.lowest):
-            bound = "larger than" if self.above else "at least"
-            raise ValueError(f"expected values {bound} {self.lowest:g}")
-        if max(schedule_values(schedule)) > self.most:
-            raise ValueError(f"expected values of at most {self.most:g}")
+        if lowest < self.minimum or (self.exclusive and lowest == self.minimum):
+            bound = "larger than" if self.exclusive else "at least"
+            raise ValueError(f"expected values {bound} {self.minimum:g}")
+        if max(schedule_values(schedule)) > self.maximum:
+            raise ValueError(f"expected values of at most {self.maximum:g}")
         return schedule
 
 
 NonNegative = Annotated[Schedule, AfterValidator(Bounded(0))]
-Positive = Annotated[Schedule, AfterValidator(Bounded(0, above=True))]
+Positive = Annotated[Schedule, AfterValidator(Bounded(0, exclusive=True))]
 Probability = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.9))]
 AtLeastOne = Annotated[Schedule, AfterValidator(Bounded(1))]
 
@@ -190,33 +192,33 @@ def at_step(schedule: Schedule, step: int) -> float:
     return schedule.at(step) if isinstance(schedule, Curve) else schedule
 
 
-# The steps at which something acts every so many of them.
+# Events that fire at a fixed interval of steps, which need not be a whole number.
 
 EverySteps = Annotated[
     Annotated[int, Field(gt=0)] | Annotated[float, Field(ge=1)],
-    in_one_sentence("expected a number of steps of at least 1, which need not be whole"),
+    in_one_sentence("expected a number of steps of at least 1; fractions are allowed"),
 ]
 
 
 def fires_at(every: float, step: int) -> bool:
-    """Return whether there is an act at a step, counted from 1."""
+    """Return whether an event fires at a step, counted from 1."""
     return step % every == 0 if isinstance(every, int) else count_fired(every, step) > count_fired(every, step - 1)
 
 
 def count_fired(every: float, step: int) -> int:
-    """Return the number of acts up to a step."""
+    """Return how often the event has fired up to and including a step."""
     steps, parts = _ratio(every)
     return ((step + 1) * parts - 1) // steps
 
 
 def fire_step(every: float, number: int) -> int:
-    """Return the step of an act, by its number, counted from 1."""
+    """Return the step at which the event fires for the `number`-th time, counted from 1."""
     steps, parts = _ratio(every)
     return number * steps // parts
 
 
 def fire_steps(every: float, start: int, stop: int) -> list[int]:
-    """Return the steps of the acts after `start` and before `stop`."""
+    """Return the steps after `start` and before `stop` at which the event fires."""
     return [
         fire_step(every, number) for number in range(count_fired(every, start) + 1, count_fired(every, stop - 1) + 1)
     ]
@@ -224,5 +226,5 @@ def fire_steps(every: float, start: int, stop: int) -> list[int]:
 
 @lru_cache(maxsize=1024)
 def _ratio(every: float) -> tuple[int, int]:
-    """The number as it is written, in decimals: exact, so that what acts together goes on doing so."""
+    """Return the interval as the exact ratio of its decimal notation, so that events that coincide keep coinciding."""
     return Fraction(str(every)).as_integer_ratio()

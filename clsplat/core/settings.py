@@ -1,7 +1,7 @@
-"""Settings: frozen models whose fields are the keys of a pipeline file, and the variants that a key chooses from.
+"""Define settings: frozen models whose fields are the keys of a pipeline file, and the named variants of a key.
 
-A variant is a subclass with a name: the literal in its field `type`, or `stage` for stages.  A pipeline file can
-name it as soon as its class is defined, in the package or in a plug-in; there is no other list of variants.
+A variant is a subclass with a name, the literal of its field `type`, or `stage` for stages.  A pipeline file can
+use it as soon as its class is defined, in the package or in a plug-in; there is no other list of variants.
 """
 
 import ast
@@ -29,7 +29,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from clsplat.core.errors import ConfigError
 
-TAGS = ("stage", "type")  # fields that hold a variant's name
+TAGS = ("stage", "type")  # fields that contain a variant's name
 Base = TypeVar("Base", bound="Settings")
 
 
@@ -37,70 +37,70 @@ class Settings(BaseModel):
     """Base of all settings in pipeline files: unknown keys and wrong types are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
-    defined: ClassVar[list[type["Settings"]]] = []  # every subclass, in the order of definition
-    output_keys: ClassVar[frozenset[str]] = frozenset()  # the model does not depend on them: they may change on resume
-    training_keys: ClassVar[frozenset[str]] = frozenset()  # they may change on resume; bits then no longer compare
-    step_keys: ClassVar[frozenset[str]] = frozenset()  # steps that grow with the length of the training
-    keyed_by_type: ClassVar[bool] = False  # in a list each type is there once, and addressed by it
-    rate_keys: ClassVar[frozenset[str]] = frozenset()  # schedules by step whose values fall as much, so that sums stay
-    family: ClassVar[str] = ""  # by which `conflicts` of others may name it, next to its type
+    defined: ClassVar[list[type["Settings"]]] = []  # all subclasses in order of definition
+    output_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume: the model does not depend on them
+    training_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume, but the bits then change too
+    step_keys: ClassVar[frozenset[str]] = frozenset()  # step numbers that scale with the length of training
+    keyed_by_type: ClassVar[bool] = False  # a list has each type at most once and is addressed by type
+    rate_keys: ClassVar[frozenset[str]] = frozenset()  # schedules that are divided by that scale, so that sums stay
+    family: ClassVar[str] = ""  # a name besides its type by which `conflicts` may refer to it
     conflicts: ClassVar[Mapping[str, str]] = {}
-    """What it does not go together with, by type or family, in the same stage or outside of stages: why; what to do."""
+    """Types or families that exclude this one, in the same stage or outside of stages: `why; what to do`."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
         Settings.defined.append(cls)
 
     def conflict_names(self) -> set[str]:
-        """Return the names by which the `conflicts` of others mean it."""
+        """Return the names by which `conflicts` of other settings may refer to this one."""
         return {self.family, *(str(getattr(self, tag)) for tag in TAGS if tag in type(self).model_fields)}
 
     def excluded(self) -> Mapping[str, str]:
-        """Return its `conflicts`, as its values make them."""
+        """Return the conflicts that apply to these values."""
         return self.conflicts
 
     def check_pipeline(self, pipeline: Any) -> None:
-        """Raise ConfigError where the pipeline file around it (PipelineFile) lacks what it needs."""
+        """Raise ConfigError if the whole pipeline file (PipelineFile) lacks something that this needs."""
 
     def parts(self) -> dict[str, Any]:
-        """Return its values by key, without those that do not count."""
+        """Return the values by key, without those that have no effect."""
         return {key: getattr(self, key) for key in type(self).model_fields}
 
     def input_path(self, key: str, scene: str | None) -> Path | None:
-        """Return the file or folder that is read where a key names one, else None.  scene: folder of the dataset."""
+        """Return the input file or folder that a key names, or None.  `scene` is the folder of the dataset."""
         value = getattr(self, key)
         return Path(value) if isinstance(value, str) and is_input_path(type(self), key) else None
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        found = handler(schema)
-        properties = handler.resolve_ref_schema(found).get("properties", {})
+        json_schema = handler(schema)
+        properties = handler.resolve_ref_schema(json_schema).get("properties", {})
         for name, text in descriptions(cls).items():
             properties.get(name, {}).setdefault("description", text)
-        return found
+        return json_schema
 
 
-def iter_settings(value: Any, place: str = "") -> Iterator[tuple[str, Settings]]:
-    """Yield all settings inside of settings or a list, each with its place, such as stages[1].optimize.losses[0]."""
+def iter_settings(value: Any, path: str = "") -> Iterator[tuple[str, Settings]]:
+    """Yield all settings nested in a value, each with its key path, such as stages[1].optimize.losses[0]."""
     if isinstance(value, list | tuple):
         for i, inner in enumerate(value):
-            yield from iter_settings(inner, f"{place}[{i}]")
+            yield from iter_settings(inner, f"{path}[{i}]")
     elif isinstance(value, dict):
-        yield from iter_settings(list(value.values()), place)
+        yield from iter_settings(list(value.values()), path)
     elif isinstance(value, Settings):
-        place = f"{place}.{name}" if (name := getattr(value, "stage", None)) else place
-        yield place, value
+        path = f"{path}.{name}" if (name := getattr(value, "stage", None)) else path
+        yield path, value
         for key, inner in value.parts().items():
-            yield from iter_settings(inner, f"{place}.{key}" if place else key)
+            yield from iter_settings(inner, f"{path}.{key}" if path else key)
 
 
 @functools.cache
 def descriptions(kind: type[BaseModel]) -> dict[str, str]:
-    """Return the docstrings of a class's fields, by name; none where its source cannot be read.
+    """Return the docstrings of a class's fields by name, or nothing if its source cannot be read.
 
-    They are read from the source when they are asked for: for all classes at each start it would take a third of it.
+    The source is parsed on demand: parsing all classes would add a third to the time of each start.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if not (issubclass(base, BaseModel) and base.__annotations__):
             continue
@@ -112,12 +112,12 @@ def descriptions(kind: type[BaseModel]) -> dict[str, str]:
         for field, below in itertools.pairwise(tree.body):
             match field, below:
                 case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
-                    found[name] = inspect.cleandoc(text)
-    return {name: text for name, text in found.items() if name in kind.model_fields}
+                    texts[name] = inspect.cleandoc(text)
+    return {name: text for name, text in texts.items() if name in kind.model_fields}
 
 
 def tag_of(kind: type[Settings]) -> tuple[str, str] | None:
-    """Return the field that names a variant, and its name; None for a class that is only a base of variants."""
+    """Return the tag field of a variant and the variant's name, or None for a base class."""
     for tag in TAGS:
         if tag in kind.model_fields and (names := typing.get_args(kind.model_fields[tag].annotation)):
             return tag, str(names[0])
@@ -125,7 +125,7 @@ def tag_of(kind: type[Settings]) -> tuple[str, str] | None:
 
 
 def resume_effect(kind: type[Settings], key: str) -> Literal["output", "training"] | None:
-    """Return what a change of a key means when a run goes on; None where it cannot.  Subclasses add to their bases."""
+    """Return what changing a key on resume affects, or None if it may not change."""
     bases = [base for base in kind.__mro__ if issubclass(base, Settings)]
     if any(key in base.output_keys for base in bases):
         return "output"
@@ -133,25 +133,25 @@ def resume_effect(kind: type[Settings], key: str) -> Literal["output", "training
 
 
 def variants(base: type[Base]) -> dict[str, type[Base]]:
-    """Return the subclasses of `base` that have a name, by name.  Raises ConfigError when two have the same one."""
+    """Return the variants of `base` by name.  Raises ConfigError when two have the same name."""
     return dict(_named(base, tuple(Settings.defined)))
 
 
 @functools.lru_cache(maxsize=256)
 def _named(base: type[Base], defined: tuple[type["Settings"], ...]) -> dict[str, type[Base]]:
-    found: dict[str, type[Base]] = {}
+    named: dict[str, type[Base]] = {}
     for kind in defined:
         if not issubclass(kind, base) or (tag := tag_of(kind)) is None:
             continue
-        if tag[1] in found:
-            places = " and ".join(f"{one.__module__}.{one.__name__}" for one in (found[tag[1]], kind))
-            raise ConfigError(f"two variants of {base.__name__} have the name '{tag[1]}': {places}; rename one")
-        found[tag[1]] = kind
-    return found
+        if tag[1] in named:
+            classes = " and ".join(f"{other.__module__}.{other.__name__}" for other in (named[tag[1]], kind))
+            raise ConfigError(f"two variants of {base.__name__} have the name '{tag[1]}': {classes}; rename one")
+        named[tag[1]] = kind
+    return named
 
 
 def invalid_variant_reason(kind: type[Settings]) -> str | None:
-    """Return why no pipeline file can name a class that is meant as a variant, or None."""
+    """Return why a class that looks like a variant cannot be used in a pipeline file, or None."""
     if kind.__subclasses__():
         return None
     if missing := sorted(getattr(kind, "__abstractmethods__", ())):
@@ -168,12 +168,12 @@ def invalid_variant_reason(kind: type[Settings]) -> str | None:
 
 
 def needs_settings(kind: type[Settings]) -> bool:
-    """Return whether the name of a variant alone is too little: it has keys without a default."""
+    """Return whether a variant has required keys, so that its name alone is not enough."""
     return any(field.is_required() for name, field in kind.model_fields.items() if name not in TAGS)
 
 
 class Variants:
-    """Marks a field that accepts one of the variants of a base: a mapping with its name, or the name alone."""
+    """Marks a field that accepts a variant of a base: a mapping with its name, or only the name."""
 
     def __init__(self, base: type[Settings]) -> None:
         self.base = base
@@ -194,43 +194,43 @@ class Variants:
         return core_schema.no_info_before_validator_function(with_tag, union)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        alone = [name for name, kind in variants(self.base).items() if not needs_settings(kind)]
+        names = [name for name, kind in variants(self.base).items() if not needs_settings(kind)]
         mapping = {"required": [self.tag], **handler(schema)}
-        return {"anyOf": [{"enum": alone}, mapping]} if alone else mapping
+        return {"anyOf": [{"enum": names}, mapping]} if names else mapping
 
 
 def _readable(text: str) -> str:
     if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-        raise ValueError("expected a path: no name of a file holds such a character")
+        raise ValueError("expected a path; it contains a character that file names cannot have")
     return text
 
 
 def in_one_sentence(expected: str) -> WrapValidator:
-    """Make one sentence of the errors of a field's notations: the first that one of them says itself, or `expected`."""
+    """Report errors of a field's notations as one sentence: the first custom message of a validator, or `expected`."""
 
     def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
         try:
             return validate(value)
         except ValidationError as error:
-            own = [one["msg"].removeprefix("Value error, ") for one in error.errors() if one["type"] == "value_error"]
-            raise ValueError(next((text for text in own if not expected.startswith(text)), expected)) from None
+            texts = [e["msg"].removeprefix("Value error, ") for e in error.errors() if e["type"] == "value_error"]
+            raise ValueError(next((text for text in texts if not expected.startswith(text)), expected)) from None
 
     return WrapValidator(validated)
 
 
-InputPath = Annotated[str, AfterValidator(_readable)]  # a file or folder that is read
+InputPath = Annotated[str, AfterValidator(_readable)]  # an input file or folder
 
 
 def is_input_path(kind: type[Settings], key: str) -> bool:
-    """Return whether a key holds the path of a file or folder that is read."""
+    """Return whether a key is the path of an input file or folder."""
     field = kind.model_fields[key]
     return InputPath in (field.annotation, *typing.get_args(field.annotation)) or any(
-        isinstance(one, AfterValidator) and one.func is _readable for one in field.metadata
+        isinstance(item, AfterValidator) and item.func is _readable for item in field.metadata
     )
 
 
 class VariantName:
-    """Marks a field that accepts the name of one of the variants of a base, or of those that `accepts` is true of."""
+    """Marks a field that accepts the name of a variant of a base for which `accepts` is true."""
 
     def __init__(self, base: type[Base], accepts: Callable[[type[Base]], bool] = lambda kind: True) -> None:
         self.base, self._accepts = base, accepts
@@ -244,22 +244,22 @@ if TYPE_CHECKING:
 else:
 
     class OneOf:
-        """`OneOf[Rule]`: any variant of Rule."""
+        """The type of a field that accepts any variant of a base, as in `OneOf[Rule]`."""
 
         def __class_getitem__(cls, base: type[Settings]) -> Any:
             return Annotated[base, Variants(base)]
 
 
 def import_modules(package: str, path: Iterable[str]) -> None:
-    """Import every module of a package, so that the variants in them are defined."""
+    """Import every module of a package, so that its variants are defined."""
     for module in pkgutil.iter_modules(path):
         importlib.import_module(f"{package}.{module.name}")
 
 
 def rebuild_models() -> None:
-    """Rebuild all models, so that their fields accept variants defined since, such as those of a plug-in."""
-    complete = [kind for kind in Settings.defined if kind.__pydantic_complete__]  # others are built at their first use
-    for kind in complete:  # a schema holds those of its variants, and theirs
+    """Rebuild all models, so that their fields accept variants defined later, such as those of a plug-in."""
+    complete = [kind for kind in Settings.defined if kind.__pydantic_complete__]  # others are built on first use
+    for kind in complete:  # schemas contain those of nested variants
         if "__pydantic_core_schema__" in vars(kind):
             del kind.__pydantic_core_schema__
     for kind in complete:

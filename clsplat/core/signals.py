@@ -1,4 +1,4 @@
-"""What Ctrl-C, SIGTERM and SIGHUP do."""
+"""Handle Ctrl-C, SIGTERM, and SIGHUP, and keep stdout and stderr from failing."""
 
 import _thread
 import errno
@@ -13,18 +13,18 @@ from typing import Any, NoReturn, TextIO
 
 from clsplat.core.errors import OutputError
 
-NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # the last is of Windows: Ctrl-Break, or the window closes
-GRACE = 60.0  # seconds for a process whose input has ended, before it is ended at once
-IMPORT_SECONDS = 10.0  # that a signal waits for the end of an import: a plug-in's may have none
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # SIGBREAK: Ctrl-Break on Windows, or its window closes
+GRACE = 60.0  # seconds to stop after stdin has closed, before the process exits
+IMPORT_SECONDS = 10.0  # at most; a plug-in's import may never end
 
 
 class _Received:
-    """The signals of the outermost block, and how many blocks there are."""
+    """The signals received in the outermost block, and the number of nested blocks."""
 
     def __init__(self) -> None:
         self.blocks = 0
-        self.number = 0  # of the last one; 0: there was none
-        self.since = 0.0  # when the first one came
+        self.number = 0  # of the last signal; 0: none
+        self.since = 0.0  # time of the first signal
 
     def take(self, number: int) -> None:
         self.since = self.since if self.number else time.monotonic()
@@ -35,28 +35,28 @@ _received = _Received()
 
 
 def exit_on_signals() -> None:
-    """Let a signal end the process with its sentence and code, from here on where no block says what else to do.
+    """Make signals exit the process with a message and exit code 130, except in `stopping_on_signals` blocks.
 
-    It is for the start, before anything is written: the import of an extension turns KeyboardInterrupt into an abort,
-    and some libraries catch whatever is raised.
+    This is for startup, before anything is written: importing an extension turns KeyboardInterrupt into an abort, and
+    some libraries catch every exception.
     """
-    for number in _taken():
-        signal.signal(number, _end_at_once)
+    for number in _handlers():
+        signal.signal(number, _exit)
 
 
-def _end_at_once(number: int, frame: Any) -> NoReturn:
+def _exit(number: int, frame: Any) -> NoReturn:
     with suppress(OSError):
         os.write(2, b"stopped\n")
     os._exit(130)
 
 
 def stop_with_input() -> None:
-    """Let the end of standard input stop the process as SIGTERM does: whoever has started it has ended, or says so."""
+    """Stop the process as SIGTERM does when stdin closes: the parent process exited or asked it to stop."""
     threading.Thread(target=_watch_input, name="input", daemon=True).start()
 
 
 def _watch_input() -> None:
-    """Read with os.read: a buffered read that waits would abort the interpreter at its end."""
+    """Wait for the end of stdin with os.read: a pending buffered read would abort the interpreter at exit."""
     with suppress(OSError):
         while os.read(0, 4096):
             pass
@@ -65,8 +65,8 @@ def _watch_input() -> None:
     os._exit(130)
 
 
-def _taken() -> dict[int, Any]:
-    """Numbers and handlers of the signals; one that is ignored, as SIGHUP is under nohup, stays ignored."""
+def _handlers() -> dict[int, Any]:
+    """Return signals and their handlers, except ignored ones: SIGHUP stays ignored under nohup."""
     numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
     handlers = {number: signal.getsignal(number) for number in numbers}
     return {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
@@ -74,7 +74,7 @@ def _taken() -> dict[int, Any]:
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` on Ctrl-C, SIGTERM and SIGHUP; outside the main thread nothing changes."""
+    """Call `stop` on Ctrl-C, SIGTERM, and SIGHUP; without effect outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -83,7 +83,7 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
         _received.take(number)
         stop()
 
-    before = _taken()
+    before = _handlers()
     _received.blocks += 1
     try:
         for number in before:
@@ -98,16 +98,16 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 
 def stop_at_once() -> None:
-    """Raise KeyboardInterrupt; in the middle of an import, which it would break, soon after its end."""
+    """Raise KeyboardInterrupt; during an import, which it would break, wait for the import to end."""
     waited = time.monotonic() - _received.since if _received.number else 0.0
     if waited < IMPORT_SECONDS and _is_importing():
-        _thread.start_new_thread(_again, (_received.number or signal.SIGINT,))  # takes no lock, as `threading` does
+        _thread.start_new_thread(_signal_again, (_received.number or signal.SIGINT,))  # `threading` would take a lock
     else:
         raise KeyboardInterrupt
 
 
 def stop_if_signaled() -> None:
-    """Raise KeyboardInterrupt where a signal came in the outermost block: a library may have caught the first one."""
+    """Raise KeyboardInterrupt if the outermost block received a signal: a library may have caught the first one."""
     if _received.number and threading.current_thread() is threading.main_thread():
         raise KeyboardInterrupt
 
@@ -120,16 +120,16 @@ def _is_importing() -> bool:
     return False
 
 
-def _again(number: int) -> None:
+def _signal_again(number: int) -> None:
     time.sleep(0.02)
     _thread.interrupt_main(signal.Signals(number))
 
 
-# stdout and stderr, which may be closed, full or gone: what is written there ends nothing.
+# stdout and stderr may be closed, full, or gone; writing to them never raises.
 
 
 class Stream:
-    """stdout or stderr, by its name in `sys`; after the first failure it drops what it is given, and knows why."""
+    """A wrapper of stdout or stderr (`name` in `sys`); after a failure it keeps the error and drops all output."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -144,7 +144,7 @@ class Stream:
 
     @property
     def rich_proxied_file(self) -> "Stream":
-        """What rich writes to: this, not the stream behind it."""
+        """Make rich write to this wrapper, not to the stream behind it."""
         return self
 
     def __getattr__(self, name: str) -> Any:
@@ -156,7 +156,7 @@ class Stream:
         return len(text)
 
     def flush(self) -> None:
-        """Write what is held back; never raises for the state of the stream."""
+        """Flush the stream; never raises for the state of the stream."""
         self._do("flush")
 
     def _do(self, action: str, *arguments: str) -> None:
@@ -167,21 +167,21 @@ class Stream:
             getattr(stream, action)(*arguments)
         except UnicodeError:
             raise
-        except RuntimeError:  # the handler of a signal prints while the stream is being written
+        except RuntimeError:  # a signal handler printed during a write
             return
         except (OSError, ValueError) as error:  # ValueError: closed by this process
             self.fault = error
             _silence(stream)
 
     def install(self) -> None:
-        """Put this in the place of the stream in `sys`, for everything that prints."""
+        """Replace the stream in `sys` by this wrapper."""
         self.fault = None
         stream = self._raw
-        if stream is None:  # closed before the start
+        if stream is None:  # closed before startup
             self.fault = OSError(errno.EBADF, os.strerror(errno.EBADF))
             stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
         if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")  # of file names that are not text
+            stream.reconfigure(errors="backslashreplace")  # for file names that are not valid text
         self._replaced = stream
         setattr(sys, self.name, self)
 
@@ -190,24 +190,24 @@ STDOUT, STDERR = Stream("stdout"), Stream("stderr")
 
 
 def install() -> None:
-    """Let nothing that prints fail; descriptors closed before the start lead nowhere, not into the next open file."""
+    """Make printing never fail; closed descriptors are opened on the null device, so that no later file gets them."""
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it takes the lowest free number
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # os.open returns the lowest free number
     STDOUT.install()
     STDERR.install()
 
 
 def check_output() -> None:
-    """Raise OutputError where stdout could not be written; a reader that closed the pipe has what it wanted."""
+    """Raise OutputError if stdout could not be written; a pipe closed by its reader is not an error."""
     STDOUT.flush()
     fault = STDOUT.fault
     if fault is None or _closed_by_reader(fault):
         return
     reason = getattr(fault, "strerror", None) or fault
-    raise OutputError(f"stdout: cannot be written ({reason}); let it lead elsewhere, or free its space")
+    raise OutputError(f"stdout: cannot be written ({reason}); redirect it elsewhere, or free space")
 
 
 def _closed_by_reader(fault: OSError | ValueError) -> bool:
@@ -216,7 +216,7 @@ def _closed_by_reader(fault: OSError | ValueError) -> bool:
 
 
 def _silence(stream: Any) -> None:
-    """Let a stream lead nowhere: what it still holds is flushed at the end, which must not fail."""
+    """Redirect a stream to the null device, so that flushing its buffer at exit does not fail."""
     with suppress(OSError, ValueError, AttributeError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
@@ -224,7 +224,7 @@ def _silence(stream: Any) -> None:
 
 
 def take_stdin() -> int:
-    """Return a number for stdin; runtimes get an empty one: on Windows asking about a pipe may wait for readers."""
+    """Return a private descriptor of stdin and give runtimes an empty one: on Windows, querying a pipe can block."""
     pipe, empty = os.dup(0), os.open(os.devnull, os.O_RDONLY)
     os.dup2(empty, 0)
     os.close(empty)
@@ -232,7 +232,7 @@ def take_stdin() -> int:
 
 
 def take_stdout() -> TextIO:
-    """Return stdout, and send what runtimes print there to stderr from here on."""
+    """Return a private stdout, and redirect everything that runtimes print there to stderr."""
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return out

@@ -1,4 +1,4 @@
-"""Output to the terminal: a live line of progress, or plain lines when the output is not a terminal."""
+"""Write to the terminal: a live progress bar, or plain lines when the output is not a terminal."""
 
 import json
 import logging
@@ -24,54 +24,54 @@ from clsplat.core.resources import full_version
 LOG = logging.getLogger("clsplat")
 CONSOLE = Console(file=signals.STDOUT, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
 ERRORS = Console(file=signals.STDERR, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
-_bars: list[Live] = []  # that are drawn
+_bars: list[Live] = []  # visible now
 
 
 class StatusSource(Protocol):
-    """The status of a run: `now` holds stage, progress (done, total, unit), step and steps."""
+    """The status of a run: `now` has stage, progress (done, total, unit), step, and steps."""
 
     @property
     def now(self) -> Any: ...
 
 
 class _TerminalHandler(logging.Handler):
-    """A handler that prints remarks to `remarks`, warnings to stderr; above a progress bar where both are terminals."""
+    """A handler that prints messages to `console` and warnings to stderr, above any visible progress bar."""
 
-    def __init__(self, remarks: Console) -> None:
+    def __init__(self, console: Console) -> None:
         super().__init__()
-        self.remarks = remarks
+        self.console = console
 
     def emit(self, record: logging.LogRecord) -> None:
         warning = record.levelno >= logging.WARNING
-        console = ERRORS if warning else self.remarks
-        if _bars and console.is_terminal:  # past the bar's console a line would be glued to it
+        console = ERRORS if warning else self.console
+        if _bars and console.is_terminal:  # otherwise the line would be glued to the bar
             console = CONSOLE
         console.print(("warning: " if warning else "") + record.getMessage(), markup=False)
 
 
-def start_logging(debug: bool, remarks: Console = CONSOLE) -> None:
-    """Send the log to the terminal, with debug lines when `debug` is True."""
+def start_logging(debug: bool, console: Console = CONSOLE) -> None:
+    """Log to the terminal, with debug lines if `debug` is True."""
     LOG.setLevel(logging.DEBUG)
     LOG.handlers.clear()
-    handler = _TerminalHandler(remarks)
+    handler = _TerminalHandler(console)
     handler.setLevel(logging.DEBUG if debug else logging.INFO)
     LOG.addHandler(handler)
 
 
 def keep_stdout_for_json() -> None:
-    """Send remarks of the log to stderr from here on: stdout holds JSON alone."""
+    """Log to stderr from now on, so that stdout has only JSON."""
     for handler in LOG.handlers:
         if isinstance(handler, _TerminalHandler):
-            handler.remarks = ERRORS
+            handler.console = ERRORS
 
 
 def print_message(text: str) -> None:
-    """Print what was done; where that cannot be written nothing is lost."""
+    """Print an informational message; failing to write it is not an error."""
     CONSOLE.print(text, markup=False)
 
 
 def show(text: str) -> None:
-    """Print what the command is for, as it is.  Raises OutputError where it cannot be written."""
+    """Print the result of a command.  Raises OutputError if it cannot be written."""
     CONSOLE.print(text, markup=False)
     signals.check_output()
 
@@ -83,7 +83,7 @@ def show_json(data: Any) -> None:
 
 
 class _LogFile(logging.FileHandler):
-    """A file of the log.  Where a line cannot be written, a warning says so once, and the work goes on."""
+    """A log file.  If a line cannot be written, it warns once and continues."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, encoding="utf-8", errors="backslashreplace")
@@ -94,36 +94,36 @@ class _LogFile(logging.FileHandler):
             self.failed = True
             error = sys.exc_info()[1]
             reason = getattr(error, "strerror", None) or error
-            LOG.warning("%s: cannot be written (%s); the work goes on without these lines", self.baseFilename, reason)
+            LOG.warning("%s: cannot be written (%s); continuing without this log", self.baseFilename, reason)
 
     def close(self) -> None:
-        with suppress(OSError):  # lines that are held back; the warning was given
+        with suppress(OSError):  # buffered lines; handleError has warned
             super().close()
 
 
 @contextmanager
 def logging_to(path: Path) -> Iterator[None]:
-    """Append the log to a file, with the time of every line, and the traceback of an error that ends the block.
+    """Append the log to a file, with the time of each line and the traceback of an exception in the block.
 
-    The file has debug lines, whatever the level of the log was.  Raises OutputError where it cannot be written at the
-    beginning; later nothing ends for the log.
+    The file includes debug lines at any log level.  Raises OutputError if the file cannot be opened; later failures
+    only warn.
     """
     if path.exists() and not path.is_file():
-        raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or give another folder")
-    form = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
+        raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or use another folder")
+    formatter = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
     first = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (full_version(),), None)
     with raising_output_error(path):
         with path.open("a", encoding="utf-8") as file:
-            file.write(form.format(first) + "\n")
+            file.write(formatter.format(first) + "\n")
         handler = _LogFile(path)
-    handler.setFormatter(form)
+    handler.setFormatter(formatter)
     level = LOG.level
     LOG.setLevel(logging.DEBUG)
     LOG.addHandler(handler)
     try:
         yield
     except BaseException as error:
-        LOG.debug("ended by %s", type(error).__name__, exc_info=error)
+        LOG.debug("stopped by %s", type(error).__name__, exc_info=error)
         raise
     finally:
         for stream in (signals.STDOUT, signals.STDERR):
@@ -135,7 +135,7 @@ def logging_to(path: Path) -> Iterator[None]:
 
 
 def progress_line(progress: TrainingProgress) -> str:
-    """Return the progress at a step as text."""
+    """Format the progress at a step as one line."""
     p = progress
     least = "" if p.growth_known else "at least "
     count = "" if p.gaussians is None else f"gaussians {p.gaussians:,}  "
@@ -146,7 +146,7 @@ def progress_line(progress: TrainingProgress) -> str:
 
 
 def device_text(device: dict[str, Any]) -> str:
-    """A device, as `clsplat.devices` lists it, and whether it works, as lines of text."""
+    """Format a device from `clsplat.devices`, and whether it works, as lines of text."""
     d = device
     sizes = f"{d['memory'] / 2**30:.1f} GiB of memory, buffers up to {d['allocation'] / 2**30:.1f} GiB"
     limits = f"groups up to {d['group']}, {d['local_memory'] >> 10} KiB local, {d['float_width']} lanes"
@@ -161,7 +161,7 @@ def device_text(device: dict[str, Any]) -> str:
 
 @contextmanager
 def progress_bar(status: StatusSource) -> Iterator[Callable[[TrainingProgress], None]]:
-    """Yield a function that shows reports; between them a terminal shows what `status` counts."""
+    """Yield a function that shows progress reports; between reports a terminal shows the counts of `status`."""
     if not CONSOLE.is_terminal:
         yield lambda progress: LOG.info(progress_line(progress))
         return
@@ -172,7 +172,7 @@ def progress_bar(status: StatusSource) -> Iterator[Callable[[TrainingProgress], 
 
 @contextmanager
 def counts_on_terminal() -> Iterator[None]:
-    """Show how far the counted work of the block is, where the output is a terminal; a log has its lines."""
+    """Show the progress of counted work in the block if the output is a terminal; otherwise it is only logged."""
     if not CONSOLE.is_terminal:
         yield
         return
@@ -188,13 +188,13 @@ def counts_on_terminal() -> Iterator[None]:
 
 
 class _RunBar:
-    """The bar of a run, made of its status as often as it is drawn: the training waits for nothing."""
+    """The bar of a run, computed from its status whenever it is drawn, so that training never waits for it."""
 
     def __init__(self, status: StatusSource) -> None:
         self.status, self.bar = status, _new_bar()
         self.task = self.bar.add_task("", total=None)
-        self.last: tuple[float, TrainingProgress] | None = None  # report, and when
-        self.first: tuple[float, int, int] | None = None  # when, step and last step of a training, as first seen
+        self.last: tuple[float, TrainingProgress] | None = None  # time, report
+        self.first: tuple[float, int, int] | None = None  # time, step, and last step at the first drawing
 
     def report(self, progress: TrainingProgress) -> None:
         self.last = time.monotonic(), progress
@@ -231,7 +231,7 @@ def _new_bar() -> Progress:
 
 @contextmanager
 def _drawn(bar: "Progress | _RunBar") -> Iterator[None]:
-    """Draw a bar in the block, several times a second; lines of the log stand above it."""
+    """Draw a bar several times a second during the block; log lines appear above it."""
     with Live(bar, console=CONSOLE, refresh_per_second=4, transient=True) as live, counts_as_debug():
         _bars.append(live)
         try:

@@ -1,4 +1,4 @@
-"""A table as lines of plain text, for the terminal and for log files."""
+"""Format a table as lines of plain text, for the terminal and for log files."""
 
 from collections.abc import Iterable, Sequence
 
@@ -6,14 +6,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-WIDE = 1 << 20  # columns: nothing is wrapped or cut, whatever the width of the terminal
+WIDE = 1 << 20  # columns, so that nothing is wrapped or cut, whatever the terminal's width
 
 
 def text_table(rows: Iterable[Sequence[str]], left: int = 0) -> str:
-    """Return rows as lines, the first `left` columns aligned to the left and the others to the right."""
+    """Format rows as lines; the first `left` columns are left-aligned, the others right-aligned."""
     table = Table.grid(padding=(0, 2))
     for row in rows:
-        table.add_row(*map(Text, row))  # `Text`: brackets are no markup
+        table.add_row(*map(Text, row))  # `Text` keeps brackets from being parsed as markup
     for column in table.columns[left:]:
         column.justify = "right"
     lines = Console(width=WIDE, color_system=None).render_lines(table, pad=False)

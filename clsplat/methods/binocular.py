@@ -23,7 +23,7 @@ class DecayOpacity(Scheduled):
     edits: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"per_pass"})
 
-    per_pass: Annotated[Positive, AfterValidator(Bounded(0, most=1))] = 0.975
+    per_pass: Annotated[Positive, AfterValidator(Bounded(0, maximum=1))] = 0.975
     """Factor of the opacities over as many steps as there are training images; 1 changes nothing."""
 
     def run(self, run: Run) -> None:

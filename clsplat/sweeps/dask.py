@@ -161,7 +161,7 @@ class _Future:
             self.future.release()
             return outcome
         if state == "error" and not isinstance(error := self.future.exception(), distributed.KilledWorker):
-            raise InternalError(f"internal error (a defect) of a worker: {type(error).__name__}: {error}")
+            raise InternalError(f"internal error (a bug) in a worker: {type(error).__name__}: {error}")
         raise CellLost
 
 

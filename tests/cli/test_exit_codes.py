@@ -106,7 +106,7 @@ def test_a_defect_is_code_1(tiny_scene, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
     code, errors = in_this_process(monkeypatch, capsys, "run", "smoke", "--scene", tiny_scene, "--out", out)
     assert code == 1
-    assert "internal error (a defect): IndexError" in errors
+    assert "internal error (a bug): IndexError" in errors
     check_status(out, 1, "failed", errors)
 
 

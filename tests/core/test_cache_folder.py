@@ -125,7 +125,7 @@ def test_a_temporary_folder_that_others_can_write_is_not_used(machine, own, trap
 def test_without_a_writable_folder_the_error_says_what_to_set(machine, monkeypatch):
     put_file(machine, "home")
     put_file(machine, "tmp")
-    with pytest.raises(OutputError, match=r"no folder for caches .*; let XDG_CACHE_HOME or TMPDIR name"):
+    with pytest.raises(OutputError, match=r"no cache folder works .*; set XDG_CACHE_HOME or TMPDIR"):
         cache_folder()
 
 

@@ -44,7 +44,7 @@ def test_only_temporary_files_of_killed_runs_are_swept(tiny_scene, tmp_path):
     done = command(
         "run", "smoke", "--scene", tiny_scene, "--out", out, "--resume", "--set", "optimize.steps=2", "--debug"
     )
-    assert done.stdout.count("which a killed run has left") == len(left)
+    assert done.stdout.count("left by a killed run") == len(left)
     assert [name for name in left if (out / name).exists()] == []
     assert [name for name in mine if not (out / name).exists()] == []
 

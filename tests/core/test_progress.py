@@ -75,7 +75,7 @@ def test_everyone_around_hears(now):
 
 
 def test_work_that_does_not_count_is_watched(monkeypatch):
-    monkeypatch.setattr(progress, "WATCH", 0.001)
+    monkeypatch.setattr(progress, "FIRST_POLL", 0.001)
     heard, seen = [], threading.Event()
 
     def listen(what, done, total, /, *, seconds_left):
@@ -126,7 +126,7 @@ def screen(monkeypatch) -> io.StringIO:
 @pytest.fixture
 def log_shown(screen) -> Iterator[None]:
     before = progress.LOG.handlers[:], progress.LOG.level
-    terminal.start_logging(debug=False, remarks=terminal.CONSOLE)
+    terminal.start_logging(debug=False, console=terminal.CONSOLE)
     yield
     progress.LOG.handlers[:] = before[0]
     progress.LOG.setLevel(before[1])

@@ -60,8 +60,8 @@ def test_a_decay_begins_at_once_and_may_grow():
     )
 
 
-NOTATION = r"expected a number, points [[step, value], …] with growing steps, {points, between}, {initial, final, over, start} or {every, value}"  # noqa: E501
-ORDER = "expected points [step, value] with growing steps"
+NOTATION = r"expected a number, points [[step, value], …] with increasing steps, {points, between}, {initial, final, over, start} or {every, value}"  # noqa: E501
+ORDER = "expected points [step, value] with increasing steps"
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test_bounds_hold_for_every_value_of_a_schedule(recipe, places, refused, acce
 def test_threshold_neither_schedule_nor_quantile_is_explained(recipe, place, value, more):
     with pytest.raises(ConfigError) as error:
         load(recipe(**{place: value}))
-    assert f".{place}: expected a number, points [[step, value], …] with growing steps" in str(error.value)
+    assert f".{place}: expected a number, points [[step, value], …] with increasing steps" in str(error.value)
     assert more in str(error.value)
     assert "\n" not in str(error.value)
 

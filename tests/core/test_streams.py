@@ -216,8 +216,7 @@ def test_a_log_on_a_full_disk_is_said_once_and_ends_nothing(tmp_path, capsys):
     captured = capsys.readouterr()
     assert captured.out == "one\ntwo\n"
     assert captured.err == (
-        f"warning: {tmp_path / 'log.txt'}: cannot be written (No space left on device); "
-        "the work goes on without these lines\n"
+        f"warning: {tmp_path / 'log.txt'}: cannot be written (No space left on device); continuing without this log\n"
     )
 
 

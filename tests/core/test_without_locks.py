@@ -40,11 +40,11 @@ def test_missing_locks_are_warned_of_and_a_dead_owner_replaced(tmp_path, without
     for values in ({"process": ended.pid}, {}):  # {}: an earlier process with the number of this one
         owned_by(tmp_path, **values)
         with lock.lock_folder(tmp_path):
-            assert f"taken over from process {values.get('process', os.getpid())}, which has ended" in caplog.text
+            assert f"taken over from process {values.get('process', os.getpid())}, which has exited" in caplog.text
             with pytest.raises(OutputError, match="is in use by this process"), lock.lock_folder(tmp_path):
                 pass
         assert not (tmp_path / LOCK).exists()
-    assert "its file system knows no locks" in caplog.text
+    assert "the file system does not support locks" in caplog.text
 
 
 def test_the_owner_before_a_start_of_the_machine_has_ended(tmp_path, without_locks, monkeypatch):
@@ -60,7 +60,7 @@ def test_a_lock_that_is_just_being_made_is_somebodys(tmp_path, without_locks):
     """Between making the file and writing into it; or a process was killed there."""
     (tmp_path / LOCK).touch()
     with (
-        pytest.raises(OutputError, match=r"another process; .* has ended, remove .*run.lock"),
+        pytest.raises(OutputError, match=r"another process; .* has exited, remove .*run.lock"),
         lock.lock_folder(tmp_path),
     ):
         pass
@@ -98,9 +98,9 @@ def test_newer_lock_is_not_removed_with_a_dead_one(tmp_path, without_locks, monk
 )
 def test_without_locks_an_owner_that_may_live_keeps_the_folder(values, tmp_path, without_locks):
     owned_by(tmp_path, **values)
-    with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"), lock.lock_folder(tmp_path):
+    with pytest.raises(OutputError, match=r"if that process has exited, remove .*run.lock"), lock.lock_folder(tmp_path):
         pass
-    with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"):
+    with pytest.raises(OutputError, match=r"if that process has exited, remove .*run.lock"):
         lock.check_free(tmp_path)
     owned_by(tmp_path, process=NONE)
     assert lock.check_free(tmp_path)

@@ -165,7 +165,7 @@ def test_a_folder_in_use_is_refused(tmp_path, monkeypatch):
     (tmp_path / "link").symlink_to("empty")
     monkeypatch.chdir(tmp_path / "here")
     for place in (*(tmp_path / name for name in ("used", "file", "link")), Path()):
-        with pytest.raises(ConfigError, match="is in use; give the name of a new folder"), new_folder(place):
+        with pytest.raises(ConfigError, match="already exists; give a new folder"), new_folder(place):
             pytest.fail("the work begins")
 
 

@@ -94,7 +94,7 @@ def test_no_stage_can_write_outside_its_folder_or_over_records(kind):
     ("place", "text"), [("scene.path", "a\\0b"), ("init.file", "\\ud800"), ("evaluate.lpips", "a\\0b")]
 )
 def test_what_no_path_can_hold_is_refused_where_paths_are_read(place, text):
-    with pytest.raises(ConfigError, match="no name of a file holds such a character"):
+    with pytest.raises(ConfigError, match="it contains a character that file names cannot have"):
         load("smoke", [f'{place}="{text}"'])
 
 

@@ -36,7 +36,7 @@ ENDINGS = {
         InternalError,
         f"ZeroDivisionError: by zero; {HINT}",
     ),
-    "a defect without words": (AssertionError(), InternalError, f"internal error (a defect): AssertionError; {HINT}"),
+    "a defect without words": (AssertionError(), InternalError, f"internal error (a bug): AssertionError; {HINT}"),
     "several lines": (RuntimeError("a\n  b"), InternalError, "RuntimeError: a b; "),
     "no memory": (MemoryError(), MemoryLimitError, "out of memory"),
     "a second Ctrl-C": (KeyboardInterrupt(), Interrupted, "stopped at once; to go on, run the same command again"),
@@ -94,7 +94,7 @@ def test_debug_shows_the_traceback_before_the_line(place, tiny_scene, tmp_path, 
     assert end.value.code == 1
     lines = capsys.readouterr().err.splitlines()
     assert "Traceback (most recent call last):" in lines
-    assert lines[-1].startswith("error: internal error (a defect): ZeroDivisionError: by zero")
+    assert lines[-1].startswith("error: internal error (a bug): ZeroDivisionError: by zero")
 
 
 def test_what_cannot_be_logged_is_a_failure_with_a_status(tiny_scene, tmp_path):
@@ -133,7 +133,7 @@ def test_output_that_cannot_be_written_is_one_line(arguments):
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
     assert done.returncode == 7
     assert done.stderr.splitlines() == [
-        "error: stdout: cannot be written (No space left on device); let it lead elsewhere, or free its space"
+        "error: stdout: cannot be written (No space left on device); redirect it elsewhere, or free space"
     ]
 
 

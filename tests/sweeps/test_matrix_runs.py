@@ -157,7 +157,7 @@ def test_a_matrix_ends_in_a_status_whatever_happens(finished, tmp_path, monkeypa
 
     monkeypatch.setattr(experiment, "write_comparison", broken)
     shutil.copytree(finished[1], tmp_path / "run")
-    with pytest.raises(InternalError, match=r"a defect\): AssertionError; run with --debug") as error:
+    with pytest.raises(InternalError, match=r"a bug\): AssertionError; run with --debug") as error:
         experiment.run_matrix(load_experiment(finished[0]), RunState.read(tmp_path / "run"), None, "resume")
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert (status["state"], status["exit_code"], status["message"]) == ("failed", 1, str(error.value))

@@ -79,7 +79,7 @@ def test_only_the_script_and_style_of_the_package_may_run(page):
 
 
 def test_a_script_that_would_end_its_element_is_refused():
-    with pytest.raises(ValueError, match="ends its element"):
+    with pytest.raises(ValueError, match="closes its element"):
         inline("'</script>'")
 
 

@@ -187,6 +187,6 @@ def test_the_report_of_a_scene_with_markup_in_its_names(tiny_scene, tmp_path):
 @pytest.mark.parametrize("text", ["", "<html>", "<html></html", "<html></html><p>"])
 def test_a_page_that_has_lost_its_end_is_refused(text, tmp_path):
     (tmp_path / "a.html").write_text(text)
-    assert refusal(require_complete, tmp_path / "a.html") == f"{tmp_path / 'a.html'}: ends before its end"
+    assert refusal(require_complete, tmp_path / "a.html") == f"{tmp_path / 'a.html'}: is truncated; make the page again"
     (tmp_path / "a.html").write_text("<html></html>\n")
     require_complete(tmp_path / "a.html")

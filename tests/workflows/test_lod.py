@@ -258,7 +258,7 @@ def test_an_empty_model_and_a_folder_in_use_are_refused(few_steps, tmp_path):
     model[:0].save(tmp_path / "empty.ply")
     with pytest.raises(DataError, match=r"empty\.ply: the model holds no Gaussians; expected some to merge"):
         clsplat.write_levels(tmp_path / "empty.ply", tmp_path / "site")
-    with pytest.raises(ConfigError, match="is in use; give the name of a new folder"):
+    with pytest.raises(ConfigError, match="already exists; give a new folder"):
         clsplat.write_levels(few_steps, tmp_path)
 
 
