@@ -55,16 +55,19 @@ def summary(named: Any) -> str:
 
 def class_page(kind: type) -> str:
     """Return a class: its docstring, its constructor, its fields with units, its methods and properties."""
-    text = f"# `{kind.__name__}` {{: #{kind.__module__}.{kind.__qualname__} }}\n\n{manual(kind)}"
+    path = f"{kind.__module__}.{kind.__qualname__}"
+    if "__init__" in vars(kind) and not dataclasses.is_dataclass(kind):
+        text = f"# `{kind.__name__}`\n\n::: {path}\n{options(2)}      heading: Constructor\n"
+        text += "      toc_label: Constructor\n      members: false\n      merge_init_into_class: true\n\n"
+    else:
+        text = f"# `{kind.__name__}` {{: #{path} }}\n\n{manual(kind)}"
     text += f"From `{kind.__module__}`.\n\n" if not hasattr(clsplat, kind.__name__) else ""
-    has_init = "__init__" in vars(kind) and not dataclasses.is_dataclass(kind)
-    text += directive(kind.__init__, 2, f"{kind.__name__}(…)") if has_init else ""  # type: ignore[misc]
     is_settings = issubclass(kind, Settings)
     fields = re.sub(r"\]\((?=\w+\.md)", "](../", key_table(kind)) if is_settings else field_table(kind)
     text += f"## Fields\n\n{fields}" if fields else ""
     members = {name: value for name, value in vars(kind).items() if not name.startswith(("_", "model_"))}
     shown = [name for name, value in members.items() if isinstance(value, MEMBERS)]
-    return text + "".join(f"::: {kind.__module__}.{kind.__qualname__}.{name}\n{options(2)}\n" for name in shown)
+    return text + "".join(f"::: {path}.{name}\n{options(2)}\n" for name in shown)
 
 
 def field_table(kind: type) -> str:
@@ -108,12 +111,11 @@ def plugin_classes() -> list[type]:
     return [kind for kind in kinds if isinstance(kind, type)]
 
 
-def directive(named: Any, level: int, heading: str = "") -> str:
+def directive(named: Any, level: int) -> str:
     """Return what mkdocstrings replaces by the documentation of a class or a function."""
-    return f"::: {named.__module__}.{named.__qualname__}\n{options(level, heading)}\n"
+    return f"::: {named.__module__}.{named.__qualname__}\n{options(level)}\n"
 
 
-def options(level: int, heading: str = "") -> str:
+def options(level: int) -> str:
     """Return the options of a directive."""
-    title = f'      heading: "{heading}"\n' if heading else ""
-    return f"    options:\n      heading_level: {level}\n{title}"
+    return f"    options:\n      heading_level: {level}\n"
