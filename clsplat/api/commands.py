@@ -79,11 +79,11 @@ def resume_job(
     folder: PathLike, scene: PathLike | None, set: Overrides, steps: int | None, on: PathLike | None
 ) -> "Job":
     """Return the job that `resume` runs, to describe it instead."""
-    from clsplat.pipeline.execution import values_of
+    from clsplat.pipeline.execution import read_execution
     from clsplat.sweeps.experiment import Job
 
     load_plugins()
-    return Job.resume(Path(folder), overrides(set), path_of(scene), values_of(path_of(on)), steps)
+    return Job.resume(Path(folder), overrides(set), path_of(scene), read_execution(path_of(on)), steps)
 
 
 def status(folder: PathLike) -> dict[str, Any]:
@@ -180,11 +180,11 @@ def _job(
     start: "Start",
     on: PathLike | None = None,
 ) -> "Job":
-    from clsplat.pipeline.execution import values_of
+    from clsplat.pipeline.execution import read_execution
     from clsplat.sweeps.experiment import Job
 
     load_plugins()
-    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start, values_of(path_of(on)))
+    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start, read_execution(path_of(on)))
 
 
 def run_job(job: "Job", device: "str | Device | None", live: int | None = None, minutes: float | None = None) -> Path:
@@ -193,7 +193,7 @@ def run_job(job: "Job", device: "str | Device | None", live: int | None = None, 
     from clsplat.pipeline.matrix import Experiment
 
     work = job.work
-    if not isinstance(work, Experiment) or work.execution.keeps is None:
+    if not isinstance(work, Experiment) or work.execution.store_folder is None:
         job.run(device, live, minutes)
         return job.out
     if live is not None or minutes is not None:
@@ -305,12 +305,12 @@ def train_in_blocks(
     on: a file that says where blocks are trained, as cells of a store, in the place of one after the other here.
     Returns what partition.json holds, `run`, the folder of the merged model, and `metrics`.
     """
-    from clsplat.pipeline.execution import Execution, values_of
+    from clsplat.pipeline.execution import Execution, read_execution
     from clsplat.workflows.blocks import BlocksPlan, train_in_blocks
 
     load_plugins()
     plan = BlocksPlan(pipeline, str(coarse), blocks, sight, steps, list(overrides), list(coarse_overrides))
-    values = values_of(path_of(on))
+    values = read_execution(path_of(on))
     execution = None if values is None else Execution.model_validate(values)
     return train_in_blocks(Path(scene), Path(out), plan, device, only_plan=only_plan, execution=execution)
 
@@ -359,12 +359,12 @@ def work_for(
 
     devices: names, default every device that works; tls: files of the authority, the certificate and its key.
     """
-    from clsplat.pipeline.execution import options
+    from clsplat.pipeline.execution import from_options
     from clsplat.sweeps.dask import offer  # where Dask is installed
 
     load_plugins()
     certificates = {key: file for key, file in zip(("ca", "cert", "key"), tls, strict=True) if file} or None
-    offer(options({"engine": scheduler, "insecure": insecure, "tls": certificates}), devices)
+    offer(from_options({"engine": scheduler, "insecure": insecure, "tls": certificates}), devices)
 
 
 # Model files in another format, as a function.

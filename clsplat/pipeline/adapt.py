@@ -1,4 +1,4 @@
-"""Settings that follow from the photographs (`adapt:`): a class looks at what is measured, and decides with reasons."""
+"""Choose settings by the photos (`adapt:`): a class gets measurements, and decides with reasons."""
 
 import json
 from abc import abstractmethod
@@ -9,34 +9,31 @@ from pydantic import Field
 
 from clsplat.core.errors import pluralize
 from clsplat.core.settings import Settings
-from clsplat.scene.quality import Measures
+from clsplat.scene.quality import Measures, is_transparent
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
 
 
 class Decision(Settings):
-    """A setting that follows from the photographs."""
+    """A setting that follows from the photos."""
 
     key: str
-    """Place of the setting, as in `--set`: a key of the model or of a stage."""
+    """Key of the setting, as in `--set`, in the model or a stage."""
     value: Any
-    """Its value, as in `--set`; null too."""
+    """Its value, as in `--set`; may be null."""
     reason: str
-    """What was measured, and why the value follows."""
+    """What was measured, and what follows from it, in one sentence."""
+    matters: bool = True
+    """Whether the decision changes this run; only then the log gives the reason."""
 
     @property
     def override(self) -> str:
         """KEY=VALUE, as in `--set`."""
         return f"{self.key}={json.dumps(self.value)}"
 
-    @property
-    def text(self) -> str:
-        """The setting and its reason."""
-        return f"{self.override}, since {self.reason}"
-
 
 class Adaptation(Settings):
-    """Decides settings by the photographs, before the first step of a run."""
+    """Decides settings by the photos, before the first step of a run."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"decisions"})
 
@@ -44,73 +41,74 @@ class Adaptation(Settings):
     keep: list[str] = Field([])
     """Keys that are not decided; `--set` of a key adds it here."""
     decisions: list[Decision] | None = None
-    """Written by a run: what was decided.  A run that has some decides no more."""
+    """What was decided, written by a run.  A run that has decisions makes no others."""
 
     @abstractmethod
     def decide(self, training: Optimize, measures: Measures) -> Iterator[Decision]:
-        """Yield a decision for each key: the same keys whatever the measures are, keys of the model or of stages.
+        """Yield a decision for each key.  The keys must not depend on the measures; they are of the model or of stages.
 
-        training: the first stage that trains Gaussians.  They are validated like `--set`.
+        training: the first stage that trains Gaussians.  Decisions are validated like `--set`.
         """
 
     def keys(self, training: Optimize) -> list[str]:
         """Return the keys that it decides."""
-        return [one.key for one in self.decide(training, Measures(0))]
+        return [decision.key for decision in self.decide(training, Measures(0))]
 
 
-FEW = 40  # training photographs; a model learns fewer by heart
-FEWEST_FOR_SKY = 12  # training photographs; fewer show too little of what is far away
-MOST = ((0.5, 0.1), (0.25, 0.3), (0.0, 0.6))  # from a share of photographs with sky on: Gaussians per pixel, at most
-POSES_FROM = 1.0  # px of mean reprojection error at the size of training
-STEPS = 3400  # of `photos`, by which the steps below are counted
+FEW = 40  # training photos; a model overfits fewer
+MIN_FOR_SKY = 12  # training photos; fewer show too little of the background
+MAX_PER_PIXEL = ((0.5, 0.1), (0.25, 0.3), (0.0, 0.6))  # from a fraction of photos with sky on: Gaussians per pixel
+MISS = 1.0  # px of mean reprojection error, at the size of training, from which poses are optimized
+STEPS = 3400  # of `photos`: the steps below are for a training of this length
 DROPOUT_UNTIL, POSES_START = 1460, 500
 
 
 class Photos(Adaptation):
-    """Decides for folders of photographs.  Fewer than 40: dropout, fewer Gaussians, perhaps a sky.  Cameras that miss
-    the points by a pixel: poses are learned."""
+    """Decides for folders of photos.  Fewer than 40: dropout, fewer Gaussians, perhaps a sky.  Cameras that miss the
+    points by a pixel: their poses are optimized."""
 
     type: Literal["photos"] = "photos"
 
     def decide(self, training: Optimize, measures: Measures) -> Iterator[Decision]:
-        count, few = measures.photographs, measures.photographs < FEW
-        counted = pluralize(count, "training photograph")
-        hull = "few leave too large a hull" if few else "many leave a small hull"
-        why = f"{counted}; of transparent photographs, the silhouettes of {hull}"
-        yield Decision(key="init.transparent", value="random" if few else "hull", reason=why)
-        yield Decision(key="init.count", value=100_000 if few else 60_000, reason=why)
+        few = measures.photographs < FEW
+        count = pluralize(measures.photographs, "training photo")
+        has_alpha = measures.scene is not None and is_transparent(measures.scene)
 
-        why = f"{counted}; {'few are' if few else 'so many are not'} learned by heart"
+        why = "the hull of few silhouettes is too large, so points start at random"
+        why = f"{count}: {why if few else 'points start in the hull of the silhouettes'}"
+        yield Decision(key="init.transparent", value="random" if few else "hull", reason=why, matters=has_alpha)
+        yield Decision(key="init.count", value=100_000 if few else 60_000, reason=why, matters=False)
+
         dropout = {"probability": [[0, 0.0], [DROPOUT_UNTIL * training.steps // STEPS, 0.2]]} if few else None
-        yield Decision(key="optimize.modules.dropout", value=dropout, reason=why)
-        drawn = {"where": "transparent"} if few else None
-        yield Decision(key="optimize.modules.random_background", value=drawn, reason=why)
+        why = f"{count}: {'dropout against overfitting' if few else 'enough to train without dropout'}"
+        yield Decision(key="optimize.modules.dropout", value=dropout, reason=why, matters=few)
+        random = {"where": "transparent"} if few else None
+        why = f"{count}: {'random' if few else 'no random'} colors behind transparent pixels"
+        yield Decision(key="optimize.modules.random_background", value=random, reason=why, matters=few and has_alpha)
 
-        first = next((i for i, stage in enumerate(training.during) if isinstance(stage, Densify)), 0)
-        most, why = _most_per_pixel(measures) if few else (None, "so many hold up as many Gaussians as grow")
-        yield Decision(key=f"optimize.during.{first}.per_pixel", value=most, reason=f"{counted}; {why}")
+        densify = next((i for i, stage in enumerate(training.during) if isinstance(stage, Densify)), 0)
+        per_pixel, why = _max_per_pixel(measures) if few else (None, ": enough for as many Gaussians as grow")
+        yield Decision(key=f"optimize.during.{densify}.per_pixel", value=per_pixel, reason=f"{count}{why}", matters=few)
 
-        sky = {"type": "auto", "photographs": 0.25} if FEWEST_FOR_SKY <= count < FEW else None
-        why = "what is far away is seen by few, and hangs near the cameras of others"
-        if not sky:
-            why = "too few for what is far away" if few else "so many show what is far away"
-        yield Decision(key="model.background", value=sky, reason=f"{counted}; {why}")
+        # Of the sky and of exposures the modules log what they choose.
+        sky = {"type": "auto", "photographs": 0.25} if MIN_FOR_SKY <= measures.photographs < FEW else None
+        why = "a sky, if they show one" if sky else "too few for a sky" if few else "enough to do without a sky"
+        yield Decision(key="model.background", value=sky, reason=f"{count}: {why}", matters=False)
 
         error = measures.reprojection_error
-        miss = error is not None and error >= POSES_FROM
-        why = "cameras are good to a pixel, and colors cost more PSNR than exposures that differ little"
-        if miss:
-            why = "cameras miss what photographs show, and exposures that differ would pull at them"
-        px = "the dataset has no reprojection error" if error is None else f"{error:,.4g} px of mean reprojection error"
-        poses = {"start": POSES_START * training.steps // STEPS} if miss else None
-        yield Decision(key="optimize.modules.camera_optimizer", value=poses, reason=f"{px}; {why}")
-        exposure = {"when": "auto"} if miss else {"when": "auto", "above": 0.2}
-        yield Decision(key="optimize.modules.exposure", value=exposure, reason=f"{px}; {why}")
+        misses = error is not None and error >= MISS
+        fit = "the reprojection error is unknown" if error is None else f"cameras fit the points to {error:,.4g} px"
+        poses = {"start": POSES_START * training.steps // STEPS} if misses else None
+        why = f"{fit}: poses {'are optimized' if misses else 'stay as they are'}"
+        yield Decision(key="optimize.modules.camera_optimizer", value=poses, reason=why, matters=error is not None)
+        exposure = {"when": "auto"} if misses else {"when": "auto", "above": 0.2}
+        why = f"{fit}: {'small' if misses else 'only large'} differences of exposure are corrected"
+        yield Decision(key="optimize.modules.exposure", value=exposure, reason=why, matters=False)
 
 
-def _most_per_pixel(measures: Measures) -> tuple[float, str]:
-    """How many Gaussians few photographs hold up, per pixel of one, and why."""
+def _max_per_pixel(measures: Measures) -> tuple[float, str]:
+    """Return how many Gaussians per pixel few photos can constrain, and the reason."""
     sky = measures.sky
-    most = next(most for share, most in MOST if (sky or 0.0) >= share)
-    seen = "the dataset does not say whether they show a sky" if sky is None else f"{sky:.0%} of them show a sky"
-    return most, f"{seen}; few hold up few Gaussians{', fewer far away' if most < MOST[-1][1] else ''}"
+    count = next(count for fraction, count in MAX_PER_PIXEL if (sky or 0.0) >= fraction)
+    seen = "" if sky is None else f", {sky:.0%} of them with sky"
+    return count, f"{seen}: at most {count:g} Gaussians per pixel"

@@ -1,4 +1,4 @@
-"""Make one sentence of a failed validation: file, line, place, what was expected, the nearest match."""
+"""Explain a failed validation in one sentence: file, line, key, what was expected, the nearest match."""
 
 import difflib
 import re
@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 
 from clsplat.core.errors import quote, shorten
 from clsplat.core.settings import TAGS, Settings, Variants, variants
-from clsplat.pipeline.yaml_file import Document, Place
+from clsplat.pipeline.yaml_file import Document, KeyPath
 
 # Read the annotations of settings: the models that a field allows, and their names.
 
@@ -31,8 +31,7 @@ def models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def bases(annotation: Any) -> list[type[Settings]]:
-    """Return the base of the variants that a field accepts, also of one that may be null, in a list; without variants
-    the list is empty."""
+    """Return the base classes of the variants that a field accepts; an empty list if it accepts none."""
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         return [base for argument in typing.get_args(annotation) for base in bases(argument)]
     if typing.get_origin(annotation) is not typing.Annotated:
@@ -41,25 +40,25 @@ def bases(annotation: Any) -> list[type[Settings]]:
 
 
 def is_union(annotation: Any) -> bool:
-    """Return whether an annotation allows several types beside null."""
-    is_one = typing.get_origin(annotation) in (typing.Union, types.UnionType)
-    return is_one and len([one for one in typing.get_args(annotation) if one is not types.NoneType]) > 1
+    """Return whether an annotation allows several types, not counting null."""
+    types_ = typing.get_args(annotation) if typing.get_origin(annotation) in (typing.Union, types.UnionType) else ()
+    return len([type_ for type_ in types_ if type_ is not types.NoneType]) > 1
 
 
 def annotation_of(field: FieldInfo) -> Any:
-    """Return a field's annotation with its marks, as it was written."""
+    """Return a field's annotation with its metadata, as it was written."""
     return typing.Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
 
 
 @lru_cache(maxsize=1024)
 def annotations(model: type[BaseModel]) -> dict[str, Any]:
-    """Return the annotations of a model's fields, with their marks, by name."""
+    """Return the annotations of a model's fields, with their metadata, by name."""
     return {name: annotation_of(field) for name, field in model.model_fields.items()}
 
 
 @lru_cache(maxsize=1024)
 def tags(model: type[BaseModel]) -> tuple[Any, ...]:
-    """Return the names of the model in pipeline files; none when it is not a variant."""
+    """Return the names of the model in pipeline files; empty if it is not a variant."""
     field = next((model.model_fields[name] for name in TAGS if name in model.model_fields), None)
     return typing.get_args(field.annotation) if field else ()
 
@@ -72,7 +71,7 @@ def inside_list(annotation: Any) -> Any:
 
 
 def model_of(data: Any, annotation: Any) -> type[BaseModel] | None:
-    """Return the model of plain data with its tag; None when it is not known."""
+    """Return the model that plain data has by its tag; None if it is unknown."""
     allowed = models(annotation)
     if len(allowed) > 1 and isinstance(data, dict):
         named = [data[name] for name in TAGS if name in data]
@@ -81,7 +80,7 @@ def model_of(data: Any, annotation: Any) -> type[BaseModel] | None:
 
 
 def with_tags(data: Any, annotation: Any) -> Any:
-    """Return plain data with every bare name of a variant as {type: name}, and a stage as {stage: name, …}."""
+    """Return plain data with each bare variant name as {type: name}, and each stage as {stage: name, …}."""
     if not isinstance(data, list | dict | str):
         return data
     if isinstance(data, list):
@@ -123,32 +122,32 @@ EXPECTATIONS = {
 
 def explain(error: ValidationError, root: type[BaseModel], path: Path, document: Document) -> str:
     """Describe the first fault, with its file and line."""
-    place, complaint = first_fault(error, root)
-    where = f"{place_text(place)}: " if place else ""  # of the whole file
-    return f"{path}:{document.line(place)}: {where}{complaint}"
+    key_path, complaint = first_fault(error, root)
+    where = f"{key_path_text(key_path)}: " if key_path else ""  # else the whole file
+    return f"{path}:{document.line(key_path)}: {where}{complaint}"
 
 
-def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[Place, str]:
-    """Return the first fault, with its place in the file.
+def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[KeyPath, str]:
+    """Return the first fault, with its key path in the file.
 
-    A misspelled key comes before a missing one, because it is often the reason.
+    A misspelled key comes before a missing one, because it often causes it.
     """
-    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
-    place, model, annotation = _follow(first["loc"], root)
-    return place, _complaint(dict(first), place, model, annotation)
+    first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
+    key_path, model, annotation = _follow(first["loc"], root)
+    return key_path, _complaint(dict(first), key_path, model, annotation)
 
 
-def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | None, annotation: Any) -> str:
+def _complaint(error: dict[str, Any], key_path: KeyPath, model: type[BaseModel] | None, annotation: Any) -> str:
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
         known = [name for name in (model.model_fields if model else {}) if name not in TAGS]
-        return f"unknown key {quote(place[-1])}{_nearest(str(place[-1]), known)}"
+        return f"unknown key {quote(key_path[-1])}{_nearest(str(key_path[-1]), known)}"
     if kind == "missing":
-        return f"'{place[-1]}' is missing"
+        return f"'{key_path[-1]}' is missing"
     if kind == "union_tag_invalid":
         known = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
         tag = shorten(str(error["ctx"]["tag"]))
-        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}; one of a plug-in needs --plugin FILE.py"
+        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}; a plug-in's needs --plugin FILE.py"
     if kind == "union_tag_not_found":
         tag = Variants(bases(annotation)[0]).tag
         return f"expected a '{tag}', the name of the {_kind(annotation)}"
@@ -164,49 +163,49 @@ def _nearest(word: str, known: list[str]) -> str:
     near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     if near:
         return f"; did you mean '{near[0]}'?"
-    return f"; there are {', '.join(sorted(known))}" if known else "; there are no other keys here, remove it"
+    return f"; there are {', '.join(sorted(known))}" if known else "; remove it, as there are no other keys"
 
 
 def _kind(annotation: Any) -> str:
-    """The name of a field's base, in words: 'world filter' for variants of WorldFilter, 'stage' for those of Stage."""
+    """Return the name of a field's base class in words, such as 'world filter' for variants of WorldFilter."""
     base = bases(annotation)[0]
     family = base.__mro__[base.__mro__.index(Settings) - 1]
     return re.sub(r"(?<=\w)(?=[A-Z])", " ", family.__name__).lower()
 
 
-def place_text(place: Place) -> str:
-    """Return a place as text, such as stages[1].optimize.steps."""
+def key_path_text(key_path: KeyPath) -> str:
+    """Return a key path as text, such as stages[1].optimize.steps."""
     text = ""
-    for part in place:
+    for part in key_path:
         name = shorten(str(part))
         text += f"[{part}]" if isinstance(part, int) else f".{name}" if text else name
     return text
 
 
-def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Place, type[BaseModel] | None, Any]:
-    """Translate a location among models, which names union members, into the file's; also the model around it, and the
-    annotation there.
+def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[KeyPath, type[BaseModel] | None, Any]:
+    """Translate pydantic's location, which names union members, into a key path of the file.
 
-    In the file a stage's name is a key of its own (stages[1].optimize.steps); a strategy's type is not.
+    Also return the model that holds the key, and the key's annotation.  In the file the name of a stage is a key
+    (stages[1].optimize.steps), while the type of a loss or rule is not.
     """
-    place: list[str | int] = []
+    key_path: list[str | int] = []
     annotation: Any = root
     model: type[BaseModel] | None = root
     for part in location:
         members = models(annotation)
         tagged = [m for m in members if part in tags(m)]
         if isinstance(part, int):
-            place.append(part)
+            key_path.append(part)
             annotation = inside_list(annotation)
         elif tagged and not (len(members) == 1 and part in members[0].model_fields):
             annotation = model = tagged[0]
             if "stage" in model.model_fields:
-                place.append(part)
+                key_path.append(part)
         elif not members and is_union(annotation):
             annotation = None  # the part names a member of the union
         else:
-            place.append(part)
+            key_path.append(part)
             model = members[0] if len(members) == 1 else model
             field = model.model_fields.get(part) if model else None
             annotation = annotation_of(field) if field else None
-    return tuple(place), model, annotation
+    return tuple(key_path), model, annotation

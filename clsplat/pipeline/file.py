@@ -1,9 +1,9 @@
-"""What a pipeline file can say.
+"""Define the keys of a pipeline file.
 
     name, seed, scene: {path, downscale, background, …}, model: {…}, rasterizer: {schedule, sort, …}
     stages: a list of   - <stage>   or   - <stage>: {field: value, …}
 
-A file is complete and strict: unknown keys are errors, and every value has its default in its model.
+Unknown keys are errors, and each default is in the model of its key.
 """
 
 from dataclasses import replace
@@ -33,100 +33,100 @@ from clsplat.training.stage import ON_HOST, Stage, Training
 
 
 class SceneSettings(Settings):
-    """The photographs, and how they are read."""
+    """The photos, and how they are read."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"image_budget"})
 
     path: InputPath | None = None
     """Folder of the dataset; usually given by --scene."""
     downscale: Annotated[float, Field(ge=1)] = 1
-    """Divisor of the photographs' size."""
+    """Divisor of the image size."""
     levels: Annotated[int, Field(ge=1, le=8)] = 1
-    """Number of sizes in training: at `downscale`, and at twice, four times, … that."""
+    """Number of image sizes in training: at `downscale`, and at twice, four times, … that."""
     alpha: Alpha = "transparency"
-    """Fourth channel of photographs: blended with the background, or a mask of the pixels that count."""
+    """Alpha channel of images: blended with the background, or a mask of the pixels that count."""
     masks: InputPath | None = None
-    """Folder of masks that something else has made, for a dataset without: `a.png` or `a.jpg.png` of the photograph
-    a.jpg, of its size, white in pixels that count.  A photograph without one counts whole."""
+    """Folder of masks for a dataset without: `a.png` or `a.jpg.png` for the image a.jpg, of the same size, white where
+    pixels count.  All pixels count in an image without a mask."""
     background: Literal["auto", "black", "white"] = "auto"
     """Color behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
-    """MiB of photographs on the device; without it, a quarter of its memory."""
+    """MiB of images on the device; default: a quarter of its memory."""
     holdout: Chosen = HOLDOUT
-    """Test views: every n-th image by name, from the first on; 0: none; or {every, offset}, {names} or {file}.  Names
-    replace the split of a dataset that has one."""
+    """Test views: every n-th image by name, starting with the first; 0: none; or {every, offset}, {names} or {file}.
+    Names replace the split of a dataset that has one."""
     train: Choice | None = None
-    """Training views that are used, such as {every: 4}, and no others; without it, all."""
+    """Training views to use, such as {every: 4}; default: all."""
     validation: ChosenOrAuto = 0
-    """Training views that are kept out to choose by (`optimize.keep`), as in `holdout`; auto: every 8th, from the
-    fifth on, and two at least."""
+    """Training views held out to choose the best model (`optimize.keep`), as for `holdout`; auto: every 8th, starting
+    with the fifth, and at least two."""
     extent: Annotated[float, Field(gt=0)] | None = None
-    """Radius of the scene, scene units, of which sizes and rates are shares; without it, that of the training
-    cameras.  A part of a scene is trained with that of the whole."""
+    """Radius of the scene, scene units, to which sizes and rates are relative; default: that of the training cameras.
+    A part of a scene is trained with the extent of the whole."""
     missing: Missing = "refuse"
-    """Photographs that the dataset names and does not have: an error, or `skip`: the scene is read without them."""
+    """Images that the dataset names but does not have: refuse the scene, or skip them."""
 
     @field_validator("masks")
     @classmethod
     def _from_any_folder(cls, masks: str | None) -> str | None:
-        """A run is measured from other working folders than that where it began."""
+        """Make the path absolute, as a run may be evaluated from another working folder."""
         return masks and str(Path(masks).absolute())
 
     @property
     def downscales(self) -> tuple[float, ...]:
-        """Divisors of the original photographs' size in training, ascending."""
+        """Divisors of the original image size in training, ascending."""
         return tuple(self.downscale * 2**level for level in range(self.levels))
 
     @property
     def folder(self) -> Path:
-        """Folder of the dataset.  Raises ConfigError when it was not given."""
+        """Folder of the dataset.  Raises ConfigError if it was not given."""
         if self.path is None:
             raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
         return Path(self.path)
 
     @property
     def split(self) -> Split:
-        """What of the dataset is for training, validation and testing."""
+        """The views for training, validation and testing."""
         lists = None if self.path is None else Path(self.path)
         return Split(self.holdout, self.train, self.validation, self.missing, lists)
 
     def masked(self, scene: Scene) -> Scene:
-        """Return a scene with its masks as set.  Raises DataError where the folder has none of them."""
+        """Return a scene with the masks of these settings.  Raises DataError if the folder has none of them."""
         return with_masks(scene, None if self.masks is None else Path(self.masks))
 
     def read(self, folder: Path) -> tuple[Scene, Background]:
-        """Return the scene of a folder with these settings, and its background.  Raises DataError."""
+        """Read a scene with these settings; return it and its background.  Raises DataError."""
         return self.applied(read_scene(folder, self.split))
 
     def applied(self, scene: Scene) -> tuple[Scene, Background]:
-        """Return a scene with these settings for alpha, masks and extent, and its background.  Raises DataError."""
-        found = replace(self.masked(scene).with_alpha(self.alpha), extent=self.extent or scene.extent)
-        return found, scene.background if self.background == "auto" else self.background
+        """Return a scene with these settings of alpha, masks and extent, and its background.  Raises DataError."""
+        changed = replace(self.masked(scene).with_alpha(self.alpha), extent=self.extent or scene.extent)
+        return changed, scene.background if self.background == "auto" else self.background
 
 
 class RasterizerSettings(Settings):
-    """How the device renders; results do not depend on it, but for where its memory ends growth."""
+    """How the device renders.  Results do not depend on it, unless growth stops because its memory is full."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"harmonics"})
 
     schedule: Schedule = "auto"
-    """Schedule of blending: wide for CPUs, simt for GPUs."""
+    """Blending schedule: wide for CPUs, simt for GPUs."""
     sort: Sort = "auto"
-    """Algorithm that orders splats by tile and depth; auto: the faster one on the first frame."""
+    """Algorithm that sorts splats by tile and depth; auto: the faster one on the first frame."""
     pair_budget: Annotated[int, Field(gt=0)] | None = None
-    """MiB of gradient records at a time; without it, the largest buffer of the device."""
+    """MiB of gradient records at a time; default: the largest buffer of the device."""
     harmonics: Harmonics = "auto"
-    """Memory of the harmonics above band 0 and of Adam's moments of them, in training.  `host`: each step sends those
-    of its view to the device and fetches them; what other views see is updated later (`optimize.update: deferred`).
-    `auto`: the device, until it does not hold as many Gaussians as there are to be, and the host from then on."""
+    """Memory for the spherical harmonics above band 0 and their Adam moments in training.  `host`: each step uploads
+    those that its view sees and downloads them again; the others are updated later (`optimize.update: deferred`).
+    `auto`: the device, or the host once the device cannot hold the expected number of Gaussians."""
     launch_tiles: Annotated[int, Field(ge=0)] = 0
-    """Number of tiles of one launch, for devices whose display limits its time; 0: all."""
+    """Number of tiles per launch, for devices whose display driver limits the time of a launch; 0: all."""
 
     def conflict_names(self) -> set[str]:
         return {ON_HOST} if self.harmonics == "host" else set()
 
     def budget(self) -> RenderLimits | None:
-        """Return the rasterizer's limits on memory and launches; None for the defaults."""
+        """Return the rasterizer's limits of memory and launches; None for the defaults."""
         if self.pair_budget is None and self.launch_tiles == 0:
             return None
         records = MAX_PAIRS if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)
@@ -148,50 +148,50 @@ Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$"), AfterValidator(_fold
 class PipelineFile(Settings):
     """The keys of a pipeline file."""
 
-    output_keys: ClassVar[frozenset[str]] = frozenset({"adapt"})  # what they set is compared at its place
+    output_keys: ClassVar[frozenset[str]] = frozenset({"adapt"})  # what it decides is compared at its own keys
 
     name: Name
     """Name of the pipeline, and of its run folder."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of all random numbers."""
     scene: SceneSettings = SceneSettings()
-    """The photographs."""
+    """The photos."""
     model: ModelSettings = ModelSettings()
     """How Gaussians are rendered."""
     rasterizer: RasterizerSettings = RasterizerSettings()
     """How the device renders."""
     prepare: list[OneOf[Step]] = Field([])
-    """Steps from photographs to a scene; their results are kept."""
+    """Steps from photos to a scene; later runs reuse their results."""
     adapt: OneOf[Adaptation] | None = None
-    """What decides settings by the photographs, before the first step."""
+    """Decides settings by the photos, before the first step."""
     stages: Annotated[list[OneOf[Stage]], Field(min_length=1)]
     """Stages, in order."""
     plugins: dict[str, str] = Field(default={})
-    """Plug-ins of the run: name and sha256.  A run writes them, and a resumed run requires them."""
+    """Plug-ins of the run: name and sha256.  A run writes them, and a resumed run needs them."""
 
     def check_together(self) -> None:
-        """Raise ConfigError for the first settings that do not go together, as their classes say."""
-        found = list(iter_settings(self))
-        for place, one in found:
-            one.check_pipeline(self)
-            for name, why in one.excluded().items():
-                for other, rival in found:
-                    apart = other.startswith("stages[") and other.partition(".")[0] != place.partition(".")[0]
-                    if name in rival.conflict_names() and not apart:
-                        own = getattr(one, "type", getattr(one, "stage", place))
+        """Raise ConfigError for the first settings that exclude each other, as their classes say."""
+        parts = list(iter_settings(self))
+        for path, part in parts:
+            part.check_pipeline(self)
+            for name, why in part.excluded().items():
+                for other, rival in parts:
+                    is_elsewhere = other.startswith("stages[") and other.partition(".")[0] != path.partition(".")[0]
+                    if name in rival.conflict_names() and not is_elsewhere:
+                        label = getattr(part, "type", getattr(part, "stage", path))
                         remedy = "" if ";" in why else "; leave one of them out"
-                        raise ConfigError(f"{place}: '{own}' does not go together with {name} ({other}): {why}{remedy}")
+                        raise ConfigError(f"{path}: '{label}' cannot be combined with {name} ({other}): {why}{remedy}")
 
     @property
     def harmonics(self) -> Harmonics:
-        """Where harmonics lie: `auto` is the device where a stage needs all of them there, or bands above 0 lack."""
-        asked = self.rasterizer.harmonics
-        is_needed = any(ON_HOST in one.excluded() for _, one in iter_settings(self.stages))
-        return "device" if asked == "auto" and (self.model.sh_degree == 0 or is_needed) else asked
+        """Where spherical harmonics are kept.  `auto` means the device if a stage needs them there, or at degree 0."""
+        setting = self.rasterizer.harmonics
+        is_needed = any(ON_HOST in part.excluded() for _, part in iter_settings(self.stages))
+        return "device" if setting == "auto" and (self.model.sh_degree == 0 or is_needed) else setting
 
     @property
     def training(self) -> Training:
-        """The first stage that trains.  Raises ConfigError when none does."""
+        """The first stage that trains.  Raises ConfigError if none does."""
         for stage in self.stages:
             if isinstance(stage, Training):
                 return stage
@@ -199,7 +199,7 @@ class PipelineFile(Settings):
 
     @property
     def optimize(self) -> Optimize:
-        """The first stage that trains Gaussians.  Raises ConfigError when none does."""
+        """The first stage that trains Gaussians.  Raises ConfigError if none does."""
         for stage in self.stages:
             if isinstance(stage, Optimize):
                 return stage

@@ -1,7 +1,7 @@
-"""The files of pipelines, found by path or by the name of a shipped one.
+"""Find the files of pipelines, by path or by the name of a shipped one.
 
-A file NAME.yaml with the key `short` stands for two pipelines, NAME and NAME_7k.  The path of the second is
-NAME_7k.yaml, which is no file on the disk; `read_pipeline` makes its text from the first.
+A file NAME.yaml with the key `short` defines two pipelines, NAME and NAME_7k.  The path of the second is NAME_7k.yaml,
+which does not exist on disk: `read_pipeline` makes its text from NAME.yaml.
 """
 
 import difflib
@@ -12,19 +12,19 @@ from clsplat.core.errors import ConfigError, quote, shell_quote
 from clsplat.core.files import PIPELINE
 from clsplat.core.resources import resource_dir
 
-SHORT = "_7k"  # how names of short pipelines end
+SHORT = "_7k"  # ending of the names of short pipelines
 HAS_SHORT = re.compile(rb"^short\s*:", re.MULTILINE)
 
 
 def shipped() -> dict[str, Path]:
-    """Return the paths of the shipped pipelines by name, in the order of their names."""
+    """Return the paths of the shipped pipelines by name, sorted."""
     files = list(resource_dir("pipelines").glob("*.yaml"))
     files += [file.with_stem(file.stem + SHORT) for file in files if HAS_SHORT.search(file.read_bytes())]
     return {file.stem: file for file in sorted(files)}
 
 
 def origin(path: Path) -> Path:
-    """Return the file on the disk that holds a pipeline: NAME.yaml for NAME_7k.yaml where only the first is there."""
+    """Return the file on disk that defines a pipeline: NAME.yaml for NAME_7k.yaml if only the first exists."""
     full = path.with_stem(path.stem.removesuffix(SHORT)) if path.stem != SHORT else path
     return full if full != path and full.is_file() and not path.exists() else path
 
@@ -34,7 +34,7 @@ def find(name: str) -> Path:
     path = Path(name)
     try:
         is_folder = path.is_dir()
-        is_file = path.exists() and not is_folder  # or a pipe, of which the reader will say so
+        is_file = path.exists() and not is_folder  # or a pipe, which the reader will refuse
         is_run = is_folder and (path / PIPELINE).is_file()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
@@ -50,11 +50,11 @@ def find(name: str) -> Path:
         return files[name]
     if is_run:
         raise ConfigError(
-            f"{path}: is a run folder, expected a pipeline; `clsplat resume {shell_quote(path)}` goes on with the run"
+            f"{path}: is a run folder; expected a pipeline; `clsplat resume {shell_quote(path)}` continues the run"
         )
     if is_folder:
-        remedy = f"with a scene it is `clsplat run splat_7k --scene {shell_quote(path)}`"
-        raise ConfigError(f"{path}: is a folder, expected a pipeline file; {remedy}")
+        remedy = f"to train on it, use `clsplat run splat_7k --scene {shell_quote(path)}`"
+        raise ConfigError(f"{path}: is a folder; expected a pipeline file; {remedy}")
     near = difflib.get_close_matches(name, files, n=1)
     unknown = ", and no such file or folder; `clsplat pipelines` lists pipelines"
     hint = f"; did you mean '{near[0]}'?" if near else unknown

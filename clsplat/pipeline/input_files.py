@@ -1,4 +1,4 @@
-"""The files that a pipeline names: where runs are compared, what they hold stands for their places."""
+"""Hash the files that a pipeline names, so that runs are compared by content rather than by path."""
 
 import hashlib
 import os
@@ -19,57 +19,56 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import fingerprint
 from clsplat.scene.images import is_image
 
-Change = Callable[[str, Path], str]  # from the text of a path, and the place that it names, to another text
+Change = Callable[[str, Path], str]  # of the text of a path, and the path that it means, to another text
 
 
-def placeless(pipeline: Pipeline) -> dict[str, Any]:
-    """Return the resolved pipeline without places: for a file that it reads stands the hash of its content.
+def with_content_hashes(pipeline: Pipeline) -> dict[str, Any]:
+    """Return the resolved pipeline with the hash of the content in place of the path of each file that it reads.
 
-    The folder of the scene is left out: a scene has an identity.  Raises DataError when a file cannot be read.
+    The folder of the scene is left out, as a scene has an identity.  Raises DataError if a file cannot be read.
     """
-    return _with(pipeline, lambda text, place: content_of(place) or text, None).resolved()
+    return _with(pipeline, lambda text, path: content_of(path) or text, None).resolved()
 
 
-def in_place(pipeline: Pipeline) -> Pipeline:
-    """Return the pipeline with absolute paths, for a process that begins in another folder."""
-    path = pipeline.settings.scene.path
-    return _with(pipeline, lambda text, place: str(place.absolute()), path and str(Path(path).absolute()))
+def with_absolute_paths(pipeline: Pipeline) -> Pipeline:
+    """Return the pipeline with absolute paths, for a process with another working folder."""
+    scene = pipeline.settings.scene.path
+    return _with(pipeline, lambda text, path: str(path.absolute()), scene and str(Path(scene).absolute()))
 
 
 def contents(pipeline: Pipeline) -> dict[str, str]:
-    """Return the hash of each file that is read, by the text that names it; what cannot be read is left out."""
-    found: dict[str, str] = {}
+    """Return the hash of each file that is read, by the text that names it, without files that cannot be read."""
+    hashes: dict[str, str] = {}
 
-    def note(text: str, place: Path) -> str:
+    def add(text: str, path: Path) -> str:
         with suppress(DataError):
-            if digest := content_of(place):
-                found[text] = digest
+            if digest := content_of(path):
+                hashes[text] = digest
         return text
 
-    _with(pipeline, note, None)
-    return found
+    _with(pipeline, add, None)
+    return hashes
 
 
-def content_of(place: Path) -> str:
-    """Return a hash of a file, of a model with all of its files, of that of a run folder, or of a folder of images; ""
-    for no such place.
+def content_of(path: Path) -> str:
+    """Return a hash of a file, of a model and its side files, or of a folder of images; "" if the path does not exist.
 
-    Raises DataError for a folder with neither, and for what cannot be read.
+    Raises DataError for other folders, and for files that cannot be read.
     """
-    if not os.path.exists(place):
+    if not os.path.exists(path):
         return ""
     try:
-        return _content_of(place)
+        return _content_of(path)
     except OSError as error:
-        raise DataError(f"{place}: cannot be read ({error.strerror}); give another file, or its rights") from error
+        raise DataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
 
 
-def _content_of(place: Path) -> str:
-    model = model_at(place)
-    if not model.is_file() and any(is_image(file) for file in place.rglob("*")):
-        return f"sha256:{fingerprint(place, place / 'nothing')}"
+def _content_of(path: Path) -> str:
+    model = model_at(path)
+    if not model.is_file() and any(is_image(file) for file in path.rglob("*")):
+        return f"sha256:{fingerprint(path, path / 'nothing')}"
     if not model.is_file():
-        raise DataError(f"{place}: holds no model; expected a file, or the folder of a finished run")
+        raise DataError(f"{path}: has no model; expected a file, or the folder of a finished run")
     others = [file for file in (*files_of(model), sky_file(model)) if file != model and file.is_file()]
     digests = " ".join(map(_digest, (model, *others)))
     return f"sha256:{hashlib.sha256(digests.encode()).hexdigest() if others else digests}"
@@ -86,20 +85,20 @@ def _known(file: Path, number: int, size: int, time: int) -> str:
 
 
 def _with(pipeline: Pipeline, change: Change, scene: str | None) -> Pipeline:
-    """The pipeline with other texts for what it reads, and this one for the folder of its scene."""
+    """Return the pipeline with changed paths of the files that it reads, and with another folder of its scene."""
     settings = pipeline.settings
     other = settings.model_copy(update={"scene": settings.scene.model_copy(update={"path": None})})
     changed = _changed(other, settings.scene.path, change)
-    placed = changed.scene.model_copy(update={"path": scene})
-    return replace(pipeline, settings=changed.model_copy(update={"scene": placed}))
+    moved = changed.scene.model_copy(update={"path": scene})
+    return replace(pipeline, settings=changed.model_copy(update={"scene": moved}))
 
 
 def _changed(value: Any, scene: str | None, change: Change) -> Any:
     if isinstance(value, Settings):
         changes = {}
         for key in type(value).model_fields:
-            before, place = getattr(value, key), value.input_path(key, scene)
-            changes[key] = _changed(before, scene, change) if place is None else change(before, place)
+            before, path = getattr(value, key), value.input_path(key, scene)
+            changes[key] = _changed(before, scene, change) if path is None else change(before, path)
         return value.model_copy(update=changes)
     if isinstance(value, list | tuple):
         return type(value)(_changed(item, scene, change) for item in value)

@@ -1,4 +1,4 @@
-"""From a pipeline file to checked stages, and back to the resolved file that a run folder holds."""
+"""Load pipeline files as checked stages, and write the resolved pipeline of a run folder."""
 
 import copy
 import logging
@@ -16,11 +16,11 @@ from clsplat.core.settings import iter_settings, variants
 from clsplat.density.edit import Rule
 from clsplat.pipeline import plugins
 from clsplat.pipeline.adapt import Decision
-from clsplat.pipeline.explanation import explain, first_fault, place_text
+from clsplat.pipeline.explanation import explain, first_fault, key_path_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
 from clsplat.pipeline.overrides import CADENCE, NoSuchKey, apply, settable, split, suggestion
-from clsplat.pipeline.yaml_file import Document, Place, read_yaml, yaml_text
+from clsplat.pipeline.yaml_file import Document, KeyPath, read_yaml, yaml_text
 from clsplat.prepare.cache import Planned, plan
 from clsplat.scene.quality import Measures
 from clsplat.training.stage import Scheduled, Stage, Training, written_twice
@@ -35,11 +35,11 @@ class Pipeline:
     path: Path
     settings: PipelineFile
     reason: str = ""
-    """Why settings are others than those of the file, in one line."""
+    """Why settings differ from those of the file, in one line."""
 
     @property
     def names(self) -> list[str]:
-        """The names of its steps and stages, in order."""
+        """The names of its preparation steps and stages, in order."""
         return [*(step.stage for step in self.settings.prepare), *(stage.stage for stage in self.stages)]
 
     @property
@@ -48,29 +48,33 @@ class Pipeline:
 
     @property
     def decisions(self) -> list[Decision]:
-        """What was decided by the photographs."""
+        """What was decided by the photos."""
         return (self.settings.adapt and self.settings.adapt.decisions) or []
 
     @property
+    def reasons(self) -> list[str]:
+        """The reasons of the decisions that change this run."""
+        return [decision.reason for decision in self.decisions if decision.matters]
+
+    @property
     def undecided(self) -> list[str]:
-        """The keys that are still to be decided by the photographs."""
+        """The keys that the photos will decide."""
         if (adapt := self.settings.adapt) is None or adapt.decisions is not None:
             return []
         return [key for key in adapt.keys(self.settings.optimize) if key not in adapt.keep]
 
     def preparation(self, out: Path) -> list[Planned]:
-        """Return the steps before a run in `out`, with the reasons to run them.  Raises DataError or ConfigError."""
+        """Return the preparation steps before a run in `out`, and why each is due.  Raises DataError or ConfigError."""
         settings, folder = self.settings, prepared_folder(out)
         if settings.prepare and settings.scene.masks is not None:
             raise ConfigError(
-                "scene.masks: prepared photographs have another shape than those of "
-                f"{settings.scene.folder}; expected a scene with cameras: run without scene.masks first, then give the "
-                f"result in {folder} as --scene, with masks of its images"
+                "scene.masks: masks do not fit photos that are still to be undistorted; run without scene.masks first, "
+                f"then use the scene in {folder} as --scene, with masks of its images"
             )
         return plan(settings.prepare, settings.scene.folder, folder) if settings.prepare else []
 
     def resolved(self) -> dict[str, Any]:
-        """Return every setting with its value, as plain data in the shape of a file."""
+        """Return every setting with its value, as plain data with the structure of a file."""
         data = self.settings.model_dump(mode="json")
         data |= {key: [_untagged(stage) for stage in data[key]] for key in STAGE_LISTS}
         return {key: value for key, value in data.items() if value or key not in ("plugins", "adapt")}
@@ -81,39 +85,39 @@ class Pipeline:
 
 
 def prepared_folder(out: Path) -> Path:
-    """Return the folder for results of `prepare:`: beside the run folder, for all runs there."""
+    """Return the folder for the results of `prepare:`, next to the run folder and shared by the runs there."""
     return out.absolute().parent / PREPARED
 
 
 def load(name: str, overrides: list[str] | None = None) -> Pipeline:
-    """Read and check a pipeline: a path, or the name of a shipped one; `overrides` are 'stage.key=value'.
+    """Read and check a pipeline, by path or by the name of a shipped one; `overrides` are 'stage.key=value'.
 
-    Raises ConfigError naming file, line, place and the nearest match.
+    Raises ConfigError with file, line, key and the nearest match.
     """
     path = find(name)
     return checked(path, read_yaml(path), overrides or [])
 
 
 def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pipeline:
-    """Check a document with overrides; the document stays unchanged.  Raises ConfigError as `load` does."""
+    """Check a document with overrides, without changing it.  Raises ConfigError as `load` does."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
     tagged = _tagged_file(document, path)
     try:
-        data = copy.deepcopy(forgotten(tagged) if any(map(_is_of_photographs, overrides)) else tagged)
-        places = [apply(data, override, PipelineFile) for override in overrides]
-        return _as_needed(Pipeline(path, _keeping(_validated(data, path, document), places)))
+        data = copy.deepcopy(without_decisions(tagged) if any(map(_changes_photos, overrides)) else tagged)
+        key_paths = [apply(data, override, PipelineFile) for override in overrides]
+        return _without_done_steps(Pipeline(path, _keep_overrides(_validated(data, path, document), key_paths)))
     except ConfigError:
         _blame(tagged, overrides, path, document)
         raise
 
 
-def _as_needed(pipeline: Pipeline) -> Pipeline:
-    """The pipeline without steps of `prepare` whose work a scene has behind it; say so."""
+def _without_done_steps(pipeline: Pipeline) -> Pipeline:
+    """Return the pipeline without `prepare` where the scene has cameras already, and log that."""
     steps, scene = pipeline.settings.prepare, pipeline.settings.scene
     if not steps or scene.path is None or not steps[0].is_done_in(scene.folder):
         return pipeline
-    reason = f"{scene.folder} holds cameras; left out: {', '.join(step.stage for step in steps)}"
+    reason = f"{scene.folder} has cameras; skipped: {', '.join(step.stage for step in steps)}"
     LOG.info("%s", reason)
     return replace(pipeline, settings=pipeline.settings.model_copy(update={"prepare": []}), reason=reason)
 
@@ -130,69 +134,69 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
         settings.check_together()
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
-    found = [one for _, one in iter_settings(settings)]
-    kinds = {*map(type, found), *(kind for one in found if isinstance(one, Rule) for kind in one.columns)}
+    parts = [part for _, part in iter_settings(settings)]
+    kinds = {*map(type, parts), *(kind for part in parts if isinstance(part, Rule) for kind in part.columns)}
     return settings.model_copy(update={"plugins": plugins.used_by(kinds)})
 
 
 def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
-    """Raise the error of the file without overrides, or else that of the first invalid override."""
-    known = [key.place for key in settable(_validated(data, path, document))]
-    without: tuple[str, ConfigError] | None = None  # what is not there since an override; a later one may make it
+    """Raise the error of the file without overrides, or that of the first invalid override."""
+    known = [key.key_path for key in settable(_validated(data, path, document))]
+    conflict: tuple[str, ConfigError] | None = None  # by the override that caused it; a later one may resolve it
     for override in overrides:
         names, _ = split(override)
         try:
-            place = apply(data, override, PipelineFile)
+            key_path = apply(data, override, PipelineFile)
         except NoSuchKey as error:
             raise OverrideError(override, error.reason + suggestion(names, known)) from error
         try:
             settings = PipelineFile.model_validate(data)
             _check_order(path, settings)
             settings.check_together()
-            without = None
+            conflict = None
         except ValidationError as error:
             where, complaint = first_fault(error, PipelineFile)
-            around = where == place[: len(where)]
-            raise OverrideError(override, complaint if around else f"{place_text(where)}: {complaint}") from error
+            around = where == key_path[: len(where)]
+            raise OverrideError(override, complaint if around else f"{key_path_text(where)}: {complaint}") from error
         except ConfigError as error:
-            without = (without[0] if without else override), error
-    if without:
-        raise OverrideError(without[0], one_line(without[1]).removeprefix(f"{path}: ")) from without[1]
+            conflict = (conflict[0] if conflict else override), error
+    if conflict:
+        raise OverrideError(conflict[0], one_line(conflict[1]).removeprefix(f"{path}: ")) from conflict[1]
 
 
-# What follows from the photographs: decided once, like `--set`, and forgotten for other photographs.
+# Settings that follow from the photos: decided once, like `--set`, and decided again for other photos.
 
-AUTO = ("chosen", "reason")  # what a run writes next to a key `auto`
+AUTO = ("chosen", "reason")  # keys that a run writes next to `auto`
 
 
 def adapted(pipeline: Pipeline, measures: Measures) -> Pipeline:
-    """Return the pipeline with what its `adapt` decides; decisions that are made stay.  Raises ConfigError."""
+    """Return the pipeline with the decisions of its `adapt`; existing decisions stay.  Raises ConfigError."""
     adapt = pipeline.settings.adapt
     return with_decisions(pipeline, adapt.decide(pipeline.settings.optimize, measures)) if adapt else pipeline
 
 
 def with_decisions(pipeline: Pipeline, decisions: Iterable[Decision]) -> Pipeline:
-    """Return the pipeline with these decisions, but for keys that it keeps; its own stay.  Raises ConfigError."""
+    """Return the pipeline with decisions, except for keys that it keeps; its own stay.  Raises ConfigError."""
     if (adapt := pipeline.settings.adapt) is None or adapt.decisions is not None:
         return pipeline
     data = pipeline.settings.model_dump(mode="json")
-    made = [one for one in decisions if one.key not in adapt.keep]
+    new = [decision for decision in decisions if decision.key not in adapt.keep]
     try:
-        for one in made:
-            apply(data, one.override, PipelineFile)
-        data["adapt"]["decisions"] = [one.model_dump() for one in made]
+        for decision in new:
+            apply(data, decision.override, PipelineFile)
+        data["adapt"]["decisions"] = [decision.model_dump() for decision in new]
         return replace(pipeline, settings=_validated(data, pipeline.path, Document(data)))
     except ConfigError as error:
-        keys = ", ".join(one.key for one in made)
+        keys = ", ".join(decision.key for decision in new)
         raise ConfigError(f"adapt: {adapt.type}: {one_line(error)}; --set of one of its keys wins: {keys}") from error
 
 
-def _keeping(settings: PipelineFile, places: Sequence[Place]) -> PipelineFile:
-    """The settings, whose `adapt` keeps what overrides have set.  Raises ConfigError where its keys have no place."""
+def _keep_overrides(settings: PipelineFile, key_paths: Sequence[KeyPath]) -> PipelineFile:
+    """Let `adapt` keep the keys that overrides set.  Raises ConfigError if it decides a key that does not exist."""
     if (adapt := settings.adapt) is None:
         return settings
     keep, data, keys = adapt.keep, settings.model_dump(mode="json"), adapt.keys(settings.optimize)
-    if unknown := [key for key in (*keep, *(one.key for one in adapt.decisions or ())) if key not in keys]:
+    if unknown := [key for key in (*keep, *(decision.key for decision in adapt.decisions or ())) if key not in keys]:
         raise ConfigError(f"adapt: {adapt.type} does not decide {quote(unknown[0])}; there are {', '.join(keys)}")
     for key in keys:
         try:
@@ -200,15 +204,15 @@ def _keeping(settings: PipelineFile, places: Sequence[Place]) -> PipelineFile:
         except OverrideError as error:
             raise ConfigError(f"adapt: {adapt.type}: {key}: {error.reason}") from error
         if own[0] not in ("model", "stages"):
-            raise ConfigError(f"adapt: {adapt.type}: {key} is used before photographs are measured")
-        if key not in keep and any(own[: len(place)] == place[: len(own)] for place in places):
+            raise ConfigError(f"adapt: {adapt.type}: {key} is used before the photos are measured")
+        if key not in keep and any(own[: len(path)] == path[: len(own)] for path in key_paths):
             keep = [*keep, key]
-    decisions = adapt.decisions and [one for one in adapt.decisions if one.key not in keep]
+    decisions = adapt.decisions and [decision for decision in adapt.decisions if decision.key not in keep]
     return settings.model_copy(update={"adapt": adapt.model_copy(update={"keep": keep, "decisions": decisions})})
 
 
-def forgotten(data: dict[str, Any]) -> dict[str, Any]:
-    """Return a file's data without what a run decided by its photographs: it is decided again."""
+def without_decisions(data: dict[str, Any]) -> dict[str, Any]:
+    """Return a file's data without what a run decided by its photos, so that it is decided again."""
     adapt = data.get("adapt")
     return {**dict(without_auto(data)), "adapt": {**adapt, "decisions": None} if isinstance(adapt, dict) else adapt}
 
@@ -219,18 +223,18 @@ def without_auto(data: Any) -> Any:
         return [without_auto(item) for item in data]
     if not isinstance(data, dict):
         return data
-    chooses = all(key in data for key in AUTO)
-    return {key: without_auto(value) for key, value in data.items() if not (chooses and key in AUTO)}
+    is_auto = all(key in data for key in AUTO)
+    return {key: without_auto(value) for key, value in data.items() if not (is_auto and key in AUTO)}
 
 
-def _is_of_photographs(override: str) -> bool:
-    """Whether an override sets which photographs are trained with, by which a run may have decided."""
+def _changes_photos(override: str) -> bool:
+    """Whether an override changes the training photos, on which decisions depend."""
     names, _ = split(override)
     return names[0] == "scene" and names[1:2] != ["validation"]
 
 
 def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
-    """The file's data with each stage as {stage: name, …}, from which the models are chosen, and without `short`."""
+    """Return the file's data with each stage as {stage: name, …}, which selects its model, and without `short`."""
     data = {key: value for key, value in document.data.items() if key != "short"}
     for key in STAGE_LISTS:
         if isinstance(data.get(key), list):
@@ -238,27 +242,27 @@ def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
     return data
 
 
-def _tagged(item: Any, place: tuple[str | int, ...], document: Document, path: Path) -> Any:
+def _tagged(item: Any, key_path: tuple[str | int, ...], document: Document, path: Path) -> Any:
     if isinstance(item, str):
         return {"stage": item}
     if not (isinstance(item, dict) and len(item) == 1 and isinstance(next(iter(item.values())), dict | None)):
-        where = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in place[:2])
-        raise ConfigError(f"{path}:{document.line(place)}: {where}: expected '- stage' or '- stage: {{key: value}}'")
+        where = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in key_path[:2])
+        raise ConfigError(f"{path}:{document.line(key_path)}: {where}: expected '- stage' or '- stage: {{key: value}}'")
     name, fields = next(iter(item.items()))
     fields = dict(fields or {})
     if "stage" in fields:
-        inner = (*place, name, "stage")
-        raise ConfigError(f"{path}:{document.line(inner)}: {place_text(inner)}: unknown key 'stage'; remove it")
+        inner = (*key_path, name, "stage")
+        raise ConfigError(f"{path}:{document.line(inner)}: {key_path_text(inner)}: unknown key 'stage'; remove it")
     if isinstance(fields.get("during"), list):
         fields["during"] = [
-            _tagged(inner, (*place, name, "during", i), document, path) for i, inner in enumerate(fields["during"])
+            _tagged(inner, (*key_path, name, "during", i), document, path) for i, inner in enumerate(fields["during"])
         ]
     return {"stage": name, **fields}
 
 
 def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
     fields = {key: value for key, value in stage.items() if key != "stage"}
-    if fields.get("every") is None:  # a cadence belongs inside `during` only
+    if fields.get("every") is None:  # only stages inside `during` have a cadence
         fields = {key: value for key, value in fields.items() if key not in CADENCE}
     if "during" in fields:
         fields["during"] = [_untagged(inner) for inner in fields["during"]]
@@ -266,43 +270,43 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
 
 
 def _late(stages: Sequence[Stage], need: str) -> str:
-    """Say of a part what should make it during a training, but does not act; "" where there is none."""
+    """Explain why a stage inside `during` does not make what another needs, as it is due too late; "" if none does."""
     step = 0
     for training in stages:
         if not isinstance(training, Training):
             continue
         for inner in training.during:
             if need in inner.makes and inner.every:
-                cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
+                cadence = f"{inner.stage} makes every {inner.every} steps after step {inner.start}"
                 acts = any(fires_at(inner.every, one) for one in range(step + 1, step + training.steps))
                 remedies = [] if acts else [f"set {inner.stage}.every below {training.steps}"]
                 remedies += [f"set {inner.stage}.start earlier"] if acts or inner.start >= step + training.steps else []
-                return f"{cadence}; the training ends before: {' and '.join(remedies)}, or use --minutes"
+                return f"{cadence}, but the training ends earlier; {' and '.join(remedies)}, or use --minutes"
         step += training.steps
     return ""
 
 
 def _check_order(path: Path, settings: PipelineFile) -> None:
-    """Raise ConfigError where a stage needs a part of the run that no earlier stage makes."""
-    made, taken, step = {"scene"}, dict[str, str](), 0
+    """Raise ConfigError if a stage needs something, such as a model, that no earlier stage makes."""
+    available, removed, step = {"scene"}, dict[str, str](), 0
     for i, stage in enumerate(settings.stages):
         for key in CADENCE if isinstance(stage, Scheduled) else ():
             if getattr(stage, key) != type(stage).model_fields[key].default:
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage}: '{key}' belongs inside optimize.during")
-        for need in sorted(stage.needs - made):
+        for need in sorted(stage.needs - available):
             makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
-            if need in taken:
-                gone = f"which {taken[need]} takes away ({makers} makes it again)"
-                raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', {gone}")
+            if need in removed:
+                reason = f"which {removed[need]} removes ({makers} makes it again)"
+                raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', {reason}")
             if late := _late(settings.stages[:i], need):
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', which {late}")
             raise ConfigError(
                 f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
             )
-        taken |= dict.fromkeys(made & stage.takes, f"stages[{i}] {stage.stage}")
-        made = (made - stage.takes) | stage.makes
+        removed |= dict.fromkeys(available & stage.takes, f"stages[{i}] {stage.stage}")
+        available = (available - stage.takes) | stage.makes
         if isinstance(stage, Training):
-            made.update(part for inner in stage.acting(step) for part in inner.makes)
+            available.update(part for inner in stage.acting(step) for part in inner.makes)
             step += stage.steps
-    if place := written_twice(settings.stages):
-        raise ConfigError(f"{path}: two stages write '{place}'; give one of them another name")
+    if file := written_twice(settings.stages):
+        raise ConfigError(f"{path}: two stages write '{file}'; give one of them another name")

@@ -1,15 +1,15 @@
-"""A pipeline file with `matrix:`: one run for each combination of pipelines, scenes, settings and seeds.
+"""Read a pipeline file with `matrix:`, which stands for one run per combination of pipelines, scenes, settings, seeds.
 
     name: ablation
     matrix:
-      pipelines: [splat_7k, my_variant.yaml]   # without these: the stages of this file
+      pipelines: [splat_7k, my_variant.yaml]   # default: the stages of this file
       scenes: [data/lego, data/garden]
       seeds: [0, 1, 2]
-      set:                                     # each key takes every value of its list
+      set:                                     # each key takes each value of its list
         densify.every: [100, 200]
-      steps: 2000                              # of each cell; what happens at a step keeps its share of them
+      steps: 2000                              # per cell; schedules are stretched to fit
 
-Each cell runs in its own folder below the run folder; its name holds its value on every axis.
+Each cell runs in its own folder in the run folder.  Its name has its value on each axis.
 """
 
 import itertools
@@ -27,18 +27,18 @@ from clsplat.core.errors import ConfigError, OverrideError, quote, shorten
 from clsplat.core.files import invalid_output_reason
 from clsplat.core.settings import InputPath, Settings
 from clsplat.pipeline.execution import Execution
-from clsplat.pipeline.explanation import explain, place_text
+from clsplat.pipeline.explanation import explain, key_path_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.stretching import in_steps
-from clsplat.pipeline.yaml_file import Document, Place, read_pipeline, read_yaml, yaml_text
+from clsplat.pipeline.yaml_file import Document, KeyPath, read_pipeline, read_yaml, yaml_text
 
-# Short names for the values of a matrix, from which those of its cells are made.
+# Short labels for the values of a matrix, which make up the names of its cells.
 
 
 def distinct(paths: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return the shortest ends of the paths that differ from each other."""
+    """Return the shortest distinct endings of paths, joined by hyphens."""
     for length in range(1, max((len(parts) for parts in paths), default=0) + 1):
         names = ["-".join(parts[-length:]) for parts in paths]
         if len(set(names)) == len(names):
@@ -47,7 +47,7 @@ def distinct(paths: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def value_text(value: Any) -> str:
-    """Return a value as a part of a name."""
+    """Return a value as part of a name."""
     if isinstance(value, list):
         return "+".join(value_text(item) for item in value)
     return value if isinstance(value, str) else json.dumps(value)
@@ -57,20 +57,20 @@ MAX_CELLS = 1000
 
 
 class Matrix(Settings):
-    """The axes; the names of cells hold the values of all axes in the file."""
+    """The axes of a matrix."""
 
     pipelines: list[InputPath] = Field([])
-    """Pipeline files, or names of shipped pipelines; without them, the stages of this file."""
+    """Pipeline files, or names of shipped pipelines; default: the stages of this file."""
     scenes: list[InputPath] = Field([])
-    """Folders of datasets; without them, the scene of the pipeline or of --scene."""
+    """Folders of datasets; default: the scene of the pipeline or of --scene."""
     seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field([])
-    """Seeds; without them, the seed of the pipeline."""
+    """Seeds; default: the seed of the pipeline."""
     set: dict[str, Annotated[list[JsonValue], Field(min_length=1)]] = Field({})
-    """Settings by place, as of --set, each with the list of its values."""
+    """Settings by key, as for --set, each with a list of values."""
     steps: Annotated[int, Field(ge=1)] | None = None
-    """Steps of each cell's training, all that happens at a step keeping its share of them; without it, as they are."""
+    """Steps of each cell's training; schedules are stretched to fit; default: as in the pipelines."""
     options: list[str] = Field([])
-    """Settings of every cell, as place=value: those of --set and --scene, which a run notes in its folder."""
+    """Settings of all cells, as key=value.  A run writes those of --set and --scene here, in its folder."""
 
     @model_validator(mode="after")
     def _has_cells(self) -> "Matrix":
@@ -84,14 +84,14 @@ class Matrix(Settings):
 
 
 class MatrixFile(Settings):
-    """The keys of a file with `matrix:`; without `matrix.pipelines` the file has those of a pipeline too."""
+    """The keys of a file with `matrix:`; without `matrix.pipelines` it has the keys of a pipeline as well."""
 
     name: Name
     """Name of the matrix, and of its run folder."""
     matrix: Matrix
     """The axes."""
     execution: Execution = Execution()
-    """Where the cells run and are kept, as in a file of `--on`; without it, one after the other in the run folder."""
+    """Where the cells run and are stored, as in a file for `--on`; default: one after another in the run folder."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Experiment:
 
     path: Path
     name: str
-    text: str  # of the file, with the options that it was opened with
+    text: str  # of the file, with the options of the command
     cells: list[Cell]
     execution: Execution = field(default_factory=Execution)
 
@@ -118,29 +118,30 @@ class _Choice:
     """A value on an axis."""
 
     label: str
-    override: str  # place=value
-    place: Place  # in the file
+    override: str  # key=value
+    key_path: KeyPath  # in the file
 
 
 def load_experiment(
     name: str, overrides: Sequence[str] = (), execution: dict[str, Any] | None = None
 ) -> Experiment | None:
-    """Read and check a pipeline file with `matrix:`, and every cell of it; None for a file without.
+    """Read and check a pipeline file with `matrix:` and all its cells; None for a file without `matrix:`.
 
-    execution: keys that take the place of the file's own.
+    execution: keys that replace those of the file.
     Raises ConfigError with file and line.
     """
     path = find(name)
     document = read_yaml(path)
     if not isinstance(document.data, dict) or "matrix" not in document.data:
         return None
-    named = document.data["matrix"].get("pipelines") if isinstance(document.data["matrix"], dict) else None
+    names_pipelines = isinstance(document.data["matrix"], dict) and document.data["matrix"].get("pipelines")
     try:
-        own = {key: value for key, value in document.data.items() if named or key in MatrixFile.model_fields}
-        file = MatrixFile.model_validate(own)
+        keys = document.data if names_pipelines else document.data.keys() & MatrixFile.model_fields.keys()
+        file = MatrixFile.model_validate({key: document.data[key] for key in document.data if key in keys})
     except ValidationError as error:
         raise ConfigError(explain(error, MatrixFile, path, document)) from error
-    given, overrides = bool(overrides) or execution is not None, _last_of_each([*file.matrix.options, *overrides])
+    has_options = bool(overrides) or execution is not None
+    overrides = _last_of_each([*file.matrix.options, *overrides])
     axes = _axes(file.matrix)
     _check_overrides(path, axes, overrides)
     bases = _bases(path, document, file.matrix)
@@ -156,14 +157,14 @@ def load_experiment(
     if execution is not None:
         data["execution"] = execution
     chosen = file.execution if execution is None else Execution.model_validate(execution)
-    return Experiment(path, file.name, yaml_text(data) if given else read_pipeline(path), cells, chosen)
+    return Experiment(path, file.name, yaml_text(data) if has_options else read_pipeline(path), cells, chosen)
 
 
 @dataclass(frozen=True)
 class _Base:
     """The pipeline of some cells, before their settings."""
 
-    label: str  # "" when it is the file with the matrix
+    label: str  # "" for the file with the matrix
     path: Path
     document: Document
 
@@ -186,7 +187,7 @@ def _bases(path: Path, document: Document, matrix: Matrix) -> list[_Base]:
 
 
 def _axes(matrix: Matrix) -> list[list[_Choice]]:
-    """Every axis but the pipelines, in the order of the cells' names."""
+    """Return all axes except the pipelines, in the order in which they appear in the names of cells."""
     axes = []
     if matrix.scenes:
         labels = distinct([Path(scene).parts for scene in matrix.scenes])
@@ -225,21 +226,21 @@ def _in_steps(cell: Cell, steps: int) -> Cell:
 def _check_choices(
     path: Path, document: Document, base: _Base, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]
 ) -> None:
-    """Check each value of the matrix by itself.  Raises ConfigError with the place of the first that does not fit."""
+    """Check each value of the matrix by itself.  Raises ConfigError with the key of the first invalid one."""
     checked(base.path, base.document, list(overrides))
     for choice in itertools.chain(*axes):
         try:
             checked(base.path, base.document, [*overrides, choice.override])
         except OverrideError as error:
-            place, line = place_text(choice.place), document.line(choice.place)
-            raise ConfigError(f"{path}:{line}: {place}: {error.reason}") from error
+            key_path, line = key_path_text(choice.key_path), document.line(choice.key_path)
+            raise ConfigError(f"{path}:{line}: {key_path}: {error.reason}") from error
 
 
 def _check_overrides(path: Path, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]) -> None:
     swept = {choice.override.partition("=")[0] for axis in axes for choice in axis}
     for override in overrides:
-        if (place := override.partition("=")[0]) in swept:
-            raise ConfigError(f"{path}: the matrix lists values of {place}; change them there, not by an option")
+        if (key_path := override.partition("=")[0]) in swept:
+            raise ConfigError(f"{path}: the matrix lists values of {key_path}; change them there, not by an option")
 
 
 def _check_names(path: Path, cells: Sequence[Cell]) -> None:
@@ -252,10 +253,10 @@ def _check_names(path: Path, cells: Sequence[Cell]) -> None:
 
 
 def _last_of_each(overrides: Sequence[str]) -> list[str]:
-    """Without those that a later one of the same place takes back."""
-    places = [override.partition("=")[0] for override in overrides]
-    return [override for i, override in enumerate(overrides) if places[i] not in places[i + 1 :]]
+    """Return the last override of each key."""
+    keys = [override.partition("=")[0] for override in overrides]
+    return [override for i, override in enumerate(overrides) if keys[i] not in keys[i + 1 :]]
 
 
-def _override(place: str, value: Any) -> str:
-    return f"{place}={json.dumps(value)}"
+def _override(key_path: str, value: Any) -> str:
+    return f"{key_path}={json.dumps(value)}"

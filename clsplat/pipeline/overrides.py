@@ -1,9 +1,9 @@
-"""`--set place=value`: changes to a pipeline file's data before it is checked.
+"""Apply `--set KEY=VALUE` to a pipeline file's data before it is checked.
 
-optimize.steps=500              a stage by its name, also one inside `during` if its name is unique
-optimize.losses.0.weight=0.5    an item of a list by its number, from 0; losses[0] is the same
-optimize.modules.exposure={}    an item of `modules` by its type: added at its place, or changed; null removes it
-stages.1.steps=500              a stage by its number, where several have the same name
+optimize.steps=500              a stage by its name, also inside `during` if the name is unique
+optimize.losses.0.weight=0.5    an item of a list by its index, from 0; losses[0] is the same
+optimize.modules.exposure={}    an item of `modules` by its type: adds or changes it; null removes it
+stages.1.steps=500              a stage by its index, if several have the same name
 """
 
 import difflib
@@ -18,28 +18,28 @@ from pydantic import BaseModel
 from clsplat.core.errors import ConfigError, OverrideError, quote, shorten
 from clsplat.core.settings import TAGS, Variants, descriptions, variants
 from clsplat.pipeline.explanation import annotations, bases, inside_list, model_of, with_tags
-from clsplat.pipeline.yaml_file import Place, parse_value
+from clsplat.pipeline.yaml_file import KeyPath, parse_value
 
 MAX_SUGGESTIONS = 3
-MAX_PARTS = 32  # of a place; real ones have up to ten
-NOT_SETTABLE = {"plugins": "a run writes it; load a plug-in with --plugin FILE"}
+MAX_PARTS = 32  # of a key path; real ones have up to ten
+NOT_SETTABLE = {"plugins": "runs write it; load a plug-in with --plugin FILE"}
 
 
 class NoSuchKey(OverrideError):
-    """A place that the pipeline does not have."""
+    """The pipeline does not have a key."""
 
 
 def split(text: str) -> tuple[list[str], str]:
-    """Return the parts of the place, and the value.  Raises OverrideError."""
-    place, equals, value = text.partition("=")
-    names = re.findall(r"[^.\[\]]+", place)
+    """Return the parts of the key path, and the value.  Raises OverrideError."""
+    key_path, equals, value = text.partition("=")
+    names = re.findall(r"[^.\[\]]+", key_path)
     if not equals or not 0 < len(names) <= MAX_PARTS:
-        raise OverrideError(text, "expected stage.key=value, for example optimize.steps=500")
+        raise OverrideError(text, "expected KEY=VALUE, such as optimize.steps=500")
     return names, value
 
 
-def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
-    """Change the data, in which each stage has its name as `stage`; return the place in the shape of the file.
+def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> KeyPath:
+    """Change the data, in which each stage has its name as `stage`; return the key path in the file.
 
     Raises OverrideError.
     """
@@ -47,25 +47,25 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
     try:
         parsed = parse_value(value)
     except ConfigError as error:
-        raise OverrideError(text, f"the value cannot be read: {error}") from error
-    node, last = _found(data, text, root)
-    if isinstance(node.data, list) and node.is_by_type(last):
+        raise OverrideError(text, f"cannot read the value: {error}") from error
+    node, last = _parent(data, text, root)
+    if isinstance(node.data, list) and node.is_keyed(last):
         node.put(last, parsed, text)
-        return (*node.place, last)
+        return (*node.key_path, last)
     if isinstance(node.data, list):
         i = node.number(last, text)
         node.data[i] = with_tags(parsed, node.inside)
-        return (*node.place, i)
+        return (*node.key_path, i)
     if not isinstance(node.data, dict):
-        raise NoSuchKey(text, f"nothing lies below {quote(node.place[-1])}")
-    if not node.place and last not in root.model_fields:
+        raise NoSuchKey(text, f"{quote(node.key_path[-1])} has no keys")
+    if not node.key_path and last not in root.model_fields:
         raise NoSuchKey(text, f"no key {quote(last)} at the top of a pipeline")
     node.data[last] = with_tags(parsed, node.annotation(last))
-    return (*node.place, last)
+    return (*node.key_path, last)
 
 
-def _found(data: dict[str, Any], text: str, root: type[BaseModel]) -> "tuple[_Node, str]":
-    """What holds the key of 'place=value', and the key's name in it.  Raises OverrideError."""
+def _parent(data: dict[str, Any], text: str, root: type[BaseModel]) -> "tuple[_Node, str]":
+    """Return the node that holds the key of 'key=value', and the key's name there.  Raises OverrideError."""
     names, _ = split(text)
     if names[0] in NOT_SETTABLE:
         raise OverrideError(text, f"'{names[0]}' cannot be set; {NOT_SETTABLE[names[0]]}")
@@ -76,42 +76,44 @@ def _found(data: dict[str, Any], text: str, root: type[BaseModel]) -> "tuple[_No
 
 
 class _Node:
-    """A dict or list of the data, with its annotation and its place in the file."""
+    """A dict or list of the data, with its annotation and its key path in the file."""
 
-    def __init__(self, data: Any, annotation: Any, place: Place) -> None:
+    def __init__(self, data: Any, annotation: Any, key_path: KeyPath) -> None:
         self.data = data
-        self.place = place
+        self.key_path = key_path
         self.model = model_of(data, annotation)
         self.inside = inside_list(annotation) if isinstance(data, list) else None
 
     def child(self, name: str, text: str) -> "_Node":
-        """Return the node of a key; a missing key is made from its default.  Raises OverrideError."""
-        if isinstance(self.data, list) and self.is_by_type(name):
-            if all(one["type"] != name for one in self.data):
+        """Return the node of a key, which is created from its default if missing.  Raises OverrideError."""
+        if isinstance(self.data, list) and self.is_keyed(name):
+            if all(item["type"] != name for item in self.data):
                 self.put(name, {}, text)
-            item = next(one for one in self.data if one["type"] == name)
-            return _Node(item, self.inside, (*self.place, name))
+            item = next(item for item in self.data if item["type"] == name)
+            return _Node(item, self.inside, (*self.key_path, name))
         if isinstance(self.data, list):
             return self._item(self.number(name, text))
         if not isinstance(self.data, dict):
-            raise NoSuchKey(text, f"nothing lies below {quote(self.place[-1])}")
+            raise NoSuchKey(text, f"{quote(self.key_path[-1])} has no keys")
         if stage := self._stage(name, text):
             return stage
         if self.data.get(name) is None:
-            if not self.place and name not in self._fields:
+            if not self.key_path and name not in self._fields:
                 raise NoSuchKey(text, f"no {quote(name)} in this pipeline")
             default = self._fields[name].get_default(call_default_factory=True) if name in self._fields else None
             is_list = isinstance(default, list)
             self.data[name] = _as_written(default) if isinstance(default, BaseModel) else [] if is_list else {}
         return self._key(name)
 
-    def is_by_type(self, name: str) -> bool:
-        """Whether the name is a type of items that are addressed by it, and not a number."""
-        is_keyed = any(base.keyed_by_type for base in bases(self.inside))
-        return is_keyed and not name.isdigit() and all(isinstance(one, dict) and "type" in one for one in self.data)
+    def is_keyed(self, name: str) -> bool:
+        """Whether the name is the type of a list item, and not an index."""
+        keyed_by_type = any(base.keyed_by_type for base in bases(self.inside))
+        return (
+            keyed_by_type and not name.isdigit() and all(isinstance(one, dict) and "type" in one for one in self.data)
+        )
 
     def put(self, name: str, value: Any, text: str) -> None:
-        """Put an item of a type at its place in a list, or in place of the one that is there; None removes that.
+        """Insert a list item of a type in its position, or replace the item of that type; None removes it.
 
         Raises OverrideError.
         """
@@ -122,89 +124,92 @@ class _Node:
             raise OverrideError(text, f"no {quote(name)}; expected one of {', '.join(kinds)}{meant}")
         if value is not None and not isinstance(value, dict):
             raise OverrideError(text, "expected a mapping of its keys, such as {}, or null")
-        places = [one["type"] for one in self.data]
-        at = places.index(name) if name in places else None
-        if at is not None:
-            del self.data[at]
+        types = [item["type"] for item in self.data]
+        index = types.index(name) if name in types else None
+        if index is not None:
+            del self.data[index]
         if value is None:
             return
-        if at is None:
-            at = sum(getattr(kinds.get(one), "order", 0) <= kinds[name].order for one in places)
-        item = {"type": name, **{key: one for key, one in value.items() if key != "type"}}
-        self.data.insert(at, with_tags(item, self.inside))
+        if index is None:
+            index = sum(getattr(kinds.get(type_), "order", 0) <= kinds[name].order for type_ in types)
+        item = {"type": name, **{key: setting for key, setting in value.items() if key != "type"}}
+        self.data.insert(index, with_tags(item, self.inside))
 
     def number(self, name: str, text: str) -> int:
-        """Return the index that a name holds.  Raises OverrideError."""
+        """Return a name as an index of the list.  Raises OverrideError."""
         if re.fullmatch(r"[0-9]{1,9}", name) and int(name) < len(self.data):
             return int(name)
         count = len(self.data)
-        raise NoSuchKey(text, f"expected a number below {count} in a list of {count}, got {quote(name)}")
+        raise NoSuchKey(text, f"expected an index below {count} in a list of {count}, got {quote(name)}")
 
     @property
     def _fields(self) -> dict[str, Any]:
         return dict(self.model.model_fields) if self.model else {}
 
     def annotation(self, name: str) -> Any:
-        """Return the annotation of a key; None where it is not known."""
+        """Return the annotation of a key; None if unknown."""
         return annotations(self.model).get(name) if self.model else None
 
     def _key(self, name: str) -> "_Node":
         annotation = self.annotation(name)
-        self.data[name] = with_tags(self.data[name], annotation)  # nothing can be set below a bare name
-        return _Node(self.data[name], annotation, (*self.place, name))
+        self.data[name] = with_tags(self.data[name], annotation)  # a bare name has no keys
+        return _Node(self.data[name], annotation, (*self.key_path, name))
 
     def _item(self, i: int) -> "_Node":
         item = self.data[i]
         name = [item["stage"]] if isinstance(item, dict) and "stage" in item else []
-        return _Node(item, self.inside, (*self.place, i, *name))
+        return _Node(item, self.inside, (*self.key_path, i, *name))
 
     def _stages(self) -> "list[_Node]":
-        """The stages in the lists of a map."""
+        """Return the stages in the lists of a map."""
         lists = [self._key(key) for key, value in self.data.items() if isinstance(value, list) and self._may_hold(key)]
         items = [node._item(i) for node in lists for i in range(len(node.data))]
         return [item for item in items if isinstance(item.data, dict) and "stage" in item.data]
 
     def _may_hold(self, key: str) -> bool:
-        """Whether a list may have stages in it: it is not known to be of other things."""
+        """Whether a list may contain stages: it does, or its type is unknown."""
         kinds = bases(inside_list(self.annotation(key)))
         return self.annotation(key) is None or any(Variants(kind).tag == "stage" for kind in kinds)
 
     def _stage(self, name: str, text: str) -> "_Node | None":
-        """The stage of that name, here or from the top inside another.  Raises OverrideError where several have it."""
-        own = self._stages()
-        found = [node for node in own if node.data["stage"] == name]
-        if not found and not self.place:
-            found = [inner for node in own for inner in node._stages() if inner.data["stage"] == name]
-        if len(found) > 1:
-            numbers = shorten(" or ".join(_address(node.place) for node in found), 200)
-            raise OverrideError(text, f"there are {len(found)} stages named {quote(name)}; write {numbers} for it")
-        return found[0] if found else None
+        """Return the stage with a name, here or, at the top, inside another stage.
+
+        Raises OverrideError if several have the name.
+        """
+        stages = self._stages()
+        matches = [node for node in stages if node.data["stage"] == name]
+        if not matches and not self.key_path:
+            matches = [inner for node in stages for inner in node._stages() if inner.data["stage"] == name]
+        if len(matches) > 1:
+            keys = shorten(" or ".join(_address(node.key_path) for node in matches), 200)
+            raise OverrideError(text, f"{len(matches)} stages are named {quote(name)}; use {keys} instead")
+        return matches[0] if matches else None
 
 
 def _as_written(default: BaseModel) -> dict[str, Any]:
-    """A default as in a file: its tag, and the keys that differ from their own defaults."""
+    """Return a default as in a file: its tag, and the keys that differ from their own defaults."""
     written = default.model_dump(mode="json", exclude_defaults=True)
     return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **written}
 
 
-def _address(place: Place) -> str:
-    """A stage's place with numbers alone, without the names of stages."""
-    return ".".join(str(part) for i, part in enumerate(place) if not (i and isinstance(place[i - 1], int)))
+def _address(key_path: KeyPath) -> str:
+    """Return a stage's key path with indices only, without the names of stages."""
+    return ".".join(str(part) for i, part in enumerate(key_path) if not (i and isinstance(key_path[i - 1], int)))
 
 
 def suggestion(names: Sequence[str], known: Sequence[str]) -> str:
-    """Return '; did you mean …?' with the known places that end with `names` or are similar; '' without any."""
-    place = ".".join(names)
-    near = [one for one in known if one.endswith(f".{place}")]
-    near = near or difflib.get_close_matches(place, known, n=1)
-    near = near or [one for one in known if one.rpartition(".")[2] == names[-1]]
+    """Return '; did you mean …?' with the known key paths that end with `names` or are similar; '' if none is."""
+    key_path = ".".join(names)
+    near = [path for path in known if path.endswith(f".{key_path}")]
+    near = near or difflib.get_close_matches(key_path, known, n=1)
+    near = near or [path for path in known if path.rpartition(".")[2] == names[-1]]
     if not near:
-        last = difflib.get_close_matches(names[-1], [one.rpartition(".")[2] for one in known], n=1)
-        near = [one for one in known if one.rpartition(".")[2] in last]
+        last = difflib.get_close_matches(names[-1], [path.rpartition(".")[2] for path in known], n=1)
+        near = [path for path in known if path.rpartition(".")[2] in last]
     return f"; did you mean {' or '.join(near[:MAX_SUGGESTIONS])}?" if near else ""
 
 
-# The keys of a pipeline that `--set` can change, in the notation of `--set`.
+# The keys of a pipeline that `--set` can change, as `--set` writes them.
 
 CADENCE = ("every", "start", "stop")  # keys of stages inside `during` only
 
@@ -213,18 +218,18 @@ CADENCE = ("every", "start", "stop")  # keys of stages inside `during` only
 class Key:
     """One setting."""
 
-    place: str  # in the notation of --set, such as optimize.losses.0.weight
+    key_path: str  # as --set writes it, such as optimize.losses.0.weight
     value: Any  # plain data
     description: str
 
     @property
     def text(self) -> str:
-        """'place=value', in the notation of --set."""
-        return f"{self.place}={value_text(self.value)}"
+        """KEY=VALUE, as --set writes it."""
+        return f"{self.key_path}={value_text(self.value)}"
 
 
 def settable(settings: BaseModel) -> list[Key]:
-    """List every key of checked settings, in their order."""
+    """List every key of checked settings, in order."""
     return list(_keys(settings, "", _addresses(settings)))
 
 
@@ -248,29 +253,29 @@ def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[
 
 
 def _addresses(settings: BaseModel) -> dict[int, str]:
-    """The shortest place of every stage, by its id: its name, the name below that of its stage, or its number."""
+    """Return the shortest key path of each stage, by id: its name, OUTER.NAME, or an index."""
     outer = list(_stages(settings))
     names = [stage.stage for _, stage in outer]
     inner = [(i, list(_stages(stage))) for i, (_, stage) in enumerate(outer)]
     inner_names = [stage.stage for _, stages in inner for _, stage in stages]
     addresses = {
-        id(stage): stage.stage if names.count(stage.stage) == 1 else place for place, stage in outer
+        id(stage): stage.stage if names.count(stage.stage) == 1 else key_path for key_path, stage in outer
     }  # fmt: skip
     for i, stages in inner:
         own = [stage.stage for _, stage in stages]
         around = addresses[id(outer[i][1])]
-        for place, stage in stages:
+        for key_path, stage in stages:
             if stage.stage not in names and inner_names.count(stage.stage) == 1:
                 addresses[id(stage)] = stage.stage
             elif own.count(stage.stage) == 1:
                 addresses[id(stage)] = f"{around}.{stage.stage}"
             else:
-                addresses[id(stage)] = f"{around}.{place}"
+                addresses[id(stage)] = f"{around}.{key_path}"
     return addresses
 
 
 def _stages(model: BaseModel) -> Iterator[tuple[str, Any]]:
-    """The stages in the lists of a model, each with its place there."""
+    """Yield the stages in the lists of a model, each with its key path there."""
     for name in type(model).model_fields:
         value = getattr(model, name)
         for i, item in enumerate(value if isinstance(value, list) else []):
@@ -279,7 +284,7 @@ def _stages(model: BaseModel) -> Iterator[tuple[str, Any]]:
 
 
 def value_text(value: Any) -> str:
-    """Return a value in the notation of --set, with as few quotes as possible."""
+    """Return a value as --set writes it, with as few quotes as possible."""
     text = f"[{','.join(map(value_text, value))}]" if isinstance(value, list) else str(value)
     try:
         return text if parse_value(text) == value and not isinstance(value, bool) else json.dumps(value)

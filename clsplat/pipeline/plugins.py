@@ -1,8 +1,8 @@
-"""Losses, rules, filters, stages, readers and more from outside the package.
+"""Import plug-ins: losses, rules, filters, stages, readers and more from outside the package.
 
 A plug-in is a Python file, given by `--plugin FILE.py`, or a module that an installed package names in the entry-point
-group `clsplat.plugins`.  Its classes can be used after its import; kernels lie beside it and may include the headers
-of `cl_kernels`.  A run records the name and the content hash of each of its plug-ins.
+group `clsplat.plugins`.  Once it is imported, its classes can be used.  Its kernels are files next to it, which may
+include the headers of `cl_kernels`.  A run records the name and the content hash of each plug-in that it uses.
 """
 
 import ast
@@ -32,17 +32,17 @@ _loaded: dict[str, "Plugin"] = {}  # by name
 
 @dataclass(frozen=True)
 class Plugin:
-    """One module from outside the package."""
+    """A plug-in that is imported."""
 
     name: str  # of the file without .py, or of the entry point
     path: Path
-    digest: str  # sha256 of its Python files, of the kernel files that they name, and of their headers
-    installed: bool  # by a package, and not by --plugin
-    kinds: tuple[type, ...]  # its settings and readers
+    digest: str  # sha256 of its Python files, the kernel files that they name, and the headers of those
+    installed: bool  # from a package rather than --plugin
+    kinds: tuple[type, ...]  # its classes of settings and readers
 
 
 def load_file(path: Path) -> Plugin:
-    """Import a plug-in.  Raises ConfigError, with file and line, when that fails or its name is taken."""
+    """Import a plug-in.  Raises ConfigError, with file and line, if that fails or its name is taken."""
     path = path.resolve()
     if not path.is_file():
         raise ConfigError(f"--plugin {path}: no such file; expected a Python file")
@@ -50,7 +50,7 @@ def load_file(path: Path) -> Plugin:
     if (before := _loaded.get(path.stem)) is not None:
         if before.path != path:
             raise ConfigError(
-                f"--plugin {path}: a plug-in named '{path.stem}' is loaded from {before.path}; rename the file"
+                f"--plugin {path}: another plug-in named '{path.stem}' is loaded, from {before.path}; rename the file"
             )
         if before.digest != digest_of(path, *_helpers(sys.modules[name], path.parent)):
             raise ConfigError(f"--plugin {path}: its files have changed since it was loaded; restart Python")
@@ -67,7 +67,7 @@ def load_file(path: Path) -> Plugin:
 
 
 def load_installed() -> None:
-    """Import the plug-ins of installed packages, once.  Raises ConfigError when one fails."""
+    """Import the plug-ins of installed packages, once.  Raises ConfigError if one fails."""
     for entry in entry_points(group=GROUP):
         if entry.name not in _loaded:
             _loaded[entry.name] = _load_entry(entry)
@@ -79,10 +79,10 @@ def loaded() -> list[Plugin]:
 
 
 def used_by(kinds: Collection[type]) -> dict[str, str]:
-    """Return name and content hash of the plug-ins of a run with settings of these classes.
+    """Return the names and content hashes of the plug-ins that a run with settings of these classes uses.
 
-    They are those given by a file, those of the classes or of their bases, and each installed one that defines a
-    reader: a run may be checked before its scene is known.
+    These are all plug-ins from files, and installed ones that define one of the classes, a base of one, or a reader,
+    as a run may be checked before its scene is known.
     """
     bases = {base for kind in kinds for base in kind.__mro__}
     return {
@@ -93,25 +93,26 @@ def used_by(kinds: Collection[type]) -> dict[str, str]:
 
 
 def require(recorded: Mapping[str, str], where: str) -> None:
-    """Raise ConfigError when a recorded plug-in is missing or has other content now; `where` names the record."""
+    """Raise ConfigError if a recorded plug-in is missing or has changed; `where` names the record."""
     if faults := differences(recorded):
         raise ConfigError(f"{where}: {faults[0]}")
 
 
 def differences(recorded: Mapping[str, str]) -> list[str]:
-    """Return a sentence for each recorded plug-in that is not loaded or has other content now."""
+    """Return a sentence for each recorded plug-in that is not loaded or has changed."""
     faults = []
     for name, digest in recorded.items():
         if name not in _loaded:
             faults.append(f"needs the plug-in '{name}', which is not loaded; use --plugin {name}.py")
         elif _loaded[name].digest != digest:
-            here = f"{_loaded[name].path} has sha256 {_loaded[name].digest[:12]}"
-            faults.append(f"needs the plug-in '{name}' with sha256 {digest[:12]}, {here}; use the file as it was")
+            path, other = _loaded[name].path, _loaded[name].digest
+            change = f"{path} has changed since (sha256 {other[:12]}, was {digest[:12]})"
+            faults.append(f"needs the plug-in '{name}', but {change}; use the earlier file")
     return faults
 
 
 def digest_of(*modules: Path) -> str:
-    """Return the sha256 of Python files, and of the kernel files and headers beside them that they and those name."""
+    """Return the sha256 of Python files, and of the kernel files and headers next to them that they name."""
     digest, waiting = sha256(), list(dict.fromkeys(modules))
     seen = set(waiting)
     while waiting:
@@ -120,9 +121,9 @@ def digest_of(*modules: Path) -> str:
         digest.update(f"{file.name}\n{len(content)}\n".encode() + content)
         named = {file.parent / name for name in _KERNEL_FILE.findall(content.decode("utf-8", "replace"))}
         named |= {file.with_suffix(".cl")} if file in modules else set()
-        found = sorted(one for one in named if one not in seen and one.is_file())
-        waiting += found
-        seen.update(found)
+        new = sorted(path for path in named if path not in seen and path.is_file())
+        waiting += new
+        seen.update(new)
     return digest.hexdigest()
 
 
@@ -133,22 +134,23 @@ def _load_entry(entry: EntryPoint) -> Plugin:
         path = Path(module.__file__ or entry.module)
         files = sorted(path for folder in getattr(package, "__path__", ()) for path in Path(folder).rglob("*.py"))
         digest = digest_of(path, *files)
-    earlier = [kind for kind in _defined() if _within(kind.__module__, package.__name__)]  # imported by others
+    defined = [kind for known in _lists() for kind in known]
+    earlier = [kind for kind in defined if _within(kind.__module__, package.__name__)]  # imported by others
     return Plugin(entry.name, path, digest, installed=True, kinds=tuple(dict.fromkeys([*kinds, *earlier])))
 
 
 @contextmanager
 def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
-    """Yield a list, filled at the end with the classes that the block defines.
+    """Yield a list that receives the classes that the block defines.
 
-    When the block fails, or when a class has the name of another, forget all that the block defined and raise
-    ConfigError; whatever a module can raise is caught, but for KeyboardInterrupt.
+    If the block fails, or a class has the name of another, undo all that the block defined and raise ConfigError.
+    Every exception is caught except KeyboardInterrupt.
     """
     kinds: list[type] = []
-    lists = _lists()  # with everything of the package, so that what the block adds is the plug-in's
+    lists = _lists()  # these have the whole package already, so that new classes belong to the plug-in
     before, modules = [list(known) for known in lists], set(sys.modules)
     try:
-        with redirect_stdout(sys.stderr):  # standard output is for results
+        with redirect_stdout(sys.stderr):  # stdout is for results
             yield kinds
         added = [kind for known, old in zip(lists, before, strict=True) for kind in known if kind not in old]
         kinds += [kind for kind in added if not _within(kind.__module__, "clsplat")]
@@ -159,7 +161,7 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
             if issubclass(kind, Settings) and (fault := invalid_variant_reason(kind)):
                 raise ConfigError(f"class {kind.__name__}: {fault}")
     except BaseException as error:
-        place = _place(module, path, error)
+        where = _where(module, path, error)
         new = {kind.__module__ for known, old in zip(lists, before, strict=True) for kind in known if kind not in old}
         for name in set(sys.modules) - modules:
             if name in new or _within(name, module.partition(".")[0]):
@@ -169,16 +171,12 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
         rebuild_models()
         if isinstance(error, KeyboardInterrupt):
             raise
-        raise _failure(place, error) from error
+        raise _failure(where, error) from error
 
 
 def _lists() -> tuple[list[type], list[type]]:
-    """The lists of all settings and of all readers; importing `clsplat.pipeline.file` has filled them."""
+    """Return the lists of all settings and all readers, which importing `clsplat.pipeline.file` has filled."""
     return Settings.defined, Reader.defined
-
-
-def _defined() -> list[type]:
-    return [kind for known in _lists() for kind in known]
 
 
 def _within(module: str, package: str) -> bool:
@@ -186,27 +184,27 @@ def _within(module: str, package: str) -> bool:
 
 
 def _package_of(module: ModuleType) -> ModuleType:
-    """The outermost package of a module that is no namespace; a module without a package itself."""
+    """Return the outermost package of a module that is not a namespace package, or the module itself."""
     parts = module.__name__.split(".")
     around = [sys.modules[".".join(parts[:i])] for i in range(1, len(parts) + 1)]
-    return next((one for one in around if one.__file__), module)
+    return next((package for package in around if package.__file__), module)
 
 
 def _helpers(module: ModuleType, folder: Path) -> list[Path]:
-    """The files of a folder that a module imports, and those that they import, whoever imported them first."""
-    waiting, found = [module], dict[Path, None]()
+    """Return the files in a folder that a module imports, directly or indirectly."""
+    waiting, files = [module], set[Path]()
     while waiting:
         for helper in _imports(waiting.pop()):
             file = Path(helper.__file__ or "").resolve()
-            own = file.suffix == ".py" and file.is_relative_to(folder) and "site-packages" not in file.parts
-            if own and file not in found and helper.__name__.partition(".")[0] != "clsplat":
-                found[file] = None
+            is_inside = file.suffix == ".py" and file.is_relative_to(folder) and "site-packages" not in file.parts
+            if is_inside and file not in files and helper.__name__.partition(".")[0] != "clsplat":
+                files.add(file)
                 waiting.append(helper)
-    return sorted(found)
+    return sorted(files)
 
 
 def _imports(module: ModuleType) -> list[ModuleType]:
-    """The modules that the import statements of a module name."""
+    """Return the modules that the import statements of a module name."""
     names: list[str] = []
     for node in ast.walk(ast.parse(read_file(Path(module.__file__ or ""), kind=ConfigError))):
         if isinstance(node, ast.Import):
@@ -220,8 +218,8 @@ def _imports(module: ModuleType) -> list[ModuleType]:
     return [sys.modules[name] for name in every if getattr(sys.modules.get(name), "__file__", None)]
 
 
-def _place(module: str, path: Path | None, error: BaseException) -> str:
-    """File and line where a plug-in fails: the last line of its own, or else the last outside the import system."""
+def _where(module: str, path: Path | None, error: BaseException) -> str:
+    """Return file and line of a failure: the last line in the plug-in, or else the last outside the import system."""
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
         return f"{error.filename}:{error.lineno}"
     frames = [
@@ -240,9 +238,9 @@ def _place(module: str, path: Path | None, error: BaseException) -> str:
     return str(path or getattr(sys.modules.get(module), "__file__", None) or module)
 
 
-def _failure(place: str, error: BaseException) -> ConfigError:
-    """The error in one line: file, line and reason."""
+def _failure(where: str, error: BaseException) -> ConfigError:
+    """Return an error in one line: file, line and reason."""
     if isinstance(error, ClsplatError):
-        return ConfigError(f"{place}: {error}")
+        return ConfigError(f"{where}: {error}")
     reason = error.msg if isinstance(error, SyntaxError) else " ".join(str(error).split()) or "no message"
-    return ConfigError(f"{place}: the plug-in cannot be imported: {type(error).__name__}: {reason[:300]}")
+    return ConfigError(f"{where}: importing the plug-in failed: {type(error).__name__}: {reason[:300]}")

@@ -1,4 +1,4 @@
-"""Summaries and keys of pipelines, and copies of them."""
+"""Summarize pipelines, list their keys, and copy them."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from clsplat.pipeline.yaml_file import read_pipeline
 from clsplat.prepare.steps import Step
 from clsplat.training.stage import Scheduled, Stage, Training
 
-MAX_KEY_WIDTH = 44  # characters; descriptions stand beside
+MAX_KEY_WIDTH = 44  # characters, of the column with keys
 
 
 def summary(path: Path) -> str:
@@ -34,17 +34,17 @@ def summary(path: Path) -> str:
 
 
 def summaries() -> list[dict[str, str]]:
-    """Return name, summary and path of every shipped pipeline."""
+    """Return the name, summary and path of each shipped pipeline."""
     return [{"name": name, "summary": summary(path), "path": str(origin(path))} for name, path in shipped().items()]
 
 
-def summaries_text(found: list[dict[str, str]]) -> str:
-    """Return a line for each of `summaries`."""
-    return text_table(((one["name"], one["summary"]) for one in found), left=2)
+def summaries_text(pipelines: list[dict[str, str]]) -> str:
+    """Return `summaries` as a table."""
+    return text_table(((pipeline["name"], pipeline["summary"]) for pipeline in pipelines), left=2)
 
 
 def manual(name: str) -> dict[str, Any]:
-    """Return a pipeline's name, summary, path, stages, and the keys that --set takes, with values and descriptions.
+    """Return the name, summary, path and stages of a pipeline, and its keys for --set with values and descriptions.
 
     Raises ConfigError.
     """
@@ -59,21 +59,22 @@ def manual(name: str) -> dict[str, Any]:
     }
 
 
-def manual_text(found: dict[str, Any]) -> str:
-    """Return a `manual` as lines of text: a key with its value, and what it means."""
-    keys = [Key(**key) for key in found["keys"]]
+def manual_text(pipeline: dict[str, Any]) -> str:
+    """Return a `manual` as text: each key with its value and its meaning."""
+    keys = [Key(**key) for key in pipeline["keys"]]
     width = min(max(len(key.text) for key in keys), MAX_KEY_WIDTH)
     lines = [f"{key.text:<{width}}  {' '.join(key.description.split())}".rstrip() for key in keys]
-    head = [f"{found['name']}: {found['summary']}", f"file: {found['path']}", f"stages: {', '.join(found['stages'])}"]
-    return "\n".join([*head, "", "Each key, as --set takes it:", *lines])
+    head = [f"{pipeline['name']}: {pipeline['summary']}", f"file: {pipeline['path']}"]
+    head.append(f"stages: {', '.join(pipeline['stages'])}")
+    return "\n".join([*head, "", "Keys, as for --set:", *lines])
 
 
 def copy(name: str, file: Path) -> Path:
-    """Copy a pipeline to a file, or into a folder; return the copy.  Raises ConfigError when the copy exists."""
+    """Copy a pipeline to a file, or into a folder; return the copy.  Raises ConfigError if the copy exists."""
     source = find(name)
     target = file / source.name if path_exists(file) and file.is_dir() else file
     if path_exists(target):
-        raise ConfigError(f"{target}: exists and is not overwritten; give another name")
+        raise ConfigError(f"{target}: exists; choose another name")
     write_text(target, read_pipeline(source))
     return target
 
@@ -82,7 +83,7 @@ def copy(name: str, file: Path) -> Path:
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the schema in the shape of the file: a stage is its name, or its name with settings."""
+    """Return the schema of the file, where a stage is its name, or its name with settings."""
     schema = PipelineFile.model_json_schema()
     definitions = schema["$defs"]
     for kind in (*variants(Stage).values(), *variants(Step).values()):
@@ -92,14 +93,14 @@ def json_schema() -> dict[str, Any]:
         ]
     schema["properties"]["stages"]["items"] = _items(variants(Stage))
     schema["properties"]["prepare"]["items"] = _items(variants(Step))
-    beside: dict[str, type[Settings]] = {"matrix": Matrix, "execution": Execution}
-    for key, kind in beside.items():
+    others: dict[str, type[Settings]] = {"matrix": Matrix, "execution": Execution}
+    for key, kind in others.items():
         own = kind.model_json_schema()
         definitions |= {**own.pop("$defs", {}), kind.__name__: own}
         schema["properties"][key] = {"$ref": f"#/$defs/{kind.__name__}"}
-    short = "Other values of the pipeline NAME_7k, by places as --set has them; the comment above describes it."
+    short = "Values for the pipeline NAME_7k, by keys as for --set; the comment above describes that pipeline."
     schema["properties"]["short"] = {"type": "object", "title": "Short", "description": short}
-    schema["required"].remove("stages")  # not required beside a matrix that names pipelines
+    schema["required"].remove("stages")  # not required with a matrix that names pipelines
     schema["anyOf"] = [
         {"required": ["stages"]},
         {"required": ["matrix"], "properties": {"matrix": {"required": ["pipelines"]}}},
@@ -111,18 +112,18 @@ def json_schema() -> dict[str, Any]:
 
 
 def _items(stages: Mapping[str, type[Settings]], required: Sequence[str] = ()) -> dict[str, Any]:
-    """The items of a list of stages, each with the `required` keys beside those that it requires itself."""
-    alone = sorted(name for name, kind in stages.items() if not required and not needs_settings(kind))
+    """Return the schema of a list's stages, each with the `required` keys in addition to its own."""
+    bare = sorted(name for name, kind in stages.items() if not required and not needs_settings(kind))
     with_settings = [
         {
             "type": "object",
-            "properties": {name: _settings(kind.__name__, required, name in alone)},
+            "properties": {name: _settings(kind.__name__, required, name in bare)},
             "required": [name],
             "additionalProperties": False,
         }
         for name, kind in stages.items()
     ]
-    return {"oneOf": [*([{"enum": alone}] if alone else []), *with_settings]}
+    return {"oneOf": [*([{"enum": bare}] if bare else []), *with_settings]}
 
 
 def _settings(title: str, required: Sequence[str], optional: bool) -> dict[str, Any]:

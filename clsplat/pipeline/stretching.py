@@ -1,9 +1,9 @@
-"""A pipeline in another number of steps: places, lengths and cadences of its training are multiplied.
+"""Stretch the schedules of a pipeline to another number of training steps.
 
-All of them are places on one axis that is stretched, by one factor: what acts does so as often, in the same order, and
-what acts at one step still does.  Cadences need not be whole for that.  Only where steps become so few that two acts
-fall on one step do they act there in the order of the list.  What is learned in so many updates, such as a filter, has
-a rate that falls as much as their number grows.
+Steps, durations and intervals are multiplied by one factor, so stages inside `during` act as often and in the same
+order as before, and those that act at the same step still do.  Intervals may become fractional.  If there are so few
+steps that two actions fall on one, they happen in the order of the list.  Learning rates of what is learned over the
+whole training, such as a filter, are divided by the factor.
 """
 
 import math
@@ -22,50 +22,49 @@ from clsplat.training.stage import Scheduled, Training
 
 Value = TypeVar("Value")
 Kind = TypeVar("Kind", bound=Training)
-MOST = 2**63 - 1  # that a file can hold
-PARTS = 10**6  # of a step: cadences are multiples of one, exact as a file holds them
+MAX_STEP = 2**63 - 1  # that a file can hold
+PARTS = 10**6  # of a step: intervals are multiples of one part, which a file holds exactly
 
 
 @dataclass(frozen=True)
 class Axis:
-    """The steps of a training, stretched: what was at a step x is at the whole step at or below x times a factor."""
+    """The stretched steps of a training: step x becomes floor(x * factor)."""
 
     exact: Fraction
-    """Of the number of steps."""
+    """Factor of the number of steps."""
     factor: Fraction
-    """Of all places: the next multiple of 1 / PARTS."""
+    """Factor of all other steps: the next multiple of 1 / PARTS."""
 
     @classmethod
     def by(cls, factor: float | Fraction) -> "Axis":
-        """Return the axis of a factor; of a float it is the number that is written so."""
+        """Return the axis of a factor; a float counts as the decimal number that it prints as."""
         exact = factor if isinstance(factor, Fraction) else Fraction(str(factor))
         return cls(exact, Fraction(math.ceil(exact * PARTS), PARTS))
 
     def at(self, step: int) -> int:
-        """Return where a step comes to be."""
-        return min(math.floor(step * self.factor), MOST)
+        """Return a stretched step."""
+        return min(math.floor(step * self.factor), MAX_STEP)
 
     def every(self, every: float) -> float:
-        """Return a cadence; what acts at each step acts at each, as does what would act more often."""
+        """Return a stretched interval; 1 stays 1, and no interval becomes shorter."""
         stretched = Fraction(str(every)) * self.factor
         if every == 1 or stretched <= 1:
             return 1
-        bounded = min(stretched, Fraction(MOST))
+        bounded = min(stretched, Fraction(MAX_STEP))
         return int(bounded) if bounded.denominator == 1 else float(bounded)
 
     def start(self, start: int, every: float) -> int:
-        """Return the step after which what acted after `start` acts: before its first act, and from the last
-        one that is left out on."""
+        """Return a stretched `start`: between the last action that it excludes and the first that it allows."""
         number = count_fired(every, start)
         return max(0, min(max(self.at(start), self._act(every, number)), self._act(every, number + 1) - 1))
 
     def stop(self, stop: int, every: float) -> int:
-        """Return the step before which what acted before `stop` acts: behind its last act."""
+        """Return a stretched `stop`: after the last action that it allows."""
         number = count_fired(every, stop - 1)
-        return min(max(self._act(every, number) + 1, min(self.at(stop), self._act(every, number + 1))), MOST)
+        return min(max(self._act(every, number) + 1, min(self.at(stop), self._act(every, number + 1))), MAX_STEP)
 
     def until(self, until: int, every: float) -> int:
-        """Return the step up to which acts follow, the last of them at it or next behind it: behind those before."""
+        """Return a stretched `until`: after the actions before it, and not after the next one."""
         number = count_fired(every, until - 1)
         return max(1, min(max(self._act(every, number) + 1, self.at(until)), self._act(every, number + 1)))
 
@@ -74,10 +73,10 @@ class Axis:
 
 
 def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
-    """Return settings whose training has so many steps, of which those that are done are the same.
+    """Return settings with another number of training steps, without changing the steps that are `done`.
 
-    So are those up to the last edit, where it has more.  Stages that have not begun there do so at the same share of
-    the steps that follow.
+    Steps up to the last edit also stay as they are, if there are enough.  Stages that start later start at the same
+    fraction of the remaining steps.
     """
 
     def changed(training: Training) -> Training:
@@ -87,40 +86,40 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
         during = [_moved(stage, fixed, left) for stage in training.during]
         return training.model_copy(update={"steps": steps, "during": during})
 
-    return of_trainings(settings, Training, changed)
+    return map_trainings(settings, Training, changed)
 
 
 def last_edit(training: Training) -> int:
-    """Return the step up to which Gaussians grow and the photographs' size changes; 0 where that is not said.
+    """Return the step until which Gaussians grow and the size of photos changes; 0 if the settings do not say.
 
-    One that is cut before would end with small photographs, or before its last pruning.
+    A training that ended earlier would end with small photos, or before its last pruning.
     """
     stops = [stage.stop for stage in training.during if isinstance(stage, Densify) and stage.stop is not None]
     return max([0, *stops, *([int(training.views.last_change)] if isinstance(training, Optimize) else [])])
 
 
-def fewest_steps(training: Training) -> int:
-    """Return the fewest steps in which a training can be stretched such that no two of its edits fall on one step."""
-    found = {
+def min_steps(training: Training) -> int:
+    """Return the fewest steps to which a training can be stretched so that no two edits fall on one step."""
+    edits = {
         step
         for stage in training.during
         if stage.edits and stage.every is not None and stage.every != 1
-        for step in fire_steps(stage.every, stage.start, min(stage.stop or MOST, training.steps))
+        for step in fire_steps(stage.every, stage.start, min(stage.stop or MAX_STEP, training.steps))
     }
     if isinstance(training, Optimize):
-        found |= {int(step) for step in training.views.changes}
-    found |= {rule.start for stage in training.during if isinstance(stage, Densify) for rule in stage.rules}
-    apart = min((later - step for step, later in pairwise(sorted(found - {0}))), default=training.steps)
-    return -(-training.steps // apart)
+        edits |= {int(step) for step in training.views.changes}
+    edits |= {rule.start for stage in training.during if isinstance(stage, Densify) for rule in stage.rules}
+    gap = min((later - step for step, later in pairwise(sorted(edits - {0}))), default=training.steps)
+    return -(-training.steps // gap)
 
 
 def in_steps(settings: PipelineFile, steps: int) -> PipelineFile:
-    """Return settings stretched so that the first training has so many steps.  Raises ConfigError when none trains."""
+    """Return settings stretched to a number of steps of the first training.  Raises ConfigError if no stage trains."""
     return stretched(settings, Fraction(steps, settings.training.steps))
 
 
 def _moved(stage: Scheduled, fixed: int, left: float) -> Scheduled:
-    """A stage that begins after a step that is fixed, with `left` times its steps from there on."""
+    """Return a stage with the steps after `fixed` multiplied by `left`, if it starts after `fixed`."""
     if stage.start <= fixed:
         return stage
     every = max(1, math.floor((stage.every or 1) * left))
@@ -130,14 +129,14 @@ def _moved(stage: Scheduled, fixed: int, left: float) -> Scheduled:
     return stage.model_copy(update={"every": every, "start": start, "stop": stop})
 
 
-def of_trainings(settings: PipelineFile, kind: type[Kind], changed: Callable[[Kind], Kind]) -> PipelineFile:
-    """Return settings with other trainings of a kind."""
+def map_trainings(settings: PipelineFile, kind: type[Kind], changed: Callable[[Kind], Kind]) -> PipelineFile:
+    """Return settings with each training of a kind replaced."""
     stages = [changed(stage) if isinstance(stage, kind) else stage for stage in settings.stages]
     return settings.model_copy(update={"stages": stages})
 
 
 def stretched(value: Value, factor: float | Fraction) -> Value:
-    """Return settings for `factor` times as many steps; each class names in `step_keys` what that changes."""
+    """Return settings for `factor` times as many steps; the `step_keys` of each class say what that changes."""
     return _stretched(value, Axis.by(factor))  # type: ignore[no-any-return]
 
 
@@ -161,7 +160,7 @@ def _stretched(value: Any, axis: Axis) -> Any:
 
 
 def _steps(name: str, steps: Any, axis: Axis, every: Any) -> Any:
-    """A number of steps; one that begins or ends what acts at multiples of `every` does so between the same of them."""
+    """Return a stretched step; as the start or stop of an interval `every`, it stays between the same actions."""
     if not isinstance(steps, int | float) or steps == 0:
         return steps
     if name == "every":
@@ -175,5 +174,5 @@ def _steps(name: str, steps: Any, axis: Axis, every: Any) -> Any:
 
 
 def _points(points: list[list[float]], axis: Axis) -> list[list[float]]:
-    """Points of a schedule; of two that fall together the later one stays."""
+    """Return the points of a schedule; of two at one step, the later one stays."""
     return [list(point) for point in {math.floor(step * axis.factor): value for step, value in points}.items()]

@@ -1,7 +1,7 @@
-"""Read YAML as plain data, with the line of every value; a file cannot run code.
+"""Read YAML as plain data, with the line of each value; a file cannot run code.
 
-Allowed are text, numbers, true, false, null, lists, and maps whose keys are text.  Anchors, aliases and merge keys
-(`<<`) work; every other tag is an error.
+Text, numbers, true, false, null, lists, and maps with text keys are allowed.  Anchors, aliases and merge keys (`<<`)
+work; every other tag is an error.
 """
 
 import io
@@ -21,33 +21,33 @@ from clsplat.core.reading import read_text
 from clsplat.pipeline.files import origin
 
 SIZE_LIMIT = 1 << 20  # bytes
-NODE_LIMIT = 20_000  # values after aliases are expanded, so that aliases to aliases cannot fill the memory
-DEPTH_LIMIT = 50  # lists and maps in each other
+NODE_LIMIT = 20_000  # values after aliases are expanded, so that nested aliases cannot fill the memory
+DEPTH_LIMIT = 50  # nested lists and maps
 INTEGER_LIMIT = 1 << 63
 CORE = "tag:yaml.org,2002:"
 MERGE = f"{CORE}merge"
 SCALAR_TAGS = tuple(CORE + name for name in ("null", "bool", "int", "float", "str"))
-PLAIN_TYPES = (bool, int, float, str)  # of scalars; ruamel's subclasses also hold the notation
+PLAIN_TYPES = (bool, int, float, str)  # of scalars; ruamel's subclasses also hold how a value was written
 TEXT_TAGS = tuple(CORE + name for name in ("timestamp", "value"))  # dates and `=` are text
-Place = tuple[str | int, ...]
+KeyPath = tuple[str | int, ...]
 
 
 @dataclass
 class Document:
-    """Plain dicts, lists and scalars, and the line on which each value stands, counted from 1."""
+    """Plain dicts, lists and scalars, and the line of each value, from 1."""
 
     data: Any
-    lines: dict[Place, int] = field(default_factory=dict)
+    lines: dict[KeyPath, int] = field(default_factory=dict)
 
-    def line(self, place: Place) -> int:
+    def line(self, key_path: KeyPath) -> int:
         """Return the line of a value, or of the innermost list or map around it."""
-        while place and place not in self.lines:
-            place = place[:-1]
-        return self.lines.get(place, 1)
+        while key_path and key_path not in self.lines:
+            key_path = key_path[:-1]
+        return self.lines.get(key_path, 1)
 
 
 class _NotPlain(Exception):
-    """A value that no settings file can hold, and its line."""
+    """A value that is not allowed in a file of settings, and its line."""
 
     def __init__(self, node: Any, complaint: str) -> None:
         super().__init__(complaint)
@@ -55,21 +55,21 @@ class _NotPlain(Exception):
 
 
 class _Bounded(Composer):
-    """Stops at the limits before the rest of a text is read, whose time grows with the square of the depth."""
+    """Stops at the limits before it reads on, as the time to parse grows with the square of the depth."""
 
     def __init__(self, loader: Any = None) -> None:
         super().__init__(loader=loader)
         self.warn_double_anchors = False
-        self._around = self._count = 0
+        self._depth = self._count = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        self._around += 1
+        self._depth += 1
         self._count += 1
-        if self._around > DEPTH_LIMIT or self._count > NODE_LIMIT:
+        if self._depth > DEPTH_LIMIT or self._count > NODE_LIMIT:
             depth, count = "lists and maps are nested too deeply", f"more than {NODE_LIMIT} values"
-            raise _NotPlain(self.parser.peek_event(), depth if self._around > DEPTH_LIMIT else count)
+            raise _NotPlain(self.parser.peek_event(), depth if self._depth > DEPTH_LIMIT else count)
         node = super().compose_node(parent, index)
-        self._around -= 1
+        self._depth -= 1
         return node
 
 
@@ -79,38 +79,38 @@ def read_yaml(path: Path) -> Document:
 
 
 def read_pipeline(path: Path) -> str:
-    """Return the text of a pipeline, of NAME_7k as the key `short` of NAME.yaml describes it.  Raises ConfigError."""
+    """Return the text of a pipeline; NAME_7k is made from NAME.yaml with its key `short`.  Raises ConfigError."""
     file = origin(path)
     text = read_text(file, "a pipeline file", ConfigError, SIZE_LIMIT)
     return text if file == path else _short(text, path, file)
 
 
-# The text of NAME_7k.yaml: that of NAME.yaml with other values, below the comment above its key `short`.
+# The text of NAME_7k.yaml is that of NAME.yaml with the values of `short`, and with the comment above that key.
 
 
 def _short(text: str, path: Path, file: Path) -> str:
     document = _parse(text, str(file))
     if not isinstance(document.data, dict) or not isinstance(document.data.get("short"), dict):
-        raise ConfigError(f"{file}: has no map 'short', which {path.name} needs; add one, or run {file.name}")
+        raise ConfigError(f"{file}: expected a map 'short', with values of {path.name}; add one, or run {file.name}")
     root = YAML(typ="safe", pure=True).compose(text)
     key, short = next(pair for pair in root.value if pair[0].value == "short")
-    root.value.remove((key, short))  # no place leads into it
+    root.value.remove((key, short))  # its own keys cannot be set
     above = re.findall(r"(?:^#.*\n)*\Z", text[: key.start_mark.index], re.MULTILINE)[0]
-    values = {place.value: text[value.start_mark.index : value.end_mark.index] for place, value in short.value}
+    values = {key_path.value: text[value.start_mark.index : value.end_mark.index] for key_path, value in short.value}
     edits = [(key.start_mark.index - len(above), short.end_mark.index, "")]
-    for place, value in {"name": path.stem, **values}.items():
-        if not (node := _node(root, place)):
-            where = f"{file}:{document.line(('short', place))}: short"
-            raise ConfigError(f"{where}: the file has no {quote(place)}; expected one of its keys, as in --set")
+    for key_path, value in {"name": path.stem, **values}.items():
+        if not (node := _node(root, key_path)):
+            where = f"{file}:{document.line(('short', key_path))}: short"
+            raise ConfigError(f"{where}: the file has no key {quote(key_path)}; expected one of its keys, as for --set")
         edits.append((node.start_mark.index, node.end_mark.index, value))
     for first, last, new in sorted(edits, reverse=True):
         text = text[:first] + new + text[last:]
     return f"{above}#\n{text}"
 
 
-def _node(root: Node, place: str) -> Node | None:
-    """The value of a place, as --set writes it; None where there is none."""
-    first, *others = place.split(".")
+def _node(root: Node, key_path: str) -> Node | None:
+    """Return the value of a key path, as --set writes it; None if there is none."""
+    first, *others = key_path.split(".")
     if not others:
         return _inside(root).get(first)
     level = [root]
@@ -125,14 +125,14 @@ def _node(root: Node, place: str) -> Node | None:
 
 
 def _inside(node: Node | None) -> dict[str, Node]:
-    """The values of a map by key, or the items of a list by number."""
+    """Return the values of a map by key, or the items of a list by index."""
     if isinstance(node, MappingNode):
         return {str(key.value): value for key, value in node.value}
     return {str(i): item for i, item in enumerate(node.value)} if isinstance(node, SequenceNode) else {}
 
 
 def parse_value(text: str) -> Any:
-    """Read one value in the notation of files: numbers, true, false, null, [lists], {maps} or text.
+    """Read one value as it would be in a file: a number, true, false, null, a [list], a {map} or text.
 
     Raises ConfigError.
     """
@@ -140,7 +140,7 @@ def parse_value(text: str) -> Any:
 
 
 def yaml_text(data: Any) -> str:
-    """Return plain data as the text of a document."""
+    """Return plain data as YAML."""
     stream = io.StringIO()
     yaml = YAML(typ="safe")
     yaml.default_flow_style = None
@@ -172,25 +172,25 @@ def _parse(text: str, name: str) -> Document:
 
 
 class _Reader:
-    """Plain data from the nodes of one document."""
+    """Makes plain data from the nodes of one document."""
 
     def __init__(self, yaml: YAML) -> None:
         self._scalars = yaml.constructor
         self._left = NODE_LIMIT
-        self._lines: dict[Place, int] = {}
+        self._lines: dict[KeyPath, int] = {}
 
     def document(self, root: Node | None) -> Document:
         return Document(None if root is None else self._plain(root, ()), self._lines)
 
-    def _plain(self, node: Node, place: Place) -> Any:
+    def _plain(self, node: Node, key_path: KeyPath) -> Any:
         self._left -= 1
         if self._left < 0:
             raise _NotPlain(node, f"more than {NODE_LIMIT} values")
         if isinstance(node, MappingNode) and node.tag == f"{CORE}map":
-            return self._map(node, place)
+            return self._map(node, key_path)
         if isinstance(node, SequenceNode) and node.tag == f"{CORE}seq":
-            self._lines |= {(*place, i): item.start_mark.line + 1 for i, item in enumerate(node.value)}
-            return [self._plain(item, (*place, i)) for i, item in enumerate(node.value)]
+            self._lines |= {(*key_path, i): item.start_mark.line + 1 for i, item in enumerate(node.value)}
+            return [self._plain(item, (*key_path, i)) for i, item in enumerate(node.value)]
         if isinstance(node, ScalarNode) and node.tag in TEXT_TAGS:
             return str(node.value)
         if isinstance(node, ScalarNode) and node.tag in SCALAR_TAGS:
@@ -198,32 +198,32 @@ class _Reader:
         tag = shorten(str(node.tag).replace(CORE, "!!"))
         raise _NotPlain(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
 
-    def _map(self, node: MappingNode, place: Place) -> dict[str, Any]:
+    def _map(self, node: MappingNode, key_path: KeyPath) -> dict[str, Any]:
         data: dict[str, Any] = {}
         merged: list[Node] = []
         for key_node, value in node.value:
             if key_node.tag == MERGE:
                 merged += value.value if isinstance(value, SequenceNode) else [value]
                 continue
-            key = self._plain(key_node, place) if isinstance(key_node, ScalarNode) else None
+            key = self._plain(key_node, key_path) if isinstance(key_node, ScalarNode) else None
             if not isinstance(key, str):
                 raise _NotPlain(
                     key_node, "expected text as a key; put a number, a date or a word such as true in quotes"
                 )
             if key in data:
                 raise _NotPlain(key_node, f"found duplicate key {quote(key)}")
-            self._lines[*place, key] = key_node.start_mark.line + 1
-            data[key] = self._plain(value, (*place, key))
+            self._lines[*key_path, key] = key_node.start_mark.line + 1
+            data[key] = self._plain(value, (*key_path, key))
         for other in merged:
-            data = {**self._merge(other, place), **data}
+            data = {**self._merge(other, key_path), **data}
         return data
 
-    def _merge(self, node: Node, place: Place) -> dict[str, Any]:
-        """The map that `<<` names; its lines are those of the map it stands in, where that has the same keys."""
+    def _merge(self, node: Node, key_path: KeyPath) -> dict[str, Any]:
+        """Return the map that `<<` names; lines of keys that the outer map has too stay those of the outer map."""
         if not isinstance(node, MappingNode):
             raise _NotPlain(node, "expected a map after '<<'")
         around, self._lines = self._lines, {}
-        data: dict[str, Any] = self._plain(node, place)
+        data: dict[str, Any] = self._plain(node, key_path)
         self._lines, inside = around, self._lines
         for inner, line in inside.items():
             self._lines.setdefault(inner, line)

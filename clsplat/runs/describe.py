@@ -54,14 +54,14 @@ def describe(
     else:
         run = open_run(pipeline, out, device, start, read=read)
         opened = run.device
-        pipeline = settle(pipeline, run, tell=LOG.debug)  # the description has them
+        pipeline = settle(pipeline, run, log_reasons=False)  # the description has them
         if start == "resume":
             resumed = restore(pipeline, run)
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
         check_run(pipeline, run)
     names = listed(pipeline, planned, out) if run is None else []
     measures, refusal = _known(pipeline, names)
-    lines += [*refusal, *(f"  {one.text}" for one in pipeline.decisions)]
+    lines += [*refusal, *(f"  adapt          {reason}" for reason in pipeline.reasons)]
     if undecided := pipeline.undecided:
         lines.append(f"  adapt          follow from the photographs: {', '.join(undecided)}")
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages if _does(stage, run)]

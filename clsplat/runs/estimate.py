@@ -109,7 +109,7 @@ def _of_training(training: Optimize, size: tuple[int, int], first: int, units: i
     pixels = size[0] * size[1]
     most = max(first, int(most_of(training, pixels) or DENSEST * pixels))
     low, high = step_seconds(units, size, first)[0], step_seconds(units, size, most)[1]
-    steps = training.fewest_steps, training.steps * (2 if training.refit else 1)
+    steps = training.min_steps, training.steps * (2 if training.refit else 1)
     of_steps, of_counts = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (first, most)))
     why = f"{of_steps} steps of {_ms(low, high)}, with {of_counts} Gaussians at {size[0]}x{size[1]} px"
     return Expected(training.stage, (steps[0] * low, steps[1] * high), why)

@@ -18,7 +18,7 @@ from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.input_files import contents
 from clsplat.pipeline.loading import Pipeline, adapted, prepared_folder
-from clsplat.pipeline.stretching import of_trainings
+from clsplat.pipeline.stretching import map_trainings
 from clsplat.prepare.cache import Planned, facts, note, noted, prepare
 from clsplat.prepare.gather import list_photographs
 from clsplat.render.rasterizer import Rasterizer
@@ -238,57 +238,45 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
     )
 
 
-# Choices that follow from the photographs, made before the first step and written into the run's pipeline.
+# Choices that follow from the photos, made before the first step and written to the run's pipeline.yaml.
 
 
-def settle(pipeline: Pipeline, run: Run, tell: Callable[[str], None] = LOG.info) -> Pipeline:
-    """Return the pipeline with what its `adapt` and its keys `auto` choose by the photographs of a run, which takes
-    it; log reasons, those of `adapt` by `tell`.
+def settle(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> Pipeline:
+    """Return the pipeline with what its `adapt` and its `auto` keys choose by the photos, and give it to the run.
 
-    Choices that are made already stay.
+    Choices that an earlier run made stay.  log_reasons: whether to log why `adapt` decides as it does.
     """
     with run.status.stage("choose"):
-        settled_pipeline = _taken(_with_modules(_adapted(pipeline, run, tell), run), run)
+        if pipeline.undecided:
+            pipeline = adapted(pipeline, measured(run.scene, lambda: sky_share(run)))
+            for reason in pipeline.reasons if log_reasons else ():
+                LOG.info("%s", reason)
+        pipeline = _with_modules(pipeline, run)
+        run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
+        run.harmonics = pipeline.settings.harmonics
         if any(isinstance(stage, Optimize) for stage in pipeline.stages):
-            _warn_of_near(settled_pipeline.settings.model.near, nearest_points(run.scene))
-        return settled_pipeline
+            _warn_of_near(pipeline.settings.model.near, nearest_points(run.scene))
+        return pipeline
 
 
 def _warn_of_near(near: float, nearest: float | None) -> None:
-    """Warn where points begin before the near plane; both in scene units."""
+    """Warn if the nearest points are in front of the near plane; both in scene units."""
     if nearest is not None and nearest < near:
         LOG.warning(
-            "nothing is drawn nearer than model.near=%g scene units, and the points of the training photographs "
-            "begin at %.3g: set model.near to %.2g",
+            "nothing nearer than model.near=%g scene units is drawn, but the nearest points of the training photos are "
+            "at %.3g; set model.near to %.2g",
             *(near, nearest, nearest / 2),
         )
 
 
-def _adapted(pipeline: Pipeline, run: Run, tell: Callable[[str], None]) -> Pipeline:
-    """The pipeline with what its `adapt` decides."""
-    if not pipeline.undecided:
-        return pipeline
-    pipeline = adapted(pipeline, measured(run.scene, lambda: sky_share(run)))
-    for one in pipeline.decisions:
-        tell(one.text)
-    return pipeline
-
-
-def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
-    """The same; the run has its settings."""
-    run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
-    run.harmonics = pipeline.settings.harmonics
-    return pipeline
-
-
 def _with_modules(pipeline: Pipeline, run: Run) -> Pipeline:
-    """The pipeline with what its modules choose."""
+    """Return the pipeline with what its training modules choose."""
 
-    def chosen(training: Optimize) -> Optimize:
+    def with_choices(training: Optimize) -> Optimize:
         modules = [module.resolve_auto(run) for module in training.modules]
         return training if modules == training.modules else training.model_copy(update={"modules": modules})
 
-    settings = of_trainings(pipeline.settings, Optimize, chosen)
-    modules = [one for stage in settings.stages if isinstance(stage, Optimize) for one in stage.modules]
+    settings = map_trainings(pipeline.settings, Optimize, with_choices)
+    modules = [module for stage in settings.stages if isinstance(stage, Optimize) for module in stage.modules]
     settings = settings.model_copy(update={"model": choose_sky(run, settings.model, modules)})
     return pipeline if settings == pipeline.settings else replace(pipeline, settings=settings)

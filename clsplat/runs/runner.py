@@ -13,7 +13,7 @@ from clsplat.core.progress import Progress, Stopped
 from clsplat.core.reading import read_json
 from clsplat.core.signals import stop_at_once, stopping_on_signals
 from clsplat.pipeline.loading import Pipeline
-from clsplat.pipeline.stretching import of_trainings
+from clsplat.pipeline.stretching import map_trainings
 from clsplat.prepare.inspect.findings import few_views
 from clsplat.runs.outputs import check_outputs, keep_checksums, sums_before, write_checksums, write_metrics
 from clsplat.runs.run_folder import RESOLVED, Start, clear
@@ -67,7 +67,7 @@ def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
         during = [_as_grown(inner, best) if isinstance(inner, Densify) else inner for inner in stage.during]
         return stage.model_copy(update={"steps": best.measured.step, "during": during, **WITHOUT})
 
-    return replace(pipeline, settings=of_trainings(pipeline.settings, Optimize, refitted))
+    return replace(pipeline, settings=map_trainings(pipeline.settings, Optimize, refitted))
 
 
 def _as_grown(stage: Densify, best: Best) -> Densify:

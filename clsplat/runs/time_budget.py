@@ -20,7 +20,7 @@ from clsplat.core.progress import Progress, log_level
 from clsplat.core.signals import stop_if_signaled
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
-from clsplat.pipeline.stretching import fewest_steps, last_edit, of_trainings, stretched, with_steps
+from clsplat.pipeline.stretching import last_edit, map_trainings, min_steps, stretched, with_steps
 from clsplat.runs.run_folder import Start
 from clsplat.runs.runner import check_run, run_stages, write_pipeline
 from clsplat.stages.optimize import Keeping
@@ -188,7 +188,7 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: fl
 def fewest(pipeline: Pipeline) -> int:
     """Return the fewest steps that the training is cut to: its edits keep apart, and a rehearsal has as many."""
     training = pipeline.settings.training
-    return max(min(STEPS, training.rehearsed), fewest_steps(training))
+    return max(min(STEPS, training.rehearsed), min_steps(training))
 
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
@@ -210,7 +210,7 @@ def _reporting(settings: PipelineFile) -> PipelineFile:
     def often(training: Training) -> Training:
         return training.model_copy(update={"log_every": min(training.log_every, -(-training.steps // REPORTS))})
 
-    return of_trainings(settings, Training, often)
+    return map_trainings(settings, Training, often)
 
 
 def _require_one_training(pipeline: Pipeline) -> None:

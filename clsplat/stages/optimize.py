@@ -82,7 +82,7 @@ class Keeping(Training):
         return [train] if own else [train, Evaluate.model_validate({**facts, "split": "validation"})]
 
     @property
-    def fewest_steps(self) -> int:
+    def min_steps(self) -> int:
         """The fewest steps of the training, with those of a refit: where no measurement is better than the first."""
         if self.patience is None:
             return self.steps

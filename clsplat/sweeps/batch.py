@@ -295,7 +295,7 @@ def run_sweep(
     device: the one of the engine inline.  A cell that fails does not stop the others; at the end a ClsplatError is
     raised with the exit code of the first one.  Raises Interrupted, Different.
     """
-    store = Store(execution.keeps or Path())
+    store = Store(execution.store_folder or Path())
     with matrix_opened(experiment, state, start) as (status, failures):
         sweep = _Sweep(
             experiment.name, experiment.text, experiment.cells, state.out, store, failures, start == "restart"

@@ -15,7 +15,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.reading import sha256
 from clsplat.core.resources import __version__, list_sources
 from clsplat.pipeline.file import SceneSettings
-from clsplat.pipeline.input_files import content_of, contents, in_place, placeless
+from clsplat.pipeline.input_files import content_of, contents, with_absolute_paths, with_content_hashes
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import plan
 from clsplat.scene.detect import read_scene
@@ -133,8 +133,8 @@ class CellRun:
 
         Raises DataError when a file that it names cannot be read.
         """
-        placed = in_place(pipeline)
-        spec = {"pipeline": placeless(placed), "scene": scene, "code": code_digest(), "bits": bits}
+        placed = with_absolute_paths(pipeline)
+        spec = {"pipeline": with_content_hashes(placed), "scene": scene, "code": code_digest(), "bits": bits}
         if pipeline.settings.prepare:
             spec["tools"] = tools_digest()
         return cls(name, spec, placed.text(), contents(placed))

@@ -11,7 +11,7 @@ from clsplat.core.schedule import divide, schedule_values
 from clsplat.gaussians.model import MODEL
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, checked
-from clsplat.pipeline.stretching import of_trainings, stretched
+from clsplat.pipeline.stretching import map_trainings, stretched
 from clsplat.pipeline.yaml_file import Document
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
@@ -103,7 +103,7 @@ def _shared(settings: PipelineFile, share: Fraction) -> PipelineFile:
             return training
         return training.model_copy(update={"rates": training.rates.times(float(share) ** -0.5)})
 
-    return of_trainings(stretched(settings, share), Optimize, changed)
+    return map_trainings(stretched(settings, share), Optimize, changed)
 
 
 def _last(pipeline: Pipeline) -> int:

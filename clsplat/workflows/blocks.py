@@ -36,7 +36,7 @@ from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.execution import Execution
-from clsplat.pipeline.input_files import placeless
+from clsplat.pipeline.input_files import with_content_hashes
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell as MatrixCell
 from clsplat.runs.estimate import DENSEST, minutes_text, most_of, step_seconds
@@ -115,7 +115,7 @@ class Blocks:
         self, scene: Path, out: Path, plan: BlocksPlan, device: str | Device | None, execution: Execution | None = None
     ) -> None:
         """execution: where blocks are trained; without it one after the other in this process."""
-        if execution is not None and execution.keeps is None:
+        if execution is not None and execution.store_folder is None:
             raise ConfigError("--on: blocks are trained as cells of a store; expected the key store, or another engine")
         self.out, self.plan, self.execution = out, plan, execution
         self._name = device if isinstance(device, str) else None
@@ -137,7 +137,7 @@ class Blocks:
     def question(self) -> dict[str, Any]:
         """Return what the folder belongs to."""
         pipelines = {"pipeline": without_start(self.pipeline), **({"coarse": self.coarse} if self.coarse else {})}
-        texts = {name: json.dumps(placeless(one), sort_keys=True) for name, one in pipelines.items()}
+        texts = {name: json.dumps(with_content_hashes(one), sort_keys=True) for name, one in pipelines.items()}
         digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
         asked = {"blocks": self.plan.blocks, "sight": self.plan.sight, "steps": self.plan.steps}
         model = {"model": sha256(self.given)} if self.given else {}
@@ -209,7 +209,7 @@ class Blocks:
             if not is_trained(pipeline, self.out / name)
         ]
         if cells:
-            name, store = f"{self.pipeline.settings.name}-{self.out.name}", Store(execution.keeps or Path())
+            name, store = f"{self.pipeline.settings.name}-{self.out.name}", Store(execution.store_folder or Path())
             Batch(name, str(self.out.resolve()), cells, self.out, store, failures).run(execution, self._name)
 
     def merge(self, parts: list[tuple[Block, Path]]) -> Path:

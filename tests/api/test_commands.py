@@ -167,7 +167,7 @@ def test_measurements(runs, tiny_scene, tmp_path):
     ("call", "error", "message"),
     [
         (lambda: clsplat.run("smokee"), ConfigError, "no pipeline named 'smokee'; did you mean 'smoke'?"),
-        (lambda: clsplat.describe_run("smoke", set={"optimize.steps": 3}), ConfigError, "optimize"),
+        (lambda: clsplat.describe_run("smoke", set={"optimze.steps": 3}), ConfigError, "optimze"),
         (lambda: clsplat.resume("nowhere"), DataError, "nowhere: has no pipeline.yaml"),
         (lambda: clsplat.status("nowhere"), DataError, "nowhere: has no readable status.json"),
         (lambda: clsplat.load("nowhere.ply"), DataError, "nowhere.ply: cannot be read"),

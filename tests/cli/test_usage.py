@@ -158,12 +158,12 @@ def test_pipelines_lists_every_recipe_on_a_line():
 
 def test_pipelines_shows_the_keys_of_one_as_set_takes_them():
     lines = clsplat("pipelines", "splat_7k").stdout.splitlines()
-    keys = [line.split("  ")[0] for line in lines[lines.index("Each key, as --set takes it:") + 1 :]]
+    keys = [line.split("  ")[0] for line in lines[lines.index("Keys, as for --set:") + 1 :]]
     assert keys == [key.text for key in settable(load("splat_7k").settings)]
     assert {"optimize.steps=7000", "optimize.losses.0.weight=0.8", "densify.every=100"} <= set(keys)
     found = manual("splat_7k")
-    assert next(key for key in found["keys"] if key["place"] == "optimize.steps") == {
-        "place": "optimize.steps",
+    assert next(key for key in found["keys"] if key["key_path"] == "optimize.steps") == {
+        "key_path": "optimize.steps",
         "value": 7000,
         "description": ANY,
     }
@@ -175,7 +175,7 @@ def test_a_copy_of_a_pipeline_never_replaces_a_file(tmp_path):
     assert (tmp_path / "mine.yaml").read_text() == shipped()["smoke"].read_text()
     (tmp_path / "mine.yaml").write_text("mine")
     refused = clsplat("pipelines", "splat", "--copy", tmp_path / "mine.yaml", expect=2)
-    assert "mine.yaml: exists and is not overwritten" in refused.stderr
+    assert "mine.yaml: exists; choose another name" in refused.stderr
     assert (tmp_path / "mine.yaml").read_text() == "mine"
     assert copy("smoke", tmp_path) == tmp_path / "smoke.yaml"
 

@@ -86,7 +86,7 @@ def test_a_damaged_setting_is_valid_or_refused(name):
 
 
 def test_any_word_as_a_value_is_valid_or_refused():
-    places = [key.place for key in settable(load("splat_7k").settings)]
+    places = [key.key_path for key in settable(load("splat_7k").settings)]
 
     @fuzzed(100, place=one_of(places), word=one_of([*WORDS, *YAML]))
     def reads(place, word):

@@ -38,7 +38,7 @@ def test_a_scene_must_tell_which_photographs_show_a_point(tiny_scene, tmp_path):
 
 
 def test_poses_are_not_learned_beside_it(rng, tmp_path):
-    with pytest.raises(ConfigError, match="'camera_optimizer' does not go together with inverse_depth"):
+    with pytest.raises(ConfigError, match="'camera_optimizer' cannot be combined with inverse_depth"):
         train(
             Yard(rng).write(tmp_path / "scene"),
             tmp_path / "run",

@@ -49,7 +49,7 @@ def decided(name: str, *overrides: str, count: int = 9, error: float | None = No
     ("photographs", "sky", "most"),
     [(4, None, 0.6), (11, 0.24, 0.6), (12, 0.25, 0.3), (25, 0.49, 0.3), (25, 0.5, 0.1), (39, 1, 0.1), (40, 1, None)],
 )
-def test_photos_decides_by_their_number_and_the_sky(photographs, sky, most):
+def test_photos_decides_by_their_count_and_the_sky(photographs, sky, most):
     settings = decided("photos", count=photographs, sky=sky).settings
     few, training, init = photographs < 40, settings.optimize, settings.stages[0]
     modules = {one.type: one for one in training.modules}
@@ -115,9 +115,9 @@ def test_other_photographs_are_decided_by_again(tmp_path):
 def test_a_run_writes_its_decisions_and_repeats_them(tiny_scene, tmp_path):
     asked = [f"scene.path='{tiny_scene}'", *FEW, ADAPT]
     text = describe(load("smoke", asked), RunState.read(tmp_path / "run"), None, "new")
-    assert "model.sh_degree=1, since 8 photographs" in text
+    assert "adapt          8 photographs\n" in text
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=[*FEW, ADAPT])
-    assert "model.sh_degree=1, since 8 photographs" in (out / "log.txt").read_text()
+    assert "INFO 8 photographs\n" in (out / "log.txt").read_text()
     written = load(str(out / "pipeline.yaml"))
     assert [one.key for one in written.decisions] == ["model.sh_degree", "optimize.modules.dropout"]
     assert written.settings.plugins.keys() == {"counted"}
@@ -144,7 +144,8 @@ def test_before_preparation_it_says_what_is_undecided():
     ("adapt", "complaint"),
     [
         ("{type: counted, key: model.sh_degre}", "adapt: counted: "),
-        ("{type: counted, key: scene.downscale}", "scene.downscale is used before photographs are measured"),
+        ("{type: counted, key: optimze.steps}", "adapt: counted: optimze.steps: no 'optimze'"),
+        ("{type: counted, key: scene.downscale}", "scene.downscale is used before the photos are measured"),
         ("{type: counted, key: optimize.steps}", r"optimize\.steps.* --set of one of its keys wins: optimize\.steps, "),
         ("photo", "no adaptation named 'photo'; did you mean 'photos'"),
         ("{type: photos, decisions: [{key: a, value: 1}]}", "'reason' is missing"),
@@ -156,17 +157,18 @@ def test_what_cannot_be_decided_is_refused_in_a_sentence(adapt, complaint):
 
 
 @pytest.mark.parametrize(("count", "clear", "sky"), [(12, True, "100%"), (12, False, "0%"), (41, True, None)])
-def test_a_run_looks_for_a_sky_where_it_decides(tmp_path, rng, monkeypatch, count, clear, sky):
+def test_a_run_looks_for_a_sky_only_with_few_photos(tmp_path, rng, monkeypatch, count, clear, sky):
     scene = Yard(rng, count, clear).write(tmp_path / "yard")
     if sky is None:
         monkeypatch.setattr("clsplat.runs.opening.sky_share", lambda run: pytest.fail("looked for a sky"))
     text = describe(
         load("photos", [f"scene.path='{scene}'", "scene.holdout=0"]), RunState.read(tmp_path / "run"), None, "new"
     )
-    assert f"{count} training photographs; " in text
-    assert sky is None or f"{sky} of them show a sky" in text
+    assert f"{count} training photo" in text or sky is None
+    assert sky is None or f"{sky} of them with sky" in text
 
 
-def test_transparent_photographs_say_nothing_of_a_sky(tiny_scene, tmp_path):
+def test_transparent_photos_have_reasons_of_their_own(tiny_scene, tmp_path):
     text = describe(load("photos", [f"scene.path='{tiny_scene}'"]), RunState.read(tmp_path / "run"), None, "new")
-    assert "8 training photographs; the dataset does not say whether they show a sky" in text
+    assert "8 training photos: at most 0.6 Gaussians per pixel" in text
+    assert "the hull of few silhouettes is too large" in text

@@ -13,7 +13,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import fire_steps, fires_at
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.stretching import Axis, fewest_steps, in_steps, last_edit, with_steps
+from clsplat.pipeline.stretching import Axis, in_steps, last_edit, min_steps, with_steps
 from clsplat.training.stage import Training
 from tests.support.pipelines import SCHEDULED
 
@@ -40,7 +40,7 @@ def known(name: str) -> tuple[PipelineFile, list[tuple[int, int]]]:
 def test_edits_keep_order_and_distance_in_any_number_of_steps(name, data):
     """As many of each kind, in the same order; those at one step stay at one, no others come to be."""
     recipe, old = known(name)
-    fewest, steps = fewest_steps(recipe.training), recipe.training.steps
+    fewest, steps = min_steps(recipe.training), recipe.training.steps
     new = edits(in_steps(recipe, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
     assert [place for _, place in new] == [place for _, place in old]
     for before, after in zip(pairwise(old), pairwise(new), strict=True):
@@ -54,7 +54,7 @@ def test_stretched_pipeline_stretches_again_with_its_own_edits(name, data):
     """Also that of a run in minutes, whose cadences are not whole.  In the fewest steps a cadence may become 1, which
     means each step in any number of them."""
     recipe, old = known(name)
-    fewest, steps = fewest_steps(recipe.training) + 1, recipe.training.steps
+    fewest, steps = min_steps(recipe.training) + 1, recipe.training.steps
     between = in_steps(recipe, data.draw(st.integers(fewest, 2 * steps)))
     new = edits(in_steps(between, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
     assert [place for _, place in new] == [place for _, place in old]
@@ -65,7 +65,7 @@ def test_stretched_pipeline_stretches_again_with_its_own_edits(name, data):
 @given(data=st.data())
 def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
     recipe, old = known(name)
-    steps = data.draw(st.integers(1, fewest_steps(recipe.training)))
+    steps = data.draw(st.integers(1, min_steps(recipe.training)))
     factor = Axis.by(Fraction(steps, recipe.training.steps)).factor
     old, new = (
         {(step, place) for step, place in one if place != -1}  # at least one change of the size stays

@@ -112,8 +112,8 @@ REFUSED = {
         r"x.yaml:5: matrix.set.optimize.stps\[0\]: unknown key 'stps'; did you mean 'steps'",
     ),
     "misspelled stage": (
-        SMALL.replace("optimize.steps", "optimize.steps"),
-        r"x.yaml:5: matrix.set.optimize.steps\[0\]: no 'optimize' in this pipeline; did you mean optimize",
+        SMALL.replace("optimize.steps", "optimze.steps"),
+        r"x.yaml:5: matrix.set.optimze.steps\[0\]: no 'optimze' in this pipeline; did you mean optimize",
     ),
     "wrong value": (
         SMALL.replace("[4, 6]", "[4, 30k]"),

@@ -23,7 +23,7 @@ PIXELS = "optimize.losses=[l1, {type: covariance_trace, pixels: 2.0}]"
     ],
 )
 def test_what_reads_places_at_rest_is_refused_beside_motion(override, what):
-    with pytest.raises(ConfigError, match=f"{re.escape(what)} does not go together with .* \\(model.time\\): it reads"):
+    with pytest.raises(ConfigError, match=f"{re.escape(what)} cannot be combined with .* \\(model.time\\): it reads"):
         load("dynamic_7k", [override])
     load("splat_7k", [override])
 
@@ -31,9 +31,9 @@ def test_what_reads_places_at_rest_is_refused_beside_motion(override, what):
 @pytest.mark.parametrize(
     ("stage", "words"),
     [
-        ("cleanup", r".rules\[\d\]: 'prune_far' does not go .*: it reads .*; leave one of them out"),
-        ("cleanup: {rules: [prune_far]}", r".rules\[0\]: 'prune_far' does not go .*: it reads"),
-        ("reinit_from_depth", ": 'reinit_from_depth' does not go .*: a depth is of one moment; leave the stage"),
+        ("cleanup", r".rules\[\d\]: 'prune_far' cannot be .*: it reads .*; leave one of them out"),
+        ("cleanup: {rules: [prune_far]}", r".rules\[0\]: 'prune_far' cannot be .*: it reads"),
+        ("reinit_from_depth", ": 'reinit_from_depth' cannot be .*: a depth is of one moment; leave the stage"),
     ],
 )
 def test_stages_that_need_rest_are_refused_on_reading(tmp_path, stage, words):

@@ -12,7 +12,7 @@ from tests.support.pipelines import KINDS
 def test_every_listed_key_can_be_set_to_its_listed_value(name):
     pipeline = load(name)
     keys = settable(pipeline.settings)
-    assert len({key.place for key in keys}) == len(keys)
+    assert len({key.key_path for key in keys}) == len(keys)
     listed = {**pipeline.resolved(), "adapt": None}  # which keeps keys that are set
     together = [key.text for key in keys]
     for overrides in (together, together[::-1]):  # one that changes another key is seen in one of the orders
@@ -21,11 +21,11 @@ def test_every_listed_key_can_be_set_to_its_listed_value(name):
 
 def test_listed_keys_are_those_that_change_something():
     before = load("micro_splatting_v2")
-    places = {key.place: key for key in settable(before.settings)}
+    places = {key.key_path: key for key in settable(before.settings)}
     assert {"seed", "scene.downscale", "init.opacity", "optimize.steps", "raise_sh.every"} <= set(places)
     assert "densify.every" not in places, "there are three of them"
     changed = load("micro_splatting_v2", ["optimize.during.2.every=7"])
-    assert {key.place for key in settable(changed.settings) if key.value != places[key.place].value} == {
+    assert {key.key_path for key in settable(changed.settings) if key.value != places[key.key_path].value} == {
         "optimize.during.2.every"
     }
 
@@ -46,29 +46,29 @@ REFUSED = {
     "model.screen_filter.type=dilate": "no screen filter named 'dilate'; did you mean 'dilation'?",
     "optimize.every=3": "unknown key 'every'; did you mean 'log_every'?",
     "export.every=3": "stages[3] export: 'every' belongs inside optimize.during",
-    "init.count.x=3": "nothing lies below 'count'",
+    "init.count.x=3": "'count' has no keys",
     "optimize.losses.0={type: 3}": "no loss named '3'",
     "steps=100": "no key 'steps' at the top of a pipeline; did you mean optimize.steps?",
     "max_gaussians=9": "no key 'max_gaussians' at the top of a pipeline; did you mean densify.max_gaussians?",
     "rates.means.start=1": "no 'rates' in this pipeline; did you mean optimize.rates.means.start?",
     "optimze.steps=5": "no 'optimze' in this pipeline; did you mean optimize.steps?",
-    "optimize.losses.9.weight=1": "expected a number below 2 in a list of 2, got '9'; did you mean",
-    "optimize.losses.²=1": "expected a number below 2 in a list of 2, got '²'",
-    "optimize.steps": "expected stage.key=value",
-    "=3": "expected stage.key=value",
-    "optimize.steps=!!float x": "the value cannot be read: 'x' cannot be read as float",
-    "optimize.steps=!!python/object/apply:os.system ['x']": "the value cannot be read: the tag !!python",
-    "optimize.steps=&a [*a]": "the value cannot be read: ",
-    "optimize.steps=[": "the value cannot be read: ",
+    "optimize.losses.9.weight=1": "expected an index below 2 in a list of 2, got '9'; did you mean",
+    "optimize.losses.²=1": "expected an index below 2 in a list of 2, got '²'",
+    "optimize.steps": "expected KEY=VALUE",
+    "=3": "expected KEY=VALUE",
+    "optimize.steps=!!float x": "cannot read the value: 'x' cannot be read as float",
+    "optimize.steps=!!python/object/apply:os.system ['x']": "cannot read the value: the tag !!python",
+    "optimize.steps=&a [*a]": "cannot read the value: ",
+    "optimize.steps=[": "cannot read the value: ",
     "name=../up": "expected text that matches",
     "stages=[int]": "stages[0]: no stage named 'int'; did you mean 'init'?",
-    "plugins.a=b": "'plugins' cannot be set; a run writes it; load a plug-in with --plugin FILE",
+    "plugins.a=b": "'plugins' cannot be set; runs write it; load a plug-in with --plugin FILE",
     "optimize.during=[{every: 3}, {to: 1, every: 3}]": "expected a 'stage', the name of the stage",
     "optimize.losses=[{weight: 3}]": "expected a 'type', the name of the loss",
     "densify.budget={gaussians: 1}": "expected a 'type', the name of the budget",
     "densify.budget.gaussians=40000": "expected a 'type', the name of the budget",
     "densify.budget={type: parabol}": "no budget named 'parabol'; did you mean 'parabola'?",
-    "model.world_filter={type: none, variance: 1}": "unknown key 'variance'; there are no other keys here, remove it",
+    "model.world_filter={type: none, variance: 1}": "unknown key 'variance'; remove it, as there are no other keys",
     "stages=3": "expected a list, got 3",
 }
 
@@ -99,7 +99,7 @@ def test_an_error_of_set_blames_set_alone(override):
 
 
 def test_a_place_has_no_thousand_parts():
-    with pytest.raises(OverrideError, match=r"expected stage\.key=value"):
+    with pytest.raises(OverrideError, match=r"expected KEY=VALUE"):
         load("smoke", ["optimize." + "x." * 1000 + "y=1"])
 
 
@@ -112,7 +112,7 @@ def test_long_values_are_shortened():
 
 def test_stages_of_one_name_are_told_apart_by_number():
     with pytest.raises(
-        OverrideError, match=r"3 stages named 'densify'; write stages\.1\.during\.1 or stages\.1"
+        OverrideError, match=r"3 stages are named 'densify'; use stages\.1\.during\.1 or stages\.1"
     ) as error:
         load("micro_splatting_v2", ["densify.every=3"])
     for place in ("stages.1.during.1", "optimize.during.1"):

@@ -297,10 +297,10 @@ def test_a_short_pipeline_is_its_file_with_the_values_of_short(write, tmp_path):
 @pytest.mark.parametrize(
     ("short", "words"),
     [
-        ("short:\n  optimize.stepps: 5\n", r"small.yaml:18: short: the file has no 'optimize.stepps'"),
-        ("short:\n  steps: 5\n", r"no 'steps'"),
-        ("short:\n  optimize.during.2.every: 5\n", r"no 'optimize.during.2.every'"),
-        ("short: [1]\n", r"has no map 'short', which small_7k.yaml needs"),
+        ("short:\n  optimize.stepps: 5\n", r"small.yaml:18: short: the file has no key 'optimize.stepps'"),
+        ("short:\n  steps: 5\n", r"no key 'steps'"),
+        ("short:\n  optimize.during.2.every: 5\n", r"no key 'optimize.during.2.every'"),
+        ("short: [1]\n", r"expected a map 'short', with values of small_7k.yaml"),
     ],
 )
 def test_a_short_pipeline_is_refused_with_its_place(tmp_path, short, words):
@@ -371,15 +371,15 @@ REFUSED = {
     ),
     "statistics that a cleanup has dropped": (
         replaced("- evaluate", "- cleanup\n  - densify: {rules: [clone]}"),
-        r"stages\[3\] densify needs 'stats', which stages\[2\] cleanup takes away \(optimize makes it again\)",
+        r"stages\[3\] densify needs 'stats', which stages\[2\] cleanup removes \(optimize makes it again\)",
     ),
     "statistics of a model that was replaced": (
         replaced("- evaluate", "- init\n  - densify: {rules: [clone]}"),
-        r"stages\[3\] densify needs 'stats', which stages\[2\] init takes away",
+        r"stages\[3\] densify needs 'stats', which stages\[2\] init removes",
     ),
     "figures of a model that was replaced": (
         replaced("- export", "- init\n  - report"),
-        r"stages\[4\] report needs 'metrics', which stages\[3\] init takes away",
+        r"stages\[4\] report needs 'metrics', which stages\[3\] init removes",
     ),
     "stage not for during": (replaced("checkpoint: {every: 5}", "init: {every: 5}"), "no stage named 'init'"),
     "duplicate key": (replaced("steps: 10", "steps: 10\n      steps: 20"), r"x.yaml:6: found duplicate key"),
@@ -447,7 +447,7 @@ def test_a_folder_is_no_pipeline_and_hides_none(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=re.escape(f"`clsplat run splat_7k --scene {tmp_path}`")):
         load(str(tmp_path))
     (tmp_path / "pipeline.yaml").write_text(SMALL)
-    with pytest.raises(ConfigError, match=r"is a run folder.* `clsplat resume .*` goes on"):
+    with pytest.raises(ConfigError, match=r"is a run folder.* `clsplat resume .*` continues"):
         load(str(tmp_path))
 
 

@@ -396,10 +396,10 @@ def test_a_scene_that_holds_cameras_is_taken_as_it_is(pipeline, tiny_scene, tmp_
     words = ["run", str(pipeline), "--scene", str(tiny_scene), "--set", "optimize.steps=3", "--out", "runs/a"]
     code, told = clsplat(*words, "--dry-run")
     assert code == 0
-    assert f"{tiny_scene} holds cameras; left out: find_features\n" in told
+    assert f"{tiny_scene} has cameras; skipped: find_features\n" in told
     assert clsplat(*words)[0] == 0
     folder = tmp_path / "runs" / "a"
-    assert f"# {tiny_scene} holds cameras; left out: find_features" in (folder / "pipeline.yaml").read_text()
+    assert f"# {tiny_scene} has cameras; skipped: find_features" in (folder / "pipeline.yaml").read_text()
     assert not (tmp_path / "runs" / "prepared").exists()
     assert clsplat("check", "runs/a")[0] == 0
     assert clsplat("resume", "runs/a", "--steps", "5")[0] == 0

@@ -90,8 +90,8 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
     assert known(asked, []) is None
 
 
-def as_cell(asked, out, device, start):
-    return wanted_cell(Cell("a", asked), Scenes(out.parent / "scenes"), Store(out.parent))
+def as_cell(asked, state, device, start):
+    return wanted_cell(Cell("a", asked), Scenes(state.out.parent / "scenes"), Store(state.out.parent))
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def as_cell(asked, out, device, start):
         (describe, "scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train with"),
         (run_pipeline, "scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected 4"),
         (as_cell, "scene={train: {names: ['01', '02']}, validation: {names: ['05']}}", "'05' is left out by scene"),
-        (run_pipeline, "scene.masks=masks", "prepared photographs have another shape"),
+        (run_pipeline, "scene.masks=masks", "masks do not fit photos that are still to be undistorted"),
         (as_cell, "scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is held out for"),
     ],
 )
@@ -183,6 +183,6 @@ def test_pairs_are_all_of_them_or_those_of_neighbors(count):
 )
 def test_patience_says_how_early_a_training_may_end(keys, fewest):
     training = {"steps": 7000, "losses": [{"type": "l1"}], **keys}
-    assert Optimize.model_validate(training).fewest_steps == fewest
+    assert Optimize.model_validate(training).min_steps == fewest
     if "patience" in keys:
-        assert Optimize.model_validate({**training, "refit": True}).fewest_steps == fewest + 350
+        assert Optimize.model_validate({**training, "refit": True}).min_steps == fewest + 350

@@ -85,7 +85,7 @@ def test_the_folder_is_found_from_elsewhere(tiny_scene, tmp_path, monkeypatch):
 
 def test_photographs_that_are_prepared_have_other_shapes(tmp_path):
     pipeline = load("photos", [f"scene.path='{tmp_path}'", f"scene.masks='{tmp_path}'"])
-    with pytest.raises(ConfigError, match=r"scene\.masks: prepared photographs have another shape"):
+    with pytest.raises(ConfigError, match=r"scene\.masks: masks do not fit photos that are still to be undistorted"):
         pipeline.preparation(tmp_path / "run")
 
 

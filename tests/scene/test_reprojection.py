@@ -101,7 +101,7 @@ def test_the_recipe_for_photographs_learns_poses_from_a_pixel_on(error, learned)
     assert training.modules == [*([CameraOptimizer(start=500)] if learned else []), exposure]
     if not learned:
         assert training.model_copy(update={"modules": []}) == load("fast").settings.training
-    assert f"{error:g} px of mean reprojection error; " in chosen.decisions[-1].reason
+    assert f"cameras fit the points to {error:g} px: " in chosen.decisions[-1].reason
     without = adapted(load("photos"), Measures(60)).settings.optimize
     assert [one.type for one in without.modules] == ["exposure"]
 
@@ -126,8 +126,8 @@ def test_inspect_says_what_the_recipe_for_photographs_does():
 @pytest.mark.parametrize(
     ("of_step", "reason"),
     [
-        ("optimize.modules.random_background={}", "'random_background' does not go together with sky: "),
-        ("optimize.modules.camera_optimizer={start: 1}", "'camera_optimizer' does not go together with sky: "),
+        ("optimize.modules.random_background={}", "'random_background' cannot be combined with sky: "),
+        ("optimize.modules.camera_optimizer={start: 1}", "'camera_optimizer' cannot be combined with sky: "),
     ],
 )
 def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rng, caplog):
@@ -142,7 +142,7 @@ def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
     for recipe in ("smoke", "photos"):  # which may decide either
         with pytest.raises(ConfigError, match="not learned together with poses"):
             load(recipe, ["optimize.modules.camera_optimizer={start: 1}", "model.background=envmap"])
-        with pytest.raises(ConfigError, match="'random_background' does not go together with sky"):
+        with pytest.raises(ConfigError, match="'random_background' cannot be combined with sky"):
             load(recipe, ["optimize.modules.random_background={}", "model.background=envmap"])
     asked = load("photos", ["model.background=envmap"])  # which may learn poses
     with pytest.raises(ConfigError, match=r"adapt: photos: .*not learned together with poses.*; --set of one"):
@@ -161,7 +161,7 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
     assert "camera_optimizer" in [one.type for one in written.training.modules]
     background = written.model.background
     assert background.chosen == "off"
-    assert background.reason.startswith("'camera_optimizer' does not go together with sky: ")
+    assert background.reason.startswith("'camera_optimizer' cannot be combined with sky: ")
     assert (tmp_path / "run" / "view_poses.json").is_file()
 
 
@@ -173,7 +173,7 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
         (["optimize.losses=[l1, {type: inverse_depth, folder: nosuch}]"], "no such file; expected the depth map of"),
         (
             ["optimize.losses=[l1, inverse_depth]", "optimize.modules.camera_optimizer={start: 1}"],
-            "does not go together with inverse_depth",
+            "cannot be combined with inverse_depth",
         ),
     ],
 )

@@ -14,7 +14,7 @@ import pytest
 from clsplat.api import commands
 from clsplat.api import commands as sweeps
 from clsplat.core.errors import ClsplatError, ConfigError, DeviceError
-from clsplat.pipeline.execution import Execution, Tls, options, values_of
+from clsplat.pipeline.execution import Execution, Tls, from_options, read_execution
 from clsplat.pipeline.recipes import json_schema
 from clsplat.sweeps import batch, engines
 from clsplat.sweeps import batch as single
@@ -157,12 +157,12 @@ def test_a_queue_runs_a_cell_by_its_number(file, runs, tmp_path):
 def test_another_execution_replaces_the_files_and_is_noted(file, tmp_path):
     on = tmp_path / "lab.yaml"
     on.write_text("engine: inline\n")
-    job = Job.open(str(file), out=tmp_path / "out", execution=values_of(on))
-    assert job.work.execution.keeps is None
+    job = Job.open(str(file), out=tmp_path / "out", execution=read_execution(on))
+    assert job.work.execution.store_folder is None
     assert "engine: inline" in job.work.text
     assert "store" not in job.work.text
     with pytest.raises(ConfigError, match="--on is for a file with `matrix:`"):
-        Job.open("smoke", execution=values_of(on))
+        Job.open("smoke", execution=read_execution(on))
 
 
 def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
@@ -180,14 +180,17 @@ def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
         ("engin: local", "x.yaml:3: execution.engin: unknown key 'engin'"),
         ("retries: 0", "x.yaml:3: execution.retries: expected a value of at least 1"),
         ("store: ''", "x.yaml:3: execution.store: expected the path of a folder, got ''"),
-        ("retries: 2", "retries has no effect with engine inline: expected a store too"),
-        ("placement: {bits: any}", "placement has no effect with engine inline: expected a store too"),
-        ("devices: [pocl]", "devices has no effect with engine inline: expected a store too"),
-        ("engine: local, tls: {ca: a, cert: b, key: c}", "tls has no effect with engine local: certificates are for"),
-        ("engine: local, insecure: true", "insecure has no effect with engine local: it is for an engine dask://"),
+        ("retries: 2", "retries has no effect with engine inline: it needs a store"),
+        ("placement: {bits: any}", "placement has no effect with engine inline: it needs a store"),
+        ("devices: [pocl]", "devices has no effect with engine inline: it needs a store"),
+        (
+            "engine: local, tls: {ca: a, cert: b, key: c}",
+            "tls has no effect with engine local: it is for engine tls://",
+        ),
+        ("engine: local, insecure: true", "insecure has no effect with engine local: it is for engine dask://"),
         (
             "engine: dask://127.0.0.1:1, devices: [a]",
-            "devices has no effect with engine dask://127.0.0.1:1: a",
+            "devices has no effect with engine dask://127.0.0.1:1: the workers",
         ),
         ("engine: dask://far:1", "expected tls:// for another machine, or insecure: true"),
         ("engine: tls://far:1", "tls://far:1: expected tls: "),
@@ -207,7 +210,7 @@ def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
     on = tmp_path / "lab.yaml"
     on.write_text(f"{{{text}}}\n")
     with pytest.raises(ConfigError, match=f"lab.yaml:1: .*{words.removeprefix('x.yaml:3: execution.')}"):
-        values_of(on)
+        read_execution(on)
 
 
 def test_the_schema_of_pipeline_files_has_the_keys_of_execution():
@@ -221,12 +224,12 @@ def test_the_schema_of_pipeline_files_has_the_keys_of_execution():
         ({"engine": "dask://far:1"}, r"expected tls:// for another machine, or insecure: true \(--insecure\)"),
         ({"engine": "tls://far:1"}, r"\(--tls-ca, --tls-cert and --tls-key\)"),
         ({"engine": "tls://far:1", "tls": {"ca": "a", "key": "b"}}, "^--tls-cert: 'cert' is missing"),
-        ({"engine": "tcp://10.0.0.1:8786"}, r"^--scheduler: .*dask://HOST:PORT \(where Dask says tcp://\)"),
+        ({"engine": "tcp://10.0.0.1:8786"}, r"^--scheduler: .*dask://HOST:PORT \(tcp:// in Dask\)"),
     ],
 )
 def test_a_wrong_option_of_a_worker_is_named(given, words):
     with pytest.raises(ConfigError, match=words):
-        options(given)
+        from_options(given)
 
 
 @pytest.fixture(scope="module")

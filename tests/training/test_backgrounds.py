@@ -71,7 +71,7 @@ def test_a_run_repeats_to_the_bit(tiny_scene, tmp_path):
 
 @pytest.mark.slow
 def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
-    with pytest.raises(ConfigError, match="does not go together with sky"):
+    with pytest.raises(ConfigError, match="cannot be combined with sky"):
         train(tiny_scene, tmp_path / "run", RANDOM, "model.background=envmap", "optimize.steps=2")
     asked = load(
         "smoke",
@@ -81,5 +81,5 @@ def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
             "model.background=envmap",
         ],
     )
-    with pytest.raises(ConfigError, match="does not go together with sky"):
+    with pytest.raises(ConfigError, match="cannot be combined with sky"):
         describe(asked, RunState.read(tmp_path / "other"), None, "new")

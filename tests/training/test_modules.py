@@ -60,7 +60,7 @@ def test_modules_are_set_by_their_type():
         (["optimize.modules=[{type: transients, start: 1}, exposure]"], "'exposure' is listed after 'transients'"),
         (["optimize.modules=[exposure, exposure]"], "'exposure' and 'exposure' exclude each other"),
         (["optimize.modules=[exposure, bilateral_grid]"], "'bilateral_grid' and 'exposure' exclude each other"),
-        (["optimize.modules.camera_optimizer={}", "model.background=envmap"], "does not go together with sky"),
+        (["optimize.modules.camera_optimizer={}", "model.background=envmap"], "cannot be combined with sky"),
     ],
 )
 def test_lists_that_do_not_go_together_are_refused(settings, fault):

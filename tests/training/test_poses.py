@@ -164,5 +164,5 @@ def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tin
 
 @pytest.mark.slow
 def test_a_sky_is_refused(tiny_scene, tmp_path):
-    with pytest.raises(ConfigError, match=r"'camera_optimizer' does not go together with sky"):
+    with pytest.raises(ConfigError, match=r"'camera_optimizer' cannot be combined with sky"):
         train(tiny_scene, tmp_path / "run", *ON, "model.background=envmap")

@@ -38,7 +38,7 @@ def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModu
     """
     background = settings.background
     rival = next((one for one in modules if SKY in one.conflicts and one.is_active(run.scene)), None)
-    conflict = rival and f"'{rival.type}' does not go together with sky: {rival.conflicts[SKY]}"
+    conflict = rival and f"'{rival.type}' cannot be combined with sky: {rival.conflicts[SKY]}"
     if conflict and settings.sky:
         raise ConfigError(f"model.background: {conflict}; leave one of them out")
     if not isinstance(background, Auto) or background.chosen is not None:
