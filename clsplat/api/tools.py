@@ -35,11 +35,11 @@ def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -
 
     It takes a minute or two on a CPU.  page: a file to write, to be attached to a report.
     """
-    from clsplat.conformance.doctor import check_place, examine, write_page
+    from clsplat.conformance.doctor import check_html_path, examine, write_page
 
     load_plugins()
     if page is not None:
-        check_place(Path(page))
+        check_html_path(Path(page))
     report = examine(device)
     if page is not None:
         write_page(report, Path(page))

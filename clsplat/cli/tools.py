@@ -34,12 +34,12 @@ def doctor(
     ] = None,
 ) -> None:
     """Prove that a device computes what the reference says; exit 4 when it does not."""
-    from clsplat.conformance.doctor import check_place, write_page
+    from clsplat.conformance.doctor import check_html_path, write_page
 
     if as_json:
         terminal.keep_stdout_for_json()
     if page is not None:
-        check_place(page)
+        check_html_path(page)
     report = tools.doctor(device)
     if as_json:
         terminal.show_json(report.data())

@@ -1,4 +1,4 @@
-"""Prove a device: all checks, with each schedule that it takes, in processes of their own."""
+"""Run all checks on a device, with each schedule that it supports, in child processes, and report a verdict."""
 
 import errno
 import logging
@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from clsplat.conformance.check import Figure
+from clsplat.conformance.check import Deviation
 from clsplat.conformance.checks import KERNELS, SPEED
 from clsplat.conformance.host import system
 from clsplat.conformance.quick import forget, remember
-from clsplat.conformance.supervision import CheckResult, supervised
+from clsplat.conformance.supervision import CheckResult, run_checks
 from clsplat.core.errors import pluralize
 from clsplat.core.files import check_result_path, raising_output_error, write_text
 from clsplat.core.page import duration_text, render
@@ -23,11 +23,9 @@ from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo, choose, resolve_schedule
 from clsplat.opencl.kernel_caches import kernel_caches
 
-# The verdict on a device, in words.
-
-BITONIC = {"count_pairs", "fill_tiles", "sort_tiles"}  # what `rasterizer.sort: radix` does without
+BITONIC = {"count_pairs", "fill_tiles", "sort_tiles"}  # kernels that `rasterizer.sort: radix` does not need
 REPORT = "report it with the file of `clsplat doctor --html FILE`"
-REMEDY = f"update the device's driver or take another device (`clsplat devices` lists them), and {REPORT}"
+REMEDY = f"update the device's driver or use another device (`clsplat devices` lists them), and {REPORT}"
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Verdict:
 
     usable: bool
     text: str
-    advice: str = ""  # what to do about what is wrong
+    advice: str = ""  # what to do about the failures
 
     @property
     def level(self) -> Literal["ready", "warning", "error"]:
@@ -44,45 +42,47 @@ class Verdict:
 
 
 def judge(default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Sequence[CheckResult]) -> Verdict:
-    """Judge the results of each schedule, and of the checks that a device needs `once`."""
-    verdict = _of_figures(default, schedules, once)
+    """Judge the results of each schedule, and of the checks that run `once` per device."""
+    verdict = _judge_failures(default, schedules, once)
     if verdict.usable and any(result.damaged_cache for part in (*schedules.values(), once) for result in part):
         advice = f"remove {kernel_caches()}, which fill again" + (f"; {verdict.advice}" if verdict.advice else "")
-        return Verdict(True, f"{verdict.text}, once its cache of built kernels, which is damaged, is removed", advice)
+        return Verdict(True, f"{verdict.text}, after removing its damaged cache of built kernels", advice)
     return verdict
 
 
-def _of_figures(default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Sequence[CheckResult]) -> Verdict:
+def _judge_failures(
+    default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Sequence[CheckResult]
+) -> Verdict:
     failures = {name: [text for result in results for text in result.failures] for name, results in schedules.items()}
     others = [text for result in once for text in result.failures]
-    good = [name for name, found in failures.items() if not found]
+    good = [name for name, texts in failures.items() if not texts]
     if good and (default in good or default not in failures):
-        return _with_the_default(good, failures, others)
+        return _judge_default(failures, others)
     if good:
         why = f"with the {default} schedule, {failures[default][0]}"
         return Verdict(True, f"use it with --set rasterizer.schedule={good[0]}: {why}", REMEDY)
-    wrong = [result for result in schedules[default] if not result.holds]
+    wrong = [result for result in schedules[default] if not result.passes]
     if all(_is_bitonic(result) for result in wrong):
         return Verdict(True, f"use it with --set rasterizer.sort=radix: {failures[default][0]}", REMEDY)
     first, more = failures[default][0], sum(map(len, failures.values())) - 1
-    rest = f"; {more} more {'is' if more == 1 else 'are'} wrong" if more else ""
+    rest = f"; {pluralize(more, 'more failure')}" if more else ""
     return Verdict(False, f"do not use it: {first}{rest}", REMEDY)
 
 
-def _with_the_default(good: list[str], failures: Mapping[str, list[str]], others: list[str]) -> Verdict:
-    wrong = [f"with the {name} schedule, {found[0]}" for name, found in failures.items() if found] + others
+def _judge_default(failures: Mapping[str, list[str]], others: list[str]) -> Verdict:
+    wrong = [f"with the {name} schedule, {texts[0]}" for name, texts in failures.items() if texts] + others
     if not wrong:
         return Verdict(True, "use it")
-    return Verdict(True, f"use it, as it is; but {wrong[0]}", f"nothing for training; {REPORT}")
+    return Verdict(True, f"use it as it is; but {wrong[0]}", f"training is not affected; {REPORT}")
 
 
 def _is_bitonic(result: CheckResult) -> bool:
-    return result.fault is None and all(figure.kernel in BITONIC for figure in result.figures if not figure.holds)
+    return result.fault is None and all(
+        deviation.kernel in BITONIC for deviation in result.deviations if not deviation.passes
+    )
 
 
-# A report of all checks of one device, as data, text and a page.
-
-SCHEMA = 1  # of `data`; a larger one may have other keys
+SCHEMA = 2  # version of the keys in `data`
 MAX_FAILURES = 12  # lines of the text
 GIB = 2**30
 
@@ -92,9 +92,9 @@ class DeviceReport:
     """What `clsplat.doctor` returns."""
 
     info: DeviceInfo
-    default: str  # schedule
+    default: str  # the default schedule
     schedules: dict[str, list[CheckResult]] = field(default_factory=dict)
-    once: list[CheckResult] = field(default_factory=list)  # memory and speed
+    once: list[CheckResult] = field(default_factory=list)  # memory and speed, with the default schedule
     seconds: float = 0.0
 
     @property
@@ -103,17 +103,17 @@ class DeviceReport:
 
     @property
     def usable(self) -> bool:
-        """Whether the device computes what the reference says, with at least one schedule."""
+        """Whether the device computes correctly with at least one schedule."""
         return self.verdict.usable
 
     @property
     def failures(self) -> dict[str, list[str]]:
-        """A sentence for everything that is wrong, by schedule; memory and speed under ''."""
+        """A sentence for each failure, by schedule; memory and speed under ''."""
         parts = {**self.schedules, "": self.once}
         return {name: [text for result in part for text in result.failures] for name, part in parts.items()}
 
     def note(self, name: str) -> dict[str, Any] | None:
-        """Return what a check noted under a name, with the default schedule or once."""
+        """Return the data that a check noted under a name, or None."""
         for result in (*self.once, *self.schedules.get(self.default, [])):
             for note in result.notes:
                 if note.name == name:
@@ -121,7 +121,7 @@ class DeviceReport:
         return None
 
     def data(self) -> dict[str, Any]:
-        """Return everything as plain data; a value that is not finite is None."""
+        """Return the report as plain data; values that are not finite are None."""
         verdict = self.verdict
         return {
             "schema": SCHEMA,
@@ -134,7 +134,7 @@ class DeviceReport:
         }
 
     def text(self) -> str:
-        """Return the summary as lines."""
+        """Return the summary, a few lines of text."""
         verdict, lines = self.verdict, [f"device    {self.info.text}, driver {self.info.driver}"]
         for name, results in self.schedules.items():
             lines.append(f"{name:<9} {summary(results)}")
@@ -147,35 +147,36 @@ class DeviceReport:
         return "\n".join(lines)
 
     def memory(self) -> str:
-        """Return the largest buffer that was written, in words."""
-        found = self.note("memory")
-        if found is None:
+        """Return the size of the largest buffer that was tested, as a sentence; '' if it was not."""
+        note = self.note("memory")
+        if note is None:
             return ""
-        sizes = f"{found['held'] / GIB:.2f} GiB of the {found['promised'] / GIB:.2f} GiB that one buffer may have"
-        return f"wrote and read {sizes}; {found['stopped']}"
+        sizes = f"{note['held'] / GIB:.2f} GiB of the {note['promised'] / GIB:.2f} GiB that one buffer may have"
+        return f"wrote and read {sizes}; {note['stopped']}"
 
     def speed(self) -> str:
-        """Return the time of a step and the peaks, in words."""
-        found = self.note("speed")
-        if found is None:
+        """Return the time of a step next to the device's peaks, as a sentence; '' if it was not measured."""
+        note = self.note("speed")
+        if note is None:
             return ""
-        width, height, count = found["scene"]
-        ratio, peaks = found["step"] / sum(found["floors"].values()), found["peaks"]
+        width, height, count = note["scene"]
+        ratio, peaks = note["step"] / sum(note["floors"].values()), note["peaks"]
         return (
-            f"{found['step']:.1f} ms a step of {count:,} Gaussians at {width} x {height} px, {ratio:.1f} times the "
-            f"least for {peaks['gflops']:.0f} GFLOP/s and {peaks['gbytes']:.1f} GB/s"
+            f"{note['step']:.1f} ms per step with {count:,} Gaussians at {width} x {height} px, {ratio:.1f} times the "
+            f"minimum at {peaks['gflops']:.0f} GFLOP/s and {peaks['gbytes']:.1f} GB/s"
         )
 
 
 def summary(results: list[CheckResult]) -> str:
-    """Return the number of checks and figures, and of those that do not hold."""
-    figures = [figure for result in results for figure in result.figures]
-    wrong = sum(not figure.holds for figure in figures)
+    """Return the number of checks, comparisons and failures, as a sentence."""
+    deviations = [deviation for result in results for deviation in result.deviations]
+    wrong = sum(not deviation.passes for deviation in deviations)
     stopped = sum(result.fault is not None for result in results)
     seconds = sum(result.seconds for result in results)
-    words = [f"{wrong} do not hold"] if wrong else []
-    words += [f"{stopped} checks could not be completed"] if stopped else []
-    return f"{len(results)} checks, {len(figures)} figures: {' and '.join(words) or 'all hold'} ({seconds:.0f} s)"
+    words = [f"{wrong} failed"] if wrong else []
+    words += [f"{pluralize(stopped, 'check')} could not be completed"] if stopped else []
+    outcome = " and ".join(words) or "all passed"
+    return f"{len(results)} checks, {len(deviations)} comparisons: {outcome} ({seconds:.0f} s)"
 
 
 def _listed(failures: list[str]) -> list[str]:
@@ -185,11 +186,15 @@ def _listed(failures: list[str]) -> list[str]:
 
 
 def _plain(result: CheckResult) -> dict[str, Any]:
-    figures = [
-        {**asdict(figure), "value": figure.value if math.isfinite(figure.value) else None, "holds": figure.holds}
-        for figure in result.figures
+    deviations = [
+        {
+            **asdict(deviation),
+            "value": deviation.value if math.isfinite(deviation.value) else None,
+            "passes": deviation.passes,
+        }
+        for deviation in result.deviations
     ]
-    return {**asdict(result), "figures": figures, "holds": result.holds}
+    return {**asdict(result), "deviations": deviations, "passes": result.passes}
 
 
 LOG = logging.getLogger("clsplat")
@@ -197,7 +202,7 @@ SCHEDULES: tuple[Literal["simt", "wide"], ...] = ("simt", "wide")
 
 
 def examine(device: str | Device | None = None) -> DeviceReport:
-    """Run all checks on a device, or on the one of a name.  Raises DeviceError where there is none that works."""
+    """Run all checks on a device, open or by name.  Raises DeviceError if there is none that works."""
     info = device.info if isinstance(device, Device) else choose(device)
     default = resolve_schedule(info, "auto")
     report, started = DeviceReport(info, default), time.perf_counter()
@@ -206,14 +211,14 @@ def examine(device: str | Device | None = None) -> DeviceReport:
         if not _is_due(schedule, report):
             continue
         results = report.schedules[schedule] = []
-        for result in supervised(info, schedule, KERNELS):
+        for result in run_checks(info, schedule, KERNELS):
             results.append(result)
             LOG.info("%s", progress(schedule, result))
-        if all(result.holds and not result.damaged_cache for result in results):
+        if all(result.passes and not result.damaged_cache for result in results):
             remember(info, schedule)
         else:
             forget(info, schedule)
-    for result in supervised(info, default, SPEED):
+    for result in run_checks(info, default, SPEED):
         report.once.append(result)
         LOG.info("%s", progress("", result))
     report.seconds = time.perf_counter() - started
@@ -221,9 +226,9 @@ def examine(device: str | Device | None = None) -> DeviceReport:
 
 
 def _is_due(schedule: str, report: DeviceReport) -> bool:
-    """simt runs everywhere; wide where it is the default, and on a CPU that computes wrongly with simt.
+    """Run simt everywhere, and wide where it is the default or where a CPU computes wrongly with simt.
 
-    Elsewhere nobody would use it, and some compilers take many minutes for its vectors.
+    Elsewhere nobody would use wide, and some compilers need many minutes for its vectors.
     """
     if schedule == "simt" or report.default == "wide":
         return True
@@ -231,19 +236,19 @@ def _is_due(schedule: str, report: DeviceReport) -> bool:
 
 
 def progress(schedule: str, result: CheckResult) -> str:
-    """Return a line for one check."""
+    """Return a line of the log for one check."""
     failures = result.failures
-    count = len(result.figures)
-    holds = f"{pluralize(count, 'figure')} hold{'s' if count == 1 else ''}" if count else "measured"
-    words = f"WRONG: {failures[0]}" if failures else holds
+    count = len(result.deviations)
+    passed = f"{pluralize(count, 'comparison')} passed" if count else "measured"
+    words = f"WRONG: {failures[0]}" if failures else passed
     return f"  {f'{schedule:<5}{result.name}':<54}{result.seconds:5.1f} s  {words}"
 
 
-# A report as one page that opens offline, to be attached to a bug report.
+# The report as an HTML page that opens offline, to attach to a bug report.
 
 
-def check_place(out: Path) -> None:
-    """Raise ConfigError for a file of another kind or of a run, OutputError where a page cannot be written."""
+def check_html_path(out: Path) -> None:
+    """Raise ConfigError for a path that is no .html file or belongs to a run, OutputError if it cannot be written."""
     check_result_path(out, ".html")
     with raising_output_error(out):
         if out.is_dir():
@@ -259,7 +264,7 @@ def write_page(report: DeviceReport, out: Path) -> None:
 
 
 def report_page(report: DeviceReport) -> str:
-    """Return the page."""
+    """Return the report as HTML."""
     verdict = report.verdict
     parts = {f"The {name} schedule": results for name, results in report.schedules.items()}
     parts |= {"Memory and speed": report.once}
@@ -270,7 +275,7 @@ def report_page(report: DeviceReport) -> str:
         level=verdict.level,
         verdict=verdict.text[0].upper() + verdict.text[1:],
         advice=verdict.advice,
-        failures=[(name or "once", text) for name, found in report.failures.items() for text in found],
+        failures=[(name or "once", text) for name, texts in report.failures.items() for text in texts],
         facts=_facts(report),
         parts={
             name: (summary(results), [(result, worst(result)) for result in results]) for name, results in parts.items()
@@ -290,13 +295,13 @@ def _facts(report: DeviceReport) -> dict[str, str]:
         "driver": info.driver,
         "limits": f"{info.memory / GIB:.1f} GiB, buffers up to {info.allocation / GIB:.1f} GiB, groups up to "
         f"{info.group}, {info.local_memory >> 10} KiB local, {info.float_width} lanes",
-        "schedule by default": report.default,
+        "default schedule": report.default,
         "memory": report.memory(),
         "clsplat": host["clsplat"],
         "system": f"{host['system']}, {host['processors']} processors",
         "Python": f"{host['python']}, NumPy {host['numpy']}",
         "environment": ", ".join(f"{name}={value}" for name, value in host["environment"].items()) or "nothing set",
-        "took": duration_text(report.seconds),
+        "duration": duration_text(report.seconds),
     }
     if training:
         first, last = training["losses"]
@@ -306,17 +311,17 @@ def _facts(report: DeviceReport) -> dict[str, str]:
 
 
 def worst(result: CheckResult) -> str:
-    """Return the figure nearest to its bound, or furthest beyond it, by its bound."""
-    found = max(result.figures, key=_excess, default=None)
-    if found is None:
+    """Return the largest deviation relative to its bound, as text."""
+    largest = max(result.deviations, key=_excess, default=None)
+    if largest is None:
         return ""
-    if found.counts:
-        return "exact" if found.value == 0 else f"{found.value:g} wrong"
-    return f"{100 * found.value / found.bound:.0f} %"
+    if largest.counts:
+        return "exact" if largest.value == 0 else f"{largest.value:g} wrong"
+    return f"{100 * largest.value / largest.bound:.0f} %"
 
 
-def _excess(figure: Figure) -> float:
-    """How far a figure is toward its bound; NaN and wrong counts are beyond all."""
-    if not figure.holds:
+def _excess(deviation: Deviation) -> float:
+    """Return a deviation divided by its bound; infinity for NaN and for wrong counts."""
+    if not deviation.passes:
         return float("inf")
-    return figure.value / figure.bound if figure.bound else 0.0
+    return deviation.value / deviation.bound if deviation.bound else 0.0

@@ -1,4 +1,4 @@
-"""The host: its system, and the variables of the environment that concern OpenCL."""
+"""Describe the host: its system, and the environment variables that concern OpenCL."""
 
 import os
 import platform
@@ -11,13 +11,13 @@ from clsplat.core import machine
 from clsplat.core.machine import available_memory
 from clsplat.core.resources import full_version
 
-CODE = ("PYOPENCL_BUILD", "POCL_", "CL_", "RUSTICL_", "LP_", "IGC_", "AMD_", "GPU_", "CUDA_")  # may change what runs
-CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not
+CODE = ("PYOPENCL_BUILD", "POCL_", "CL_", "RUSTICL_", "LP_", "IGC_", "AMD_", "GPU_", "CUDA_")  # may change the code
+CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not change the code
 PREFIXES = (*CODE, "CLSPLAT_", "OCL_", "PYOPENCL_NO", "PYOPENCL_CTX", "OCLGRIND_")
 
 
 def system() -> dict[str, Any]:
-    """Return what a bug report needs of the host; of the environment only what concerns OpenCL."""
+    """Return what a bug report needs to know about the host; only variables that concern OpenCL."""
     return {
         "clsplat": full_version(),
         "system": platform.platform(),
@@ -31,13 +31,9 @@ def system() -> dict[str, Any]:
 
 
 def code_variables() -> dict[str, str]:
-    """Return the variables with which compilers and runtimes may make other code of the same kernels."""
-    found = _variables(CODE)
-    return {
-        name: value
-        for name, value in found.items()
-        if not name.startswith(CACHES) and name not in machine.THREAD_VARIABLES
-    }
+    """Return the variables that may change what compilers and runtimes make of the same kernels."""
+    neutral = (*CACHES, *machine.THREAD_VARIABLES)
+    return {name: value for name, value in _variables(CODE).items() if not name.startswith(neutral)}
 
 
 def _variables(prefixes: tuple[str, ...]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Small random scenes, for the kernels and for the reference alike."""
+"""Make small random scenes for the kernels and the reference."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ EYE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.
 
 @dataclass(frozen=True)
 class Case:
-    """N Gaussians in front of one camera; parameters in float32, so that both sides see the same numbers."""
+    """N Gaussians in front of one camera, in float32, so that kernels and reference use the same numbers."""
 
     parameters: dict[str, NDArray[Any]]  # [N, components] float32
     view: View
@@ -30,7 +30,7 @@ class Case:
     near: float = 0.2
     variance: float = 0.3
     compensate: float = 0.0
-    pixel_box: float = 0.0  # 1: with a variance of 0
+    pixel_box: float = 0.0  # 1: the box filter, with a variance of 0
     dropout: DropoutMask | None = None
 
     @property
@@ -72,14 +72,14 @@ class Case:
     def project(self, thresholds: ref.Thresholds = SHARP) -> ref.Splats:
         splats = ref.project(self.gaussians(), self.camera(), self.degree, **self.numbers(), thresholds=thresholds)
         if self.dropout:
-            left_out = ref.dropped(**vars(self.dropout), count=len(splats.visible))
+            dropped = ref.dropped(**vars(self.dropout), count=len(splats.visible))
             for values in (values for values in vars(splats).values() if isinstance(values, np.ndarray)):
-                values[left_out] = 0
+                values[dropped] = 0
         return splats
 
 
 def random_case(rng: np.random.Generator, count: int, width: int = 40, height: int = 30, **changes: Any) -> Case:
-    """Gaussians spread over the view and somewhat beyond it, a few pixels large."""
+    """Return Gaussians of a few pixels, spread over the view and slightly beyond it."""
     focal = 0.9 * width
     depth = rng.uniform(1.5, 6, count)
     across = rng.uniform(-0.65, 0.65, (count, 2)) * [width / focal, height / focal]
@@ -99,7 +99,7 @@ def random_case(rng: np.random.Generator, count: int, width: int = 40, height: i
 
 
 def with_world_filter(case: Case, rng: np.random.Generator) -> Case:
-    """The same Gaussians under a 3D filter of about half their size."""
+    """Return the same Gaussians with a 3D filter of about half their size."""
     sizes = np.exp(case.parameters["log_scales"].mean(axis=1, keepdims=True))
     variance = (sizes * rng.uniform(0.2, 0.8, sizes.shape)) ** 2
     return replace(case, parameters={**case.parameters, "filter_variance": variance.astype(np.float32)})
@@ -119,23 +119,24 @@ def safe_case(
     change: Callable[[dict[str, NDArray[Any]]], None] = lambda parameters: None,
     **changes: Any,
 ) -> Case:
-    """A scene in which no pixel is nearer to a threshold than `margin`, so that float32 and float64 blend the same."""
+    """Return a scene in which no pixel is within `margin` of a threshold, so that float32 and float64 blend alike."""
     for _ in range(200):
         case = random_case(rng, count, width, height, **changes)
         change(case.parameters)
         gaps = ref.margin(case.project(), width, height)
         if min(gaps.alpha, gaps.transmittance, gaps.cap) > margin and gaps.depth > min(margin, 2e-6):
             return case
-    raise AssertionError("no scene with margins was found")
+    raise AssertionError("no scene with these margins was found")
 
-
-# What the kernels' sums over pixels are as gradients of splats (cl_kernels/splat.h, pixel_box.h).
 
 Floats = NDArray[Any]
 
 
 def gradients_of_sums(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
-    """dL/d(mean2d), [N, 2], and dL/d(conic), [N, 3], of sums [N, PIXEL_SUMS]; culled splats have sums of 0."""
+    """Convert sums over pixels, [N, PIXEL_SUMS], to dL/d(mean2d), [N, 2], and dL/d(conic), [N, 3].
+
+    See cl_kernels/splat.h and pixel_box.h.  The sums of culled splats are 0.
+    """
     if splats.pixel_box:
         return m[:, 1:3], _covariance_gradient(splats, m[:, 3:6])
     a, b, c = splats.conic.T
@@ -144,18 +145,21 @@ def gradients_of_sums(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
 
 
 def _covariance_gradient(splats: Splats, m: Floats) -> Floats:
-    """From the derivatives by k = xy / yy, ln s, s² = yy, and ln t, t² = xx - xy² / yy; turned: x for y."""
-    found = np.zeros((len(m), 3))
+    """Apply the chain rule to derivatives by k = xy / yy, ln s and ln t, with s² = yy and t² = xx - xy² / yy.
+
+    If xx > yy, x and y are swapped.
+    """
+    gradient = np.zeros((len(m), 3))
     for n in np.flatnonzero(splats.visible):
         xx, xy, yy = splats.conic[n]
-        turned = xx > yy
-        if turned:
+        swapped = xx > yy
+        if swapped:
             xx, yy = yy, xx
         k, t2 = xy / yy, xx - xy * xy / yy
         by_k, by_s, by_t = m[n]
         by_t2 = by_t / (2 * t2)
         by_yy = -by_k * k / yy + by_s / (2 * yy) + by_t2 * k * k
-        found[n] = by_t2, by_k / yy - 2 * k * by_t2, by_yy
-        if turned:
-            found[n] = found[n, ::-1]
-    return found
+        gradient[n] = by_t2, by_k / yy - 2 * k * by_t2, by_yy
+        if swapped:
+            gradient[n] = gradient[n, ::-1]
+    return gradient

@@ -1,4 +1,4 @@
-"""Run checks in processes of their own, and go on after one that dies or hangs."""
+"""Run checks in child processes, and continue after one that crashes or hangs."""
 
 import json
 import os
@@ -12,74 +12,74 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from clsplat.conformance.check import Check, Figure, Note
+from clsplat.conformance.check import Check, Deviation, Note
 from clsplat.core.errors import shorten
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.opencl.kernel_caches import empty_kernel_caches
 
-WORKER = ("-P", "-m", "clsplat.conformance.worker")  # -P: nothing of the working folder is imported
-CHECK_SECONDS = 900  # without a word from a check; an interpreter of kernels needs minutes
-END_SECONDS = 30  # between the end of the output and that of the process, which may write its memory to a file
+WORKER = ("-P", "-m", "clsplat.conformance.worker")  # -P: import nothing from the working folder
+TIMEOUT_S = 900  # longest silence of a check; a kernel interpreter needs minutes
+EXIT_TIMEOUT_S = 30  # from the end of the output to the exit of the process, which may write a core dump
 
 
 @dataclass
 class CheckResult:
-    """What one check found on a device."""
+    """The result of one check on a device."""
 
     name: str
     kernels: tuple[str, ...]
     seconds: float = 0.0
-    figures: list[Figure] = field(default_factory=list)
+    deviations: list[Deviation] = field(default_factory=list)
     notes: list[Note] = field(default_factory=list)
     fault: str | None = None  # why it could not be completed
-    log: str = ""  # of a build that failed
-    out_of_memory: bool = False  # the fault is no more than that
-    hangs: bool = False  # the fault is that, or an answer that cannot be read
-    damaged_cache: bool = False  # there was a fault, and with empty caches of kernels there is none
+    log: str = ""  # log of a failed build
+    out_of_memory: bool = False  # whether the fault is a lack of memory
+    hangs: bool = False  # whether the fault is a timeout or unreadable output
+    damaged_cache: bool = False  # whether it failed, and succeeded with empty caches of built kernels
 
     @property
-    def holds(self) -> bool:
-        return self.fault is None and all(figure.holds for figure in self.figures)
+    def passes(self) -> bool:
+        return self.fault is None and all(deviation.passes for deviation in self.deviations)
 
     @property
     def failures(self) -> list[str]:
-        """A sentence for everything that is wrong."""
+        """A sentence for each failure."""
         stopped = [f"{self.name}: {shorten(self.fault, 240)}"] if self.fault else []
-        return stopped + [figure.text for figure in self.figures if not figure.holds]
+        return stopped + [deviation.text for deviation in self.deviations if not deviation.passes]
 
 
-def supervised(
-    info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float = CHECK_SECONDS
+def run_checks(
+    info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float = TIMEOUT_S
 ) -> Iterator[CheckResult]:
     """Run checks on a device with a schedule; yield each result when it is complete.
 
-    A check that says nothing for `seconds` is stopped.  One that cannot be completed is tried again with empty caches
-    of built kernels, until that does not help.
+    A check that is silent for `seconds` is stopped.  A check that cannot be completed is repeated with empty caches of
+    built kernels, as long as that helps.
     """
-    left, trying = list(checks), True
-    while left:
+    remaining, retry = list(checks), True
+    while remaining:
         done = 0
-        for result in _one_process(info, schedule, left, seconds):
-            if trying and result.fault and not result.out_of_memory and not result.hangs:
-                again = _with_empty_caches(info, schedule, left[done], seconds)
-                trying = again.fault is None
-                result = again if trying else result
+        for result in _run_in_process(info, schedule, remaining, seconds):
+            if retry and result.fault and not result.out_of_memory and not result.hangs:
+                repeated = _run_with_empty_caches(info, schedule, remaining[done], seconds)
+                retry = repeated.fault is None
+                result = repeated if retry else result
             done += 1
             yield result
-        left = left[done:]
+        remaining = remaining[done:]
 
 
-def _with_empty_caches(info: DeviceInfo, schedule: str, check: Check, seconds: float) -> CheckResult:
+def _run_with_empty_caches(info: DeviceInfo, schedule: str, check: Check, seconds: float) -> CheckResult:
     with empty_kernel_caches() as variables:
-        (result,) = _one_process(info, schedule, [check], seconds, variables)
+        (result,) = _run_in_process(info, schedule, [check], seconds, variables)
     result.damaged_cache = result.fault is None
     return result
 
 
-def _one_process(
+def _run_in_process(
     info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float, variables: Mapping[str, str] | None = None
 ) -> Iterator[CheckResult]:
-    """Results of the first checks, up to and including one that ends the process: at least one."""
+    """Yield the results of checks up to and including the first that ends the process: at least one."""
     command = [sys.executable, *WORKER, *map(str, info.place), schedule]
     names = [check.name for check in checks]
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
@@ -91,19 +91,19 @@ def _one_process(
             encoding="utf-8",
             env={**os.environ, **(variables or {})},
         )
-        assert process.stdin is not None  # open until the end, which is the worker's too
+        assert process.stdin is not None  # the worker exits when it is closed
         assert process.stdout is not None
         lines: queue.Queue[str | None] = queue.Queue()
         threading.Thread(target=_pump, args=(process.stdout, lines), daemon=True).start()
         try:
             for check in checks:
                 result = CheckResult(check.name, check.kernels)
-                ended = _fill(result, lines, seconds)
-                if ended is not None:
-                    result.fault = ended or _death(process, errors)
-                    result.hangs = bool(ended)
+                stop_reason = _read_result(result, lines, seconds)
+                if stop_reason is not None:
+                    result.fault = stop_reason or _exit_reason(process, errors)
+                    result.hangs = bool(stop_reason)
                 yield result
-                if ended is not None:
+                if stop_reason is not None:
                     return
         finally:
             process.kill()
@@ -111,21 +111,21 @@ def _one_process(
             process.stdin.close()
 
 
-def _fill(result: CheckResult, lines: "queue.Queue[str | None]", seconds: float) -> str | None:
-    """Take the lines of one check; None: it is complete, "": the process ended, else why it is stopped."""
+def _read_result(result: CheckResult, lines: "queue.Queue[str | None]", seconds: float) -> str | None:
+    """Read the lines of one check; return None if it is complete, "" if the process ended, else why to stop it."""
     while True:
         try:
             text = lines.get(timeout=seconds)
         except queue.Empty:
-            return f"gives no answer for {seconds} s"
+            return f"gives no answer within {seconds} s"
         if text is None:
             return ""
         try:
             line: dict[str, Any] = json.loads(text)
         except ValueError:
-            return f"ends in the middle of a line: {shorten(text, 100)}"
-        if "figure" in line:
-            result.figures.append(Figure(**line["figure"]))
+            return f"prints a line that is not JSON: {shorten(text, 100)}"
+        if "deviation" in line:
+            result.deviations.append(Deviation(**line["deviation"]))
         elif "note" in line:
             result.notes.append(Note(**line["note"]))
         elif "fault" in line:
@@ -141,16 +141,16 @@ def _pump(stdout: IO[str], lines: "queue.Queue[str | None]") -> None:
     lines.put(None)
 
 
-def _death(process: "subprocess.Popen[str]", errors: IO[str]) -> str:
-    """Why a process ended: its signal or exit code, and the last line that it wrote."""
+def _exit_reason(process: "subprocess.Popen[str]", errors: IO[str]) -> str:
+    """Return why a process ended: its signal or exit code, and the last line that it wrote."""
     try:
-        code = process.wait(END_SECONDS)
+        code = process.wait(EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        return "closes its output, and does not end"
+        return "closes its output but does not exit"
     errors.seek(0)
     written = [line.strip() for line in errors.read().splitlines() if line.strip()]
     last = f" ({shorten(written[-1], 300)})" if written else ""
     if code < 0:
-        names = {one.value: one.name for one in signal.Signals}
-        return f"the runtime ends the process with {names.get(-code, f'signal {-code}')}{last}"
-    return f"the process ends with code {code}{last}"
+        names = {number.value: number.name for number in signal.Signals}
+        return f"the runtime crashes with {names.get(-code, f'signal {-code}')}{last}"
+    return f"the process exits with code {code}{last}"

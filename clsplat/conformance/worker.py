@@ -1,7 +1,7 @@
-"""Run checks on the device of two numbers, in a process of its own, and print what they find: one line of JSON each.
+"""Run checks on a device, given by platform and device number, and print their results as lines of JSON.
 
-A runtime may abort the process: the check of the next line is then the one that it ended.  The process ends with the
-one that waits for it, which holds the other end of stdin.
+A runtime may abort the process; the parent then knows which check did not end.  The process exits when its parent
+closes stdin or exits.
 """
 
 import json
@@ -21,12 +21,12 @@ from clsplat.core.signals import take_stdin, take_stdout
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import Schedule, list_devices
 
-LOG_LIMIT = 4000  # characters of a build log
+MAX_LOG = 4000  # characters of a build log
 
 
 def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> None:
-    """Open the device and run the checks of these names."""
-    threading.Thread(target=_end_with, args=(take_stdin(),), daemon=True).start()
+    """Open the device and run the checks with these names."""
+    threading.Thread(target=_exit_with_parent, args=(take_stdin(),), daemon=True).start()
     out = take_stdout()
     info = next(info for info in list_devices() if info.place == (platform, number))
     opened = cache(lambda: Device(info, schedule))
@@ -38,17 +38,17 @@ def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> No
 
 def _run(out: TextIO, check: Check, opened: Callable[[], Device]) -> None:
     try:
-        for found in check.figures(opened()):
-            if isinstance(found, Note):
-                _print(out, note=asdict(found))
+        for result in check.deviations(opened()):
+            if isinstance(result, Note):
+                _print(out, note=asdict(result))
             else:
-                _print(out, figure=asdict(found))
-    except Exception as error:  # a finding about the device, not the end of the checks
-        what = one_line(error) if isinstance(error, ClsplatError) else f"{_source_of(error)}: {one_line(error)}"
-        log = str(error.__cause__)[:LOG_LIMIT] if isinstance(error, KernelError) and error.__cause__ else ""
+                _print(out, deviation=asdict(result))
+    except Exception as error:  # a failure of the device; the other checks continue
+        fault = one_line(error) if isinstance(error, ClsplatError) else f"{_source_of(error)}: {one_line(error)}"
+        log = str(error.__cause__)[:MAX_LOG] if isinstance(error, KernelError) and error.__cause__ else ""
         _print(
             out,
-            fault=shorten(what, 600),
+            fault=shorten(fault, 600),
             log=log,
             out_of_memory=isinstance(as_clsplat_error(error), MemoryLimitError),
         )
@@ -57,11 +57,11 @@ def _run(out: TextIO, check: Check, opened: Callable[[], Device]) -> None:
 def _source_of(error: Exception) -> str:
     if type(error).__module__.startswith("pyopencl"):
         return "the OpenCL runtime refuses a call"
-    return f"the check ends with {type(error).__name__}, which may be a defect of clsplat"
+    return f"the check raises {type(error).__name__}, which may be a bug in clsplat"
 
 
-def _end_with(pipe: int) -> None:
-    """End this process, whatever it does, when the other one closes its end of a pipe or has ended."""
+def _exit_with_parent(pipe: int) -> None:
+    """Exit, whatever this process does, when the parent closes its end of a pipe or exits."""
     while os.read(pipe, 1024):
         pass
     os._exit(1)

@@ -13,10 +13,10 @@ import pytest
 import clsplat
 from clsplat import cli
 from clsplat.conformance import doctor, reference, supervision
-from clsplat.conformance.check import Check, Figure, Note
+from clsplat.conformance.check import Check, Deviation, Note
 from clsplat.conformance.checks import BY_NAME, KERNELS, SPEED, whole
 from clsplat.conformance.doctor import DeviceReport, examine, judge, report_page
-from clsplat.conformance.supervision import CheckResult, supervised
+from clsplat.conformance.supervision import CheckResult, run_checks
 from clsplat.core.errors import ConfigError, MemoryLimitError, OutputError
 from clsplat.core.machine import is_alive
 from clsplat.opencl import runtimes
@@ -25,16 +25,16 @@ from clsplat.opencl.discovery import resolve_schedule
 from tests.support.doctor_worker import worker
 from tests.support.html_page import Page
 
-WRONG = Figure("blend_backward", "gradients of conics, 17 Gaussians", 3e-2, 2e-4)
-RIGHT = Figure("blend_backward", "gradients of colors", 1e-6, 2e-4)
+WRONG = Deviation("blend_backward", "gradients of conics, 17 Gaussians", 3e-2, 2e-4)
+RIGHT = Deviation("blend_backward", "gradients of colors", 1e-6, 2e-4)
 
 
 def checks(*names: str) -> list[Check]:
     return [Check(name, ("blend_backward",), None) for name in names]
 
 
-def result(*figures: Figure, fault: str | None = None) -> list[CheckResult]:
-    return [CheckResult("a check", ("blend_backward",), 1.0, list(figures), fault=fault)]
+def result(*deviations: Deviation, fault: str | None = None) -> list[CheckResult]:
+    return [CheckResult("a check", ("blend_backward",), 1.0, list(deviations), fault=fault)]
 
 
 VERDICTS = {
@@ -48,21 +48,21 @@ VERDICTS = {
     "the other one is wrong": (
         {"wide": result(RIGHT), "simt": result(WRONG)},
         True,
-        "use it, as it is; but with the simt schedule, blend_backward differs by 0.03",
+        "use it as it is; but with the simt schedule, blend_backward differs by 0.03",
     ),
     "both are wrong": (
-        {"wide": result(WRONG), "simt": result(fault="the runtime ends the process with SIGABRT")},
+        {"wide": result(WRONG), "simt": result(fault="the runtime crashes with SIGABRT")},
         False,
         "do not use it: blend_backward differs by 0.03 in gradients of conics, 17 Gaussians, bound 0.0002; "
-        "1 more is wrong",
+        "1 more failure",
     ),
     "a sort is wrong": (
-        dict.fromkeys(("wide", "simt"), result(Figure("sort_tiles", "order of 300 pairs", 2, 0, counts=True))),
+        dict.fromkeys(("wide", "simt"), result(Deviation("sort_tiles", "order of 300 pairs", 2, 0, counts=True))),
         True,
         "use it with --set rasterizer.sort=radix: sort_tiles gives 2 wrong values in order of 300 pairs",
     ),
     "not a number": (
-        {"wide": result(Figure("exp", "x", float("nan"), 1.0))},
+        {"wide": result(Deviation("exp", "x", float("nan"), 1.0))},
         False,
         "do not use it: exp differs by nan in x",
     ),
@@ -79,37 +79,37 @@ def test_the_verdict_says_what_to_do(case):
 
 
 def test_wrong_memory_does_not_hide_behind_right_kernels():
-    verdict = judge("wide", {"wide": result(RIGHT)}, result(Figure("fill_words", "samples", 3, 0, counts=True)))
-    assert verdict.text == "use it, as it is; but fill_words gives 3 wrong values in samples"
+    verdict = judge("wide", {"wide": result(RIGHT)}, result(Deviation("fill_words", "samples", 3, 0, counts=True)))
+    assert verdict.text == "use it as it is; but fill_words gives 3 wrong values in samples"
 
 
-def test_checks_go_on_after_a_runtime_that_ends_the_process(monkeypatch, info):
+def test_checks_continue_after_a_runtime_crashes(monkeypatch, info):
     worker(monkeypatch)
-    results = list(supervised(info, "simt", checks("first", "dies", "second", "leaves", "third")))
+    results = list(run_checks(info, "simt", checks("first", "dies", "second", "leaves", "third")))
     assert [one.name for one in results] == ["first", "dies", "second", "leaves", "third"]
-    assert [one.holds for one in results] == [True, False, True, False, True]
-    assert results[1].fault == "the runtime ends the process with SIGABRT (noise of a runtime)"
-    assert results[3].fault == "the process ends with code 3 (noise of a runtime)"
+    assert [one.passes for one in results] == [True, False, True, False, True]
+    assert results[1].fault == "the runtime crashes with SIGABRT (noise of a runtime)"
+    assert results[3].fault == "the process exits with code 3 (noise of a runtime)"
 
 
 def test_a_runtime_that_hangs_is_stopped(monkeypatch, info):
     monkeypatch.setattr(supervision, "WORKER", ("-c", "import time; time.sleep(600)"))
-    (one,) = supervised(info, "simt", checks("hangs"), 1)
-    assert one.fault == "gives no answer for 1 s"
+    (one,) = run_checks(info, "simt", checks("hangs"), 1)
+    assert one.fault == "gives no answer within 1 s"
 
 
 @pytest.mark.parametrize(
     ("end", "fault"),
     [
-        ("time.sleep(0.5); raise KeyError('rows')", "the process ends with code 1 (KeyError: 'rows')"),
-        ("time.sleep(600)", "closes its output, and does not end"),
+        ("time.sleep(0.5); raise KeyError('rows')", "the process exits with code 1 (KeyError: 'rows')"),
+        ("time.sleep(600)", "closes its output but does not exit"),
     ],
 )
 def test_a_process_is_given_time_for_its_code(monkeypatch, info, end, fault):
     """Its output closes before it has one."""
-    monkeypatch.setattr(supervision, "END_SECONDS", 5, raising=False)
+    monkeypatch.setattr(supervision, "EXIT_TIMEOUT_S", 5, raising=False)
     monkeypatch.setattr(supervision, "WORKER", ("-c", f"import os, time; os.close(1); {end}"))
-    assert [one.fault for one in supervised(info, "simt", checks("rows"))] == [fault]
+    assert [one.fault for one in run_checks(info, "simt", checks("rows"))] == [fault]
 
 
 def test_device_that_cannot_open_for_lack_of_memory_is_reported(monkeypatch, info):
@@ -119,20 +119,20 @@ def test_device_that_cannot_open_for_lack_of_memory_is_reported(monkeypatch, inf
         "worker.Device = refuse; worker.main(int(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:4], sys.argv[4:])"
     )
     monkeypatch.setattr(supervision, "WORKER", ("-c", script))
-    results = list(supervised(info, "simt", [BY_NAME["scans"], BY_NAME["rendering"]]))
+    results = list(run_checks(info, "simt", [BY_NAME["scans"], BY_NAME["rendering"]]))
     assert [(one.fault, one.out_of_memory) for one in results] == [("opening it: no memory", True)] * 2
 
 
-def test_a_fault_that_empty_caches_mend_is_one_of_the_caches(monkeypatch, info):
+def test_a_fault_that_empty_caches_fix_is_a_damaged_cache(monkeypatch, info):
     worker(monkeypatch)
-    results = list(supervised(info, "simt", checks("first", "cached", "second", "cached", "leaves", "cached")))
-    assert [one.holds for one in results] == [True, True, True, True, False, False], (
+    results = list(run_checks(info, "simt", checks("first", "cached", "second", "cached", "leaves", "cached")))
+    assert [one.passes for one in results] == [True, True, True, True, False, False], (
         "nobody tries again without success"
     )
     assert [one.damaged_cache for one in results] == [False, True, False, True, False, False]
     verdict = judge("simt", {"simt": results[:4]}, [])
     assert verdict.usable
-    assert verdict.text == "use it, once its cache of built kernels, which is damaged, is removed"
+    assert verdict.text == "use it, after removing its damaged cache of built kernels"
     assert re.search("remove .*pyopencl", verdict.advice)
     assert not judge("simt", {"simt": results}, []).usable
 
@@ -149,7 +149,7 @@ def test_process_of_a_check_ends_with_its_parent(info, tmp_path):
         "from clsplat.conformance import supervision; from clsplat.conformance.checks import BY_NAME\n"
         "from clsplat.opencl.discovery import list_devices\n"
         f"info = next(one for one in list_devices() if one.place == {info.place})\n"
-        f"supervision.WORKER = ('-c', {hangs!r}); list(supervision.supervised(info, 'simt', [BY_NAME['scans']]))"
+        f"supervision.WORKER = ('-c', {hangs!r}); list(supervision.run_checks(info, 'simt', [BY_NAME['scans']]))"
     )
     waiting = subprocess.Popen([sys.executable, "-c", waits])
     try:
@@ -174,8 +174,8 @@ def test_a_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_pat
         (tmp_path / name).write_text("raise RuntimeError('of the user')")
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
     monkeypatch.chdir(tmp_path)
-    (one,) = supervised(info, resolve_schedule(info, "auto"), [BY_NAME["scans"]])
-    assert one.holds, one.fault
+    (one,) = run_checks(info, resolve_schedule(info, "auto"), [BY_NAME["scans"]])
+    assert one.passes, one.fault
     assert runtimes.fault_of("key", *info.place) is None
 
 
@@ -200,18 +200,18 @@ def report_of(info, **schedules: list[CheckResult]) -> DeviceReport:
 
 
 def test_a_report_is_json_whatever_the_values_are(info):
-    report = report_of(info, wide=result(WRONG, Figure("exp", "x", float("nan"), 1.0)))
+    report = report_of(info, wide=result(WRONG, Deviation("exp", "x", float("nan"), 1.0)))
     data = json.loads(json.dumps(report.data(), allow_nan=False))
-    assert data["schema"] == 1
+    assert data["schema"] == 2
     assert data["verdict"]["usable"] is False
-    found = data["schedules"]["wide"][0]["figures"]
+    found = data["schedules"]["wide"][0]["deviations"]
     assert [one["value"] for one in found] == [0.03, None]
-    assert not any(one["holds"] for one in found)
+    assert not any(one["passes"] for one in found)
     assert data["device"]["name"] == info.name
     assert "blend_backward differs by 0.03" in report.text()
 
 
-def test_the_page_shows_every_figure_and_the_head_of_a_build_log(info):
+def test_page_shows_every_comparison_and_the_build_log(info):
     broken = CheckResult("projection", ("project_forward",), fault="project.cl does not build", log="error: <unknown>")
     page = report_page(report_of(info, wide=[*result(WRONG, RIGHT), broken], simt=result(RIGHT)))
     assert Page(page).text
@@ -225,20 +225,20 @@ def test_the_page_shows_every_figure_and_the_head_of_a_build_log(info):
         assert text in page
 
 
-def memory_of(monkeypatch, largest: int, figure: Figure = RIGHT) -> tuple[list[str], DeviceReport]:
+def memory_of(monkeypatch, largest: int, deviation: Deviation = RIGHT) -> tuple[list[str], DeviceReport]:
     """What the memory check finds wrong on a device that gives no larger buffer, and its report."""
 
     def buffer(device, size):
         if -(-size // 64) * 64 > largest:
             raise MemoryLimitError("could not allocate (MEM_OBJECT_ALLOCATION_FAILURE)")
-        yield figure
+        yield deviation
 
-    monkeypatch.setattr(whole, "_buffer_figures", buffer)
+    monkeypatch.setattr(whole, "_check_buffer", buffer)
     monkeypatch.setattr(whole, "available_memory", lambda: 2**34)
     info = SimpleNamespace(memory=2**33, allocation=2**30 + 4)
     found = list(whole.memory(SimpleNamespace(info=info), None))
-    figures, notes = ([one for one in found if isinstance(one, kind)] for kind in (Figure, Note))
-    once = [CheckResult("memory", ("fill_words",), 1.0, figures, notes)]
+    deviations, notes = ([one for one in found if isinstance(one, kind)] for kind in (Deviation, Note))
+    once = [CheckResult("memory", ("fill_words",), 1.0, deviations, notes)]
     return once[0].failures, DeviceReport(info, "wide", {"wide": result(RIGHT)}, once)
 
 
@@ -260,9 +260,9 @@ def test_memory_held_by_other_programs_is_no_device_fault(monkeypatch, largest, 
 
 @pytest.mark.parametrize("largest", [2**30 + 4, 2**28])
 def test_a_buffer_that_was_given_and_holds_other_values_is_wrong(monkeypatch, largest):
-    failures, report = memory_of(monkeypatch, largest, Figure("fill_words", "samples", 3, 0, counts=True))
+    failures, report = memory_of(monkeypatch, largest, Deviation("fill_words", "samples", 3, 0, counts=True))
     assert failures
-    assert report.verdict.text == "use it, as it is; but fill_words gives 3 wrong values in samples"
+    assert report.verdict.text == "use it as it is; but fill_words gives 3 wrong values in samples"
 
 
 @pytest.mark.parametrize(("value", "code"), [("1e-6", 0), ("0.3", 4)])
@@ -293,7 +293,7 @@ def test_the_command_ends_with_4_where_a_device_computes_wrongly(monkeypatch, ca
 def test_page_that_cannot_be_written_is_refused_first(monkeypatch, info, tmp_path, name, error, words):
     (tmp_path / "a folder.html").mkdir()
     (tmp_path / "a file").write_text("")
-    monkeypatch.setattr(doctor, "supervised", lambda *_: pytest.fail("the work began"))
+    monkeypatch.setattr(doctor, "run_checks", lambda *_: pytest.fail("the work began"))
     with pytest.raises(error, match=f"{name}: .*{words}"):
         clsplat.doctor(Device(info), tmp_path / name)
 

@@ -293,11 +293,11 @@ def kernel_of(planted: str) -> tuple[str, str]:
 
 
 def first_failure(device: Device, planted: str, checks: list[Check]) -> str | None:
-    """The first figure beyond its bound in the checks of a fault's kernel; those named as the fault come first."""
+    """The first deviation beyond its bound in the checks of a fault's kernel; those named as the fault come first."""
     kernel, words = kernel_of(planted)[0], set(planted.split())
     for check in sorted(checks, key=lambda check: -len(words & set(check.name.split()))):
-        for found in check.figures(device) if kernel in check.kernels else ():
-            if not isinstance(found, Note) and not found.holds:
+        for found in check.deviations(device) if kernel in check.kernels else ():
+            if not isinstance(found, Note) and not found.passes:
                 return found.text
     return None
 

@@ -1,10 +1,6 @@
-"""The check before a device makes pictures or models: it is done once, and a wrong device is refused everywhere."""
+"""The check before a device renders or trains: it runs once, and a wrong device is refused everywhere."""
 
 import io
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,13 +11,11 @@ import pytest
 
 import clsplat
 from clsplat.conformance import checks, host, quick, supervision
-from clsplat.conformance import quick as uses
 from clsplat.conformance import worker as worker_process
 from clsplat.conformance.check import Check
 from clsplat.conformance.checks import ESSENTIAL
 from clsplat.conformance.doctor import examine
 from clsplat.conformance.scenes import random_case
-from clsplat.core import machine
 from clsplat.core.errors import DeviceError, MemoryLimitError
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import tuning_of
@@ -50,7 +44,7 @@ def like(device, **changes):
 )
 def test_bitonic_is_checked_where_the_run_can_choose_it(monkeypatch, info, empty_cache, team, sort, bitonic):
     found = []
-    monkeypatch.setattr(quick, "supervised", lambda info, schedule, checks, seconds: found.extend(checks) or [])
+    monkeypatch.setattr(quick, "run_checks", lambda info, schedule, checks, seconds: found.extend(checks) or [])
     device = like(Device(info), tuning={"TEAM": team})
     quick.ensure_correct(device, sort)
     assert any("sort_tiles" in check.kernels for check in found) == bitonic
@@ -96,48 +90,6 @@ def test_a_damaged_cache_of_kernels_is_no_fault_of_the_device(monkeypatch, info,
     assert not list(empty_cache.iterdir())
 
 
-USE = """
-import os, sys
-from pathlib import Path
-from clsplat.conformance import quick as uses
-uses.begin([Path(name) for name in sys.argv[2:]])
-if sys.argv[1] == "suddenly":
-    os.abort()
-"""
-
-
-@pytest.mark.parametrize("end", ["suddenly", "in order"])
-def test_device_is_rechecked_after_a_process_ends_silently(monkeypatch, info, empty_cache, end):
-    worker(monkeypatch)
-    device = Device(info)
-    quick.ensure_correct(device)
-    worker(monkeypatch, damaged="True")
-    records = [quick._record(info, device.schedule, "radix")]
-    subprocess.run([sys.executable, "-c", USE, end, *map(str, records)], check=False, capture_output=True)
-    if end == "in order":
-        quick.ensure_correct(device)
-        return
-    for _ in range(2):  # until that helps
-        with pytest.raises(DeviceError, match="cache of built kernels is damaged"):
-            quick.ensure_correct(device)
-    worker(monkeypatch)
-    quick.ensure_correct(device)
-    monkeypatch.setattr(supervision, "WORKER", ("-c", "raise SystemExit(1)"))
-    quick.ensure_correct(device)
-
-
-def test_the_first_processes_of_two_containers_have_a_mark_each(monkeypatch, tmp_path):
-    """An orderly end of one says nothing of the other."""
-    marks = []
-    for namespace in ("pid:[1]", "pid:[2]"):
-        monkeypatch.setattr(machine, "_pid_namespace", lambda namespace=namespace: namespace)
-        monkeypatch.setattr(uses, "_own", set())
-        uses.begin([tmp_path / "conformance" / "record"])
-        marks += uses._own
-    assert sorted(marks) == sorted((tmp_path / uses.FOLDER).iterdir())
-    assert len(marks) == 2
-
-
 def test_an_exception_of_a_runtime_is_a_sentence():
     def check(device, rng):
         raise cl.LogicError("clCreateKernel failed: INVALID_KERNEL_NAME")
@@ -152,7 +104,7 @@ def test_the_log_says_that_a_check_begins(monkeypatch, info, empty_cache, caplog
     worker(monkeypatch)
     with caplog.at_level("INFO", "clsplat"):
         quick.ensure_correct(Device(info))
-    assert f"checking {info.name}; this takes some seconds" in caplog.text
+    assert f"checking {info.name}; this takes a few seconds" in caplog.text
 
 
 def test_a_device_that_computes_wrongly_is_refused(monkeypatch, info, empty_cache):
@@ -212,7 +164,7 @@ def test_device_is_checked_each_time_without_a_writable_cache(monkeypatch, info,
     blocked.write_text("")
     monkeypatch.setattr(quick, "cache_folder", lambda: blocked)
     started = []
-    monkeypatch.setattr(quick, "supervised", lambda *arguments: started.append(arguments) or [])
+    monkeypatch.setattr(quick, "run_checks", lambda *arguments: started.append(arguments) or [])
     for _ in range(2):
         quick.ensure_correct(Device(info))
     assert len(started) == 2
@@ -258,17 +210,9 @@ def test_a_wrong_device_makes_no_picture_and_no_model(
 
 def test_a_device_is_proved_once_for_all_that_it_does(monkeypatch, info, empty_cache, tiny_scene, model, tmp_path):
     started = []
-    supervised = quick.supervised
-    monkeypatch.setattr(quick, "supervised", lambda *arguments: started.append(1) or supervised(*arguments))
+    run_checks = quick.run_checks
+    monkeypatch.setattr(quick, "run_checks", lambda *arguments: started.append(1) or run_checks(*arguments))
     worker(monkeypatch)
     for work in ("Renderer", "render_views", "evaluate", "Trainer"):
         WORK[work](tiny_scene, model, tmp_path, Device(info))
         assert len(started) == 1
-
-
-@pytest.mark.parametrize("records", [5, None, "name", [None, "a\0b", "../x"]])
-def test_a_damaged_mark_of_a_use_stops_nothing(records, tmp_path):
-    (tmp_path / "in_use").mkdir()
-    (tmp_path / "in_use" / "7-x.json").write_text(json.dumps({"process": os.getpid(), "records": records}))
-    uses.forget_after_sudden_ends(tmp_path)
-    assert not list((tmp_path / "in_use").iterdir())

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.training import DROPOUT, dropout_figures, hidden_figures
+from clsplat.conformance.checks.training import DROPOUT, check_dropout, check_hidden
 from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.gaussians.gaussians import DropoutMask
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import on_devices, on_one_setting
-from tests.support.figures import hold
 
 COUNTS = (1, 15, 16, 17, 63, 64, 65)
 
@@ -18,13 +18,13 @@ COUNTS = (1, 15, 16, 17, 63, 64, 65)
 @on_devices("count", COUNTS)
 def test_a_step_leaves_out_what_the_oracle_draws(device, rng, count):
     case = replace(random_case(rng, count), dropout=DROPOUT)
-    hold(dropout_figures(device, case, rng, "the scene"))
-    hold(hidden_figures(device, case, rng))
+    assert_within_bounds(check_dropout(device, case, rng, "the scene"))
+    assert_within_bounds(check_hidden(device, case, rng))
 
 
 def test_filters_and_dropout_multiply(device, rng):
     case = with_world_filter(random_case(rng, 40, variance=0.1, compensate=1.0), rng)
-    hold(dropout_figures(device, replace(case, dropout=DROPOUT), rng, "the scene"))
+    assert_within_bounds(check_dropout(device, replace(case, dropout=DROPOUT), rng, "the scene"))
 
 
 def test_the_share_that_is_left_out_is_the_probability():

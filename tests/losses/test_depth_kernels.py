@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import relative_error
-from clsplat.conformance.checks.blending import depth_figures, gradients_of, inverse_depths, losses_of_depths
+from clsplat.conformance.checks.blending import check_depth, gradients_of, inverse_depths, losses_of_depths
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.core.errors import ConfigError
 from clsplat.losses.depth import InverseDepth
@@ -17,22 +17,22 @@ from clsplat.photos.depths import PointDepths, nearest_in_pixels
 from clsplat.scene.scene import Tracks
 from clsplat.stages.optimize import Optimize
 from clsplat.training.modules.depth_supervision import KnownDepthsState
+from tests.support.deviations import assert_within_bounds, same_of_schedules
 from tests.support.device_images import trainer_of
 from tests.support.devices import on_one_setting
-from tests.support.figures import hold, same_of_schedules
 
 
 def test_plane_and_gradients(device, rng):
-    hold(inverse_depths(device, rng))
+    assert_within_bounds(inverse_depths(device, rng))
 
 
 def test_the_loss_and_its_gradient(device, rng):
-    hold(losses_of_depths(device, rng))
+    assert_within_bounds(losses_of_depths(device, rng))
 
 
 def test_the_box_of_the_pixel(device, rng):
     case = replace(safe_case(rng, 40, 33, 30, 1e-5, variance=0.0, pixel_box=1.0))
-    hold(depth_figures(device, case, rng.normal(size=(4, 30, 33)).astype(np.float32), "the pixel's box"))
+    assert_within_bounds(check_depth(device, case, rng.normal(size=(4, 30, 33)).astype(np.float32), "the pixel's box"))
 
 
 @on_one_setting

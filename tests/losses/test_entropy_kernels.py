@@ -17,9 +17,9 @@ from clsplat.losses.image import L1, WeightEntropy
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer, RenderLimits
 from clsplat.stages.optimize import Optimize
+from tests.support.deviations import same_of_schedules
 from tests.support.device_images import SIZES, trainer_of
 from tests.support.devices import on_devices, on_one_setting, product
-from tests.support.figures import same_of_schedules
 
 
 def entropy_of(device: Device, case: Case, sort: str = "radix") -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.images import LOSSES, camera_of, comparison_of, loss_figures
+from clsplat.conformance.checks.images import LOSSES, camera_of, check_loss, comparison_of
 from clsplat.conformance.checks.images import pictures as images
 from clsplat.core.errors import DataError
 from clsplat.core.settings import variants
@@ -14,15 +14,15 @@ from clsplat.losses.base import ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, ssim_maps
 from clsplat.photos.photographs import Photograph, apply_mask, unpack
 from clsplat.render.workspace import Workspace
+from tests.support.deviations import assert_within_bounds
 from tests.support.device_images import SIZES, gradient_of
 from tests.support.devices import each_once, on_devices, on_one_setting
-from tests.support.figures import hold
 
 
 @on_devices("width, height, loss, oracle, kernel", each_once(SIZES, LOSSES))
 def test_value_and_gradient(device, rng, width, height, loss, oracle, kernel):
     x, y = images(rng, width, height)
-    hold(loss_figures(device, loss(weight=0.7), 0.7, oracle, kernel, x, y))
+    assert_within_bounds(check_loss(device, loss(weight=0.7), 0.7, oracle, kernel, x, y))
 
 
 @on_one_setting

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.images import camera_of, haar_figures, planes_of
+from clsplat.conformance.checks.images import camera_of, check_haar, planes_of
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
@@ -21,8 +21,8 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import StepTrainer
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import each_once, on_devices, on_one_setting, product
-from tests.support.figures import hold
 from tests.support.runs import train
 
 SIZES = ((1, 1), (2, 1), (1, 2), (3, 3), (15, 4), (16, 16), (17, 5), (33, 18), (127, 32), (128, 33), (129, 65))
@@ -48,7 +48,7 @@ def through(device, image: np.ndarray, taps, mask: np.ndarray | None = None) -> 
 @on_devices("width, height, share", each_once(SIZES, [None, 0.7, 0.1]))
 def test_photograph_and_derivatives_are_the_oracles(device, rng, width, height, share):
     for taps in ((0.0, 0.0), HAAR, (0.3, 0.9)):
-        hold(haar_figures(device, rng, width, height, share, np.array(taps)))
+        assert_within_bounds(check_haar(device, rng, width, height, share, np.array(taps)))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.37, 1.0, 1.2])

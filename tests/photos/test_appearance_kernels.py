@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.appearance import color_figures
+from clsplat.conformance.checks.appearance import check_color
 from clsplat.conformance.checks.images import camera_of, planes_of
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
@@ -17,8 +17,8 @@ from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, Gain, change_colors
 from clsplat.training.trainer import StepTrainer
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import on_devices, on_one_setting, product
-from tests.support.figures import hold
 
 SMOOTH = (L2(),)
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
@@ -27,7 +27,7 @@ SIZES = ((1, 1), (2, 1), (15, 4), (16, 16), (17, 5), (33, 18), (127, 32), (129, 
 
 @on_devices("width, height", SIZES)
 def test_image_and_derivatives(device, rng, width, height):
-    hold(color_figures(device, rng, width, height))
+    assert_within_bounds(check_color(device, rng, width, height))
 
 
 @on_one_setting

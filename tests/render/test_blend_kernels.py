@@ -3,12 +3,12 @@
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.blending import BACKGROUND, blend_figures, layer_figures
+from clsplat.conformance.checks.blending import BACKGROUND, check_blend, check_layer
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.deviations import assert_within_bounds, same_of_schedules
 from tests.support.devices import each_once, on_devices, on_one_setting
-from tests.support.figures import hold, same_of_schedules
 
 
 def render(device: Device, case: Case, sort: str = "radix") -> tuple[np.ndarray, np.ndarray]:
@@ -23,7 +23,7 @@ def render(device: Device, case: Case, sort: str = "radix") -> tuple[np.ndarray,
 
 
 def compare(device: Device, case: Case) -> None:
-    hold(blend_figures(device, case, "the scene"))
+    assert_within_bounds(check_blend(device, case, "the scene"))
 
 
 @on_devices("width, height", [(64, 48), (15, 17), (16, 16)])
@@ -115,4 +115,4 @@ def test_depth_in_bands_is_the_same(device, rng):
     each_once([(1, 1), (15, 3), (16, 16), (17, 5), (33, 18), (65, 2), (129, 17)], [3, 4]),
 )
 def test_both_the_loss_and_the_derivatives(device, rng, width, height, channels):
-    hold(layer_figures(device, rng, width, height, channels))
+    assert_within_bounds(check_layer(device, rng, width, height, channels))

@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import CONIC, relative_error
-from clsplat.conformance.checks.motion import TIME, moment_figures, motion, moving_case
+from clsplat.conformance.checks.motion import TIME, check_moment, motion, moving_case
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.formats.splats import MOTION, PARAMETERS, STILL, WIDTHS, width_of
@@ -15,17 +15,17 @@ from clsplat.gaussians.model import Model
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.render.motion import at_moment
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import on_devices, on_one_setting
-from tests.support.figures import hold
 
 
 def test_motion_and_its_gradients(device, rng):
-    hold(motion(device, rng))
+    assert_within_bounds(motion(device, rng))
 
 
 @on_devices("count", [16, 63, 64, 129])
 def test_sizes_around_the_groups(device, rng, count):
-    hold(moment_figures(device, rng, count, width_of(2, True)))
+    assert_within_bounds(check_moment(device, rng, count, width_of(2, True)))
 
 
 @on_one_setting

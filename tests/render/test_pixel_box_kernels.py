@@ -8,15 +8,15 @@ import pytest
 from scipy.special import ndtr
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.blending import blend_figures, pixel_sums_of, render, sum_figures
+from clsplat.conformance.checks.blending import check_blend, check_sum, pixel_sums_of, render
 from clsplat.conformance.checks.pixel_box import BOX, SIZES, of_size
-from clsplat.conformance.checks.projection import not_drawable, record_figures, splats_of
+from clsplat.conformance.checks.projection import check_record, not_drawable, splats_of
 from clsplat.conformance.reference.blending import box_derivatives, box_response
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
+from tests.support.deviations import same_of_schedules
 from tests.support.devices import each_once, on_devices, on_one_setting
-from tests.support.figures import same_of_schedules
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(48)
 PIECES = 6
@@ -131,17 +131,17 @@ def test_gradients_of_the_reference_are_finite_differences(rng):
         assert np.linalg.norm(found[name] - truth) < 1e-4 * np.linalg.norm(truth), name
 
 
-def hold(figures) -> None:
-    for figure in figures:
-        assert figure.holds, figure.text
+def assert_within_bounds(deviations) -> None:
+    for deviation in deviations:
+        assert deviation.passes, deviation.text
 
 
 @on_devices("width, height, size", each_once([(16, 16), (17, 15), (33, 31), (5, 3)], SIZES))
 def test_edges_of_tiles(device, rng, width, height, size):
     case = of_size(SIZES[size], rng, 20, width, height)
-    hold(blend_figures(device, case, size))
+    assert_within_bounds(check_blend(device, case, size))
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
-    hold(sum_figures(case, pixel_sums_of(device, case, weights, 11), weights, size))
+    assert_within_bounds(check_sum(case, pixel_sums_of(device, case, weights, 11), weights, size))
 
 
 def test_what_cannot_be_drawn(device, rng):
@@ -182,8 +182,8 @@ def test_where_the_axes_change_places(device, rng):
 def test_round_splats_at_the_change(device, rng):
     case = random_case(rng, 40, **BOX)
     case.parameters["log_scales"][:] = case.parameters["log_scales"][:, :1]
-    hold(record_figures(device, case, "round Gaussians"))
-    hold(blend_figures(device, case, "round Gaussians"))
+    assert_within_bounds(check_record(device, case, "round Gaussians"))
+    assert_within_bounds(check_blend(device, case, "round Gaussians"))
 
 
 @on_one_setting

@@ -6,25 +6,25 @@ import numpy as np
 
 from clsplat.conformance.checks.projection import (
     beyond_the_clamp,
-    gradient_figures,
-    hidden_figures,
+    check_gradient,
+    check_hidden,
+    check_pose,
+    check_record,
     not_drawable,
-    pose_figures,
-    record_figures,
     splats_of,
 )
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.gaussians.gaussians import HIDDEN_VIEWS, hide
 from clsplat.render.camera import CAMERA
 from clsplat.render.rasterizer import RECORD, Rasterizer, RenderLimits
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import each_once, on_devices, on_one_setting
-from tests.support.figures import hold
 
 COUNTS = (7, 8, 9, 16, 63, 64, 200)  # others are in the checks of projection.py
 
 
 def compare(device, case: Case) -> None:
-    hold(record_figures(device, case, "the scene"))
+    assert_within_bounds(check_record(device, case, "the scene"))
 
 
 @on_devices("count", COUNTS)
@@ -39,7 +39,7 @@ def test_filters(device, rng, variance, compensate):
 
 @on_devices("count, views", each_once(COUNTS, [1, HIDDEN_VIEWS, 2 * HIDDEN_VIEWS + 1]))
 def test_a_view_leaves_out_what_is_hidden_in_it(device, rng, count, views):
-    hold(hidden_figures(device, random_case(rng, count), rng, views))
+    assert_within_bounds(check_hidden(device, random_case(rng, count), rng, views))
 
 
 @on_one_setting
@@ -98,7 +98,7 @@ def test_camera_struct_has_the_kernels_layout(device):
 
 
 def backward_case(device, rng, case: Case) -> None:
-    hold(gradient_figures(device, case, rng, "the scene"))
+    assert_within_bounds(check_gradient(device, case, rng, "the scene"))
 
 
 @on_devices("count", COUNTS)
@@ -122,4 +122,4 @@ def test_gradients_where_the_ray_is_clamped(device, rng):
 
 @on_devices("count", [16, 64, 511, 513])
 def test_sums_over_groups(device, rng, count):
-    hold(pose_figures(device, random_case(rng, count), rng, f"{count} Gaussians"))
+    assert_within_bounds(check_pose(device, random_case(rng, count), rng, f"{count} Gaussians"))

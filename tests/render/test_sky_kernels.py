@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.sky import cover_figures, sky_figures
+from clsplat.conformance.checks.sky import check_cover, check_sky
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.sky import Sky
@@ -17,20 +17,20 @@ from clsplat.render.sky import Skies
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.sky import LearnedSky
 from clsplat.training.trainer import StepTrainer
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import on_devices, on_one_setting
-from tests.support.figures import hold
 
 SIZES = ((1, 1, 8), (2, 1, 9), (15, 4, 8), (16, 16, 16), (17, 5, 33), (33, 18, 8), (127, 9, 21), (129, 17, 64))
 
 
 @on_devices("width, height, side", SIZES)
 def test_picture_and_derivatives(device, rng, width, height, side):
-    hold(sky_figures(device, rng, width, height, side))
+    assert_within_bounds(check_sky(device, rng, width, height, side))
 
 
 @on_devices("width, height, side", SIZES)
 def test_what_covers_the_sky(device, rng, width, height, side):
-    hold(cover_figures(device, rng, width, height, side))
+    assert_within_bounds(check_cover(device, rng, width, height, side))
 
 
 class Scene:

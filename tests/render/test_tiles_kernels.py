@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.tiles import bitonic_figures, radix_figures, scan_figure, tiler_of
+from clsplat.conformance.checks.tiles import check_bitonic, check_radix, check_scan, tiler_of
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import DataError
 from clsplat.opencl import device as program
@@ -16,8 +16,8 @@ from clsplat.opencl.device import Device
 from clsplat.render.camera import camera_values
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.camera import MAX_SIDE
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import each_once, on_devices, on_one_setting, product
-from tests.support.figures import hold
 
 
 def lists_of(device, case, sort):
@@ -249,7 +249,7 @@ COUNTS = (2, 7, 64, 512, 1023, 1024, *LARGE)
 @on_devices("count", [0, *COUNTS])
 def test_scan(device, rng, count):
     values = rng.integers(0, 100, count).astype(np.uint32)
-    hold([scan_figure(device, values)])
+    assert_within_bounds([check_scan(device, values)])
 
 
 @on_devices("before", [0, 3, 511, pytest.param(70_000, marks=pytest.mark.large)])
@@ -257,22 +257,22 @@ def test_sums_of_a_scan_stay_at_the_largest_number(device, before):
     """Where sums would wrap they end at 2^32 - 1: in an item, a group, and behind the sums of other groups."""
     values = np.ones(before + 4, np.uint32)
     values[[0, -2, -1]] = 2**31, 2**31 - 3, 5
-    hold([scan_figure(device, values)])
+    assert_within_bounds([check_scan(device, values)])
     assert tiler_of(device).scan(device.upload(values), len(values), "test").get()[-1] == 2**32 - 1
-    hold([scan_figure(device, np.array([2**31, 2**31, 5], np.uint32))])
+    assert_within_bounds([check_scan(device, np.array([2**31, 2**31, 5], np.uint32))])
 
 
 @on_devices("count, bits", each_once(COUNTS, [1, 9, 12, 32]))
 def test_radix_is_a_stable_sort(device, rng, count, bits):
     keys = rng.integers(0, 2**bits, count, dtype=np.uint64).astype(np.uint32)
-    hold(radix_figures(device, keys, bits))
+    assert_within_bounds(check_radix(device, keys, bits))
 
 
 @on_devices("keys", ["equal", "ascending", "descending"])
 def test_radix_with_orderly_keys(device, keys):
     count = 3000
     values = {"equal": np.full(count, 7), "descending": np.arange(count)[::-1], "ascending": np.arange(count)}[keys]
-    hold(radix_figures(device, values.astype(np.uint32), 12))
+    assert_within_bounds(check_radix(device, values.astype(np.uint32), 12))
 
 
 # tile lengths around the bitonic group, its powers of two and the capacity of local memory (1024 or 2048)
@@ -281,4 +281,4 @@ LENGTHS = (0, 1, 2, 3, 5, 63, 64, 65, 127, 128, 1023, 1024, 1025, 0, 2047, 2048,
 
 @on_devices("equal_depths", [False, True])
 def test_bitonic_sorts_tiles_of_any_length(device, rng, equal_depths):
-    hold(bitonic_figures(device, rng, LENGTHS, 50 if equal_depths else 2**31))
+    assert_within_bounds(check_bitonic(device, rng, LENGTHS, 50 if equal_depths else 2**31))

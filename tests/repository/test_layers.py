@@ -12,7 +12,7 @@ ROOMS = (  # from the top down; a room imports only from those below it
     "formats", "opencl", "core",
 )  # fmt: skip
 TEXTS = {  # what turns results into lines of text, which the commands print
-    "clsplat.conformance.doctor": {"check_place", "write_page"},
+    "clsplat.conformance.doctor": {"check_html_path", "write_page"},
     "clsplat.core.text_table": {"text_table"},
     "clsplat.gaussians.validate": {"lines", "verdict"},
     "clsplat.pipeline.files": {"shipped"},  # for completion, which must be fast

@@ -1,4 +1,4 @@
-"""A script in the place of the process that proves a device: it answers at once, and as a test wants."""
+"""Replace the process that checks a device by a script that answers at once, as a test wants."""
 
 from clsplat.conformance import supervision
 
@@ -14,11 +14,12 @@ for name in sys.argv[4:]:
         continue
     if name == "leaves":
         sys.exit(3)
-    print(json.dumps({"figure": {"kernel": "blend_backward", "what": "x", "value": %s, "bound": 0.1, "counts": False}}))
+    deviation = {"kernel": "blend_backward", "what": "x", "value": %s, "bound": 0.1, "counts": False}
+    print(json.dumps({"deviation": deviation}))
     print(json.dumps({"end": name, "seconds": 0.1}), flush=True)
 """
 
 
 def worker(monkeypatch, value: str = "1e-6", damaged: str = 'name == "cached"') -> None:
-    """Put a script in the place of the process that opens the device; `damaged` says where empty caches help."""
+    """Replace the process that opens the device by a script; `damaged`: for which checks empty caches help."""
     monkeypatch.setattr(supervision, "WORKER", ("-c", SCRIPT % (damaged, value)))

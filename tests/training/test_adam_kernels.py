@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.checks.projection import not_drawable
-from clsplat.conformance.checks.training import average_figures, behind_each_fifth, seen_figures, step_figures
+from clsplat.conformance.checks.training import behind_each_fifth, check_average, check_seen, check_step
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import DeviceModel
@@ -13,8 +13,8 @@ from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.training import adam as average
 from clsplat.training.adam import Adam, Rates, Rows
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import each_once, on_devices, on_one_setting, product
-from tests.support.figures import hold
 
 
 def frame_of(device: Device, case: Case, model: DeviceModel) -> Frame:
@@ -68,7 +68,7 @@ def touches_a_pixel(case: Case) -> np.ndarray:
 
 @on_devices("count", [16, 64, 150])
 def test_steps(device, rng, count):
-    hold(step_figures(device, rng, count))
+    assert_within_bounds(check_step(device, rng, count))
 
 
 @on_devices(
@@ -176,7 +176,7 @@ def test_rate_of_the_means_decays():
 
 @on_devices("count", [0, 16, 63, 64, 150])
 def test_seen_rows(device, rng, count):
-    hold(seen_figures(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians"))
+    assert_within_bounds(check_seen(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians"))
 
 
 @on_devices(
@@ -234,7 +234,7 @@ def test_bits_do_not_depend_on_the_vectors_of_an_item(device, rng, vectors, rows
 
 @on_devices("count", [16, 64, 150])
 def test_the_average_of_three_steps(device, rng, count):
-    hold(average_figures(device, rng, count))
+    assert_within_bounds(check_average(device, rng, count))
 
 
 @on_one_setting

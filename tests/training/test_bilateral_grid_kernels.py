@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.appearance import grid_figures, grids_of, table_figures
+from clsplat.conformance.checks.appearance import check_grid, check_table, grids_of
 from clsplat.conformance.checks.images import camera_of, planes_of
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
@@ -17,8 +17,8 @@ from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState
 from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, change_back, change_colors
 from clsplat.training.trainer import StepTrainer
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import on_devices, on_one_setting, product
-from tests.support.figures import hold
 
 MORE = ((2, 1, (16, 16, 16)), (15, 4, (2, 2, 2)), (16, 16, (3, 3, 3)), (129, 65, (4, 4, 4)), (3, 257, (4, 16, 1)))
 WIDTH, HEIGHT = 50, 36
@@ -26,16 +26,16 @@ WIDTH, HEIGHT = 50, 36
 
 @on_devices("width, height, nodes", MORE)
 def test_image_and_derivatives(device, rng, width, height, nodes):
-    hold(grid_figures(device, rng, width, height, nodes))
+    assert_within_bounds(check_grid(device, rng, width, height, nodes))
 
 
 def test_a_fourth_plane_is_copied(device, rng):
-    hold(grid_figures(device, rng, 33, 18, (4, 4, 4), channels=4))
+    assert_within_bounds(check_grid(device, rng, 33, 18, (4, 4, 4), channels=4))
 
 
 @on_devices("nodes", product([(16, 16, 8)]))
 def test_smoothness_updates_and_the_mean(device, rng, nodes):
-    hold(table_figures(device, rng, nodes))
+    assert_within_bounds(check_table(device, rng, nodes))
 
 
 @on_one_setting

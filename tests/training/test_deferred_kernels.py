@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.training import behind_each_fifth, deferred_figures, seen_rows, trained
+from clsplat.conformance.checks.training import behind_each_fifth, check_deferred, seen_rows, trained
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.core.errors import ConfigError
 from clsplat.gaussians.deferred import Deferred
@@ -12,8 +12,8 @@ from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
+from tests.support.deviations import assert_within_bounds
 from tests.support.devices import each_once, on_devices, on_one_setting, product
-from tests.support.figures import hold
 
 
 def hide(model: DeviceModel, case: Case, step: int) -> None:
@@ -61,7 +61,7 @@ def assert_equal(device: Device, case: Case, **settings: object) -> None:
 
 @on_devices("count", [0, 16, 64])
 def test_updates_that_wait(device, rng, count):
-    hold(deferred_figures(device, rng, count))
+    assert_within_bounds(check_deferred(device, rng, count))
 
 
 @on_devices(

@@ -3,17 +3,17 @@
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.images import SCALES, camera_of, planes_of, transient_figures
+from clsplat.conformance.checks.images import SCALES, camera_of, check_transient, planes_of
 from clsplat.render.workspace import Workspace
 from clsplat.training.modules.transients import BINS, mask_transients, measure_residuals
+from tests.support.deviations import assert_within_bounds
 from tests.support.device_images import SIZES
 from tests.support.devices import each_once, on_devices, product
-from tests.support.figures import hold
 
 
 @on_devices("width, height, scale, share", each_once(SIZES, product(SCALES, [None, 0.5, 0.0])))
 def test_residuals_numbers_and_masks_are_those_of_the_reference(device, rng, width, height, scale, share):
-    hold(transient_figures(device, rng, width, height, scale, share))
+    assert_within_bounds(check_transient(device, rng, width, height, scale, share))
 
 
 def test_a_bin_begins_at_its_upper_bits(device):

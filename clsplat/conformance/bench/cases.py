@@ -129,7 +129,7 @@ LEAST_RATE = 1e-30  # changes nothing, so that every step does the same work; at
 
 @dataclass
 class BenchResult:
-    """One scene's figures, in milliseconds."""
+    """One scene's deviations, in milliseconds."""
 
     work: Work
     stages: dict[str, float]

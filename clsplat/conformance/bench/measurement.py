@@ -81,7 +81,7 @@ def beside(now: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
     return lines
 
 
-# The figures as text.
+# The deviations as text.
 
 
 def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str:

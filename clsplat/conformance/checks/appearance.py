@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import SUM, Checks, Figure, Note, by_element, equal
+from clsplat.conformance.check import SUM, Checks, Deviation, Note, by_element, equal
 from clsplat.conformance.checks.images import SIZES, camera_of, outside, planes_of
 from clsplat.conformance.reference import appearance
 from clsplat.conformance.reference.appearance import changed_by_grid
@@ -58,9 +58,9 @@ def picture_of(rng: np.random.Generator, grid: NDArray[Any], width: int, height:
     return image
 
 
-def grid_figures(
+def check_grid(
     device: Device, rng: np.random.Generator, width: int, height: int, nodes: tuple[int, ...], channels: int = 3
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     """Compare an image, its gradient, and that by the grid."""
     what = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
     grids = grids_of(device, rng, nodes)
@@ -94,7 +94,7 @@ def grid_figures(
         yield equal("color_grid_backward", f"gradient of the fourth plane, {what}", grad_image[3], uploaded.get()[3])
 
 
-def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Iterator[Figure]:
+def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Iterator[Deviation]:
     """Compare the smoothness of a grid, three updates of it, and what they leave of the others."""
     what, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
     grids, workspace = grids_of(device, rng, nodes, weight), Workspace(device)
@@ -127,24 +127,24 @@ def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ..
 
 
 @CHECKS.add("color_grid_forward", "color_grid_backward", "color_grid_row_sums", "color_grid_gather")
-def color_grids(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def color_grids(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height, nodes in CASES:
-        yield from grid_figures(device, rng, width, height, nodes)
-    yield from grid_figures(device, rng, 33, 18, (4, 4, 4), channels=4)
+        yield from check_grid(device, rng, width, height, nodes)
+    yield from check_grid(device, rng, 33, 18, (4, 4, 4), channels=4)
 
 
 @CHECKS.add("color_grid_smoothness", "color_grid_update", "color_grid_center")
-def color_grid_tables(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def color_grid_tables(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for nodes in ((4, 4, 4), (1, 1, 1), (5, 1, 3)):
-        yield from table_figures(device, rng, nodes)
+        yield from check_table(device, rng, nodes)
 
 
 # The colors of a photograph: a change of an image and its derivatives.
 
 
-def color_figures(
+def check_color(
     device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     """Compare an image with a third of its pixels beyond white, its gradient, and that by the matrix."""
     what = f"{width} x {height} px"
     matrix = (IDENTITY + rng.normal(0, 0.2, (3, 4))).astype(np.float32).astype(np.float64)
@@ -175,18 +175,18 @@ def color_figures(
 
 
 @CHECKS.add("colors_forward", "colors_backward")
-def colors(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def colors(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in SIZES:
-        yield from color_figures(device, rng, width, height)
-    yield from color_figures(device, rng, 33, 18, channels=4)
+        yield from check_color(device, rng, width, height)
+    yield from check_color(device, rng, 33, 18, channels=4)
 
 
 # What a camera makes of light.
 
 
-def response_figures(
+def check_response(
     device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     """Compare what a camera makes of an image with values below black and beyond white, its gradient, and that by the
     numbers."""
     what, kernel = f"{width} x {height} px", "camera_response"
@@ -217,7 +217,7 @@ def response_figures(
 
 
 @CHECKS.add("camera_response")
-def responses(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def responses(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in SIZES:
-        yield from response_figures(device, rng, width, height)
-    yield from response_figures(device, rng, 33, 18, channels=4)
+        yield from check_response(device, rng, width, height)
+    yield from check_response(device, rng, 33, 18, channels=4)

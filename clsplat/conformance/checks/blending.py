@@ -14,12 +14,12 @@ from clsplat.conformance.check import (
     GRADIENT,
     SUM,
     Checks,
-    Figure,
+    Deviation,
     Note,
     by_element,
     by_norm,
+    check_image,
     equal,
-    image_figures,
 )
 from clsplat.conformance.checks.images import SIZES, camera_of, comparison_of, outside, planes_of
 from clsplat.conformance.scenes import Case, gradients_of_sums, random_case, safe_case
@@ -44,7 +44,7 @@ def render(device: Device, case: Case, sort: Sort = "radix") -> Frame:
     return Rasterizer(device, sort).forward(case.model(device), case.device_camera(device), device.upload(BACKGROUND))
 
 
-def blend_figures(device: Device, case: Case, what: str, sort: Sort = "radix") -> Iterator[Figure]:
+def check_blend(device: Device, case: Case, what: str, sort: Sort = "radix") -> Iterator[Deviation]:
     """Compare image and transmittance of a scene with the reference; outside the image they are zero."""
     frame, (width, height) = render(device, case, sort), case.size
     image, transmittance = frame.image.get(), frame.transmittance.get()
@@ -52,9 +52,9 @@ def blend_figures(device: Device, case: Case, what: str, sort: Sort = "radix") -
     outside[:, :height, :width] = 0
     yield equal("blend_forward", f"pixels outside the image, {what}", outside, 0.0)
     expected, left, _ = ref.blend(case.project(), width, height, BACKGROUND.astype(np.float64))
-    yield from image_figures("blend_forward", f"image, {what}", image[:, :height, :width], expected)
+    yield from check_image("blend_forward", f"image, {what}", image[:, :height, :width], expected)
     found = transmittance[None, :height, :width]
-    yield from image_figures("blend_forward", f"transmittance, {what}", found, left[None])
+    yield from check_image("blend_forward", f"transmittance, {what}", found, left[None])
 
 
 def pixel_sums_of(
@@ -79,7 +79,7 @@ def pixel_sums_of(
     return pixel_sums.get()[:, : model.gaussians.count].T.astype(np.float64)
 
 
-def sum_figures(case: Case, m: NDArray[Any], weights: NDArray[Any], what: str) -> Iterator[Figure]:
+def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], what: str) -> Iterator[Deviation]:
     """Compare sums over pixels, [N, PIXEL_SUMS or more], as the gradients of splats."""
     kernel, splats = "blend_backward", case.project()
     truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
@@ -110,38 +110,38 @@ def _of_all_sizes(parameters: dict[str, NDArray[Any]]) -> None:
 
 
 @CHECKS.add("blend_forward")
-def images(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def images(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count, width, height in ((0, 20, 20), (1, 16, 16), (17, 15, 17), (60, 33, 31), (120, 40, 30), (40, 5, 3)):
         case = safe_case(rng, count, width, height, MARGIN)
-        yield from blend_figures(device, case, f"{count} Gaussians, {width} x {height} px")
-    yield from blend_figures(device, safe_case(rng, 300, 14, 14, 2e-6, _opaque), "long tiles, finished pixels")
-    yield from blend_figures(device, safe_case(rng, 300, 14, 14, 2e-6, dim), "long tiles, dim pixels")
-    yield from blend_figures(device, safe_case(rng, 30, 40, 40, MARGIN, _of_all_sizes), "huge and tiny splats")
+        yield from check_blend(device, case, f"{count} Gaussians, {width} x {height} px")
+    yield from check_blend(device, safe_case(rng, 300, 14, 14, 2e-6, _opaque), "long tiles, finished pixels")
+    yield from check_blend(device, safe_case(rng, 300, 14, 14, 2e-6, dim), "long tiles, dim pixels")
+    yield from check_blend(device, safe_case(rng, 30, 40, 40, MARGIN, _of_all_sizes), "huge and tiny splats")
 
 
 @CHECKS.add("blend_backward", "sum_records")
-def gradients_of_blending(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def gradients_of_blending(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count, width, height in ((1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24)):
         case = safe_case(rng, count, width, height, MARGIN)
         weights = rng.normal(size=(3, height, width)).astype(np.float32)
         what = f"{count} Gaussians, {width} x {height} px"
-        yield from sum_figures(case, pixel_sums_of(device, case, weights), weights, what)
+        yield from check_sum(case, pixel_sums_of(device, case, weights), weights, what)
     case = safe_case(rng, 300, 14, 14, 2e-6, _opaque)
     weights = rng.normal(size=(3, 14, 14)).astype(np.float32)
-    yield from sum_figures(case, pixel_sums_of(device, case, weights), weights, "long tiles, finished pixels")
+    yield from check_sum(case, pixel_sums_of(device, case, weights), weights, "long tiles, finished pixels")
     case = safe_case(rng, 300, 14, 14, 2e-6, dim)
-    yield from sum_figures(case, pixel_sums_of(device, case, weights), weights, "long tiles, dim pixels")
+    yield from check_sum(case, pixel_sums_of(device, case, weights), weights, "long tiles, dim pixels")
 
 
 @CHECKS.add("blend_backward", "sum_records")
-def statistics_of_blending(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def statistics_of_blending(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     width, height = 48, 32  # whole tiles: the plane of texture is known beyond the image's edge
     case = safe_case(rng, 40, width, height, MARGIN)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
     texture = np.where(rng.random((height, width)) < 0.9, rng.uniform(0, 0.5, (height, width)), -1).astype(np.float32)
-    yield from sum_figures(case, pixel_sums_of(device, case, weights, ABS_X + 2), weights, "with absolute gradients")
+    yield from check_sum(case, pixel_sums_of(device, case, weights, ABS_X + 2), weights, "with absolute gradients")
     m = pixel_sums_of(device, case, weights, ALL_SUMS, texture=texture)
-    yield from sum_figures(case, m, weights, "with weights and texture")
+    yield from check_sum(case, m, weights, "with weights and texture")
     blended = ref.blend_weights(case.project(), width, height) * (texture >= 0)
     yield by_norm("blend_backward", "sums of weights", m[:, WEIGHT], blended.sum(axis=(1, 2)), GRADIENT)
     expected = (blended * texture).sum(axis=(1, 2))
@@ -153,11 +153,11 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Iterator
         counts = pixel_sums_of(device, one, weights, ALL_SUMS, texture=flags)[:, BLENDED]
         expected = (ref.blend_weights(one.project(), width, height) > 0) * (flags > 0)
         yield equal("blend_backward", "numbers of pixels", counts, expected.sum(axis=(1, 2)))
-    yield from sum_figures(case, pixel_sums_of(device, case, weights, WEIGHT + 2, texture=flags), weights, "fewer sums")
+    yield from check_sum(case, pixel_sums_of(device, case, weights, WEIGHT + 2, texture=flags), weights, "fewer sums")
 
 
 @CHECKS.add("blend_forward", "blend_backward")
-def entropy_of_weights(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def entropy_of_weights(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
         case, what = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
         rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
@@ -165,15 +165,15 @@ def entropy_of_weights(device: Device, rng: np.random.Generator) -> Iterator[Fig
         planes = frame.image.get()
         yield equal("blend_forward", f"colors beside the entropy, {what}", planes[:3], render(device, case).image.get())
         expected = ref.weight_entropy(case.project(), width, height)
-        yield from image_figures("blend_forward", f"entropy, {what}", planes[3:, :height, :width], expected[None])
+        yield from check_image("blend_forward", f"entropy, {what}", planes[3:, :height, :width], expected[None])
         weights = np.zeros((4, camera.rows, camera.stride), np.float32)
         weights[:, :height, :width] = rng.normal(size=(4, height, width))
         m = rasterizer.pixel_sums(model, frame, device.upload(weights)).get()[:, :count].T.astype(np.float64)
-        yield from sum_figures(case, m, weights[:, :height, :width], f"with the entropy, {what}")
+        yield from check_sum(case, m, weights[:, :height, :width], f"with the entropy, {what}")
 
 
 @CHECKS.add("blend_backward")
-def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     """A loss of the transmittance alone is that of an image of black splats before one white channel."""
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
         case, what = safe_case(rng, count, width, height, MARGIN), f"with the transmittance, {count} Gaussians"
@@ -195,7 +195,7 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Iterator[F
 
 
 @CHECKS.add("sum_records")
-def sums_of_records(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def sums_of_records(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     lanes = int(device.tuning["LANES"])
     for count in (1, 15, 17, 65):
         pairs, stride = rng.integers(0, 6, count), -(-count // 64) * 64
@@ -220,7 +220,7 @@ def sums_of_records(device: Device, rng: np.random.Generator) -> Iterator[Figure
 
 
 @CHECKS.add("blend_forward", "blend_backward")
-def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     case = random_case(rng, 150, 50, 70)
     case.parameters["log_scales"][:10] += 1.5  # some over many rows of tiles, and too many tiles for a mask
     weights = rng.normal(size=(3, 70, 50)).astype(np.float32)
@@ -254,12 +254,12 @@ def gradients_of(
     return frame.image.get()[:, :height, :width], sums.get()[:, :count].T.astype(np.float64), depths, means
 
 
-def depth_figures(device: Device, case: Case, weights: Floats, what: str) -> Iterator[Figure]:
+def check_depth(device: Device, case: Case, weights: Floats, what: str) -> Iterator[Deviation]:
     """Compare image, sums and gradients with the reference."""
     splats, (width, height), background = case.project(), case.size, BACKGROUND.astype(np.float64)
     image, m, depths, means = gradients_of(device, case, weights)
     expected = ref.inverse_depth(splats, width, height)
-    yield from image_figures("blend_forward", f"inverse depth, {what}", image[3:], expected[None])
+    yield from check_image("blend_forward", f"inverse depth, {what}", image[3:], expected[None])
     of_image = ref.blend_backward(splats, width, height, background, weights[:3])
     of_depth, by_depth = ref.inverse_depth_backward(splats, width, height, weights[3])
     mean2d, conic = (getattr(of_image, name) + getattr(of_depth, name) for name in ("mean2d", "conic"))
@@ -279,11 +279,11 @@ def depth_figures(device: Device, case: Case, weights: Floats, what: str) -> Ite
 
 
 @CHECKS.add("project_forward", "blend_forward", "blend_backward", "sum_inverse_depths", "inverse_depth_backward")
-def inverse_depths(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def inverse_depths(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
         case, what = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
         weights = rng.normal(size=(4, height, width)).astype(np.float32)
-        yield from depth_figures(device, case, weights, what)
+        yield from check_depth(device, case, weights, what)
         plain = Rasterizer(device, "radix").forward(
             case.model(device), case.device_camera(device), device.upload(BACKGROUND)
         )
@@ -294,7 +294,7 @@ def inverse_depths(device: Device, rng: np.random.Generator) -> Iterator[Figure 
 
 
 @CHECKS.add("inverse_depth_loss")
-def losses_of_depths(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def losses_of_depths(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height, count in ((1, 1, 1), (17, 33, 64), (40, 20, 65)):
         x = rng.uniform(0, 1, (4, height, width)).astype(np.float32)
         comparison = comparison_of(device, x, x[:3])
@@ -321,7 +321,9 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Iterator[Figur
 # A layer of splats before an image.
 
 
-def layer_figures(device: Device, rng: np.random.Generator, width: int, height: int, channels: int) -> Iterator[Figure]:
+def check_layer(
+    device: Device, rng: np.random.Generator, width: int, height: int, channels: int
+) -> Iterator[Deviation]:
     """Compare the colors of both, the loss and the derivatives; a sign of T says something else."""
     camera, workspace = camera_of(device, width, height), Workspace(device)
     layer, image = (rng.random((number, height, width)).astype(np.float32) for number in (3, channels))
@@ -347,7 +349,7 @@ def layer_figures(device: Device, rng: np.random.Generator, width: int, height: 
 
 
 @CHECKS.add("lay_over", "look_behind")
-def layer(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def layer(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in SIZES:
         for channels in (3, 4):
-            yield from layer_figures(device, rng, width, height, channels)
+            yield from check_layer(device, rng, width, height, channels)

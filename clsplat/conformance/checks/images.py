@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Figure, Note, by_element, equal
+from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Deviation, Note, by_element, equal
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, WeightEntropy, view_error
 from clsplat.methods.opti3dgs import apply_filter, filter_gradients
@@ -59,9 +59,9 @@ def pictures(rng: np.random.Generator, width: int, height: int) -> tuple[NDArray
     return x, y
 
 
-def loss_figures(
+def check_loss(
     device: Device, loss: ImageLoss, weight: float, oracle: Any, kernel: str, x: NDArray[Any], y: NDArray[Any]
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     """Compare value and gradient of a loss of weight `weight`."""
     comparison, what = comparison_of(device, x, y), f"{type(loss).__name__}, {x.shape[2]} x {x.shape[1]} px"
     found = loss.add(comparison)
@@ -72,20 +72,20 @@ def loss_figures(
     planes, camera = comparison.gradient.get(), comparison.camera
     error = np.abs(planes[:, : camera.height, : camera.width] - weight * gradient).max()
     largest = max(float(np.abs(weight * gradient).max()), 1e-30)
-    yield Figure(kernel, f"gradient of {what}", float(error) / largest, LOSS_GRADIENT)
+    yield Deviation(kernel, f"gradient of {what}", float(error) / largest, LOSS_GRADIENT)
     yield equal(kernel, f"gradient outside the image, {what}", outside(camera, planes), 0.0)
 
 
 @CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient")
-def losses(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def losses(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in SIZES:
         x, y = pictures(rng, width, height)
         for loss, oracle, kernel in LOSSES:
-            yield from loss_figures(device, loss(weight=0.7), 0.7, oracle, kernel, x, y)
+            yield from check_loss(device, loss(weight=0.7), 0.7, oracle, kernel, x, y)
 
 
 @CHECKS.add("pixel_loss", "ssim_gradient")
-def losses_that_add_up(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def losses_that_add_up(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     x, y = pictures(rng, 50, 20)
     comparison = comparison_of(device, x, y)
     expected = np.zeros(x.shape)
@@ -93,11 +93,11 @@ def losses_that_add_up(device: Device, rng: np.random.Generator) -> Iterator[Fig
         loss(weight=weight).add(comparison)
         expected += weight * oracle(x.astype(np.float64), y.astype(np.float64))[1]
     error = np.abs(comparison.gradient.get()[:, :20, :50] - expected).max() / np.abs(expected).max()
-    yield Figure("ssim_gradient", "sum of the gradients of three losses", float(error), LOSS_GRADIENT)
+    yield Deviation("ssim_gradient", "sum of the gradients of three losses", float(error), LOSS_GRADIENT)
 
 
 @CHECKS.add("view_error", "sum_errors")
-def errors_of_views(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def errors_of_views(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in SIZES:
         (x, y), what = pictures(rng, width, height), f"{width} x {height} px"
         gradient, comparison = rng.normal(size=x.shape).astype(np.float32), comparison_of(device, x, y)
@@ -112,7 +112,7 @@ def errors_of_views(device: Device, rng: np.random.Generator) -> Iterator[Figure
 
 
 @CHECKS.add("weight_entropy")
-def entropies(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def entropies(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in SIZES:
         x, what = rng.uniform(0, 1, (4, height, width)).astype(np.float32), f"{width} x {height} px"
         comparison = comparison_of(device, x, x[:3])
@@ -126,7 +126,7 @@ def entropies(device: Device, rng: np.random.Generator) -> Iterator[Figure | Not
 
 
 @CHECKS.add("unpack_pixels", "apply_mask", "change_background")
-def photographs(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def photographs(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in SIZES:
         pixels = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
         mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
@@ -150,7 +150,7 @@ def photographs(device: Device, rng: np.random.Generator) -> Iterator[Figure | N
 
 
 @CHECKS.add("blur_rows", "blur_columns")
-def blur(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def blur(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in ((1, 1), (15, 4), (33, 18), (65, 7)):
         for sigma, share in ((1.0, None), (2.5, 0.7), (0.5, 0.05)):
             image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
@@ -165,9 +165,9 @@ def blur(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
             yield equal("blur_columns", f"pixels outside the image, {what}", outside(camera, found), 0.0)
 
 
-def haar_figures(
+def check_haar(
     device: Device, rng: np.random.Generator, width: int, height: int, share: float | None, taps: NDArray[Any]
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     """Compare a photograph that passed the Haar transform, and the derivatives by its filter."""
     image, gradient = rng.uniform(0, 1, (3, height, width)).astype(np.float32), rng.normal(size=(3, height, width))
     mask = None if share is None else rng.random((height, width)) < share
@@ -189,10 +189,10 @@ def haar_figures(
 
 
 @CHECKS.add("haar_forward", "haar_backward")
-def haar(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def haar(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in ((1, 1), (2, 2), (16, 5), (17, 33), (129, 66)):
         for share in (None, 0.6):
-            yield from haar_figures(device, rng, width, height, share, rng.normal(size=2).round(2))
+            yield from check_haar(device, rng, width, height, share, rng.normal(size=2).round(2))
 
 
 def magnitude_of(image: NDArray[Any]) -> NDArray[Any]:
@@ -203,7 +203,7 @@ def magnitude_of(image: NDArray[Any]) -> NDArray[Any]:
 
 
 @CHECKS.add("image_gradient", "hide_masked")
-def texture(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def texture(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in ((1, 1), (7, 5), (17, 17), (40, 30), (65, 3)):
         image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
         mask = rng.random((height, width)) < 0.9
@@ -225,9 +225,9 @@ def texture(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]
 SCALES = (1.0, 1e-2, 8.0)  # of the differences: some lie beyond the bins, on either side
 
 
-def transient_figures(
+def check_transient(
     device: Device, rng: np.random.Generator, width: int, height: int, scale: float, share: float | None
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     """Compare residuals and masks of a picture of which a mask leaves a share; bins and masks are exact."""
     x, y = pictures(rng, width, height)
     x = (y + np.float32(scale) * (x - y)).astype(np.float32)
@@ -255,8 +255,8 @@ def transient_figures(
 
 
 @CHECKS.add("measure_residuals", "mask_transients")
-def transients(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def transients(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height in SIZES:
         for scale in SCALES:
-            yield from transient_figures(device, rng, width, height, scale, None)
-            yield from transient_figures(device, rng, width, height, scale, 0.7)
+            yield from check_transient(device, rng, width, height, scale, None)
+            yield from check_transient(device, rng, width, height, scale, 0.7)

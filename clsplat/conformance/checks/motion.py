@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, SUM, Checks, Figure, Note, by_element, by_norm, equal, wrong
+from clsplat.conformance.check import CONIC, SUM, Checks, Deviation, Note, by_element, by_norm, equal, wrong
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.formats.splats import MOTION, STILL, WIDTHS, fields_of, width_of
 from clsplat.gaussians.gaussians import Gaussians
@@ -40,7 +40,7 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
     return replace(case, parameters=parameters, view=replace(case.view, time=TIME))
 
 
-def moment_figures(device: Device, rng: np.random.Generator, count: int, width: int) -> Iterator[Figure]:
+def check_moment(device: Device, rng: np.random.Generator, count: int, width: int) -> Iterator[Deviation]:
     """The tables at a moment, and the gradients by them carried back."""
     case, (degree, turns) = moving_case(rng, count, width), WIDTHS[width]
     model, camera, what = case.model(device), case.device_camera(device), f"{count} of {width} columns"
@@ -73,7 +73,7 @@ def moment_figures(device: Device, rng: np.random.Generator, count: int, width: 
     yield by_norm("move_backward", f"by the logit at the center, {what}", center, by_logit, CONIC)
 
 
-def still_figures(device: Device, rng: np.random.Generator) -> Iterator[Figure]:
+def check_still(device: Device, rng: np.random.Generator) -> Iterator[Deviation]:
     """A motion of none gives the bits of none."""
     case = random_case(rng, 65)
     motion = np.zeros((65, width_of(3, True)), np.float32)
@@ -88,9 +88,9 @@ def still_figures(device: Device, rng: np.random.Generator) -> Iterator[Figure]:
     yield equal("move_forward", "an image of Gaussians that stand still", images[1], images[0])
 
 
-def step_figures(
+def check_step(
     device: Device, rng: np.random.Generator, count: int, width: int, every: int = 0xFFFFFFFF
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     """Two updates, in which durations reach their bound.  every: as in motion_step."""
     case = moving_case(rng, count, width)
     model, rates = case.model(device), MotionRates(log_duration=0.5, min_duration=0.3).at(3, EXTENT)
@@ -118,18 +118,18 @@ def step_figures(
 
 
 @CHECKS.add("move_forward", "turn_forward", "move_backward", "turn_backward", "motion_step")
-def motion(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def motion(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
-        yield from moment_figures(device, rng, count, width_of(1, False))
-        yield from step_figures(device, rng, count, width_of(3, True))
-        yield from step_figures(device, rng, count, width_of(3, True), every=0)
+        yield from check_moment(device, rng, count, width_of(1, False))
+        yield from check_step(device, rng, count, width_of(3, True))
+        yield from check_step(device, rng, count, width_of(3, True), every=0)
     for width in WIDTHS:
-        yield from moment_figures(device, rng, 65, width)
-    yield from still_figures(device, rng)
+        yield from check_moment(device, rng, 65, width)
+    yield from check_still(device, rng)
 
 
 @CHECKS.add("motion_l2", "short_duration")
-def penalties_of_motion(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def penalties_of_motion(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
         table = moving_case(rng, count, 8).parameters[MOTION]
         table[1::7, :3] = 0

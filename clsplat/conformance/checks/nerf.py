@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.check import GRADIENT, SUM, Checks, Figure, Note, by_element, by_norm, equal
+from clsplat.conformance.check import GRADIENT, SUM, Checks, Deviation, Note, by_element, by_norm, equal
 from clsplat.conformance.checks.images import planes_of
 from clsplat.conformance.reference import nerf as ref
 from clsplat.conformance.scenes import random_case
@@ -124,7 +124,7 @@ def rows_of(table: Array, first: int, count: int) -> NDArray[Any]:
 
 
 @CHECKS.add("draw_pixels", "cast_rays", "spread_edges", "resample_edges")
-def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     """Pixels, rays and where they are cut, drawn and even."""
     for count in RAYS:
         case = FieldCase.of(device, rng, count, Draw(7, 11, 5))
@@ -132,10 +132,10 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure
         yield equal("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
         yield by_element("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
         for rays in (case.rays, replace(case.rays, draw=None)):
-            yield from _edge_figures(replace(case, rays=rays), f"{count} rays, {'drawn' if rays.draw else 'even'}")
+            yield from _check_edge(replace(case, rays=rays), f"{count} rays, {'drawn' if rays.draw else 'even'}")
 
 
-def _edge_figures(case: FieldCase, what: str) -> Iterator[Figure]:
+def _check_edge(case: FieldCase, what: str) -> Iterator[Deviation]:
     coarse, fine = ((level.edges.get(), level.weights.get()) for level in case.levels.render(case.on_device, case.rays))
     shape, (edges, weights) = case.shape, coarse
     drawn, again = case.units(shape.coarse_samples, ref.COARSE), case.units(shape.fine_samples, ref.FINE)
@@ -150,7 +150,7 @@ def _edge_figures(case: FieldCase, what: str) -> Iterator[Figure]:
 
 
 @CHECKS.add("encode_frustums", "encode_directions")
-def encodings(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def encodings(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     """What the network reads of a sample."""
     for count in RAYS:
         case = FieldCase.of(device, rng, count, Draw(1, 2, 0))
@@ -188,7 +188,7 @@ CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, place
 
 
 @CHECKS.add("grid_places", "grid_forward", "grid_backward")
-def grids_of_features(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def grids_of_features(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     """Where samples are in a grid, what a network reads of it there, and derivatives by its numbers."""
     for count in RAYS:
         case = FieldCase.of(device, rng, count, Draw(1, 2, 0), grid=GRID)
@@ -199,7 +199,7 @@ def grids_of_features(device: Device, rng: np.random.Generator) -> Iterator[Figu
         yield by_element("grid_places", f"variances of {count} rays", found[:, 3], variances, 1e-3)
     for tiles, ends, keys in CASES:
         case = FieldCase.of(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
-        yield from _grid_figures(device, rng, case, _places(rng, tiles, ends))
+        yield from _check_grid(device, rng, case, _places(rng, tiles, ends))
 
 
 def _places(rng: np.random.Generator, tiles: int, ends: tuple[float, float]) -> NDArray[np.float32]:
@@ -214,9 +214,9 @@ def _by_sample(table: NDArray[np.float32]) -> NDArray[np.float64]:
     return table.transpose(0, 2, 1).reshape(-1, table.shape[1]).astype(np.float64)
 
 
-def _grid_figures(
+def _check_grid(
     device: Device, rng: np.random.Generator, case: FieldCase, places: NDArray[np.float32]
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     shape, encoding, tiles = case.shape, case.levels.encoding, len(places)
     assert shape.grid is not None
     what = f"{tiles} tiles, {shape.grid.levels} levels to {shape.grid.finest} with {shape.grid.entries}"
@@ -261,7 +261,7 @@ FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
     *("dense_forward", "dense_backward", "dense_weights", "dense_biases", "dense_sums"),
     *("composite_forward", "composite_backward"),
 )
-def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def fields(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     """Colors of rays and derivatives by all parameters, through both levels."""
     for count, keys in FIELDS_CASES:
         case = FieldCase.of(device, rng, count, Draw(3, 4, 2), **keys)
@@ -271,7 +271,7 @@ def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
         parameters = case.on_device
         for scale, level in zip((0.1, 1.0), case.levels.render(parameters, case.rays), strict=True):
             comparison = _Comparison.of(case, level, scale)
-            yield from comparison.figures(f"{count} rays, {level.samples} samples")
+            yield from comparison.deviations(f"{count} rays, {level.samples} samples")
             case.levels.differentiate(parameters, level, RayTarget(case.planes, scale, errors), gradient)
             squares = (comparison.differences[:count] ** 2).sum(axis=1)
             yield by_element("composite_backward", f"squares of {count} rays", errors.get()[2:], squares, SUM, 1e-3)
@@ -284,12 +284,12 @@ def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
             what = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
             for name in ("dense_backward", "grid_backward"):
                 yield by_norm(name, what, own.of(gradient.get()), wanted, GRADIENT)
-        yield from _gradient_figures(case.shape, gradient.get(), expected, f"{count} rays")
+        yield from _check_gradient(case.shape, gradient.get(), expected, f"{count} rays")
 
 
-def _gradient_figures(
+def _check_gradient(
     shape: FieldShape, gradient: NDArray[Any], expected: list[ref.Weights], what: str
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     gradient = gradient[: shape.of_network]
     used = np.zeros(shape.of_network, bool)
     for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
@@ -333,7 +333,7 @@ class _Comparison:
         differences[: case.rays.counted] -= case.wanted()
         return cls(level, scale, network, weights, (colors, densities), inputs, composite, differences)
 
-    def figures(self, what: str) -> Iterator[Figure]:
+    def deviations(self, what: str) -> Iterator[Deviation]:
         colors, densities = (
             rows_of(table, 0, count) for table, count in ((self.level.raw_colors, 3), (self.level.raw_densities, 1))
         )
@@ -352,7 +352,7 @@ class _Comparison:
 
 
 @CHECKS.add("place_colors")
-def pictures_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def pictures_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     """A whole picture: the pixels in their places, zeros around them."""
     case = FieldCase.of(device, rng, 1, Draw(0, 1, 0))
     field = Field(case.shape, case.on_device, device.upload(BACKGROUND))
@@ -364,7 +364,7 @@ def pictures_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Fig
 
 
 @CHECKS.add("dense_update")
-def updates_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def updates_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     """Adam, over some updates of gradients of all sizes."""
     learned = LearnedField.first(SHAPE, 0, device.upload(BACKGROUND))
     count = SHAPE.parameters

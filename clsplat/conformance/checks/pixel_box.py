@@ -7,19 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import GRADIENT, Checks, Figure, Note, by_norm, equal
+from clsplat.conformance.check import GRADIENT, Checks, Deviation, Note, by_norm, equal
 from clsplat.conformance.checks.blending import (
     ALL_SUMS,
     BACKGROUND,
     MARGIN,
-    blend_figures,
+    check_blend,
+    check_sum,
     dim,
     pixel_sums_of,
     render,
-    sum_figures,
 )
-from clsplat.conformance.checks.projection import gradient_figures, record_figures
-from clsplat.conformance.checks.training import fused_figures
+from clsplat.conformance.checks.projection import check_gradient, check_record
+from clsplat.conformance.checks.training import check_fused
 from clsplat.conformance.scenes import Case, random_case, safe_case, with_world_filter
 from clsplat.density.survey import SQUARE
 from clsplat.opencl.device import Device
@@ -39,37 +39,37 @@ def of_size(size: float, rng: np.random.Generator, count: int, width: int, heigh
 
 
 @CHECKS.add("project_forward", "project_backward", "update_gaussians")
-def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in (1, 17, 65):
         case, what = random_case(rng, count, **BOX), f"{count} Gaussians for the pixel's box"
-        yield from record_figures(device, case, what)
-        yield from gradient_figures(device, case, rng, what)
+        yield from check_record(device, case, what)
+        yield from check_gradient(device, case, rng, what)
     filtered = with_world_filter(random_case(rng, 30, **BOX), rng)
-    yield from record_figures(device, filtered, "filtered Gaussians for the pixel's box")
-    yield from gradient_figures(device, filtered, rng, "filtered Gaussians for the pixel's box")
-    yield from fused_figures(device, rng, random_case(rng, 40, **BOX), "40 Gaussians for the pixel's box")
+    yield from check_record(device, filtered, "filtered Gaussians for the pixel's box")
+    yield from check_gradient(device, filtered, rng, "filtered Gaussians for the pixel's box")
+    yield from check_fused(device, rng, random_case(rng, 40, **BOX), "40 Gaussians for the pixel's box")
 
 
 @CHECKS.add("blend_forward", "blend_backward", "count_large", "emit_large")
-def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count, width, height in ((0, 20, 20), (1, 16, 16), (17, 33, 15), (65, 40, 30)):
         case = of_size(0.0, rng, count, width, height)
-        yield from blend_figures(device, case, f"{count} Gaussians over the pixel's box, {width} x {height} px")
-    yield from blend_figures(device, safe_case(rng, 300, 14, 14, 2e-6, dim, **BOX), "long tiles over the pixel's box")
+        yield from check_blend(device, case, f"{count} Gaussians over the pixel's box, {width} x {height} px")
+    yield from check_blend(device, safe_case(rng, 300, 14, 14, 2e-6, dim, **BOX), "long tiles over the pixel's box")
     for what, size in SIZES.items():
         case = of_size(size, rng, 25, 40, 30)
-        yield from blend_figures(device, case, f"splats {what} over the pixel's box")
+        yield from check_blend(device, case, f"splats {what} over the pixel's box")
         weights = rng.normal(size=(3, 30, 40)).astype(np.float32)
         sums = pixel_sums_of(device, case, weights, ALL_SUMS, texture=np.ones((30, 40), np.float32))
-        yield from sum_figures(case, sums, weights, f"splats {what} over the pixel's box")
+        yield from check_sum(case, sums, weights, f"splats {what} over the pixel's box")
         squares = ref.falloff_squares(case.project(), 40, 30, BACKGROUND.astype(np.float64), weights)
         yield by_norm("blend_backward", f"sums of squares, {what}", sums[:, SQUARE], squares, GRADIENT)
     few = pixel_sums_of(device, case, weights)
-    yield from sum_figures(case, few, weights, "without more sums over the pixel's box")
+    yield from check_sum(case, few, weights, "without more sums over the pixel's box")
 
 
 @CHECKS.add("blend_forward", "blend_backward", "emit_large")
-def the_pixel_box_in_bands(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def the_pixel_box_in_bands(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     case = random_case(rng, 60, 150, 130, **BOX)
     case.parameters["log_scales"][:10] += 1.5
     weights = rng.normal(size=(3, 130, 150)).astype(np.float32)

@@ -14,7 +14,7 @@ from clsplat.conformance.check import (
     PROJECTION,
     SUM,
     Checks,
-    Figure,
+    Deviation,
     Note,
     by_element,
     by_norm,
@@ -42,7 +42,7 @@ def splats_of(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], N
     return frame.splats.get(), keys, frame.radius.get()[: len(keys)]
 
 
-def record_figures(device: Device, case: Case, what: str) -> Iterator[Figure]:
+def check_record(device: Device, case: Case, what: str) -> Iterator[Deviation]:
     """Compare the records of a scene with the reference."""
     kernel = "project_forward"
     records, keys, radius = splats_of(device, case)
@@ -60,7 +60,7 @@ def record_figures(device: Device, case: Case, what: str) -> Iterator[Figure]:
     conic = covariances_of(record) if case.pixel_box else record[:, 2:5]
     size = np.maximum(np.linalg.norm(truth.conic[drawn], axis=1), 1e-30)
     error = np.linalg.norm(conic - truth.conic[drawn], axis=1) / size
-    yield Figure(kernel, f"conics, {what}", float(error.max(initial=0)), CONIC)
+    yield Deviation(kernel, f"conics, {what}", float(error.max(initial=0)), CONIC)
     yield by_element(kernel, f"opacities, {what}", record[:, 5], truth.opacity[drawn], PROJECTION)
     yield by_element(kernel, f"colors, {what}", record[:, 6:9], truth.color[drawn], PROJECTION, floor=1)
     yield by_element(kernel, f"depths, {what}", keys[drawn].view(np.float32), truth.depth[drawn], DEPTH)
@@ -97,7 +97,7 @@ def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any])
     return ~right
 
 
-def gradient_figures(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Figure]:
+def check_gradient(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Deviation]:
     """Give the kernel and the reference the same sums over a Gaussian's pixels; compare the parameters' gradients."""
     model, camera = case.model(device), case.device_camera(device)
     rasterizer = Rasterizer(device, "radix")
@@ -160,18 +160,18 @@ def beyond_the_clamp(rng: np.random.Generator) -> Case:
 
 
 @CHECKS.add("project_forward")
-def projection(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def projection(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
-        yield from record_figures(device, random_case(rng, count), f"{count} Gaussians")
+        yield from check_record(device, random_case(rng, count), f"{count} Gaussians")
     for degree in range(3):
-        yield from record_figures(device, random_case(rng, 20, degree=degree), f"harmonics of degree {degree}")
+        yield from check_record(device, random_case(rng, 20, degree=degree), f"harmonics of degree {degree}")
     for variance, compensate in FILTERS:
         case = with_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
-        yield from record_figures(device, case, f"filters of {variance:g} px², compensate {compensate:g}")
+        yield from check_record(device, case, f"filters of {variance:g} px², compensate {compensate:g}")
 
 
 @CHECKS.add("project_forward")
-def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     records, keys, radius = splats_of(device, not_drawable(rng))
     culled = [0, 1, 2, 3, 4, 5, 7, 8]
     yield equal("project_forward", "records of Gaussians behind, faint or not finite", records[culled], 0.0)
@@ -180,7 +180,7 @@ def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator)
     yield wrong("project_forward", "records that are not numbers", np.isnan(records))
 
 
-def hidden_figures(device: Device, case: Case, rng: np.random.Generator, views: int) -> Iterator[Figure]:
+def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: int) -> Iterator[Deviation]:
     """Hide Gaussians in training views; compare each view's picture with that of the others alone."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     left_out = rng.random((views, count)) < 0.5
@@ -199,26 +199,26 @@ def hidden_figures(device: Device, case: Case, rng: np.random.Generator, views: 
 
 
 @CHECKS.add("project_forward")
-def gaussians_that_views_leave_out(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def gaussians_that_views_leave_out(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count, views in ((17, 2), (65, HIDDEN_VIEWS + 1)):
-        yield from hidden_figures(device, random_case(rng, count), rng, views)
+        yield from check_hidden(device, random_case(rng, count), rng, views)
 
 
 @CHECKS.add("project_backward")
-def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
-        yield from gradient_figures(device, random_case(rng, count), rng, f"{count} Gaussians")
+        yield from check_gradient(device, random_case(rng, count), rng, f"{count} Gaussians")
     for degree in range(3):
         case = random_case(rng, 20, degree=degree)
-        yield from gradient_figures(device, case, rng, f"harmonics of degree {degree}")
+        yield from check_gradient(device, case, rng, f"harmonics of degree {degree}")
     for variance, compensate in FILTERS:
         case = with_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
-        yield from gradient_figures(device, case, rng, f"filters of {variance:g} px², compensate {compensate:g}")
-    yield from gradient_figures(device, beyond_the_clamp(rng), rng, "rays beyond the image")
+        yield from check_gradient(device, case, rng, f"filters of {variance:g} px², compensate {compensate:g}")
+    yield from check_gradient(device, beyond_the_clamp(rng), rng, "rays beyond the image")
 
 
 @CHECKS.add("sampling_interval", "filter_variance")
-def world_filter(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def world_filter(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
         case = random_case(rng, count)
         case.parameters["means"][::3] *= 4  # out of sight of some, or of all
@@ -238,7 +238,7 @@ def world_filter(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
 
 
 @CHECKS.add("paint_depth")
-def depth(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def depth(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
         case = random_case(rng, count)
         frame = Rasterizer(device, "radix").forward(
@@ -254,7 +254,7 @@ def depth(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
 # poses.cl: derivatives by the place and the focal length of a camera.
 
 
-def pose_figures(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Figure]:
+def check_pose(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Deviation]:
     """Give the kernel and the reference the same sums over a Gaussian's pixels; compare the pose's derivatives."""
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device, "radix")
     frame, count = rasterizer.forward(model, camera, device.zeros(3)), model.gaussians.count
@@ -275,14 +275,14 @@ def pose_figures(device: Device, case: Case, rng: np.random.Generator, what: str
 
 
 @CHECKS.add("pose_gradient")
-def poses(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def poses(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in (1, 15, 17, 65, 600):
-        yield from pose_figures(device, random_case(rng, count), rng, f"{count} Gaussians")
+        yield from check_pose(device, random_case(rng, count), rng, f"{count} Gaussians")
     for degree in range(3):
-        yield from pose_figures(device, random_case(rng, 20, degree=degree), rng, f"harmonics of degree {degree}")
+        yield from check_pose(device, random_case(rng, 20, degree=degree), rng, f"harmonics of degree {degree}")
     for variance, compensate in ((0.1, 1.0), (0.0, 0.0)):
         case = with_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
-        yield from pose_figures(device, case, rng, f"filters of {variance:g} px², compensate {compensate:g}")
-    yield from pose_figures(device, beyond_the_clamp(rng), rng, "rays beyond the limits")
+        yield from check_pose(device, case, rng, f"filters of {variance:g} px², compensate {compensate:g}")
+    yield from check_pose(device, beyond_the_clamp(rng), rng, "rays beyond the limits")
     case = replace(random_case(rng, 30), variance=0.0, pixel_box=1.0)
-    yield from pose_figures(device, case, rng, "the pixel's box")
+    yield from check_pose(device, case, rng, "the pixel's box")

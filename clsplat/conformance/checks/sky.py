@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import SUM, Checks, Figure, Note, by_element, by_norm, equal
+from clsplat.conformance.check import SUM, Checks, Deviation, Note, by_element, by_norm, equal
 from clsplat.conformance.checks.images import outside, planes_of
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.gaussians.sky import DeviceSky
@@ -58,7 +58,7 @@ def planes_in_rows(texels: NDArray[Any]) -> NDArray[np.float32]:
     return np.ascontiguousarray(texels.reshape(-1, texels.shape[2]).T, np.float32)
 
 
-def sky_figures(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Figure]:
+def check_sky(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Deviation]:
     """Compare a picture and the derivative by the map; finished pixels have a negative transmittance."""
     view, what = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels a side"
     image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
@@ -78,7 +78,7 @@ def sky_figures(device: Device, rng: np.random.Generator, width: int, height: in
     yield equal("sky_gather", f"texels that are not shown, {what}", hidden, 0.0)
 
 
-def cover_figures(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Figure]:
+def check_cover(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Deviation]:
     """Compare the loss of what covers the sky; photographs are far from the difference that decides."""
     view, what, difference, weight = SkyView(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
     sky = ref.sky_image(view.texels.astype(np.float64), view.directions)
@@ -100,19 +100,19 @@ def cover_figures(device: Device, rng: np.random.Generator, width: int, height: 
 
 
 @CHECKS.add("sky_forward", "sky_backward", "sky_gather")
-def sky(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def sky(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height, side in SIZES:
-        yield from sky_figures(device, rng, width, height, side)
+        yield from check_sky(device, rng, width, height, side)
 
 
 @CHECKS.add("sky_matches", "sky_cover")
-def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for width, height, side in SIZES:
-        yield from cover_figures(device, rng, width, height, side)
+        yield from check_cover(device, rng, width, height, side)
 
 
 @CHECKS.add("sky_update")
-def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     """Three updates; texels that the view does not show stay."""
     side = 16
     view, texels = SkyView(device, rng, 9, 7, side), side**2

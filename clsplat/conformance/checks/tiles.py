@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.check import Checks, Figure, Note, equal, wrong
+from clsplat.conformance.check import Checks, Deviation, Note, equal, wrong
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Frame, Rasterizer
@@ -24,14 +24,14 @@ def tiler_of(device: Device, sort: Sort = "radix") -> Tiler:
     return Tiler(device, Workspace(device), sort)
 
 
-def scan_figure(device: Device, values: NDArray[Any]) -> Figure:
+def check_scan(device: Device, values: NDArray[Any]) -> Deviation:
     """Compare an exclusive prefix sum, which stays at the largest number."""
     offsets = tiler_of(device).scan(device.upload(values), len(values), "test").get()
     expected = np.minimum(np.concatenate([[0], np.cumsum(values, dtype=np.uint64)]), 2**32 - 1).astype(np.uint32)
     return equal("scan_offsets", f"sums of {len(values)} values", offsets, expected)
 
 
-def radix_figures(device: Device, keys: NDArray[Any], bits: int) -> Iterator[Figure]:
+def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Iterator[Deviation]:
     """Compare a stable sort of keys below 2^bits."""
     sorted_keys, places = tiler_of(device).sort_pairs(device.upload(keys), bits, len(keys), "test")
     expected = np.argsort(keys, kind="stable")
@@ -39,9 +39,9 @@ def radix_figures(device: Device, keys: NDArray[Any], bits: int) -> Iterator[Fig
     yield equal("radix_scatter", f"order of {len(keys)} keys of {bits} bits", sorted_keys.get(), keys[expected])
 
 
-def bitonic_figures(
+def check_bitonic(
     device: Device, rng: np.random.Generator, lengths: tuple[int, ...], deepest: int
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     """Sort tiles of these lengths by depth keys below `deepest`, ties by pair."""
     tiles, pairs = len(lengths), sum(lengths)
     pair_tile = rng.permutation(np.repeat(np.arange(tiles), lengths)).astype(np.uint32)
@@ -58,39 +58,39 @@ def bitonic_figures(
 
 
 @CHECKS.add("scan_blocks", "scan_offsets")
-def scans(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def scans(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
-        yield scan_figure(device, rng.integers(0, 100, count).astype(np.uint32))
-    yield scan_figure(device, rng.integers(0, 2**31, 40_001, dtype=np.uint32))  # sums that would wrap
+        yield check_scan(device, rng.integers(0, 100, count).astype(np.uint32))
+    yield check_scan(device, rng.integers(0, 2**31, 40_001, dtype=np.uint32))  # sums that would wrap
 
 
 @CHECKS.add("radix_count", "radix_scatter")
-def radix_sort(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def radix_sort(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
         for bits in (9, 32):
             keys = rng.integers(0, 2**bits, count, dtype=np.uint64).astype(np.uint32)
-            yield from radix_figures(device, keys, bits)
+            yield from check_radix(device, keys, bits)
     for orderly in (np.full(3000, 7), np.arange(3000)[::-1]):
-        yield from radix_figures(device, orderly.astype(np.uint32), 12)
+        yield from check_radix(device, orderly.astype(np.uint32), 12)
 
 
 @CHECKS.add("count_pairs", "fill_tiles", "sort_tiles")
-def bitonic_sort(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def bitonic_sort(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for deepest in (50, 2**31):
-        yield from bitonic_figures(device, rng, LENGTHS, deepest)
+        yield from check_bitonic(device, rng, LENGTHS, deepest)
 
 
 @CHECKS.add("count_large", "emit_large", "emit_pairs", "find_tile_offsets", "permute")
-def tile_lists(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def tile_lists(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count, width, height in ((1, 16, 16), (60, 17, 15), (150, 100, 70), (64, 5, 3), (40, 210, 130)):
         case = random_case(rng, count, width, height)
         case.parameters["log_scales"][: count // 10] += 1.5
         case.parameters["means"][: count // 3] = case.parameters["means"][count // 3 : 2 * (count // 3)]  # equal depths
         for sort in ("radix", "bitonic"):
-            yield from list_figures(device, case, sort, f"{count} Gaussians, {width} x {height} px, {sort}")
+            yield from check_list(device, case, sort, f"{count} Gaussians, {width} x {height} px, {sort}")
 
 
-def list_figures(device: Device, case: Case, sort: Sort, what: str) -> Iterator[Figure]:
+def check_list(device: Device, case: Case, sort: Sort, what: str) -> Iterator[Deviation]:
     """Every tile lists the splats that reach it, front to back, once, and hardly any other."""
     rasterizer = Rasterizer(device, sort)
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
@@ -162,19 +162,19 @@ def case_of(device: Device, rng: np.random.Generator, columns: int, rows: int, c
 
 
 @CHECKS.add("count_large", "emit_large", "project_forward")
-def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
-    yield from all_figures(device, rng)
+def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+    yield from check_all(device, rng)
 
 
-def all_figures(device: Device, rng: np.random.Generator) -> Iterator[Figure]:
+def check_all(device: Device, rng: np.random.Generator) -> Iterator[Deviation]:
     """Compare lists of pictures with many rows, of rectangles around a mask's size, and of wrong counts."""
     for columns, rows in (TALL, *WHOLE):
         case, what = case_of(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
-        yield from list_figures(device, case, "radix", what)
-    yield from miscounted_figures(device, case_of(device, rng, *TALL))
+        yield from check_list(device, case, "radix", what)
+    yield from check_miscounted(device, case_of(device, rng, *TALL))
 
 
-def miscounted_figures(device: Device, case: Case) -> Iterator[Figure]:
+def check_miscounted(device: Device, case: Case) -> Iterator[Deviation]:
     """Each splat lists as many tiles of the image as were counted, whatever that is, each once."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
@@ -208,4 +208,4 @@ def miscounted_figures(device: Device, case: Case) -> Iterator[Figure]:
         yield equal("emit_large", f"places behind {what}", tile[len(owner) :], UNTOUCHED)
         pairs = np.stack([owner, tile[: len(owner)]], axis=1)
         twice = len(pairs) - len(np.unique(pairs, axis=0)) - int(np.maximum(0, count - camera.tiles).sum())
-        yield Figure("emit_large", f"tiles listed twice, {what}", max(0, twice), 0, counts=True)
+        yield Deviation("emit_large", f"tiles listed twice, {what}", max(0, twice), 0, counts=True)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, SUM, Checks, Figure, Note, by_element, by_norm, equal
+from clsplat.conformance.check import CONIC, SUM, Checks, Deviation, Note, by_element, by_norm, equal
 from clsplat.conformance.checks.blending import BACKGROUND
 from clsplat.conformance.checks.projection import COUNTS as DROPOUT_COUNTS
-from clsplat.conformance.checks.projection import expected_gradients, gradient_figures, record_figures, splats_of
+from clsplat.conformance.checks.projection import check_gradient, check_record, expected_gradients, splats_of
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.deferred import Deferred
@@ -31,7 +31,7 @@ EXTENT = 2.5
 SPLAT_OPACITY = int(constants("splat.h")["SPLAT_OPACITY"])
 
 
-def step_figures(device: Device, rng: np.random.Generator, count: int) -> Iterator[Figure]:
+def check_step(device: Device, rng: np.random.Generator, count: int) -> Iterator[Deviation]:
     """Three updates from gradients of very different sizes."""
     case = random_case(rng, count)
     model = case.model(device)
@@ -75,7 +75,7 @@ def _sums_of(
     return frame, rasterizer.pixel_sums(model, frame, device.upload(weights))
 
 
-def fused_figures(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Figure]:
+def check_fused(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Deviation]:
     """One update on the way: moments against the reference's gradients, values against the device's own moments."""
     kernel, count = "update_gaussians", len(case.parameters["means"])
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
@@ -94,7 +94,7 @@ def fused_figures(device: Device, rng: np.random.Generator, case: Case, what: st
         yield by_element(kernel, f"{name}, {what}", gaussians.get(name), before - step, 3e-7, floor)
 
 
-def seen_figures(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Figure]:
+def check_seen(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Deviation]:
     """The fifth update, of seen rows alone, with moments from before, by each kernel from the same gradients."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
@@ -135,26 +135,26 @@ def behind_each_fifth(case: Case) -> Case:
 
 
 @CHECKS.add("adam_step")
-def adam_figures(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def check_adam(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
-        yield from step_figures(device, rng, count)
+        yield from check_step(device, rng, count)
 
 
 @CHECKS.add("adam_step", "update_gaussians")
-def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
-        yield from seen_figures(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians")
+        yield from check_seen(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians")
 
 
 @CHECKS.add("update_gaussians")
-def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count, degree in ((1, 3), (17, 0), (40, 2), (150, 3)):
         case = with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
         what = f"{count} Gaussians, degree {degree}"
-        yield from fused_figures(device, rng, behind_each_fifth(case), what)
+        yield from check_fused(device, rng, behind_each_fifth(case), what)
 
 
-def penalty_figures(
+def check_penalty(
     device: Device,
     rng: np.random.Generator,
     count: int,
@@ -162,7 +162,7 @@ def penalty_figures(
     oracle: Any,
     interval: NDArray[Any] | None = None,
     parameter: str = "log_scales",
-) -> Iterator[Figure]:
+) -> Iterator[Deviation]:
     """Compare value and gradient of a penalty of weight 3, for Gaussians of many sizes and forms."""
     case = random_case(rng, count)
     case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
@@ -183,23 +183,21 @@ def penalty_figures(
 
 
 @CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity")
-def penalties(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def penalties(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
         interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
         trace = CovarianceTrace(weight=3.0, above=0.02)
-        yield from penalty_figures(
-            device, rng, count, trace, lambda s: ref.covariance_trace(s, 0.02 * EXTENT**2, EXTENT)
-        )
+        yield from check_penalty(device, rng, count, trace, lambda s: ref.covariance_trace(s, 0.02 * EXTENT**2, EXTENT))
         in_pixels = CovarianceTrace(weight=3.0, above=9.0, pixels=4.0)
         bound = 3 * (4.0 * interval) ** 2
-        yield from penalty_figures(
+        yield from check_penalty(
             device, rng, count, in_pixels, lambda s, bound=bound: ref.covariance_trace(s, bound, EXTENT), interval
         )
         shape = Anisotropy(weight=3.0, above=8.0)
-        yield from penalty_figures(device, rng, count, shape, lambda s: ref.anisotropy(s, 8.0))
-        yield from penalty_figures(device, rng, count, MeanScale(weight=3.0), lambda s: ref.mean_scale(s, EXTENT))
+        yield from check_penalty(device, rng, count, shape, lambda s: ref.anisotropy(s, 8.0))
+        yield from check_penalty(device, rng, count, MeanScale(weight=3.0), lambda s: ref.mean_scale(s, EXTENT))
         opacity = MeanOpacity(weight=3.0)
-        yield from penalty_figures(device, rng, count, opacity, ref.mean_opacity, parameter="logit_opacity")
+        yield from check_penalty(device, rng, count, opacity, ref.mean_opacity, parameter="logit_opacity")
 
 
 def _tables(gaussians: Gaussians) -> dict[str, NDArray[Any]]:
@@ -207,7 +205,7 @@ def _tables(gaussians: Gaussians) -> dict[str, NDArray[Any]]:
 
 
 @CHECKS.add("set_rows", "zero_rows", "gather_rows", "count_not_finite", "fill_words")
-def rows_of_tables(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def rows_of_tables(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in (0, 1, 15, 17, 1025):
         array = device.upload(np.full(count, 3, np.float32))
         array.fill(-1.5)
@@ -233,7 +231,7 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Iterator[Figure 
         case.parameters["quats"][64, 2] = case.parameters["sh_rest"][0, 44] = value
         found = case.model(device).gaussians.not_finite()
         mistaken = {"quats", "sh_rest"} ^ set(found)
-        yield Figure("count_not_finite", f"tables with {value}", len(mistaken), 0, counts=True)
+        yield Deviation("count_not_finite", f"tables with {value}", len(mistaken), 0, counts=True)
 
 
 # Updates of harmonics that wait until a view sees their Gaussians.
@@ -276,7 +274,7 @@ def trained(
     return {name: gaussians.get(name) for name in Deferred.names}
 
 
-def deferred_figures(device: Device, rng: np.random.Generator, count: int) -> Iterator[Figure]:
+def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Iterator[Deviation]:
     """Compare waiting updates with the reference, and with the bits of updates at once."""
     case = random_case(rng, count)
     before = case.parameters["sh_rest"]
@@ -299,21 +297,21 @@ def deferred_figures(device: Device, rng: np.random.Generator, count: int) -> It
 
 
 @CHECKS.add("replay_updates", "note_update", "adam_step")
-def updates_that_wait(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def updates_that_wait(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in DEFERRED_COUNTS:
-        yield from deferred_figures(device, rng, count)
+        yield from check_deferred(device, rng, count)
 
 
 # Averages of the parameters over steps.
 
 
 @CHECKS.add("add_to_average", "count_step", "take_average")
-def averages(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def averages(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in COUNTS:
-        yield from average_figures(device, rng, count)
+        yield from check_average(device, rng, count)
 
 
-def average_figures(device: Device, rng: np.random.Generator, count: int) -> Iterator[Figure]:
+def check_average(device: Device, rng: np.random.Generator, count: int) -> Iterator[Deviation]:
     """The average of three steps, where the last row, if it is not the only one, is new after the first step."""
     steps = [random_case(rng, count).parameters for _ in range(3)]
     gaussians = random_case(rng, count).model(device).gaussians
@@ -343,13 +341,13 @@ SEED, STEP = 0x9E3779B9, 700
 DROPOUT = DropoutMask(0.3, SEED, STEP)
 
 
-def dropout_figures(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Figure]:
+def check_dropout(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Deviation]:
     """Compare the records, and the gradients of the parameters, of a step that leaves Gaussians out."""
-    yield from record_figures(device, case, what)
-    yield from gradient_figures(device, case, rng, what)
+    yield from check_record(device, case, what)
+    yield from check_gradient(device, case, rng, what)
 
 
-def hidden_figures(device: Device, case: Case, rng: np.random.Generator) -> Iterator[Figure]:
+def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Iterator[Deviation]:
     """Hide Gaussians in a view of which others are dropped; the records are those without both."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     left_out = rng.random((2, count)) < 0.5
@@ -361,10 +359,10 @@ def hidden_figures(device: Device, case: Case, rng: np.random.Generator) -> Iter
 
 
 @CHECKS.add("draw_left_out", "project_forward", "project_backward")
-def dropout(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def dropout(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     for count in DROPOUT_COUNTS:
         case = replace(random_case(rng, count), dropout=DROPOUT)
-        yield from dropout_figures(device, case, rng, f"{count} Gaussians, some dropped")
-        yield from hidden_figures(device, case, rng)
+        yield from check_dropout(device, case, rng, f"{count} Gaussians, some dropped")
+        yield from check_hidden(device, case, rng)
     filtered = with_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
-    yield from dropout_figures(device, replace(filtered, dropout=DROPOUT), rng, "30 filtered Gaussians, some dropped")
+    yield from check_dropout(device, replace(filtered, dropout=DROPOUT), rng, "30 filtered Gaussians, some dropped")

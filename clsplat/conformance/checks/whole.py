@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance.bench.cases import Peaks, measure_peaks, run_bench
 from clsplat.conformance.bench.cases import case as bench_case
-from clsplat.conformance.check import Checks, Figure, Note, by_element, equal
+from clsplat.conformance.check import Checks, Deviation, Note, by_element, equal
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.core.errors import MemoryLimitError
 from clsplat.core.machine import available_memory
@@ -69,7 +69,7 @@ def train(
 
 
 @CHECKS.add()
-def training(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def training(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     case = random_case(rng, 120, 48, 40)
     start = {name: table.copy() for name, table in case.parameters.items()}
     start["means"] += rng.normal(0, 0.05, start["means"].shape).astype(np.float32)
@@ -82,18 +82,18 @@ def training(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note
     for name, table in tables.items():
         if table.shape != same[name].shape:
             difference, where = abs(len(same[name]) - count), f"rows of {name} after {what}, a second time"
-            yield Figure("training", where, difference, 0, counts=True)
+            yield Deviation("training", where, difference, 0, counts=True)
         else:
             bits = same[name].view(np.uint32), table.view(np.uint32)
             yield equal("training", f"{name} after {what}, a second time", *bits)
     finite = sum(int(np.count_nonzero(~np.isfinite(table))) for table in tables.values())
-    yield Figure("training", f"values that are not finite after {what}", finite, 0, counts=True)
+    yield Deviation("training", f"values that are not finite after {what}", finite, 0, counts=True)
     if len(values) == STEPS:
-        yield Figure("training", f"the loss after {what}, as a share of the first one", values[-1] / values[0], 0.7)
+        yield Deviation("training", f"the loss after {what}, as a share of the first one", values[-1] / values[0], 0.7)
 
 
 @SPEED.add()
-def memory(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def memory(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     """Allocate buffers of growing size, write all of each, and read samples: up to what one buffer may have.
 
     A refusal is no fault of the device: other programs may hold its memory, which OpenCL does not tell.
@@ -106,7 +106,7 @@ def memory(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     while size > held:
         started = time.perf_counter()
         try:
-            yield from _buffer_figures(device, size)
+            yield from _check_buffer(device, size)
         except MemoryLimitError:
             stopped = f"a buffer of {size / 2**20:,.0f} MiB is refused: {CLAIMED}"
             break
@@ -119,7 +119,7 @@ def memory(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     yield Note("memory", {"promised": promised, "held": held, "free": free, "stopped": stopped})
 
 
-def _buffer_figures(device: Device, size: int) -> Iterator[Figure]:
+def _check_buffer(device: Device, size: int) -> Iterator[Deviation]:
     whole = device.empty(size // 4)
     whole.fill(1.5)
     Array(device, whole.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not be seen at the other end
@@ -130,7 +130,7 @@ def _buffer_figures(device: Device, size: int) -> Iterator[Figure]:
 
 
 @SPEED.add("peak_fma", "peak_exp", "peak_copy")
-def yardsticks(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def yardsticks(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     lanes, group = (int(device.tuning[name]) for name in ("LANES", "GROUP"))
     program, whole = device.program("peak.cl"), 2 * group
     result = device.empty(whole * lanes)
@@ -152,7 +152,7 @@ def yardsticks(device: Device, rng: np.random.Generator) -> Iterator[Figure | No
 
 
 @SPEED.add()
-def speed(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def speed(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
     peaks = measure_peaks(device, repeats=2)
     one = bench_case(device, *BENCH, load("splat").settings)
     result = run_bench({"": one}, Peaks(**asdict(peaks)), repeats=5)[""]
