@@ -107,7 +107,7 @@ def key_table(kind: Kind, without: tuple[str, ...] = ()) -> str:
         bound = next((part for part in parts(field) if isinstance(part, Bounded)), None)
         takes = expected(node)
         if bound:
-            takes = takes.replace(BY_STEP, f"{BY_STEP} {'>' if bound.above else '≥'} {bound.lowest:g}")
+            takes = takes.replace(BY_STEP, f"{BY_STEP} {'>' if bound.exclusive else '≥'} {bound.minimum:g}")
         cells = (f"`{name}`", takes, default, texts.get(name, ""))
         rows += "| " + " | ".join(" ".join(cell.split()).replace("|", "\\|") for cell in cells) + " |\n"
     return f"{TABLE}{rows}\n" if rows else ""
