@@ -29,7 +29,7 @@ from clsplat.training.modules.sky_choice import sky_advice
 from clsplat.training.records import VIEWS, over_views
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
-from clsplat.viewer.charts import COLORS, Line, Marks, curve, plan
+from clsplat.viewer.charts import COLORS, Line, camera_plans, curve
 
 # What would make a scene better, in sentences for the page of a run.
 
@@ -135,41 +135,10 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-# The cameras of a run from above, beside the points of its scene.
-
-MOST_POINTS = 1500
-FAR = 3.0  # points farther than this, in halves of the cameras' extent around their middle, are left out
-
-
 def cameras(run: Run) -> list[Markup]:
-    """Draw training and test cameras from above, and Gaussians between them."""
-    scene = run.original
-    if len(scene.views) < 2:
-        return []
-    right, ahead = _axes(scene.views)
-
-    def flat(points: NDArray[np.floating]) -> NDArray[np.float64]:
-        return np.stack([points @ right, points @ ahead], axis=-1)
-
-    marks = []
-    for split in SPLITS:
-        views = scene.split(split)
-        if views:
-            directions = np.stack([view.world_to_camera[2, :3] for view in views])
-            marks.append(Marks(split, flat(np.stack([view.position for view in views])), flat(directions)))
-    centers = np.concatenate([one.centers for one in marks])
-    middle, reach = centers.mean(axis=0), FAR * float(np.abs(centers - centers.mean(axis=0)).max())
-    means = run.model.gaussians.get("means") if run.gaussians else np.zeros((0, 3), np.float32)
-    points = flat(means[:: max(1, len(means) // MOST_POINTS)].astype(np.float64))
-    near = points[(np.abs(points - middle) < max(reach, 1e-9)).all(axis=1)]
-    return safe_charts([plan("cameras from above", marks, near)])
-
-
-def _axes(views: Sequence[View]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two directions across what is up for the cameras, each [3]."""
-    up = upward(views)
-    right = across(up)
-    return right, np.cross(right, up)
+    """Draw the cameras by split, with Gaussians around them, from above and from the side."""
+    points = run.model.gaussians.get("means") if run.gaussians else np.zeros((0, 3), np.float32)
+    return safe_charts(camera_plans({split: run.original.split(split) for split in SPLITS}, points))
 
 
 # Curves over the steps of a run, and of its Gaussians.

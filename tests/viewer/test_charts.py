@@ -27,7 +27,6 @@ def test_points_that_are_not_finite_are_left_out():
 
 
 @pytest.mark.parametrize(("counts", "labels"), [
-    ((8040, 8040), ["8,040"]),
     ((8040, 8041), ["8,040", "8,041"]),
     ((8035, 8042), ["8,036", "8,038", "8,040", "8,042"]),
     ((2, 3), ["2", "3"]),
@@ -38,6 +37,12 @@ def test_points_that_are_not_finite_are_left_out():
 def test_ticks_of_counts_are_whole_numbers(counts, labels):
     chart = curve("Gaussians", [Line(list(zip((10.0, 20.0), map(float, counts), strict=True)))])
     assert rows(chart) == labels
+
+
+def test_charts_that_show_a_single_value_are_left_out():
+    assert curve("Gaussians", [Line([(10.0, 8.0), (20.0, 8.0)])]) == ""
+    assert curve("PSNR", [Line([(10.0, 8.0)]), Line([(10.0, 9.0)])]) == ""
+    assert histogram("points", [7.0, 7.0]) == ""
 
 
 def test_ticks_of_steps_are_integers_and_those_of_measures_not():

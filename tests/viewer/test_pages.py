@@ -23,7 +23,7 @@ FOLDER = Path(package.__file__).parent / "core" / "templates"
 DRAWINGS = {"clsplat/viewer/charts.py"}  # SVG, escaped there
 STATES = ("good", "warn", "bad", "note")  # colors of text with papers of their own
 WITHOUT_TEXT = {  # a background, or text on one that another rule or the page's data fix
-    *("td.bar i", "button.grown", ".slider::after", ".space canvas", ".space button:hover", ".space output", ".chip"),
+    *("td.bar i", "button.grown", ".slider::after", ".chip"),
 }
 TAG = re.compile(r"</?(html|head|body|p|div|span|table|t[rdh]|h\d|ul|li|a|b|i|br|img|pre|figure|svg|style|script)[\s>]")
 
@@ -103,11 +103,11 @@ def test_every_template_file_is_part_of_a_page():
 
 
 def test_values_are_escaped_and_charts_are_not():
-    values = {"state": "ready", "verdict": HOSTILE, "findings": [], "figures": {HOSTILE: HOSTILE}, "space": None}
+    values = {"state": "ready", "verdict": HOSTILE, "findings": [], "figures": {HOSTILE: HOSTILE}, "cameras": []}
     chart = curve(HOSTILE, [Line([(0.0, 0.0), (1.0, 1.0)])])
     seen = safe_charts([chart, ""]), [(HOSTILE, 3)]
-    page = Page(render("inspect.html.j2", title=HOSTILE, subtitle=HOSTILE, seen=seen, lists=[], **values))
-    assert page.elements["script"] == 1
+    page = Page(render("inspect.html.j2", title=HOSTILE, subtitle=HOSTILE, seen=seen, far="", lists=[], **values))
+    assert page.elements["script"] == 0
     assert page.elements["svg"] == 1
     assert page.text.count(HOSTILE) == 8, "title twice, subtitle, verdict, a figure twice, a view, a chart"
 
@@ -141,7 +141,7 @@ def test_data_cannot_end_their_script():
 
 def test_name_that_is_not_unicode_shows_a_question_mark():
     page = render("inspect.html.j2", title="\udcff.png", subtitle="", state="ready", verdict="", findings=[],
-                  figures={}, space=None, seen=None, lists=[])  # fmt: skip
+                  figures={}, cameras=[], far="", seen=None, lists=[])  # fmt: skip
     assert "<title>?.png</title>" in page
 
 

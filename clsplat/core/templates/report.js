@@ -1,4 +1,4 @@
-// A picture that is chosen fills the window, until it is chosen again or Escape is pressed.
+// A clicked image fills the window until the next click or Escape.
 const grown = () => document.querySelector("button.grown");
 document.addEventListener("click", event => {
   const chosen = event.target.closest("button.tagged"), before = grown();
