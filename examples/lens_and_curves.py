@@ -59,12 +59,12 @@ class CameraResponseState(ModuleState):
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
     def __init__(self, settings: CameraResponse, views: Sequence[str], cameras: dict[str, str]) -> None:
-        """views: the names of the training views, by number; cameras: of each view, by name."""
+        """views: names of the training views by index; cameras: the camera of each view, by name."""
         super().__init__()
         self.settings, self.views, self.cameras = settings, views, cameras
 
     def row(self, view: str) -> Floats:
-        """Return the numbers of a view's camera, [17]."""
+        """Return the parameters of a view's camera, [17]."""
         return TABLE.row(self.scalars, self.cameras[view])
 
     def after_render(self, step: TrainingStep) -> None:
@@ -72,16 +72,16 @@ class CameraResponseState(ModuleState):
             row, weight = self.row(self.views[step.view]), at_step(self.settings.weight, step.number)
             step.module_losses.append(LossValue("response", lambda: weight * float(row @ row)))
             step.save(self, (step.image, row, 2 * weight * row, []))
-            step.image = taken(step.workspace, step.camera, step.image, row)
+            step.image = respond(step.workspace, step.camera, step.image, row)
 
     def backward(self, step: TrainingStep) -> None:
         if kept := step.saved(self):
-            step.gradient = taken(step.workspace, step.camera, kept[0], kept[1], step.gradient)
+            step.gradient = respond(step.workspace, step.camera, kept[0], kept[1], step.gradient)
             kept[3].append(step.workspace.array("response sums", (20, step.camera.rows)).get_later())
 
     def update(self, step: TrainingStep) -> None:
         if (kept := step.saved(self)) and step.view is not None:
-            gradient, rate = by_numbers(kept[1], kept[3][0]()) + kept[2], at_step(self.settings.rate, step.number)
+            gradient, rate = by_parameters(kept[1], kept[3][0]()) + kept[2], at_step(self.settings.rate, step.number)
             TABLE.update(self.scalars, self.cameras[self.views[step.view]], gradient, rate)
 
     def apply_to(self, scene: Scene) -> Scene:
@@ -92,8 +92,8 @@ class CameraResponseState(ModuleState):
 
 
 def with_rows(scene: Scene, rows: Mapping[str, Floats]) -> Scene:
-    """Return a scene whose views are measured as their cameras take them; rows: numbers by the name of a view, [17]."""
-    responses = {view: partial(taken, row=row) for view, row in rows.items()}
+    """Return a scene whose views are measured through their cameras' responses.  rows: parameters by view, [17]."""
+    responses = {view: partial(respond, row=row) for view, row in rows.items()}
     return replace(scene, views=tuple(replace(view, response=responses.get(view.name)) for view in scene.views))
 
 
@@ -103,22 +103,24 @@ def slopes_of(row: Floats) -> Floats:
     return np.asarray(slopes / (slopes @ AREAS)[:, None])
 
 
-def by_numbers(row: Floats, sums: Floats) -> Floats:
-    """Return derivatives by a camera's numbers, [17], from the sums of rows of pixels, [20, rows]."""
-    found, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], slopes_of(row)
-    by_logs = slopes * found[5:].reshape(3, 5)
+def by_parameters(row: Floats, sums: Floats) -> Floats:
+    """Return the gradient of a camera's parameters, [17], from the sums of rows of pixels, [20, rows]."""
+    totals, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], slopes_of(row)
+    by_logs = slopes * totals[5:].reshape(3, 5)
     by_logs -= slopes * AREAS * by_logs.sum(axis=1, keepdims=True)
-    return np.concatenate([found[:5], np.delete(by_logs, 2, axis=1).ravel()])
+    return np.concatenate([totals[:5], np.delete(by_logs, 2, axis=1).ravel()])
 
 
-def taken(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, back: Array | None = None) -> Array:
-    """Return what a camera makes of an image, [3 or 4, rows, stride]; or, back from a gradient by that, the gradient by
-    the image, with the sums of rows in the workspace."""
+def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, back: Array | None = None) -> Array:
+    """Return an image, [3 or 4, rows, stride], after a camera's response.
+
+    back: the gradient of that; then return the gradient of the image, and leave the sums of rows in the workspace.
+    """
     result = workspace.array("grad_response" if back else "response", image.shape)
     sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2
-    scalars = workspace.device.upload(np.concatenate([row[2:5], slopes_of(row).ravel()]).astype(np.float32))
+    numbers = workspace.device.upload(np.concatenate([row[2:5], slopes_of(row).ravel()]).astype(np.float32))
     center = {f"center_{x}": float(camera.values[f"c{x}"] + half * shift) for x, shift in zip("xy", row, strict=False)}
     given: dict[str, Any] = {"image": image, "gradient": back or image, "found": result, "row_sums": sums, **center}
-    given |= {"numbers": scalars, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
+    given |= {"numbers": numbers, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
     workspace.device.program(KERNEL).camera_response(groups=(1, camera.rows), **given, **camera.plane_arguments())
     return result

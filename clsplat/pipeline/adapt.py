@@ -82,7 +82,7 @@ class Photos(Adaptation):
         dropout = {"probability": [[0, 0.0], [DROPOUT_UNTIL * training.steps // STEPS, 0.2]]} if few else None
         why = f"{count}: {'dropout against overfitting' if few else 'enough to train without dropout'}"
         yield Decision(key="optimize.modules.dropout", value=dropout, reason=why, matters=few)
-        random = {"where": "transparent"} if few else None
+        random = {"when": "transparent"} if few else None
         why = f"{count}: {'random' if few else 'no random'} colors behind transparent pixels"
         yield Decision(key="optimize.modules.random_background", value=random, reason=why, matters=few and has_alpha)
 
@@ -101,7 +101,7 @@ class Photos(Adaptation):
         poses = {"start": POSES_START * training.steps // STEPS} if misses else None
         why = f"{fit}: poses {'are optimized' if misses else 'stay as they are'}"
         yield Decision(key="optimize.modules.camera_optimizer", value=poses, reason=why, matters=error is not None)
-        exposure = {"when": "auto"} if misses else {"when": "auto", "above": 0.2}
+        exposure = {"when": "auto"} if misses else {"when": "auto", "min_spread": 0.2}
         why = f"{fit}: {'small' if misses else 'only large'} differences of exposure are corrected"
         yield Decision(key="optimize.modules.exposure", value=exposure, reason=why, matters=False)
 

@@ -16,7 +16,7 @@ from clsplat.opencl.device import Device
 from clsplat.photos.depths import PointDepths, nearest_in_pixels
 from clsplat.scene.scene import Tracks
 from clsplat.stages.optimize import Optimize
-from clsplat.training.modules.depth_supervision import KnownDepthsState
+from clsplat.training.modules.depth_supervision import DepthSupervisionState
 from tests.support.deviations import assert_within_bounds, same_of_schedules
 from tests.support.device_images import trainer_of
 from tests.support.devices import on_one_setting
@@ -132,7 +132,7 @@ def test_steps_with_the_loss_bring_depths_to_the_known_ones(device, rng):
     for weight in (0.0, 0.3):
         local = np.random.default_rng(3)
         trainer, photograph = trainer_of(device, local, [L1(weight=0.0), InverseDepth(weight=weight)])
-        trainer.modules = [KnownDepthsState(known(device, trainer, photograph))]
+        trainer.modules = [DepthSupervisionState(known(device, trainer, photograph))]
         photograph = replace(photograph, camera=replace(photograph.camera, view=0), mask=None)
         measured = replace(trainer, losses=[L1(weight=0.0), InverseDepth(weight=1.0)])
         for step in range(1, 60):

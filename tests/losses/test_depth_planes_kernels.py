@@ -16,7 +16,7 @@ from clsplat.render.painter import SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import Tracks
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.depth_supervision import KnownDepthsState
+from clsplat.training.modules.depth_supervision import DepthSupervisionState
 from clsplat.training.trainer import StepTrainer
 from tests.support.devices import on_one_setting
 
@@ -49,7 +49,7 @@ def error_after(device, weight: float) -> float:
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians), black
     trainer = StepTrainer(*parts, [L1(weight=0.8), InverseDepth(weight=weight)], RATES)
     tracks = Tracks(points, {name: np.arange(len(points)) for name in NAMES})
-    trainer.modules = [KnownDepthsState(PointDepths(device, tracks, NAMES, 2.0))]
+    trainer.modules = [DepthSupervisionState(PointDepths(device, tracks, NAMES, 2.0))]
     for step in range(1, STEPS + 1):
         trainer.step(photographs[step % len(NAMES)], step)
     return float(np.median(np.abs(model.gaussians.get("means")[plain, 2] - DEPTH)))

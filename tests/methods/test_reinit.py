@@ -16,7 +16,7 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.training import checkpoint
 from clsplat.training.modules.base import learned_scene
-from clsplat.training.modules.camera_optimizer import DEPTHS, SHIFTS, CameraOptimizer, CameraState
+from clsplat.training.modules.camera_optimizer import DEPTHS, TRANSLATIONS, CameraOptimizer, CameraState
 from clsplat.training.run import Run
 from tests.support.runs import digest, train
 
@@ -102,7 +102,7 @@ def test_they_lie_where_the_cameras_were_learned_to_be(tiny_scene, tmp_path):
     run, moved = opened(tiny_scene, plane(), tmp_path / "run"), opened(tiny_scene, plane(), tmp_path / "moved")
     poses = CameraState(CameraOptimizer(), moved.scene.split("train"), moved.original.views)
     poses.scalars |= {f"{DEPTHS}/{view.name}": 1.0 for view in poses.views}
-    poses.scalars |= {f"{SHIFTS}/{view.name}/z": 0.3 for view in poses.views}
+    poses.scalars |= {f"{TRANSLATIONS}/{view.name}/z": 0.3 for view in poses.views}
     moved.modules = {"camera_optimizer": poses}
     expected = [view.position for view in learned_scene(moved).split("train")]
     assert np.abs(np.array(expected) - [view.position for view in run.scene.split("train")]).max() > 0.1
@@ -140,7 +140,7 @@ def test_a_model_that_covers_nothing_is_refused(tiny_scene, tmp_path):
     with pytest.raises(NumericError, match="covers no pixel of the training images; train longer before"):
         ReinitFromDepth(stage="reinit_from_depth").act(run)
     assert run.model.gaussians.count == 3
-    assert run.whole, "so that it can be saved"
+    assert run.is_consistent, "so that it can be saved"
 
 
 @pytest.fixture(scope="module")

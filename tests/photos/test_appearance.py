@@ -37,14 +37,14 @@ def test_the_gain_is_that_of_the_reference(rng):
 @MODELS
 def test_numbers_of_gains_make_these_gains_and_zeros_no_change(rng, model):
     gains = rng.normal(0, 0.3, 3)
-    assert np.diag(model.matrix(model.of_gains(gains))) == pytest.approx(np.exp(gains))
+    assert np.diag(model.matrix(model.from_gains(gains))) == pytest.approx(np.exp(gains))
     assert (model.matrix(np.zeros(len(model.columns))) == IDENTITY).all()
     assert model.penalty(np.zeros(len(model.columns)))[0] == 0
 
 
 @MODELS
 def test_the_fitted_matrix_is_the_one_that_made_a_photograph(rng, model):
-    image, made = rng.uniform(0, 0.6, (500, 3)), model.of_gains(np.array([0.2, -0.1, 0.3]))
+    image, made = rng.uniform(0, 0.6, (500, 3)), model.from_gains(np.array([0.2, -0.1, 0.3]))
     matrix = model.matrix(made)
     photograph = image @ matrix[:, :3].T + matrix[:, 3]
     assert model.fitted(image, photograph) == pytest.approx(matrix)

@@ -15,7 +15,7 @@ from clsplat.photos.photographs import Photograph
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, Gain, change_colors
+from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, Gain, transform_colors
 from clsplat.training.trainer import StepTrainer
 from tests.support.deviations import assert_within_bounds
 from tests.support.devices import on_devices, on_one_setting, product
@@ -34,7 +34,7 @@ def test_image_and_derivatives(device, rng, width, height):
 def test_no_change_cuts_white_alone(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
     camera = camera_of(device, 33, 18)
-    found = change_colors(Workspace(device), camera, planes_of(device, camera, image), IDENTITY).get()
+    found = transform_colors(Workspace(device), camera, planes_of(device, camera, image), IDENTITY).get()
     assert (found[:, :18, :33] == np.minimum(image, 1)).all()
 
 
@@ -90,7 +90,7 @@ def gradients_of(device, rng, colors, losses) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("losses", [(L1(weight=0.8), Dssim(weight=0.2)), (L2(), WeightEntropy(weight=0.1))])
 def test_numbers_of_no_change_give_the_gradients_of_none(device, rng, monkeypatch, losses):
     """The entropy of the fourth plane passes as it is."""
-    monkeypatch.setattr(Gain, "of_gains", lambda self, gains: np.zeros(3))
+    monkeypatch.setattr(Gain, "from_gains", lambda self, gains: np.zeros(3))
     state = rng.bit_generator.state
     plain = gradients_of(device, rng, None, losses)
     rng.bit_generator.state = state

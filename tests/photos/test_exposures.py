@@ -72,7 +72,7 @@ def test_a_run_begins_with_both(rng, tmp_path):
     scene = read_scene(tmp_path, 0)
     run = SimpleNamespace(
         scene=scene,
-        exposures={},
+        cache={},
         photographs=SimpleNamespace(get=lambda view: Photograph(load_image(view)[..., :3])),
         status=SimpleNamespace(counted=lambda views, *_: views),
     )

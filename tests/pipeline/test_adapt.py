@@ -57,8 +57,8 @@ def test_photos_decides_by_their_count_and_the_sky(photographs, sky, most):
     assert modules.keys() == {"exposure", *(("dropout", "random_background") if few else ())}
     if few:
         assert [at_step(modules["dropout"].probability, step) for step in (0, 730, 1460)] == [0, 0.1, 0.2]
-        assert modules["random_background"].where == "transparent"
-    assert modules["exposure"].above == 0.2
+        assert modules["random_background"].when == "transparent"
+    assert modules["exposure"].min_spread == 0.2
     assert (settings.model.background is not None) == (12 <= photographs < 40)
     assert [one.per_pixel for one in training.during if isinstance(one, Densify)] == [most, None]
     if not few:
@@ -72,7 +72,7 @@ def test_photos_in_fewer_steps_ends_its_schedules_earlier():
     short = replace(asked, settings=in_steps(asked.settings, 1700))
     modules = {one.type: one for one in adapted(short, Measures(9, 2.0)).settings.optimize.modules}
     assert at_step(modules["dropout"].probability, 730) == 0.2
-    assert (modules["camera_optimizer"].start, modules["exposure"].above) == (250, 0.03)
+    assert (modules["camera_optimizer"].start, modules["exposure"].min_spread) == (250, 0.03)
 
 
 @pytest.mark.parametrize(

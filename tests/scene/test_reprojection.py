@@ -97,7 +97,7 @@ def test_places_in_text_that_are_no_numbers_are_not_known(tmp_path):
 def test_the_recipe_for_photographs_learns_poses_from_a_pixel_on(error, learned):
     chosen = adapted(load("photos"), Measures(60, error))
     training = chosen.settings.optimize
-    exposure = Exposure(when="auto", **({} if learned else {"above": 0.2}))
+    exposure = Exposure(when="auto", **({} if learned else {"min_spread": 0.2}))
     assert training.modules == [*([CameraOptimizer(start=500)] if learned else []), exposure]
     if not learned:
         assert training.model_copy(update={"modules": []}) == load("fast").settings.training
@@ -140,12 +140,12 @@ def test_optional_sky_is_off_with_what_excludes_it(of_step, reason, tmp_path, rn
 
 def test_poses_beside_a_sky_are_refused_where_the_file_has_both():
     for recipe in ("smoke", "photos"):  # which may decide either
-        with pytest.raises(ConfigError, match="not learned together with poses"):
+        with pytest.raises(ConfigError, match="cannot be learned together with poses"):
             load(recipe, ["optimize.modules.camera_optimizer={start: 1}", "model.background=envmap"])
         with pytest.raises(ConfigError, match="'random_background' cannot be combined with sky"):
             load(recipe, ["optimize.modules.random_background={}", "model.background=envmap"])
     asked = load("photos", ["model.background=envmap"])  # which may learn poses
-    with pytest.raises(ConfigError, match=r"adapt: photos: .*not learned together with poses.*; --set of one"):
+    with pytest.raises(ConfigError, match=r"adapt: photos: .*cannot be learned together with poses.*; --set of one"):
         adapted(asked, Measures(60, 1.0))
 
 

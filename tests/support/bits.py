@@ -87,7 +87,7 @@ NAMED = {
     "alpha_as_mask": sets("scene.alpha=mask"),
     "affine": sets("optimize.modules.exposure.model=affine"),
     "background_random": sets("optimize.modules.random_background={}"),
-    "background_transparent": sets("optimize.modules.random_background.where=transparent", same_as="background_random"),
+    "background_transparent": sets("optimize.modules.random_background.when=transparent", same_as="background_random"),
     "blocks_command": Case(
         command=("blocks", "{blocks}", "--scene", "{still}", "--coarse", "{model}", "--blocks", "3", "--out", "{out}")
     ),
@@ -111,7 +111,7 @@ NAMED = {
     ),
     "fisheye": sets(scene="fisheye"),
     "gain": sets("optimize.modules.exposure={}"),
-    "grid": sets("optimize.modules.bilateral_grid={cells: [3, 2, 4]}"),
+    "grid": sets("optimize.modules.bilateral_grid={grid_shape: [3, 2, 4]}"),
     "haar": sets("optimize.modules.haar={learn: filter}"),
     "harmonics_on_host": sets("rasterizer.harmonics=host", same_as="splat_7k"),
     "inside": sets("stages.1.during.1.inside={low: [0, null, null]}"),
@@ -148,14 +148,14 @@ NAMED = {
     "resolution": sets("optimize.views.resolution=[[0, 2], [20, 1]]"),
     "schedule_simt": sets("rasterizer.schedule=simt"),
     "seen": sets("optimize.update=seen"),
-    "skip": sets("optimize.modules.skip={start: 8, warm_up: 1, least: 0}"),
+    "skip": sets("optimize.modules.skip_backward={start: 8, warm_up: 1, min_fraction: 0}"),
     "sky": sets("model.background=envmap"),
     "sky_as_splats": sets("model.background={type: envmap, side: 8}", "export.sky=splats"),
     "sweep": sets("init.source=points+sweep", scene="lens"),
     "threads_1": Case(environment=ONE_THREAD, same_as="splat_7k"),
     "threads_1_with_many": sets(*MANY, environment=ONE_THREAD, same_as="many"),
     "threads_2": Case(environment=TWO_THREADS, same_as="splat_7k"),
-    "transients": sets("optimize.modules.transients={start: 4, above: 1, tail: 0}"),
+    "transients": sets("optimize.modules.transients={start: 4, outlier_ratio: 1, tail_ratio: 0}"),
 }
 
 

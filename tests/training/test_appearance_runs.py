@@ -79,7 +79,7 @@ def test_a_run_folder_is_measured_in_the_photographs_colors_too(with_gains, few_
     assert "psnr_color" not in evaluate(few_steps)["test"]["1"]
     for damage in ("[]", '{"type": "lens"}'):
         (tmp_path / "view_colors.json").write_text(damage)
-        with pytest.raises(DataError, match=r"the type of colors is .* expected one of \w+"):
+        with pytest.raises(DataError, match=r"unknown type .* expected \w+"):
             read_color_model(tmp_path / "point_cloud.ply")
 
 
@@ -154,7 +154,7 @@ def test_run_chooses_colors_where_exposures_differ(rng, tmp_path):
 )
 def test_the_reason_says_which_bound_decided(spread, explained, chosen, said):
     exposures = Exposures({"a": np.full(3, spread), "b": np.full(3, -spread)}, "at 9 points", explained)
-    run = SimpleNamespace(scene=SimpleNamespace(split=lambda _: []), exposures={(): exposures})
+    run = SimpleNamespace(scene=SimpleNamespace(split=lambda _: []), cache={("colors", ()): exposures})
     found = Exposure(when="auto").resolve_auto(run)
     assert (found.chosen, found.reason) == (chosen, exposures.text + said)
 

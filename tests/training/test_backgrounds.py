@@ -13,7 +13,7 @@ from clsplat.runs.describe import describe
 from clsplat.runs.state import RunState
 from clsplat.scene.detect import read_scene
 from clsplat.scene.view import load_image
-from clsplat.training.modules.random_background import drawn_background
+from clsplat.training.modules.random_background import random_color
 from tests.support.runs import digest, train
 
 RANDOM = "optimize.modules.random_background={}"
@@ -21,7 +21,7 @@ RANDOM = "optimize.modules.random_background={}"
 
 def test_colors_depend_on_the_seed_and_the_step_alone():
     device = Device(choose())
-    drawn = [tuple(drawn_background(device, seed, step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
+    drawn = [tuple(random_color(device, seed, step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
     assert len(set(drawn)) == 3
     assert drawn[0] == drawn[3]
 
@@ -29,7 +29,7 @@ def test_colors_depend_on_the_seed_and_the_step_alone():
 def test_photograph_has_the_drawn_color_where_transparent(tiny_scene):
     device, scene = Device(choose()), read_scene(tiny_scene)
     photographs, view = Photographs(device, "white"), scene.split("train")[0]
-    behind = drawn_background(device, 0, 3)
+    behind = random_color(device, 0, 3)
     height, width = view.camera.height, view.camera.width
 
     def shown() -> np.ndarray:
@@ -51,7 +51,7 @@ def test_a_run_repeats_to_the_bit(tiny_scene, tmp_path):
     assert digest(train(tiny_scene, tmp_path / "again", *steps, RANDOM).out) == whole
     assert digest(train(tiny_scene, tmp_path / "scene", *steps).out) != whole
     found = train(
-        tiny_scene, tmp_path / "transparent", *steps, "optimize.modules.random_background.where=transparent"
+        tiny_scene, tmp_path / "transparent", *steps, "optimize.modules.random_background.when=transparent"
     ).out
     assert digest(found) == whole
     opaque = [
@@ -64,7 +64,7 @@ def test_a_run_repeats_to_the_bit(tiny_scene, tmp_path):
                 f"optimize.modules.random_background={value}",
             ).out
         )
-        for name, value in (("transparent", "{where: transparent}"), ("scene", "null"))
+        for name, value in (("transparent", "{when: transparent}"), ("scene", "null"))
     ]
     assert opaque[0] == opaque[1]
 
@@ -77,7 +77,7 @@ def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
         "smoke",
         [
             f"scene.path='{tiny_scene}'",
-            "optimize.modules.random_background.where=transparent",
+            "optimize.modules.random_background.when=transparent",
             "model.background=envmap",
         ],
     )

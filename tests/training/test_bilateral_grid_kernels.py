@@ -15,7 +15,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState
-from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, change_back, change_colors
+from clsplat.training.modules.exposure import Affine, Exposure, ExposureState, color_gradients, transform_colors
 from clsplat.training.trainer import StepTrainer
 from tests.support.deviations import assert_within_bounds
 from tests.support.devices import on_devices, on_one_setting, product
@@ -71,7 +71,7 @@ class Case:
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         behind = device.upload(np.array([0.2, 0.5, 0.9], np.float32))
         self.trainer = StepTrainer(*parts, behind, (L2(),), Rates())
-        self.state = GridState(BilateralGrid(cells=list(nodes), weight=0.1), ("a", "b"), device)
+        self.state = GridState(BilateralGrid(grid_shape=list(nodes), weight=0.1), ("a", "b"), device)
         self.state.rate, self.trainer.modules = 0.01, [self.state]
         self.state.start_from({"b": np.array([0.3, 0.1, -0.2])})
         self.values = self.state.tables()["values"]
@@ -118,18 +118,18 @@ def test_the_mean_over_photographs_and_places_stays_at_no_change(device, rng):
 def test_one_matrix_is_the_affine_kind(device, rng):
     """Its image, and the derivatives by both."""
     values = rng.normal(0, 0.2, (2, 12, 1, 1, 1)).astype(np.float32)
-    grids = GridState(BilateralGrid(cells=[1, 1, 1]), ("a", "b"), device)
+    grids = GridState(BilateralGrid(grid_shape=[1, 1, 1]), ("a", "b"), device)
     grids.load({}, {"values": values})
     affine = ExposureState(Exposure(model=Affine(weight=0)), ("a", "b"))
     affine.scalars.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
     image, gradient = (planes_of(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))
     found = grids.changed(workspace, camera, image, 1).get()
-    expected = change_colors(workspace, camera, image, affine.matrix(1)).get()
+    expected = transform_colors(workspace, camera, image, affine.matrix(1)).get()
     assert found == pytest.approx(expected, abs=1e-6)
     passed, by_grid = grids.differentiated(workspace, camera, image, gradient, 1)
     passed, by_grid = passed.get(), by_grid.get()
-    through, by_matrix = change_back(workspace, camera, image, affine.matrix(1), gradient)
+    through, by_matrix = color_gradients(workspace, camera, image, affine.matrix(1), gradient)
     assert passed == pytest.approx(through.get(), abs=1e-5)
     assert by_grid == pytest.approx(by_matrix().ravel(), rel=1e-4, abs=1e-4)
 

@@ -24,14 +24,14 @@ from clsplat.runs.model_file import evaluate
 from clsplat.runs.status import summary
 from clsplat.training import archive, checkpoint, memory
 from clsplat.training.modules.base import attach_modules, read_color_model
-from clsplat.training.modules.bilateral_grid import BilateralGrid, bytes_of
+from clsplat.training.modules.bilateral_grid import BilateralGrid, grid_bytes
 from clsplat.training.modules.exposure import Exposure, Gain
 from clsplat.training.run import Run
 from tests.support.runs import FEW, ONE_CORE, digest, train
 
 PLAIN = '''
 from typing import Literal
-from clsplat.training.modules.exposure import IDENTITY, Appearance, ColorState, Gain, Written
+from clsplat.training.modules.exposure import IDENTITY, Appearance, ColorState, Gain, ColorReport
 
 
 class Plain(Appearance):
@@ -51,14 +51,15 @@ class Views(ColorState):
     def start_from(self, log_gains):
         self.scalars |= {f"colors/{view}/steps": 0.0 for view in self.views}
 
-    def written(self):
+    def report(self):
         steps = {view: self.scalars[f"colors/{view}/steps"] for view in self.views}
-        return Written(dict.fromkeys(self.views, IDENTITY), {"meaning": "none", "type": "plain", "photographs": steps})
+        facts = {"meaning": "none", "type": "plain", "photographs": steps}
+        return ColorReport(dict.fromkeys(self.views, IDENTITY), facts)
 
     def update(self, step):
         self.scalars[f"colors/{self.views[step.view]}/steps"] += 1
 '''
-GRID = (*FEW, "optimize.modules.bilateral_grid={cells: [3, 2, 4]}")
+GRID = (*FEW, "optimize.modules.bilateral_grid={grid_shape: [3, 2, 4]}")
 
 
 @pytest.fixture(scope="module")
@@ -77,12 +78,12 @@ def test_the_key_takes_cells_of_each_axis():
     def grid(setting: str):
         return load("smoke", [f"optimize.modules.bilateral_grid={setting}"]).settings.training.modules[0]
 
-    assert grid("{}") == BilateralGrid(cells=[4, 4, 4])
-    assert grid("{cells: [16, 16, 8]}").cells == [16, 16, 8]
+    assert grid("{}") == BilateralGrid(grid_shape=[4, 4, 4])
+    assert grid("{grid_shape: [16, 16, 8]}").grid_shape == [16, 16, 8]
     assert grid("{when: auto}") == BilateralGrid(when="auto")
     for wrong in ("[4, 4]", "[0, 4, 4]", "[4, 4, 17]", "4"):
         with pytest.raises(ConfigError, match=r"bilateral_grid.*cells"):
-            grid(f"{{cells: {wrong}}}")
+            grid(f"{{grid_shape: {wrong}}}")
 
 
 def test_rate_warms_up_and_falls_as_unknown_exposures_need():
@@ -133,7 +134,7 @@ def test_one_core_gives_the_same_bits(info):
 def test_grids_lie_beside_the_model_and_metrics_use_gains(with_grids, few_steps, tmp_path):
     data = json.loads((with_grids / "view_colors.json").read_text())
     found = np.load(with_grids / data["file"], allow_pickle=False)
-    assert (data["type"], data["cells"]) == ("bilateral_grid", [3, 2, 4])
+    assert (data["type"], data["grid_shape"]) == ("bilateral_grid", [3, 2, 4])
     assert found.shape == (8, 4, 2, 3, 3, 4)
     assert found.dtype == np.float32
     assert found.mean(axis=(0, 2, 3)) == pytest.approx(np.tile(np.eye(3, 4), (4, 1, 1)), abs=1e-6)
@@ -169,7 +170,7 @@ def test_training_resumes_its_grids_and_restarts_with_others(ended, cells):
     (same,) = attach_modules(ended.settings.training.modules, run, 24)
     assert same.scalars == before.scalars
     assert all((table == before.tables()[name]).all() for name, table in same.tables().items())
-    (other,) = attach_modules([BilateralGrid(cells=cells)], run, 24)
+    (other,) = attach_modules([BilateralGrid(grid_shape=cells)], run, 24)
     assert other is run.modules["bilateral_grid"] is not before
     assert not other.tables()["values"].any()
     assert other.scalars[f"colors/{other.names[0]}/updates"] == 0 < before.scalars[f"colors/{other.names[0]}/updates"]
@@ -186,9 +187,9 @@ def test_memory_counts_them_before_the_first_gaussian(ended):
         run.settings = run.settings.model_copy(update={"stages": stages})
         return run.memory_plan(memory.first_tables(0)).fixed
 
-    wide = BilateralGrid(cells=[16, 16, 8])
+    wide = BilateralGrid(grid_shape=[16, 16, 8])
     more = fixed(wide) - fixed(Exposure())
-    assert more == bytes_of([16, 16, 8], len(views), height) + 3 * 4 * width * height
+    assert more == grid_bytes([16, 16, 8], len(views), height) + 3 * 4 * width * height
     assert more > 3 * 4 * 12 * 16 * 16 * 8 * len(views)
     assert fixed(wide.model_copy(update={"when": "auto"})) == fixed(wide), "as long as it is not chosen"
     off = wide.model_copy(update={"when": "auto", "chosen": "off"})
@@ -197,14 +198,14 @@ def test_memory_counts_them_before_the_first_gaussian(ended):
 
 @pytest.mark.slow
 def test_a_dry_run_checks_them(tiny_scene, tmp_path):
-    def told(cells: str) -> object:
-        setting = [f"optimize.modules.bilateral_grid={{cells: {cells}}}"]
+    def describe(shape: str) -> object:
+        setting = [f"optimize.modules.bilateral_grid={{grid_shape: {shape}}}"]
         return commands.describe_run("smoke", tiny_scene, tmp_path / "run", set=setting)
 
-    assert told("[4, 4, 2]")
+    assert describe("[4, 4, 2]")
     assert not (tmp_path / "run").exists()
-    with pytest.raises(ConfigError, match="cells"):
-        told("[4, 4]")
+    with pytest.raises(ConfigError, match="grid_shape"):
+        describe("[4, 4]")
 
 
 def test_damaged_tables_are_refused():
@@ -223,7 +224,7 @@ def test_damaged_tables_are_refused():
         with pytest.raises(DataError, match=r"its grids are not|of its BilateralGrid has"):
             BilateralGrid.check_saved(rows, damaged)
     for damage in ({"colors/b/row": 6.0}, {"colors/a/row": 0.5}, {"colors/c/row": 2.0}):
-        with pytest.raises(DataError, match="grids of the colors of 2 photographs"):
+        with pytest.raises(DataError, match="color grids of 2 photographs"):
             BilateralGrid.check_saved(rows | damage, good)
 
 

@@ -153,7 +153,7 @@ def test_they_are_in_no_output_and_bits_repeat(tiny_scene, tmp_path, few_steps):
     "others",
     [
         (
-            "optimize.modules.transients={start: 4, above: 1, tail: 0}",
+            "optimize.modules.transients={start: 4, outlier_ratio: 1, tail_ratio: 0}",
             "optimize.modules.exposure={}",
             "optimize.modules.camera_optimizer={start: 4}",
         ),
@@ -173,11 +173,11 @@ def test_tables_that_are_not_theirs_are_refused(device, rng):
     tables = Pair(device, rng).own.tables()
     Distractors.check_saved({}, tables)
     damaged = [
-        ({"means": tables["means"][:-1]}, "as many for each photograph"),
-        ({"updates": tables["updates"][:0]}, "as many for each photograph"),
-        ({"sh_base": tables["sh_base"][:, :2]}, "as many for each photograph"),
+        ({"means": tables["means"][:-1]}, "the same number of rows for each photograph"),
+        ({"updates": tables["updates"][:0]}, "the same number of rows for each photograph"),
+        ({"sh_base": tables["sh_base"][:, :2]}, "the same number of rows for each photograph"),
         ({"quats": np.full_like(tables["quats"], np.nan)}, "quats of its Distractors has values that are not finite"),
-        ({"sh_rest": tables["means"]}, "as many for each photograph"),
+        ({"sh_rest": tables["means"]}, "the same number of rows for each photograph"),
     ]
     for change, message in damaged:
         with pytest.raises(DataError, match=message):

@@ -117,8 +117,8 @@ NEEDED = {  # so that each acts within seven steps
     "camera_optimizer": {"start": 2, "focal": "auto"},
     "distractors": {"count": 30, "start": 2},
     "dropout": {"probability": 0.1},
-    "skip": {"start": 3, "warm_up": 1, "least": 0},
-    "transients": {"start": 2, "above": 1, "tail": 0},
+    "skip_backward": {"start": 3, "warm_up": 1, "min_fraction": 0},
+    "transients": {"start": 2, "outlier_ratio": 1, "tail_ratio": 0},
 }
 
 

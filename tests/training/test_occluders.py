@@ -17,7 +17,7 @@ from tests.support.runs import train
 
 SIZE, PHOTOGRAPHS, SHARE, AREA = 40, 14, 0.4, 0.1  # a share of them has a rectangle, which covers a part
 MAGENTA = 255, 0, 255, 255
-TRANSIENTS = "optimize.modules.transients={start: 140, tail: 3, above: 2}"
+TRANSIENTS = "optimize.modules.transients={start: 140, tail_ratio: 3, outlier_ratio: 2}"
 DISTRACTORS = "optimize.modules.distractors={start: 30}"
 ENDS = "optimize.evaluate.every=1000", "checkpoint.every=1000", "reset_opacity.stop=1"
 STEPS = (

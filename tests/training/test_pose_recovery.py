@@ -18,7 +18,7 @@ from clsplat.render.painter import SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.modules.camera_optimizer import DEPTHS, CameraOptimizer, CameraState, Move
+from clsplat.training.modules.camera_optimizer import DEPTHS, CameraOptimizer, CameraState, PoseChange
 from clsplat.training.trainer import StepTrainer
 
 VIEWS, STEPS, ANGLE, DEPTH = 6, 300, np.radians(0.3), 3.0
@@ -47,13 +47,21 @@ def learned(
     background, photographs = device.upload(np.full(3, 0.3, np.float32)), list[Photograph]()
     places = [np.array([0.25 * number - 0.6, 0.15 * (number % 3), 0]) for number in range(VIEWS)]
     truth = [
-        replace(case.view, name=str(n), world_to_camera=Move(np.zeros(3), place, 0).of(case.view.world_to_camera))
+        replace(
+            case.view,
+            name=str(n),
+            world_to_camera=PoseChange(np.zeros(3), place, 0).apply_to(case.view.world_to_camera),
+        )
         for n, place in enumerate(places)
     ]
     turns, shifts = jitter * rng.normal(size=(2, VIEWS, 3)) * np.array([[[ANGLE]], [[0.003 * DEPTH]]])
     turns, shifts = turns - turns.mean(axis=0), shifts - shifts.mean(axis=0)
     views = [
-        replace(view, world_to_camera=Move(turn, shift, 0).of(view.world_to_camera), camera=view.camera.zoomed(zoom))
+        replace(
+            view,
+            world_to_camera=PoseChange(turn, shift, 0).apply_to(view.world_to_camera),
+            camera=view.camera.zoomed(zoom),
+        )
         for view, turn, shift in zip(truth, turns, shifts, strict=True)
     ]
     for number, (view, given) in enumerate(zip(truth, views, strict=True)):
@@ -61,10 +69,10 @@ def learned(
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
         photographs.append(Photograph(replace(upload_camera(device, given), view=number), device.upload(pixels)))
     rate = Decay(initial=2e-3, final=2e-5, over=STEPS)
-    settings = CameraOptimizer(start=0, turn=rate, shift=rate, focal="auto")
+    settings = CameraOptimizer(start=0, rotation=rate, translation=rate, focal="auto")
     poses = CameraState(settings, views, views)
     poses.rates = *settings.rates(STEPS, VIEWS), settings.focal_rate(STEPS, 1)
-    for table in poses.tables_of:
+    for table in poses.pose_tables:
         table.begin(poses.scalars, {})
     poses.scalars |= {f"{DEPTHS}/{view.name}": DEPTH for view in views}
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians, []), background

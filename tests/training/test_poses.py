@@ -19,7 +19,7 @@ from clsplat.training.modules.camera_optimizer import (
     DEPTHS,
     CameraOptimizer,
     CameraState,
-    Move,
+    PoseChange,
 )
 from tests.support.oracle import BACKGROUND, general_camera, random_gaussians, to_world
 from tests.support.runs import FEW, digest, killed, train
@@ -70,11 +70,11 @@ def test_derivatives_by_numbers_are_those_of_the_moved_scene(rng, depth):
     turn, shift = 0.4 * rng.normal(size=3), rng.normal(size=3)
 
     def value(turn: np.ndarray, shift: np.ndarray) -> float:
-        at = Move(turn, shift, depth).of(pose)
+        at = PoseChange(turn, shift, depth).apply_to(pose)
         return float((weights * np.sin(points @ at[:, :3].T + at[:, 3])).sum())
 
-    move = Move(turn, shift, depth)
-    at = move.of(pose)
+    move = PoseChange(turn, shift, depth)
+    at = move.apply_to(pose)
     center = -at[:, :3].T @ at[:, 3]
     by_points = (weights * np.cos(points @ at[:, :3].T + at[:, 3])) @ at[:, :3]
     by_turn, by_shift = move.gradients(at, by_points.sum(axis=0), np.cross(points - center, by_points).sum(axis=0))
@@ -82,7 +82,7 @@ def test_derivatives_by_numbers_are_those_of_the_moved_scene(rng, depth):
     assert by_shift == pytest.approx(numeric(lambda change: value(turn, shift + change)), rel=1e-7)
     at_pivot = at[:, :3] @ (shift - pose[:, :3].T @ pose[:, 3] + depth * pose[2, :3]) + at[:, 3]
     assert at_pivot == pytest.approx([0, 0, depth]), "it turns about that point"
-    small, larger = (Move(size * turn, shift, 0).gradients(at, np.zeros(3), by_turn)[0] for size in (1e-5, 1e-3))
+    small, larger = (PoseChange(size * turn, shift, 0).gradients(at, np.zeros(3), by_turn)[0] for size in (1e-5, 1e-3))
     assert small == pytest.approx(larger, rel=2e-3)
 
 
@@ -101,13 +101,13 @@ def test_rates_begin_after_the_start_and_follow_the_visits():
 def test_cameras_that_were_not_trained_on_move_as_the_others_do(tiny_scene):
     scene = read_scene(tiny_scene, 5)
     poses = CameraState(CameraOptimizer(), scene.split("train"), scene.views)
-    for table in poses.tables_of:
+    for table in poses.pose_tables:
         table.begin(poses.scalars, {})
     poses.scalars |= {f"{DEPTHS}/{view.name}": 0.0 for view in poses.views}
     for view, other in zip(scene.views, poses.apply_to(scene).views, strict=True):
         assert other.world_to_camera == pytest.approx(view.world_to_camera, abs=1e-12)
     middle = np.mean([view.position for view in poses.views], axis=0)
-    poses.tables_of[1].begin(poses.scalars, {view.name: 0.1 * (view.position - middle) for view in poses.views})
+    poses.pose_tables[1].begin(poses.scalars, {view.name: 0.1 * (view.position - middle) for view in poses.views})
     for view, other in zip(scene.views, poses.apply_to(scene).views, strict=True):
         assert other.position == pytest.approx(middle + 1.1 * (view.position - middle))
         assert other.world_to_camera[:, :3] == pytest.approx(view.world_to_camera[:, :3])
@@ -129,8 +129,8 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_poses, tiny_s
     scalars = run.modules["camera_optimizer"].scalars
     assert scalars == checkpoint.load(checkpoint.saved(with_poses)[-1])[0].modules["camera_optimizer"]
     assert sum(value for name, value in scalars.items() if name.endswith("x/updates")) == 2 * (12 - 2)
-    assert attach_modules([], run, 24)[0].move(run.scene.split("train")[0].name).shift.any(), "they stay"
-    for table in run.modules["camera_optimizer"].tables_of:
+    assert attach_modules([], run, 24)[0].pose_change(run.scene.split("train")[0].name).translation.any(), "they stay"
+    for table in run.modules["camera_optimizer"].pose_tables:
         rows = np.array([table.row(scalars, view) for view in table.views])
         assert rows.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-12)
         assert np.abs(rows).max() > 1e-4
@@ -158,7 +158,7 @@ def test_figures_and_tables_are_of_the_cameras_that_were_learned(with_poses, tin
         assert min(np.abs(pose - view.world_to_camera).max() for pose in written) < 1e-9
     for damage in ("[]", json.dumps({"photographs": {scene.views[0].name: {"world_to_camera": [1, 2]}}})):
         (tmp_path / "view_poses.json").write_text(damage)
-        with pytest.raises(DataError, match=r"view_poses.json: .*(expected a mapping|has no pose of 3 rows)"):
+        with pytest.raises(DataError, match=r"view_poses.json: .*(expected a mapping|has no valid pose of 3 rows)"):
             CameraOptimizer.apply_side_files(tmp_path / "point_cloud.ply", scene)
 
 

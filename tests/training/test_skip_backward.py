@@ -22,16 +22,15 @@ from clsplat.pipeline.stretching import stretched
 from clsplat.runs import opening
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
-from clsplat.training.modules.skip_backward import Skip, SkipState
+from clsplat.training.modules.skip_backward import SkipBackward, SkipBackwardState
 from clsplat.training.run import Run
 from clsplat.training.trainer import StepTrainer
 from tests.support.runs import FEW, digest, train
 
 pytestmark = pytest.mark.slow
 
-FROM_5 = (
-    "optimize.modules.skip={start: 5, warm_up: 12, least: 0.25}"  # of the fifty steps of smoke, on eight photographs
-)
+SKIP = "optimize.modules.skip_backward"
+FROM_5 = SKIP + "={start: 5, warm_up: 12, min_fraction: 0.25}"  # of the fifty steps of smoke, on eight photographs
 HAAR = "optimize.modules.haar={learn: filter}"
 PENALTY = "optimize.losses=[l1, {type: dssim, weight: 0.3}, {type: anisotropy, above: 2.0, weight: 0.01}]"
 NO_EDITS = ("densify.every=1000", "raise_sh.every=1000", "reset_opacity.every=1000", "optimize.evaluate.every=1000")
@@ -40,7 +39,7 @@ NO_EDITS = ("densify.every=1000", "raise_sh.every=1000", "reset_opacity.every=10
 # ---- the rule
 
 
-def slow_rule(skip: Skip, visits: list[tuple[str, float]]) -> list[bool]:
+def slow_rule(skip: SkipBackward, visits: list[tuple[str, float]]) -> list[bool]:
     """Which of the steps after `start` are skipped: every sum from all visits before, again at every step."""
 
     def converged(at: int) -> bool:
@@ -52,7 +51,7 @@ def slow_rule(skip: Skip, visits: list[tuple[str, float]]) -> list[bool]:
         return bool(earlier) and loss <= math.fsum(w * value for w, value in zip(weights, earlier, strict=True))
 
     share = sum(not converged(at) for at in range(skip.warm_up)) / skip.warm_up
-    least = share if skip.least == "auto" else skip.least
+    least = share if skip.min_fraction == "auto" else skip.min_fraction
     skipped: list[bool] = []
     for now in range(len(visits)):
         whole = skipped.count(False)
@@ -60,7 +59,7 @@ def slow_rule(skip: Skip, visits: list[tuple[str, float]]) -> list[bool]:
     return skipped
 
 
-def decisions(skip: Skip, visits: list[tuple[str, float]]) -> list[bool]:
+def decisions(skip: SkipBackward, visits: list[tuple[str, float]]) -> list[bool]:
     """What the rule decides, step by step, with what it keeps between them."""
     scalars: dict[str, float] = {}
     found = []
@@ -87,7 +86,7 @@ def made_up(rng: np.random.Generator, views: int, steps: int, noise: float) -> l
     ],
 )
 def test_the_rule_is_that_of_plain_sums(rng, least, views, noise, decay):
-    skip = Skip(start=0, warm_up=40, decay=decay, least=least)
+    skip = SkipBackward(start=0, warm_up=40, decay=decay, min_fraction=least)
     visits = made_up(rng, views, 160, noise)
     found = decisions(skip, visits)
     assert found == slow_rule(skip, visits)
@@ -99,15 +98,15 @@ def test_the_rule_is_that_of_plain_sums(rng, least, views, noise, decay):
 def test_the_least_share_of_whole_steps_is_kept_and_used(least):
     """Losses that only fall would all be skipped."""
     visits = [(f"view {step % 9}", 1 / (1 + step)) for step in range(2000)]
-    found = np.array(decisions(Skip(start=0, warm_up=100, least=least), visits))
+    found = np.array(decisions(SkipBackward(start=0, warm_up=100, min_fraction=least), visits))
     whole = np.cumsum(~found) / np.arange(1, len(found) + 1)
     assert whole.min() >= least
     assert whole[-1] == pytest.approx(max(least, 100 / 2000), abs=1e-3)
-    assert not decisions(Skip(start=0, warm_up=9), visits)[9:].count(True), "a warm-up of first visits alone"
+    assert not decisions(SkipBackward(start=0, warm_up=9), visits)[9:].count(True), "a warm-up of first visits alone"
 
 
 def test_a_loss_that_is_not_finite_changes_nothing():
-    skip, scalars = Skip(start=0, warm_up=1, least=0), {}
+    skip, scalars = SkipBackward(start=0, warm_up=1, min_fraction=0), {}
     scalars.update(skip.decide("a", 1.0, scalars).scalars)
     for loss in (math.nan, math.inf):
         visit = skip.decide("a", loss, scalars)
@@ -116,7 +115,7 @@ def test_a_loss_that_is_not_finite_changes_nothing():
 
 
 def test_view_has_an_average_per_size_and_none_before_the_start():
-    state = SkipState(Skip(start=8), [View("a.png", Camera(40, 30, 1, 1, 1, 1), np.eye(3, 4))])
+    state = SkipBackwardState(SkipBackward(start=8), [View("a.png", Camera(40, 30, 1, 1, 1, 1), np.eye(3, 4))])
     for step, width in ((8, 40), (9, 40), (10, 20), (11, 40)):
         camera = SimpleNamespace(width=width, height=30)
         kept: list[Any] = []
@@ -137,13 +136,15 @@ def test_view_has_an_average_per_size_and_none_before_the_start():
 
 @pytest.mark.parametrize("least", ["2", "-0.1", "much", "[1]", "null"])
 def test_a_share_that_is_none_is_refused(least):
-    with pytest.raises(ConfigError, match=r"optimize\.modules\.skip\.least=.*: expected 'auto' or a share from 0 to 1"):
-        load("smoke", ["optimize.modules.skip.start=9", f"optimize.modules.skip.least={least}"])
+    with pytest.raises(ConfigError, match=r"skip_backward\.min_fraction=.*: expected 'auto' or a share from 0 to 1"):
+        load(
+            "smoke", ["optimize.modules.skip_backward.start=9", f"optimize.modules.skip_backward.min_fraction={least}"]
+        )
 
 
 def test_stretched_recipe_skips_later_with_the_same_warm_up():
-    skip = stretched(load("splat_7k", ["optimize.modules.skip.start=4000"]).settings, 2.0).training.modules[0]
-    assert skip == Skip(start=8000, decay=0.95, warm_up=500, least="auto")
+    skip = stretched(load("splat_7k", ["optimize.modules.skip_backward.start=4000"]).settings, 2.0).training.modules[0]
+    assert skip == SkipBackward(start=8000, decay=0.95, warm_up=500, min_fraction="auto")
     assert load("splat_7k").settings.training.modules == []
 
 
@@ -189,10 +190,10 @@ def test_a_skipped_step_leaves_all_as_it_was(tiny_scene, tmp_path, more):
 def test_each_size_of_a_resolution_schedule_has_own_averages(tiny_scene, tmp_path):
     """Photographs are half as large up to step 19."""
     sizes = "optimize.views.resolution={points: [[0, 2], [20, 1]], between: steps}"
-    run, steps = begun(tiny_scene, tmp_path, "optimize.modules.skip={start: 2, warm_up: 40}", sizes, *NO_EDITS)
+    run, steps = begun(tiny_scene, tmp_path, SKIP + "={start: 2, warm_up: 40}", sizes, *NO_EDITS)
     for _ in range(36):
         next(steps)
-    averages = [name.split("/")[2] for name in run.modules["skip"].scalars if name.startswith("skip/loss/")]
+    averages = [name.split("/")[2] for name in run.modules["skip_backward"].scalars if name.startswith("skip/loss/")]
     assert set(averages) == {"20x20", "40x40"}
     assert len(averages) > 8, "photographs"
 
@@ -201,7 +202,7 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
     run, steps = begun(tiny_scene, tmp_path, FROM_5)
     for _ in range(9):
         next(steps)
-    before = state(run), dict(run.modules["skip"].scalars)
+    before = state(run), dict(run.modules["skip_backward"].scalars)
 
     def broken(trainer: StepTrainer, view: ViewLosses) -> ViewGradients:
         raise MemoryError
@@ -209,7 +210,7 @@ def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_pat
     monkeypatch.setattr(StepTrainer, "backward", broken)
     with pytest.raises(MemoryError):
         next(steps)
-    assert (run.step, (state(run), dict(run.modules["skip"].scalars))) == (9, before)
+    assert (run.step, (state(run), dict(run.modules["skip_backward"].scalars))) == (9, before)
 
 
 def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatch):
@@ -221,7 +222,11 @@ def test_up_to_the_start_no_step_reads_its_loss(tiny_scene, tmp_path, monkeypatc
         return get(array)
 
     monkeypatch.setattr(Array, "get", counted)
-    for name, settings in {"none": (), "later": ("optimize.modules.skip.start=9",), "from 5": (FROM_5,)}.items():
+    for name, settings in {
+        "none": (),
+        "later": (f"{SKIP}.start=9",),
+        "from 5": (FROM_5,),
+    }.items():
         _, steps = begun(tiny_scene, tmp_path / name, *settings, *NO_EDITS)
         for _ in range(9):
             next(steps)
@@ -237,9 +242,9 @@ def test_a_run_that_skips_resumes_to_the_bit(tiny_scene, tmp_path, caplog):
     first = train(tiny_scene, tmp_path / "first", *settings)
     (told,) = first.records.read("skip")
     assert told["steps"] == 45
-    assert told["least"] == 0.25
+    assert told["min_fraction"] == 0.25
     assert 8 < told["skipped"] <= 0.75 * 45
-    line = f"{told['skipped']} of 45 steps after step 5 were skipped; at least 25.0% were to do the whole work"
+    line = f"skipped {told['skipped']} of 45 steps after step 5; at least 25.0% had to be full steps"
     assert caplog.text.count(line) == 1
     whole = digest(first.out)
     again = shutil.copytree(first.out, tmp_path / "again")
@@ -249,29 +254,35 @@ def test_a_run_that_skips_resumes_to_the_bit(tiny_scene, tmp_path, caplog):
         (again / name).unlink()
     resumed = train(tiny_scene, tmp_path / "again", *settings, resume=True)
     assert digest(resumed.out) == whole
-    assert resumed.modules["skip"].scalars == first.modules["skip"].scalars
+    assert resumed.modules["skip_backward"].scalars == first.modules["skip_backward"].scalars
     assert resumed.records.read("skip") == [told]
 
 
 def test_auto_takes_its_share_from_the_warm_up(tiny_scene, tmp_path):
     """Of forty steps on eight photographs, the first visits at least."""
-    settings = ("optimize.modules.skip={start: 2, warm_up: 40}", "optimize.steps=80", *NO_EDITS)
+    settings = (SKIP + "={start: 2, warm_up: 40}", "optimize.steps=80", *NO_EDITS)
     run = train(tiny_scene, tmp_path / "run", *settings)
     (told,) = run.records.read("skip")
-    assert 8 / 40 <= told["least"] == run.modules["skip"].scalars["skip/above"] / 40
+    assert 8 / 40 <= told["min_fraction"] == run.modules["skip_backward"].scalars["skip/above"] / 40
     assert told["steps"] == 78
-    assert 0 < told["skipped"] <= (1 - told["least"]) * 78
+    assert 0 < told["skipped"] <= (1 - told["min_fraction"]) * 78
 
 
 def test_up_to_the_start_the_bits_are_those_without_it(tiny_scene, few_steps, tmp_path):
-    run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.skip.start=12")
+    run = train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.skip_backward.start=12")
     assert digest(run.out) == digest(few_steps)
     assert [line["steps"] for line in run.records.read("skip")] == [0]
-    assert not run.modules["skip"].scalars
+    assert not run.modules["skip_backward"].scalars
 
 
 def test_a_run_may_go_on_with_it(tiny_scene, killed_run, caplog):
-    run = train(tiny_scene, killed_run, *FEW, "optimize.modules.skip={start: 8, warm_up: 1, least: 0}", resume=True)
+    run = train(
+        tiny_scene,
+        killed_run,
+        *FEW,
+        SKIP + "={start: 8, warm_up: 1, min_fraction: 0}",
+        resume=True,
+    )
     assert caplog.text.count("from here on the bits are not those of a run without a change") == 1
     assert json.loads((killed_run / "metrics.json").read_text())["steps"] == 12
-    assert run.modules["skip"].scalars["skip/steps"] == 4
+    assert run.modules["skip_backward"].scalars["skip/steps"] == 4

@@ -7,7 +7,7 @@ from clsplat.training import checkpoint
 from clsplat.training.modules.transients import BINS, KEYS, Transients, mask_transients, measure_residuals
 from tests.support.runs import FEW, digest, train
 
-ON = (*FEW, "optimize.modules.transients={start: 4, above: 1, tail: 0}")
+ON = (*FEW, "optimize.modules.transients={start: 4, outlier_ratio: 1, tail_ratio: 0}")
 
 
 def distribution(**scalars: float) -> dict[str, float]:
@@ -16,7 +16,7 @@ def distribution(**scalars: float) -> dict[str, float]:
 
 
 def test_the_threshold_is_in_units_of_the_upper_edge_of_a_bin():
-    settings = Transients(start=10, quantile=0.9, above=1, tail=0)
+    settings = Transients(start=10, quantile=0.9, outlier_ratio=1, tail_ratio=0)
     scalars = distribution(_40=50, _60=40, _80=10)
     assert settings.threshold(scalars, 10) is None, "not yet"
     assert settings.threshold({}, 11) is None
@@ -51,7 +51,7 @@ def test_a_run_learns_the_distribution_of_residuals(tiny_scene, tmp_path, few_st
 
 @pytest.mark.slow
 def test_where_no_pixel_is_left_out_the_bits_are_those_without(tiny_scene, tmp_path, few_steps):
-    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.transients={start: 4, tail: 1e9}")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.modules.transients={start: 4, tail_ratio: 1e9}")
     assert digest(tmp_path / "run") == digest(few_steps)
 
 

@@ -17,8 +17,8 @@ from clsplat.photos.appearance import IDENTITY, LUMINANCE
 from clsplat.render.camera import CAMERA
 from clsplat.render.workspace import Workspace
 from clsplat.training.modules.bilateral_grid import BilateralGrid, GridState, row_length
-from clsplat.training.modules.camera_response import by_numbers, taken
-from clsplat.training.modules.exposure import change_back, change_colors
+from clsplat.training.modules.camera_response import by_parameters, respond
+from clsplat.training.modules.exposure import color_gradients, transform_colors
 
 CHECKS = Checks()
 MARGIN = 1e-3  # from white, from black and between two levels, where a derivative is that of one side
@@ -35,7 +35,7 @@ CASES = (  # width, height, nodes
 
 def grids_of(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> GridState:
     """The second of three photographs has matrices about no change, and the others have others."""
-    found = GridState(BilateralGrid(cells=list(nodes), weight=weight), ("a", "b", "c"), device)
+    found = GridState(BilateralGrid(grid_shape=list(nodes), weight=weight), ("a", "b", "c"), device)
     found.load({}, {"values": rng.normal(0, 0.2, found.shape).astype(np.float32)})
     return found
 
@@ -156,13 +156,13 @@ def check_color(
     for name in ("colored", "grad_colored"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes = planes_of(device, camera, image)
-    found = change_colors(workspace, camera, planes, matrix).get()
+    found = transform_colors(workspace, camera, planes, matrix).get()
     exact = image[:3].astype(np.float64)
     expected = ref.colored(exact, matrix)
     yield by_element("colors_forward", f"colors, {what}", found[:3, :height, :width], expected, 2e-6, floor=1.0)
     yield equal("colors_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)
     uploaded = planes_of(device, camera, gradient)
-    grad_image, waiting = change_back(workspace, camera, planes, matrix, uploaded)
+    grad_image, waiting = color_gradients(workspace, camera, planes, matrix, uploaded)
     by_image, by_matrix = ref.colored_backward(exact, matrix, gradient[:3].astype(np.float64))
     passed = grad_image.get()
     yield by_element("colors_backward", f"gradient, {what}", passed[:3, :height, :width], by_image, 2e-6, floor=1.0)
@@ -199,7 +199,10 @@ def check_response(
     for name in ("response", "grad_response"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
-    found, passed = taken(workspace, camera, planes, row).get(), taken(workspace, camera, planes, row, uploaded).get()
+    found, passed = (
+        respond(workspace, camera, planes, row).get(),
+        respond(workspace, camera, planes, row, uploaded).get(),
+    )
     sums = workspace.array("response sums", (20, camera.rows)).get()
     exact, given = image[:3].astype(np.float64), gradient[:3].astype(np.float64)
     expected = appearance.taken(exact, row, middle)
@@ -210,7 +213,7 @@ def check_response(
     yield by_element(kernel, f"gradient, {what}", passed[:3, :height, :width], by_image, 1e-5, floor=largest)
     yield equal(kernel, f"gradient outside the image, {what}", outside(camera, passed[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
-    yield by_element(kernel, f"gradient by the numbers, {what}", by_numbers(row, sums), by_row, SUM, floor=floor)
+    yield by_element(kernel, f"gradient by the numbers, {what}", by_parameters(row, sums), by_row, SUM, floor=floor)
     if channels > 3:
         yield equal(kernel, f"fourth plane, {what}", found[3], planes.get()[3])
         yield equal(kernel, f"gradient of the fourth plane, {what}", passed[3], uploaded.get()[3])

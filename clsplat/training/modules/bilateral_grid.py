@@ -1,4 +1,4 @@
-"""Colors of each photograph by place and luminance: bilateral grids (cl_kernels/color_grid.cl)."""
+"""Fit colors per photograph by position and luminance: bilateral grids (cl_kernels/color_grid.cl)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,49 +20,49 @@ from clsplat.training.modules.exposure import (
     TABLE,
     VIEW_COLORS,
     Appearance,
+    ColorReport,
     ColorState,
     Gain,
     RateOrAuto,
-    Written,
 )
 from clsplat.training.run import Run
 
 VIEW_GRIDS = "view_colors.npy"
 ENTRIES = int(constants("color_grid.h")["ENTRIES"])
 TABLES = ("values", "moment1", "moment2")
-WARM_UP = 1000  # steps in which the rate of grids grows from 1 % of itself (gsplat); a tenth of shorter trainings
+WARM_UP = 1000  # steps (gsplat), or a tenth of a shorter training
 Nodes = Annotated[int, Field(ge=1, le=int(constants("color_grid.h")["MOST_NODES"]))]
 GRID_MEANING = (
-    f"{MEANING}; [E | b] is the trilinear mean of the matrices about a pixel; file: matrices [photographs, luminance, "
-    "height, width, 3, 4], float32, the outer ones on the edges of the image, at black and at white of "
-    "{} red + {} green + {} blue; matrix: the mean of a photograph's"
+    f"{MEANING}; [E | b] is interpolated trilinearly; file: matrices [photographs, luminance, height, width, 3, 4], "
+    "float32, the outer ones on the edges of the image, at black and at white of {} red + {} green + {} blue; "
+    "matrix: the mean of a photograph's matrices"
 ).format(*LUMINANCE)
 
 
 class BilateralGrid(Appearance):
-    """Colors of each photograph by place and luminance: a bilateral grid of affine changes (Wang et al. 2024).
+    """Learn a bilateral grid of affine color transforms per photograph (Wang et al. 2024).
 
-    It follows what a phone does to parts of a photograph, local tone mapping, which `exposure` cannot.  It also follows
-    what the model should learn, so that held-out photographs are often worse with it: try `exposure` first.  The mean
-    over photographs and places stays that of no change at each luminance.  A grid that was fitted in one place says
-    nothing of another, so that figures are in colors of `gain`.
+    It follows the local tone mapping of phones, which `exposure` cannot.  It also absorbs what the model should learn,
+    so test views are often worse with it: try `exposure` first.  At each luminance, the mean transform over photographs
+    and positions stays the identity.  A grid cannot be fitted to one half of a photograph and tested on the other, so
+    metrics use the color model `gain`.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
 
     type: Literal["bilateral_grid"] = "bilateral_grid"
-    cells: Annotated[list[Nodes], Field(min_length=3, max_length=3)] = Field([4, 4, 4])
-    """Matrices along the width, the height and the luminance, 1 to 16 each.  Between them colors are trilinear; the
-    outer ones lie on the edges, at black and at white.  Published are [16, 16, 8]."""
+    grid_shape: Annotated[list[Nodes], Field(min_length=3, max_length=3)] = Field([4, 4, 4])
+    """Matrices along the width, the height and the luminance, 1 to 16 each, interpolated trilinearly; the outer ones
+    are on the edges, at black and at white.  The paper uses [16, 16, 8]."""
     rate: RateOrAuto = "auto"
-    """Learning rate of the matrices, by Adam, by step; auto: 2e-3 to 2e-5 (gsplat), where no tracks tell the exposures
-    that of `exposure`; it grows from 1 % of itself in 1000 steps, or a tenth of fewer than 10 000.  At most 0.5."""
+    """Learning rate; by step.  auto: 2e-3 to 2e-5 (gsplat), or that of `exposure` if exposures are unknown, with a
+    warm-up from 1% over 1000 steps, or a tenth of all steps if that is less.  At most 0.5."""
     weight: Annotated[float, Field(ge=0)] = 10.0
-    """Factor of the loss that makes the grid of the photograph of a step smooth: the sum over the axes of the mean of
-    the squared differences of neighbors."""
+    """Weight of the total variation loss of the step's grid: the mean squared difference of neighbors, summed over the
+    axes."""
 
     side_files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors", VIEW_GRIDS: "color grids"}
-    device_planes: ClassVar[int] = 9  # with the gradient that passes white
+    device_planes: ClassVar[int] = 9  # with the gradient where white clips
 
     def create_state(self, run: Run) -> "GridState":
         return GridState(self, [view.name for view in run.scene.split("train")], run.device)
@@ -71,7 +71,7 @@ class BilateralGrid(Appearance):
         if self.chosen == "off":
             return 0
         rows = max(-(-view.camera.height // tile) * tile for view in views)
-        return super().device_bytes(views, tile) + bytes_of(self.cells, len({view.name for view in views}), rows)
+        return super().device_bytes(views, tile) + grid_bytes(self.grid_shape, len({view.name for view in views}), rows)
 
     @classmethod
     def check_saved(cls, scalars: Scalars, tables: Tables) -> None:
@@ -79,15 +79,15 @@ class BilateralGrid(Appearance):
         shapes = {table.shape for table in tables.values()}
         if tables.keys() not in ({*TABLES}, {*TABLES[:1]}) or len(shapes) != 1 or shapes.pop()[1:2] != (ENTRIES,):
             raise DataError(f"its grids are not [photographs, {ENTRIES}, nz, ny, nx]")
-        named, held = sorted(row for key, row in scalars.items() if key.endswith("/row")), len(tables["values"])
-        if named != list(range(held)):
-            raise DataError(f"it has grids of the colors of {held} photographs, and its numbers name other rows")
+        rows, count = sorted(row for key, row in scalars.items() if key.endswith("/row")), len(tables["values"])
+        if rows != list(range(count)):
+            raise DataError(f"it has color grids of {count} photographs, but scalars of other rows")
 
     def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
         if self.rate != "auto":
             return self.rate
-        of_gains = super().rate_of(steps, photographs, known)
-        rate = Decay(initial=2e-3, final=2e-5, over=steps) if known else of_gains
+        from_gains = super().rate_of(steps, photographs, known)
+        rate = Decay(initial=2e-3, final=2e-5, over=steps) if known else from_gains
         warm_up = max(1, min(WARM_UP, steps // 10))
         later = [warm_up + round((steps - warm_up) * share) for share in np.linspace(0, 1, 11)]
         points = {step: [float(step), at_step(rate, step)] for step in later}
@@ -99,13 +99,13 @@ class BilateralGrid(Appearance):
 
 
 class GridState(ColorState):
-    """The grids of all photographs on the device, with Adam's moments: each [photographs, ENTRIES, nz, ny, nx]."""
+    """The grids of all photographs on the device, with Adam moments, each [photographs, ENTRIES, nz, ny, nx]."""
 
     settings: BilateralGrid
 
     def __init__(self, settings: BilateralGrid, views: Sequence[str], device: Device) -> None:
         super().__init__(settings, views)
-        self.device, self.shape = device, (len(self.names), ENTRIES, *reversed(settings.cells))
+        self.device, self.shape = device, (len(self.names), ENTRIES, *reversed(settings.grid_shape))
         self.arrays: dict[str, Array] = {name: device.zeros(self.shape) for name in TABLES}
 
     def tables(self, whole: bool = True) -> Tables:
@@ -115,7 +115,7 @@ class GridState(ColorState):
         return "values" in tables and tables["values"].shape == self.shape
 
     def load(self, scalars: Scalars, tables: Tables) -> None:
-        """Those that are not given become 0."""
+        """Missing tables become 0."""
         super().load(scalars, tables)
         for name, array in self.arrays.items():
             array.set(np.ascontiguousarray(tables.get(name, np.zeros(self.shape, np.float32))))
@@ -130,7 +130,7 @@ class GridState(ColorState):
         self._center()
 
     def row(self, view: int) -> int:
-        """Return the row of a training view by its number."""
+        """Return the row of a training view."""
         return self.names.index(self.views[view])
 
     def after_render(self, step: TrainingStep) -> None:
@@ -151,7 +151,7 @@ class GridState(ColorState):
         if (kept := step.saved(self)) and step.view is not None:
             self.learn(step.workspace, step.view, kept[1][0], step.number)
 
-    def written(self) -> Written:
+    def report(self) -> ColorReport:
         values = self.arrays["values"].get()
         grids = values.reshape(-1, 3, 4, *values.shape[2:]).transpose(0, 3, 4, 5, 1, 2) + IDENTITY.astype(np.float32)
         means = {view: one.mean(axis=(0, 1, 2), dtype=np.float64) for view, one in zip(self.names, grids, strict=True)}
@@ -159,11 +159,11 @@ class GridState(ColorState):
         facts = {
             "meaning": GRID_MEANING,
             "type": self.settings.type,
-            "cells": list(self.settings.cells),
+            "grid_shape": list(self.settings.grid_shape),
             "file": VIEW_GRIDS,
             "photographs": rows,
         }
-        return Written(means, facts, {VIEW_GRIDS: np.ascontiguousarray(grids, np.float32)})
+        return ColorReport(means, facts, {VIEW_GRIDS: np.ascontiguousarray(grids, np.float32)})
 
     def changed(self, workspace: Workspace, camera: DeviceCamera, image: Array, view: int) -> Array:
         found = workspace.array("colored", image.shape)
@@ -173,8 +173,8 @@ class GridState(ColorState):
         return found
 
     def smoothness(self, workspace: Workspace, view: int) -> Array:
-        """Write the derivatives of the smoothness; return its shares, whose sum it is."""
-        nodes, row = dict(zip("xyz", self.settings.cells, strict=True)), row_length(self.settings.cells)
+        """Write the gradient of the total variation loss; return its terms."""
+        nodes, row = dict(zip("xyz", self.settings.grid_shape, strict=True)), row_length(self.settings.grid_shape)
         sizes: dict[str, Any] = {f"n{axis}": n for axis, n in nodes.items()}
         by_smoothness, shares = (workspace.array(f"grid {name}", row) for name in ("smoothness", "shares"))
         differences = {axis: row // n * (n - 1) for axis, n in nodes.items()}
@@ -193,8 +193,8 @@ class GridState(ColorState):
     def differentiated(
         self, workspace: Workspace, camera: DeviceCamera, image: Array, gradient: Array, view: int
     ) -> tuple[Array, Array]:
-        """Return the gradient by an image from that by what `changed` made of it, and that by the grid, [row]."""
-        (nx, _, nz), row = self.settings.cells, row_length(self.settings.cells)
+        """Return the gradients of the input image and of the grid, [row], from that of the image `changed` returned."""
+        (nx, _, nz), row = self.settings.grid_shape, row_length(self.settings.grid_shape)
         found = workspace.array("grad_colored", image.shape)
         passed = workspace.array("grid passed", (3, *image.shape[1:]))
         sums, by_grid = (
@@ -220,10 +220,10 @@ class GridState(ColorState):
         return found, by_grid
 
     def _arguments(self, camera: DeviceCamera, image: Array, view: int) -> dict[str, Any]:
-        nx, ny, nz = self.settings.cells
+        nx, ny, nz = self.settings.grid_shape
         return {
             "values": self.arrays["values"],
-            "first": self.row(view) * row_length(self.settings.cells),
+            "first": self.row(view) * row_length(self.settings.grid_shape),
             **{"nx": nx, "ny": ny, "nz": nz, "channels": image.shape[0]},
             "per_column": (nx - 1) / camera.width,
             "per_row": (ny - 1) / camera.height,
@@ -231,11 +231,11 @@ class GridState(ColorState):
         }
 
     def learn(self, workspace: Workspace, view: int, by_grid: Array, step: int) -> None:
-        """Change the grid of a view by Adam, with a count of updates of its own, then center all.
+        """Update the grid of a view by Adam, with its own update count, then center all grids.
 
-        by_grid: derivatives of the losses of the image, [row]; those of the smoothness are as `smoothness` left them.
+        by_grid: gradient of the image losses, [row]; that of the total variation is still in the workspace.
         """
-        key, row = f"{TABLE}/{self.views[view]}/updates", row_length(self.settings.cells)
+        key, row = f"{TABLE}/{self.views[view]}/updates", row_length(self.settings.grid_shape)
         self.scalars[key] = updates = self.scalars.get(key, 0.0) + 1
         arguments: dict[str, Any] = dict(self.arrays)
         workspace.device.program("color_grid_table.cl").color_grid_update(
@@ -251,7 +251,7 @@ class GridState(ColorState):
         self._center()
 
     def _center(self) -> None:
-        """Subtract the mean over photographs and places at each level of luminance."""
+        """Subtract the mean over photographs and positions at each luminance."""
         photographs, _, levels, rows, columns = self.shape
         self.device.program("color_grid_table.cl").color_grid_center(
             groups=ENTRIES * levels,
@@ -261,12 +261,12 @@ class GridState(ColorState):
         )
 
 
-def row_length(cells: Sequence[int]) -> int:
-    """Return the values of one photograph."""
-    return ENTRIES * math.prod(cells)
+def row_length(shape: Sequence[int]) -> int:
+    """Return the number of values of one photograph's grid."""
+    return ENTRIES * math.prod(shape)
 
 
-def bytes_of(cells: Sequence[int], photographs: int, rows: int) -> int:
-    """Return what grids take on the device.  rows: of the largest view, whole tiles."""
-    row, columns = row_length(cells), ENTRIES * cells[0] * cells[2]
+def grid_bytes(shape: Sequence[int], photographs: int, rows: int) -> int:
+    """Return the bytes of grids on the device.  rows: of the largest view, in whole tiles."""
+    row, columns = row_length(shape), ENTRIES * shape[0] * shape[2]
     return 4 * (len(TABLES) * photographs * row + 3 * row + columns * rows)

@@ -1,4 +1,4 @@
-"""What each camera makes of light: the falloff of its lens, and a response curve of each channel."""
+"""Learn how each camera records light: the falloff of its lens, and a response curve per channel."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -25,32 +25,31 @@ TABLE = ViewTable("responses", (), ("center_x", "center_y", "a", "b", "c", *CURV
 
 
 class CameraResponse(TrainingModule):
-    """Vignetting and response curves of each camera, learned with the Gaussians; all its photographs share them.
+    """Learn vignetting and response curves with the Gaussians, one set per camera.
 
-    A pixel x of the scene becomes f(v x) before the losses.  v = 1 + a q + b q² + c q³ is the falloff of the lens
+    A pixel x of the render becomes f(v x) before the losses.  v = 1 + a q + b q² + c q³ is the falloff of the lens
     (Goldman and Chen 2005): q is the squared distance from a center, in half diagonals of the image; center_x and
     center_y lead to it from the principal point.  f is a monotone spline of each channel (Ramsay 1988), f(0) = 0 and
     f(1) = 1.  Its slope is piecewise linear; red_0, 1, 3 and 4 are its logarithms at 0, 1/4, 3/4 and 1, less that at
-    1/2.  PPISP (Deutsch et al. 2026) has such a falloff, and a curve of powers.  All numbers begin at 0, which
-    changes nothing.
+    1/2.  PPISP (Deutsch et al. 2026) has such a falloff, and a curve of powers.  All parameters start at 0, the
+    identity.
 
-    Views have one camera where the dataset gives them the same lens, or the same pinhole camera.  Test views are
-    measured as their camera takes them; a camera without a photograph in the training changes nothing.  The model, and
-    all pictures of it, stay as the scene shows them.
+    Views with the same lens or the same pinhole camera in the dataset share a set.  Test views are measured through
+    their camera's set; a camera without training photos has the identity.  The model and its renders do not change.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})
-    order: ClassVar[int] = 25  # before the colors of a photograph, which cut white
-    device_planes: ClassVar[int] = 8  # the image as the camera takes it, and its gradient, each with a fourth plane
+    order: ClassVar[int] = 25  # before modules for colors, which clip white
+    device_planes: ClassVar[int] = 8  # the image after the response, and its gradient, four channels each
     conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
     side_files: ClassVar[Mapping[str, str]] = {FILE: "responses of the cameras"}
 
     type: Literal["camera_response"] = "camera_response"
     rate: NonNegative = 1e-3
-    """Learning rate of the numbers of a camera, by Adam, by step; a training of a few hundred steps needs 5e-3."""
+    """Learning rate (Adam) of the parameters; number by step. Trainings of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared numbers of the step's camera among the losses, by step: what all photographs
-    have in common the Gaussians can show as well."""
+    """Weight of the sum of the squared parameters of the step's camera; number by step. It leaves to the Gaussians
+    what all photos have in common."""
 
     def create_state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)
@@ -61,17 +60,17 @@ class CameraResponse(TrainingModule):
 
 
 class CameraResponseState(ModuleState):
-    """The numbers of each camera, by the name of the first view that has it."""
+    """Parameters of each camera, keyed by the first view that uses it."""
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
     def __init__(self, settings: CameraResponse, views: Sequence[str], cameras: dict[str, str]) -> None:
-        """views: the names of the training views, by number; cameras: of each view, by name."""
+        """views: names of the training views by index; cameras: the camera of each view, by name."""
         super().__init__()
         self.settings, self.views, self.cameras = settings, views, cameras
 
     def row(self, view: str) -> Floats:
-        """Return the numbers of a view's camera, [17]."""
+        """Return the parameters of a view's camera, [17]."""
         return TABLE.row(self.scalars, self.cameras[view])
 
     def after_render(self, step: TrainingStep) -> None:
@@ -79,16 +78,16 @@ class CameraResponseState(ModuleState):
             row, weight = self.row(self.views[step.view]), at_step(self.settings.weight, step.number)
             step.module_losses.append(LossValue("response", lambda: weight * float(row @ row)))
             step.save(self, (step.image, row, 2 * weight * row, []))
-            step.image = taken(step.workspace, step.camera, step.image, row)
+            step.image = respond(step.workspace, step.camera, step.image, row)
 
     def backward(self, step: TrainingStep) -> None:
         if kept := step.saved(self):
-            step.gradient = taken(step.workspace, step.camera, kept[0], kept[1], step.gradient)
+            step.gradient = respond(step.workspace, step.camera, kept[0], kept[1], step.gradient)
             kept[3].append(step.workspace.array("response sums", (20, step.camera.rows)).get_later())
 
     def update(self, step: TrainingStep) -> None:
         if (kept := step.saved(self)) and step.view is not None:
-            gradient, rate = by_numbers(kept[1], kept[3][0]()) + kept[2], at_step(self.settings.rate, step.number)
+            gradient, rate = by_parameters(kept[1], kept[3][0]()) + kept[2], at_step(self.settings.rate, step.number)
             TABLE.update(self.scalars, self.cameras[self.views[step.view]], gradient, rate)
 
     def apply_to(self, scene: Scene) -> Scene:
@@ -99,8 +98,8 @@ class CameraResponseState(ModuleState):
 
 
 def with_rows(scene: Scene, rows: Mapping[str, Floats]) -> Scene:
-    """Return a scene whose views are measured as their cameras take them; rows: numbers by the name of a view, [17]."""
-    responses = {view: partial(taken, row=row) for view, row in rows.items()}
+    """Return a scene whose views are measured through their cameras' responses.  rows: parameters by view, [17]."""
+    responses = {view: partial(respond, row=row) for view, row in rows.items()}
     return replace(scene, views=tuple(replace(view, response=responses.get(view.name)) for view in scene.views))
 
 
@@ -110,22 +109,24 @@ def slopes_of(row: Floats) -> Floats:
     return np.asarray(slopes / (slopes @ AREAS)[:, None])
 
 
-def by_numbers(row: Floats, sums: Floats) -> Floats:
-    """Return derivatives by a camera's numbers, [17], from the sums of rows of pixels, [20, rows]."""
-    found, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], slopes_of(row)
-    by_logs = slopes * found[5:].reshape(3, 5)
+def by_parameters(row: Floats, sums: Floats) -> Floats:
+    """Return the gradient of a camera's parameters, [17], from the sums of rows of pixels, [20, rows]."""
+    totals, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], slopes_of(row)
+    by_logs = slopes * totals[5:].reshape(3, 5)
     by_logs -= slopes * AREAS * by_logs.sum(axis=1, keepdims=True)
-    return np.concatenate([found[:5], np.delete(by_logs, 2, axis=1).ravel()])
+    return np.concatenate([totals[:5], np.delete(by_logs, 2, axis=1).ravel()])
 
 
-def taken(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, back: Array | None = None) -> Array:
-    """Return what a camera makes of an image, [3 or 4, rows, stride]; or, back from a gradient by that, the gradient by
-    the image, with the sums of rows in the workspace."""
+def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Floats, back: Array | None = None) -> Array:
+    """Return an image, [3 or 4, rows, stride], after a camera's response.
+
+    back: the gradient of that; then return the gradient of the image, and leave the sums of rows in the workspace.
+    """
     result = workspace.array("grad_response" if back else "response", image.shape)
     sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2
-    scalars = workspace.device.upload(np.concatenate([row[2:5], slopes_of(row).ravel()]).astype(np.float32))
+    numbers = workspace.device.upload(np.concatenate([row[2:5], slopes_of(row).ravel()]).astype(np.float32))
     center = {f"center_{x}": float(camera.values[f"c{x}"] + half * shift) for x, shift in zip("xy", row, strict=False)}
     given: dict[str, Any] = {"image": image, "gradient": back or image, "found": result, "row_sums": sums, **center}
-    given |= {"numbers": scalars, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
+    given |= {"numbers": numbers, "channels": image.shape[0], "back": int(back is not None), "per_px": 1 / half}
     workspace.device.program(KERNEL).camera_response(groups=(1, camera.rows), **given, **camera.plane_arguments())
     return result

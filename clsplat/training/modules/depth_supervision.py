@@ -1,4 +1,4 @@
-"""The depths that a training knows, where a loss reads them."""
+"""Supply known depths to the loss that reads them."""
 
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,7 +12,7 @@ from clsplat.training.run import Run
 
 
 class DepthSupervision(TrainingModule):
-    """The depths that a loss reads.  The loss brings it: no list names it."""
+    """The depths that the loss `inverse_depth` reads, which implies this module."""
 
     implicit_type: ClassVar[str] = "depth_supervision"
     order: ClassVar[int] = -10
@@ -25,36 +25,33 @@ class DepthSupervision(TrainingModule):
         return cls(type=cls.implicit_type, losses=losses) if losses else None
 
     def check_run(self, run: Run) -> None:
-        """Raise DataError where nothing tells which photographs show a point, or one has no depth map, ConfigError
-        where two losses name different folders."""
+        """Raise DataError if the scene has no tracks or a depth map is missing; ConfigError for two folders."""
         if len({loss.folder for loss in self.losses}) > 1:
-            raise ConfigError(
-                "the loss 'inverse_depth' is given with two folders; expected one loss of it, or one folder"
-            )
+            raise ConfigError("the loss 'inverse_depth' is listed with two folders; keep one of them")
         if run.scene.tracks is None:
             raise DataError(
-                f"{run.scene.path}: nothing tells which photographs show a point, which the loss 'inverse_depth' "
-                "needs; expected a COLMAP model with points: leave the loss out"
+                f"{run.scene.path}: the loss 'inverse_depth' needs points with tracks, as in a COLMAP model; "
+                "remove the loss, or use such a dataset"
             )
         if self._maps:
             self._maps.require(view.name for view in run.scene.split("train"))
 
     @property
     def _maps(self) -> DepthMaps | None:
-        """The maps in the one folder that is named; None: points alone."""
+        """The depth maps; None to use points only."""
         folder = self.losses[0].folder
         return DepthMaps(Path(folder)) if folder else None
 
-    def create_state(self, run: Run) -> "KnownDepthsState":
+    def create_state(self, run: Run) -> "DepthSupervisionState":
         self.check_run(run)
         assert run.scene.tracks is not None
         views = run.scene.split("train")
         tracks, names = within(run.scene.tracks, views), [view.name for view in views]
-        return KnownDepthsState(PointDepths(run.device, tracks, names, run.scene.extent, self._maps))
+        return DepthSupervisionState(PointDepths(run.device, tracks, names, run.scene.extent, self._maps))
 
 
-class KnownDepthsState(ModuleState):
-    """The known depths in a step."""
+class DepthSupervisionState(ModuleState):
+    """The known depths of the training views."""
 
     is_saved: ClassVar[bool] = False
 

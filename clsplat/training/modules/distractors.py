@@ -1,7 +1,7 @@
-"""What each photograph has before the scene: people, cars and whatever else no other photograph shows there.
+"""Model what only one photograph shows, such as people and cars, by Gaussians in front of its camera.
 
-They are no rows of the model: nothing that grows, measures or writes it ever sees them.  Their unit of length is their
-first depth, so that they are the same in every scene.
+These Gaussians are not rows of the model, so growth, metrics and files ignore them.  Their unit of length is their
+initial depth, so that rates do not depend on the scene.
 """
 
 from collections.abc import Sequence
@@ -28,33 +28,33 @@ from clsplat.training.modules.base import ModuleState, Scalars, Tables, Training
 from clsplat.training.run import Run
 
 UPDATES = "updates"
-WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}  # of tables that change
-NEAR = 0.2  # of their first depth
-SIZE, OPACITY = 0.5, 0.05  # first standard deviation, of the distance of two of them; first opacity
+WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}  # of trained tables
+NEAR = 0.2  # near plane, in initial depths
+SIZE, OPACITY = 0.5, 0.05  # initial standard deviation, as a share of their spacing; initial opacity
 GOLDEN = (5**0.5 - 1) / 2
-# A photograph has a few dozen steps in a short training: larger rates than the scene's (ours)
+# A short training visits each photograph only a few dozen times, so rates are larger than those of the scene (ours)
 RATES = Rates(means=2e-3, quats=2e-3, log_scales=2e-2, logit_opacity=0.1, sh_base=2e-2, sh_rest=0.0).at(0, 1.0)
 
 
 class Distractors(TrainingModule):
-    """Give each photograph Gaussians of its own, just before its camera (DeSplat, Wang et al. 2024).
+    """Give each photograph its own Gaussians just in front of its camera (DeSplat, Wang et al. 2024).
 
-    They take up what the scene does not have, and are in no other picture, no measurement and no file.  Their number
-    stays.  Those that cover more than they explain fade.
+    They absorb what is not part of the scene, and appear in no other image, metric or file.  Their number is fixed.  A
+    loss on the area that they cover fades those that explain little.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start", "cover"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
-    order: ClassVar[int] = 20  # in the colors of the scene
-    device_planes: ClassVar[int] = 12  # which rendering and comparing them take, at most
+    order: ClassVar[int] = 20  # before the modules for colors: these Gaussians have the colors of the scene
+    device_planes: ClassVar[int] = 12  # to render and compare them, at most
 
     type: Literal["distractors"] = "distractors"
     count: Annotated[int, Field(gt=0, le=10_000)] = 200
-    """Number of them for each photograph."""
+    """Number of Gaussians per photograph."""
     start: Annotated[int, Field(ge=0)] = 0
-    """Global step after which they are there."""
+    """Global step after which they are rendered."""
     cover: NonNegative = 0.1
-    """Weight of the mean of what they cover of a photograph, from 0 to 1, among the losses; by step."""
+    """Weight of the loss on their mean alpha over the photograph; by step."""
 
     def create_state(self, run: Run) -> "DistractorsState":
         sort, budget = run.rasterizer.tiler.sort, run.rasterizer.budget
@@ -72,14 +72,14 @@ class Distractors(TrainingModule):
         photographs, rows = len(tables.get(UPDATES, ())), len(tables.get("means", ()))
         shapes = {name: (photographs if name == UPDATES else rows, width) for name, width in widths.items()}
         if not photographs or not rows or rows % photographs or {n: t.shape for n, t in tables.items()} != shapes:
-            raise DataError("its distractors are not as many for each photograph")
+            raise DataError("its distractor tables do not have the same number of rows for each photograph")
 
 
 class DistractorsState(ModuleState):
-    """The Gaussians of each photograph on the device, as many for each, with its own Adam."""
+    """The Gaussians of each photograph on the device, with an Adam for each photograph."""
 
     def __init__(self, settings: Distractors, views: Sequence[View], rasterizer: Rasterizer) -> None:
-        """views: of the training; rasterizer: for these Gaussians alone."""
+        """views: training views; rasterizer: for these Gaussians only, since frames share its buffers."""
         super().__init__()
         self.settings, self.rasterizer, self.adams = settings, rasterizer, list[Adam]()
         self._names = list(dict.fromkeys(view.name for view in views))
@@ -100,8 +100,8 @@ class DistractorsState(ModuleState):
 
     def tables(self, whole: bool = True) -> Tables:
         names = [name for one in WIDTHS for name in (one, *moment_tables(one))]
-        found = {name: np.concatenate([adam.gaussians.get(name) for adam in self.adams]) for name in names}
-        return {**found, UPDATES: np.array([[adam.updates["means"]] for adam in self.adams], np.float32)}
+        tables = {name: np.concatenate([adam.gaussians.get(name) for adam in self.adams]) for name in names}
+        return {**tables, UPDATES: np.array([[adam.updates["means"]] for adam in self.adams], np.float32)}
 
     def after_render(self, step: TrainingStep) -> None:
         if step.view is None or step.number <= self.settings.start:
@@ -130,18 +130,20 @@ class DistractorsState(ModuleState):
 
 
 def first_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint8]]]) -> Tables:
-    """Return the first Gaussians of photographs, [height, width, 3] with their views: spread evenly over each, with its
-    colors, nearly clear."""
+    """Return the initial Gaussians of photographs: spread evenly, with the photographs' colors, almost transparent.
+
+    photographs: views and pixels, [height, width, 3].
+    """
     parts = [_spread(count, view, pixels) for view, pixels in photographs]
-    found = {name: np.concatenate([part[name] for part in parts]).astype(np.float32) for name in WIDTHS}
-    moments = {moment: np.zeros_like(values) for name, values in found.items() for moment in moment_tables(name)}
-    return {**found, **moments, UPDATES: np.zeros((len(parts), 1), np.float32)}
+    values = {name: np.concatenate([part[name] for part in parts]).astype(np.float32) for name in WIDTHS}
+    moments = {moment: np.zeros_like(table) for name, table in values.items() for moment in moment_tables(name)}
+    return {**values, **moments, UPDATES: np.zeros((len(parts), 1), np.float32)}
 
 
 def _spread(count: int, view: View, pixels: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-    """Gaussians at the places of a Fibonacci lattice, one unit of length before a camera."""
-    camera, places = view.camera, np.arange(count) + 0.5
-    x, y = camera.width * places / count, camera.height * ((places * GOLDEN) % 1)
+    """Return Gaussians on a Fibonacci lattice, one unit of length in front of a camera."""
+    camera, index = view.camera, np.arange(count) + 0.5
+    x, y = camera.width * index / count, camera.height * ((index * GOLDEN) % 1)
     colors = pixels[y.astype(int), x.astype(int)] / 255
     size = SIZE * np.sqrt(camera.width * camera.height / count / (camera.fx * camera.fy))
     return {
@@ -154,7 +156,7 @@ def _spread(count: int, view: View, pixels: NDArray[np.uint8]) -> dict[str, NDAr
 
 
 def _adam(device: Device, tables: Tables, number: int) -> Adam:
-    """The Gaussians of one photograph, with their moments."""
+    """Return the Adam of one photograph's Gaussians, with their moments."""
     count = len(tables["means"]) // len(tables[UPDATES])
     rows = slice(number * count, (number + 1) * count)
     parameters = {name: tables[name][rows] for name in WIDTHS}

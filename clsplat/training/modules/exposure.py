@@ -1,9 +1,10 @@
-"""Colors of each photograph, where exposures differ: between the rendered image and the losses.
+"""Fit the exposure of each photograph: a color transform between render and losses.
 
-A photograph has its numbers, all 0 where its colors are the scene's.  They make a matrix [E | b], and a pixel c of the
-rendered image becomes min(1, E c + b) before every loss (cl_kernels/colors.cl).
+A photograph has a few parameters, all 0 for the identity.  They make a matrix [E | b], and a pixel c of the render
+becomes min(1, E c + b) before the losses (cl_kernels/colors.cl).
 """
 
+import itertools
 import json
 import logging
 import math
@@ -37,65 +38,65 @@ from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 VIEW_COLORS = "view_colors.json"
-TABLE, KNOWN = "colors", "known exposures"  # KNOWN: whether the numbers began with exposures that were measured
+TABLE, KNOWN = "colors", "known exposures"  # KNOWN: whether parameters were initialized from measured exposures
 SUMS = int(constants("colors.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
-FEW_VISITS = 400  # of a photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
-MOST = 5e-2  # learning rate
-Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.5))]  # Adam's steps are as long: a gain of 1.6 in each
+MIN_VISITS = 400  # per photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
+MAX_RATE = 5e-2
+Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.5))]  # the size of an Adam step: a gain of 1.6
 RateOrAuto = Annotated[Literal["auto"] | Rate, explain_schedule(", or auto")]
-SPREAD = 0.03  # of the exposures: smaller ones are within what tracks measure
-# Of the differences: 17 to 31 % in three captures as they are, 40 to 71 % in the same with exposures changed by 25 %.
+SPREAD = 0.03  # the accuracy of measurements on tracks
+# In three captures exposure explains 17 to 31% of the variance; with exposures changed by 25%, 40 to 71%.
 EXPLAINED = 1 / 3
 
 
 @dataclass(frozen=True)
-class Written:
-    """What a training leaves of the colors of its photographs."""
+class ColorReport:
+    """The learned colors of the photographs, for side files."""
 
-    matrices: dict[str, Floats]  # of each photograph, the mean where it has several, [3, 4]
-    facts: dict[str, Any]  # for JSON: at least `meaning` and `type`, the name of the kind
-    arrays: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # by the names of files of NumPy's
+    matrices: dict[str, Floats]  # by photograph; the mean of several, [3, 4]
+    facts: dict[str, Any]  # for JSON, with `meaning` and `type`
+    arrays: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # by name of a .npy file
 
 
 class Appearance(TrainingModule):
-    """Numbers of each photograph, which are learned with the Gaussians; their mean over the photographs stays 0.
+    """Color parameters of each photograph, learned with the Gaussians; their mean over the photographs stays 0.
 
-    Without that, a change of all of them and the opposite one of the Gaussians would be the same to every loss, and the
-    colors of the model would drift.
+    Otherwise no loss would notice a common change of all photographs that the Gaussians undo, and the colors of the
+    model would drift.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
-    order: ClassVar[int] = 30  # after what stands in front of the scene
+    order: ClassVar[int] = 30  # after what is in front of the scene
     family: ClassVar[str] = "appearance"
-    conflicts: ClassVar[Mapping[str, str]] = {"blocks": "those of blocks would differ"}
+    conflicts: ClassVar[Mapping[str, str]] = {"blocks": "the colors of blocks would differ"}
     side_files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors"}
-    device_planes: ClassVar[int] = 6  # the image in the colors of its photograph, and its gradient
+    device_planes: ClassVar[int] = 6  # the transformed image, and its gradient
 
     rate: RateOrAuto = "auto"
-    """Learning rate of the numbers, by Adam, by step; auto: 1e-2 to 1e-3, where each photograph is visited 400 times or
-    more 2e-3 to 2e-5; where no tracks tell the exposures, as large as a gain of 2.7 needs, up to 5e-2.  At most 0.5."""
+    """Learning rate; by step.  auto: 2e-3 to 2e-5, with fewer than 400 visits per photograph 1e-2 to 1e-3; if exposures
+    are unknown, as large as a gain of 2.7 needs, up to 5e-2.  At most 0.5."""
 
     when: Literal["always", "auto"] = "always"
-    """`auto`: where exposures differ, by what the photographs show of the same points.
+    """`auto`: only if exposures differ.
 
-    The logarithms of the exposures are measured on the tracks of the dataset's points, before training.  Two bounds are
-    to be passed: the standard deviation of the exposures, and their share of what differs between photographs of one
-    point; light that changes with the direction of view is the rest.  Elsewhere the bits are those without it."""
-    above: Annotated[float, Field(ge=0)] = SPREAD
-    """With `when: auto`, standard deviation of the logarithms of the exposures; 0.03 is 3 %."""
-    explained: Annotated[float, Field(ge=0, lt=1)] = EXPLAINED
-    """With `when: auto`, share of the differences."""
+    Before training, log exposures are measured on the tracks of the dataset's points.  The module is active if both
+    their standard deviation and the variance that they explain are large enough; view-dependent light is the rest of
+    the variance.  If it is not active, the model is bit-identical to one without the module."""
+    min_spread: Annotated[float, Field(ge=0)] = SPREAD
+    """With `when: auto`, the smallest standard deviation of log exposures; 0.03 is 3%."""
+    min_explained_variance: Annotated[float, Field(ge=0, lt=1)] = EXPLAINED
+    """With `when: auto`, the smallest share of the color variance of points that exposures explain."""
     chosen: Literal["on", "off"] | None = None
-    """Written by a run: what `auto` has chosen."""
+    """Written by a run: the choice of `auto`."""
     reason: str = ""
     """Written by a run: why."""
 
     @property
     @abstractmethod
     def fit(self) -> "ColorModel":
-        """What images are measured with: colors that are fitted to a photograph."""
+        """The color model that metrics fit to a photograph."""
 
     def is_active(self, scene: Scene | None = None) -> bool:
         return self.when == "always" or self.chosen == "on"
@@ -104,31 +105,28 @@ class Appearance(TrainingModule):
         return 0 if self.chosen == "off" else super().device_bytes(views, tile)
 
     def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
-        """Return the learning rate by step of a training with so many steps and photographs.
-
-        known: whether the numbers begin near those of the photographs.
-        """
+        """Return the learning rate schedule.  known: whether parameters start near their final values."""
         if self.rate != "auto":
             return self.rate
         visits = steps / photographs
-        initial, final = (1e-2, 1e-3) if visits < FEW_VISITS else (2e-3, 2e-5)
+        initial, final = (1e-2, 1e-3) if visits < MIN_VISITS else (2e-3, 2e-5)
         if not known:
-            needed = min(math.log(10) / (0.9 * visits), MOST)  # the sum of rates that fall to a tenth is 1
+            needed = min(math.log(10) / (0.9 * visits), MAX_RATE)  # so that decaying rates sum to 1
             initial, final = max(initial, needed), max(final, needed / 10)
         return Decay(initial=initial, final=final, over=steps)
 
     def resolve_auto(self, run: Run) -> "Appearance":
-        """Return it with the choice that follows from the exposures of the photographs; one that is made stays."""
+        """Return the module with the choice of `when: auto`, unless it is made already."""
         if self.when == "always" or self.chosen is not None:
             return self
         exposures = exposures_of(run)
         if not exposures.log_gains:
             return self._choose("off", exposures.text)
-        few, alike = exposures.spread <= self.above, exposures.explained <= self.explained
-        bounds = [f"{self.above:.1%}", f"{self.explained:.0%} of what differs"]
-        if not few and not alike:
+        small = exposures.spread <= self.min_spread, exposures.explained <= self.min_explained_variance
+        bounds = f"{self.min_spread:.1%}", f"{self.min_explained_variance:.0%} of what differs"
+        if not any(small):
             return self._choose("on", f"{exposures.text}; more than {bounds[0]}, and than {bounds[1]}")
-        missed = " nor ".join(bound for bound, decides in zip(bounds, (few, alike), strict=True) if decides)
+        missed = " nor ".join(itertools.compress(bounds, small))
         return self._choose("off", f"{exposures.text}; not more than {missed}")
 
     def _choose(self, chosen: Literal["on", "off"], reason: str) -> "Appearance":
@@ -144,46 +142,48 @@ class Appearance(TrainingModule):
         name = data.get("type") if isinstance(data, dict) else None
         if not isinstance(name, str) or name not in known:
             names = ", ".join(known)
-            raise DataError(f"{path}: the type of colors is {quote(name)}; expected one of {names}: write it again")
+            raise DataError(
+                f"{path}: unknown type of colors {quote(name)}, expected {names}; train again, or remove the file"
+            )
         facts = {key: data[key] for key in ("model",) if key in data}
         return known[name].model_validate(facts).fit if known[name] is cls else None
 
 
 class ColorModel(Settings):
-    """What makes the colors of a scene those of one photograph: one matrix for all its pixels, of a few numbers."""
+    """A color transform of a photograph: one matrix for all its pixels, from a few parameters."""
 
-    columns: ClassVar[tuple[str, ...]] = ()  # names of the numbers of a photograph
-    fitted_to_a_channel: ClassVar[int] = 1  # numbers that `fitted` finds for each of red, green and blue
+    columns: ClassVar[tuple[str, ...]] = ()  # names of the parameters of a photograph
+    fitted_to_a_channel: ClassVar[int] = 1  # numbers per channel that `fitted` fits
 
     type: str
     """Name of the model."""
 
     @abstractmethod
     def fitted(self, image: Floats, photograph: Floats) -> Floats:
-        """Return the matrix, [3, 4], that brings an image nearest to a photograph by least squares, pixels [M, 3]."""
+        """Return the matrix, [3, 4], that fits an image to a photograph by least squares, pixels [M, 3]."""
 
     @abstractmethod
     def matrix(self, row: Floats) -> Floats:
-        """Return [E | b], [3, 4], of a photograph's numbers, [columns]."""
+        """Return [E | b], [3, 4], from the parameters, [columns]."""
 
     @abstractmethod
     def gradient(self, row: Floats, by_matrix: Floats) -> Floats:
-        """Return derivatives by a photograph's numbers, [columns], from those by its matrix, [3, 4]."""
+        """Return the gradient of the parameters, [columns], from that of the matrix, [3, 4]."""
 
     @abstractmethod
-    def of_gains(self, log_gains: Floats) -> Floats:
-        """Return the numbers, [columns], that come nearest to gains of red, green and blue: their logarithms, [3]."""
+    def from_gains(self, log_gains: Floats) -> Floats:
+        """Return the parameters, [columns], closest to gains of red, green and blue, given by their logarithms, [3]."""
 
     def penalty(self, row: Floats) -> tuple[float, Floats]:
-        """Return a loss of a photograph's numbers alone, and its derivatives."""
+        """Return a regularization loss on the parameters, and its gradient."""
         return 0.0, np.zeros_like(row)
 
 
 class Gain(Gains, ColorModel):
-    """An exposure and a white balance of each photograph.
+    """Exposure and white balance of each photograph.
 
-    Channels are multiplied by exp(exposure + (red, green, blue)); green follows from red and blue, so that the
-    luminance follows the exposure alone.
+    Channels are multiplied by exp(exposure + (red, green, blue)); green follows from red and blue, so that only the
+    exposure changes the luminance.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("exposure", "red", "blue")
@@ -200,16 +200,16 @@ class Gain(Gains, ColorModel):
         tied = green * LUMINANCE / LUMINANCE[1]
         return np.array([red + green + blue, red - tied[0], blue - tied[2]])
 
-    def of_gains(self, log_gains: Floats) -> Floats:
+    def from_gains(self, log_gains: Floats) -> Floats:
         exposure = LUMINANCE @ log_gains
         return np.array([exposure, log_gains[0] - exposure, log_gains[2] - exposure])
 
 
 class Affine(ColorModel):
-    """An affine change of the colors of each photograph, twelve numbers (Kerbl et al. 2024).
+    """An affine color transform of each photograph, twelve parameters (Kerbl et al. 2024).
 
-    It follows white balance, contrast and haze, and also what is none of these: colors that change with the direction
-    of view, which it takes from the Gaussians; `weight` holds it back.  `gain` generalizes better.
+    It follows white balance, contrast and haze, but also absorbs view-dependent color that belongs to the Gaussians;
+    `weight` limits that.  `gain` generalizes better.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
@@ -218,8 +218,7 @@ class Affine(ColorModel):
 
     type: Literal["affine"] = "affine"
     weight: Annotated[float, Field(ge=0)] = 1e-2
-    """Factor of the loss that pulls the matrix of the photograph of a step to that of no change: the sum of the squared
-    differences, without the constants."""
+    """Weight of a loss that pulls the matrix to the identity: the sum of squared differences, without the offsets."""
 
     def matrix(self, row: Floats) -> Floats:
         return IDENTITY + row.reshape(3, 4)
@@ -227,7 +226,7 @@ class Affine(ColorModel):
     def gradient(self, row: Floats, by_matrix: Floats) -> Floats:
         return by_matrix.ravel()
 
-    def of_gains(self, log_gains: Floats) -> Floats:
+    def from_gains(self, log_gains: Floats) -> Floats:
         return (np.column_stack([np.diag(np.exp(log_gains)), np.zeros(3)]) - IDENTITY).ravel()
 
     def penalty(self, row: Floats) -> tuple[float, Floats]:
@@ -244,11 +243,11 @@ class Affine(ColorModel):
 
 
 class Exposure(Appearance):
-    """Colors of each photograph, where exposures differ: one matrix for all its pixels."""
+    """Fit the exposure of each photograph, if exposures differ: one color matrix for all its pixels."""
 
     type: Literal["exposure"] = "exposure"
     model: OneOf[ColorModel] = Gain()
-    """What a photograph has: `gain`, an exposure and a white balance, or `affine`."""
+    """`gain`: exposure and white balance; `affine`: a full matrix."""
 
     @property
     def fit(self) -> ColorModel:
@@ -259,12 +258,12 @@ class Exposure(Appearance):
 
 
 class ColorState(ModuleState):
-    """What a training has of the colors of its photographs, of whichever kind."""
+    """The learned colors of the photographs; base of all kinds."""
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
     def __init__(self, settings: Appearance, views: Sequence[str]) -> None:
-        """views: the names of the training views, by number; one of several sizes has one row."""
+        """views: names of the training views by index; the sizes of a view share a row."""
         super().__init__()
         self.settings, self.views, self.names = settings, views, tuple(dict.fromkeys(views))
         self.rate: Schedule = 0.0
@@ -279,28 +278,28 @@ class ColorState(ModuleState):
         self.rate = self.settings.rate_of(last, len(self.names), self.scalars.get(KNOWN, 1.0) > 0)
 
     def start_from(self, log_gains: Mapping[str, Floats]) -> None:
-        """Set the first numbers.  log_gains: of red, green and blue by view, where known, [3]."""
+        """Initialize the parameters.  log_gains: of red, green and blue, by view, if known, [3]."""
 
     @property
     def color_model(self) -> ColorModel:
         return self.settings.fit
 
     @abstractmethod
-    def written(self) -> Written:
-        """Return what the run folder gets."""
+    def report(self) -> ColorReport:
+        """Return the contents of the side files."""
 
     def write(self, run: Run) -> None:
-        """Write the colors of each training photograph; log a line.  Raises NumericError where they are not finite."""
-        found = self.written()
-        if wrong := next((view for view, matrix in found.matrices.items() if not np.isfinite(matrix).all()), None):
+        """Write the colors of each training photograph.  Raises NumericError if they are not finite."""
+        report = self.report()
+        if wrong := next((view for view, matrix in report.matrices.items() if not np.isfinite(matrix).all()), None):
             raise NumericError(
                 f"the colors of {quote(wrong)} are not finite; lower optimize.modules.{self.settings.type}.rate"
             )
-        write_text(run.out / VIEW_COLORS, json.dumps(found.facts, indent=1) + "\n")
-        for name, array in found.arrays.items():
+        write_text(run.out / VIEW_COLORS, json.dumps(report.facts, indent=1) + "\n")
+        for name, array in report.arrays.items():
             with open_atomic(run.out / name) as file:
                 np.save(file, array, allow_pickle=False)
-        greens = [matrix[1, 1] for matrix in found.matrices.values()]
+        greens = [matrix[1, 1] for matrix in report.matrices.values()]
         LOG.info(
             "colors of %d photographs in %s: green is multiplied by %.2f to %.2f",
             *(len(greens), VIEW_COLORS, min(greens), max(greens)),
@@ -308,7 +307,7 @@ class ColorState(ModuleState):
 
 
 class ExposureState(ColorState):
-    """The numbers of one matrix for each photograph."""
+    """The parameters of one matrix for each photograph."""
 
     settings: Exposure
 
@@ -320,8 +319,8 @@ class ExposureState(ColorState):
         return self.table.begun(scalars)
 
     def start_from(self, log_gains: Mapping[str, Floats]) -> None:
-        of_gains = self.settings.model.of_gains
-        self.table.begin(self.scalars, {view: of_gains(gains) for view, gains in log_gains.items()})
+        from_gains = self.settings.model.from_gains
+        self.table.begin(self.scalars, {view: from_gains(gains) for view, gains in log_gains.items()})
 
     def after_render(self, step: TrainingStep) -> None:
         if step.view is None:
@@ -329,13 +328,13 @@ class ExposureState(ColorState):
         row = self.table.row(self.scalars, self.views[step.view])
         penalty, matrix, image = self.settings.model.penalty(row)[0], self.settings.model.matrix(row), step.image
         step.save(self, (image, matrix, []))
-        step.image = change_colors(step.workspace, step.camera, image, matrix)
+        step.image = transform_colors(step.workspace, step.camera, image, matrix)
         step.module_losses.append(LossValue("colors", lambda: penalty))
 
     def backward(self, step: TrainingStep) -> None:
         if kept := step.saved(self):
             image, matrix, waits = kept
-            step.gradient, wait = change_back(step.workspace, step.camera, image, matrix, step.gradient)
+            step.gradient, wait = color_gradients(step.workspace, step.camera, image, matrix, step.gradient)
             waits.append(wait)
 
     def update(self, step: TrainingStep) -> None:
@@ -344,16 +343,16 @@ class ExposureState(ColorState):
         self.learn(step.view, kept[2][0](), step.number)
 
     def learn(self, view: int, by_matrix: Floats, step: int) -> None:
-        """Change the numbers of a view; by_matrix: derivatives of the losses by its matrix, [3, 4]."""
+        """Update the parameters of a view.  by_matrix: gradient of its matrix, [3, 4]."""
         row = self.table.row(self.scalars, self.views[view])
         gradient = self.settings.model.gradient(row, by_matrix) + self.settings.model.penalty(row)[1]
         self.table.update(self.scalars, self.views[view], gradient, at_step(self.rate, step))
 
     def matrix(self, view: int) -> Floats:
-        """Return the matrix of a training view by its number, [3, 4]."""
+        """Return the matrix of a training view, [3, 4]."""
         return self.settings.model.matrix(self.table.row(self.scalars, self.views[view]))
 
-    def written(self) -> Written:
+    def report(self) -> ColorReport:
         rows = {view: self.table.row(self.scalars, view) for view in self.table.views}
         matrices = {view: self.settings.model.matrix(row) for view, row in rows.items()}
         model = self.settings.model
@@ -363,11 +362,11 @@ class ExposureState(ColorState):
         }
         meaning = f"{MEANING}; matrix: the rows of [E | b]"
         facts = {"meaning": meaning, "type": self.settings.type, "model": model.type, "photographs": photographs}
-        return Written(matrices, facts)
+        return ColorReport(matrices, facts)
 
 
 def exposures_of(run: Run) -> Exposures:
-    """Return what the training photographs show of their exposures, or else what their cameras noted; measured once."""
+    """Return the exposures of the training photographs, measured on tracks, or else from EXIF; cached in the run."""
     views = run.scene.split("train")
     names = tuple(view.name for view in views)
     key = TABLE, names
@@ -379,39 +378,39 @@ def exposures_of(run: Run) -> Exposures:
 
         counted = run.status.counted(views, "photographs", len(views))
         shown = measured(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
-        told = len(shown.log_gains) == len(set(names))
-        run.cache[key] = shown if told else with_noted(shown, noted(views))
+        is_complete = len(shown.log_gains) == len(set(names))
+        run.cache[key] = shown if is_complete else with_noted(shown, noted(views))
     exposures: Exposures = run.cache[key]
     return exposures
 
 
-def change_colors(workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats) -> Array:
-    """Return an image, [3 or 4, rows, stride], with the colors that a matrix [3, 4] makes of its own."""
-    found = workspace.array("colored", image.shape)
+def transform_colors(workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats) -> Array:
+    """Return an image, [3 or 4, rows, stride], with its colors transformed by a matrix, [3, 4]."""
+    colored = workspace.array("colored", image.shape)
     workspace.device.program("colors.cl").colors_forward(
-        groups=(1, camera.rows), image=image, colored=found, **_arguments(camera, image, matrix)
+        groups=(1, camera.rows), image=image, colored=colored, **_arguments(camera, image, matrix)
     )
-    return found
+    return colored
 
 
-def change_back(
+def color_gradients(
     workspace: Workspace, camera: DeviceCamera, image: Array, matrix: Floats, gradient: Array
 ) -> tuple[Array, Callable[[], Floats]]:
-    """Return the gradient by an image from that by what `change_colors` made of it, and a wait for that by the matrix.
+    """Return the gradient of the input of `transform_colors`, and a function that waits for that of the matrix.
 
-    The sums of each row are added in double, in the order of rows.
+    gradient: of the output.  Sums of rows are added in double precision, in order.
     """
-    found, sums = workspace.array("grad_colored", image.shape), workspace.array("color sums", (SUMS, camera.rows))
+    grad_image, sums = workspace.array("grad_colored", image.shape), workspace.array("color sums", (SUMS, camera.rows))
     workspace.device.program("colors.cl").colors_backward(
         groups=(1, camera.rows),
         image=image,
         gradient=gradient,
-        grad_image=found,
+        grad_image=grad_image,
         row_sums=sums,
         **_arguments(camera, image, matrix),
     )
     copied = sums.get_later()
-    return found, lambda: np.cumsum(copied(), axis=1, dtype=np.float64)[:, -1].reshape(3, 4)
+    return grad_image, lambda: np.cumsum(copied(), axis=1, dtype=np.float64)[:, -1].reshape(3, 4)
 
 
 def _arguments(camera: DeviceCamera, image: Array, matrix: Floats) -> dict[str, Any]:

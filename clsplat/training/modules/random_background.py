@@ -1,4 +1,4 @@
-"""The color behind everything, where each step draws its own."""
+"""Draw a random background color in each step."""
 
 import logging
 from collections.abc import Mapping
@@ -16,35 +16,35 @@ LOG = logging.getLogger("clsplat")
 
 
 class RandomBackground(TrainingModule):
-    """Draw the color behind everything in each step: uniform, by the seed and the step alone."""
+    """Draw a uniform random background color in each step; it depends only on the seed and the step."""
 
-    conflicts: ClassVar[Mapping[str, str]] = {"sky": "it is behind everything, and drawn colors would be too"}
+    conflicts: ClassVar[Mapping[str, str]] = {"sky": "both are the background"}
     optional_on_resume: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"where"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"when"})
 
     type: Literal["random_background"] = "random_background"
-    where: Literal["always", "transparent"] = "always"
-    """transparent: only where the background shows behind photographs."""
+    when: Literal["always", "transparent"] = "always"
+    """`transparent`: only if the photographs have transparent pixels."""
 
     def is_active(self, scene: Scene | None = None) -> bool:
-        return self.where == "always" or (scene is not None and background_shows(scene))
+        return self.when == "always" or (scene is not None and background_shows(scene))
 
     def create_state(self, run: Run) -> ModuleState:
-        if self.where == "transparent":
-            LOG.info("background of the steps: random, since it shows behind photographs")
+        if self.when == "transparent":
+            LOG.info("random background in training, since photographs have transparent pixels")
         run.photographs.keep_transparency()
-        return _Drawing(run.device, run.seed)
+        return RandomBackgroundState(run.device, run.seed)
 
 
-class _Drawing(ModuleState):
+class RandomBackgroundState(ModuleState):
     def __init__(self, device: Device, seed: int) -> None:
         super().__init__()
         self.device, self.seed = device, seed
 
     def before_render(self, step: TrainingStep) -> None:
-        step.background = drawn_background(self.device, self.seed, step.number)
+        step.background = random_color(self.device, self.seed, step.number)
 
 
-def drawn_background(device: Device, seed: int, step: int) -> Array:
-    """Return the color of a global step, [3] in [0, 1)."""
+def random_color(device: Device, seed: int, step: int) -> Array:
+    """Return the background color of a global step, [3] in [0, 1)."""
     return device.upload(np.random.default_rng([seed, step]).random(3, np.float32))

@@ -1,4 +1,4 @@
-"""Which steps skip the backward pass: those whose view has converged."""
+"""Skip the backward pass of steps whose view has converged."""
 
 import logging
 import math
@@ -14,55 +14,53 @@ from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingS
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-COUNTS = ("steps", "whole", "warm_up", "above")  # names in the numbers of a run, in the folder `skip`
+COUNTS = ("steps", "whole", "warm_up", "above")  # names of scalars, after `skip/`
 
 
 @dataclass(frozen=True)
 class Visit:
-    """What a step does with its view."""
+    """The decision about one step."""
 
     skipped: bool = False
-    scalars: Mapping[str, float] = field(default_factory=dict)  # those that change when the step is done
+    scalars: Mapping[str, float] = field(default_factory=dict)  # new values, set when the step is done
 
 
-class Skip(TrainingModule):
-    """Skip the backward pass and the update where a view has converged (SkipGS, Li et al. 2026).
+class SkipBackward(TrainingModule):
+    """Skip the backward pass and the update of views that have converged (SkipGS, Li et al. 2026).
 
-    Every step after `start` renders its view, compares it, and adds the loss to the moving average of the view's
-    losses; a step whose loss is not above the average does nothing else.  A warm-up, in which nothing is skipped, finds
-    the least share of steps that do the whole work.  Ours, where the published text is silent: that share is one of all
-    steps after `start`, with those of the warm-up; a view's first visit has no average, and is never skipped; a size of
-    a view has an average of its own; penalties are no part of the loss.
+    Every step after `start` renders its view and adds the loss to a moving average for that view.  If the loss is not
+    above the average, the rest of the step is skipped.  During a warm-up nothing is skipped; it determines the smallest
+    fraction of full steps.  Where the paper is silent, we chose: the fraction counts all steps after `start`, including
+    the warm-up; the first visit of a view is never skipped; each size of a view has its own average; penalties are not
+    part of the loss.
 
-    A step that is skipped updates nothing: no parameter, no moment and no count of Adam's updates, no statistic (their
-    means are over the views that were not skipped), no number of another module; penalties are not computed,
-    and the loss that is recorded is without them.  It counts as a step: rates, weights, the order of views and all
-    stages of `during`, those that edit or add noise too, go on.
+    A skipped step updates nothing: no parameter, no moment or update count of Adam, no statistic, and no other module.
+    Its penalties are not computed, and are missing from the recorded loss.  It still counts as a step for schedules,
+    the order of views, and the stages of `during`.
     """
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
     order: ClassVar[int] = 99  # it reads the losses of all others
     optional_on_resume: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"start", "decay", "warm_up", "least"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"start", "decay", "warm_up", "min_fraction"})
 
-    type: Literal["skip"] = "skip"
+    type: Literal["skip_backward"] = "skip_backward"
     start: Annotated[int, Field(ge=0)]
-    """Global step after which steps may be skipped: where growth has ended and photographs have their full size."""
+    """Global step after which steps may be skipped.  Choose one after growth, with photographs at full size."""
     decay: Annotated[float, Field(ge=0, lt=1)] = 0.95
-    """Share of a view's average that stays at a visit."""
+    """Decay of the moving average, per visit of a view."""
     warm_up: Annotated[int, Field(gt=0)] = 500
-    """Steps from `start` on that are not skipped; `auto` needs several for each photograph."""
-    least: Annotated[
+    """Number of steps after `start` that are never skipped; `auto` needs several per photograph."""
+    min_fraction: Annotated[
         Literal["auto"] | Annotated[float, Field(ge=0, le=1)], in_one_sentence("expected 'auto' or a share from 0 to 1")
     ] = "auto"
-    """Least share of steps that do the whole work; `auto`: the share of the warm-up that would not have been
-    skipped."""
+    """Smallest fraction of full steps; `auto`: the fraction of the warm-up that would not have been skipped."""
 
     def create_state(self, run: Run) -> ModuleState:
-        return SkipState(self, run.scene.split("train"))
+        return SkipBackwardState(self, run.scene.split("train"))
 
     def decide(self, name: str, loss: float, scalars: Mapping[str, float]) -> Visit:
-        """Decide on a step after `start`; name: of the view's average."""
+        """Decide whether to skip a step after `start`.  name: scalar with the view's average."""
         if not math.isfinite(loss):
             return Visit()
         steps, whole, warm_up, above = (scalars.get(f"skip/{count}", 0.0) for count in COUNTS)
@@ -70,20 +68,20 @@ class Skip(TrainingModule):
         converged = average is not None and loss <= average
         if warming := warm_up < self.warm_up:
             warm_up, above = warm_up + 1, above + (not converged)
-        skipped = converged and not warming and whole >= self.share(above, warm_up) * steps
+        skipped = converged and not warming and whole >= self.fraction(above, warm_up) * steps
         counts = steps, whole + (not skipped), warm_up, above
         after = loss if average is None else self.decay * average + (1 - self.decay) * loss
         return Visit(skipped, {name: after, **dict(zip((f"skip/{count}" for count in COUNTS), counts, strict=True))})
 
-    def share(self, above: float, warm_up: float) -> float:
-        """The least share of whole steps; warm_up: its steps so far, of which so many were `above` the average."""
-        return above / max(warm_up, 1) if self.least == "auto" else self.least
+    def fraction(self, above: float, warm_up: float) -> float:
+        """Return the smallest fraction of full steps.  above: steps of the warm-up with a loss above the average."""
+        return above / max(warm_up, 1) if self.min_fraction == "auto" else self.min_fraction
 
 
-class SkipState(ModuleState):
+class SkipBackwardState(ModuleState):
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
-    def __init__(self, settings: Skip, views: Sequence[View]) -> None:
+    def __init__(self, settings: SkipBackward, views: Sequence[View]) -> None:
         super().__init__()
         self.settings, self.names = settings, [view.name for view in views]
 
@@ -102,11 +100,9 @@ class SkipState(ModuleState):
     update_skipped = update
 
     def finish(self, run: Run) -> None:
-        """Say and record how many steps were skipped."""
+        """Log and record how many steps were skipped."""
         steps, whole, warm_up, above = (self.scalars.get(f"skip/{count}", 0.0) for count in COUNTS)
-        least, skipped = self.settings.share(above, warm_up), steps - whole
-        run.records.add(run.step, "skip", steps=int(steps), skipped=int(skipped), least=least)
-        whole_at_least = f"at least {least:.1%} were to do the whole work"
-        LOG.info(
-            f"{skipped:,.0f} of {steps:,.0f} steps after step {self.settings.start:,} were skipped; {whole_at_least}"
-        )
+        fraction, skipped = self.settings.fraction(above, warm_up), steps - whole
+        run.records.add(run.step, "skip", steps=int(steps), skipped=int(skipped), min_fraction=fraction)
+        after = f"after step {self.settings.start:,}"
+        LOG.info(f"skipped {skipped:,.0f} of {steps:,.0f} steps {after}; at least {fraction:.1%} had to be full steps")

@@ -1,6 +1,6 @@
-"""Pixels that do not count since their photograph shows what the scene does not have: people, cars, reflections.
+"""Mask transient objects, such as people and cars, by their residuals.
 
-Found by their residuals alone (SpotLessSplats, Sabour et al. 2024, without its network; RobustSplat, Fu et al. 2025).
+After SpotLessSplats (Sabour et al. 2024), without its network, and RobustSplat (Fu et al. 2025).
 """
 
 from collections.abc import Callable, Mapping
@@ -20,57 +20,59 @@ from clsplat.training.run import Run
 _NAMES = constants("transients.cl")
 BINS, FIRST_BIN, BIN_SHIFT = (int(_NAMES[name]) for name in ("BINS", "FIRST_BIN", "BIN_SHIFT"))
 KEYS = tuple(f"{k:02d}" for k in range(BINS))
-TAIL = 0.99  # share of the pixels
+TAIL = 0.99  # quantile that tells whether there are outliers
 
 
 class Transients(TrainingModule):
-    """Leave out the pixels of a photograph that differ much more from the image than most do.
+    """Mask the pixels of a photograph whose residuals are far larger than most.
 
-    A residual is a pixel's absolute difference, the mean over channels.  The distribution of all views' residuals is
-    kept over the steps.  While its 99 % quantile is more than `tail` times its `quantile`, pixels of more than `above`
-    times that do not count, where most of the box about them has more too: details that a model does not have yet are
-    thin.  They are black in both images, as those of a mask file.  The two factors are ours.
+    A residual is a pixel's absolute difference, averaged over channels.  A running histogram holds the residuals of all
+    views.  While its 99% quantile exceeds `tail_ratio` times its `quantile`, pixels above `outlier_ratio` times the
+    `quantile` are masked, if most of the box around them is above it too: details that the model has not learned yet
+    are thin.  Masked pixels are black in both images, as with mask files.  The two ratios are ours.
     """
 
-    training_keys: ClassVar[frozenset[str]] = frozenset({"start", "quantile", "above", "tail", "box", "decay"})
+    training_keys: ClassVar[frozenset[str]] = frozenset(
+        {"start", "quantile", "outlier_ratio", "tail_ratio", "box_size", "decay"}
+    )
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
-    device_planes: ClassVar[int] = 2  # residuals, and the mask that leaves out the large ones
-    order: ClassVar[int] = 90  # they compare what all others have made of both images
+    device_planes: ClassVar[int] = 2  # residuals and mask
+    order: ClassVar[int] = 90  # after all changes of both images
 
     type: Literal["transients"] = "transients"
     start: Annotated[int, Field(ge=0)]
-    """Global step after which pixels are left out: where the scene is there, but not yet what passes through it."""
+    """Global step after which pixels are masked.  Choose one at which the model shows the scene without transients."""
     quantile: Annotated[float, Field(gt=0, lt=1)] = 0.9
-    """Share of the pixels whose residuals are those of the scene."""
-    above: Annotated[float, Field(ge=1)] = 3.0
-    """Residual from which on a pixel is left out, in units of that quantile."""
-    tail: Annotated[float, Field(ge=0)] = 6.0
-    """99 % quantile above which photographs hold something else, in the same units; 0: they do in any case."""
-    box: Annotated[float, Field(ge=0, lt=1)] = 0.04
-    """Side of the box, a share of the photograph's width; the nearest odd number of px from 3 on is taken."""
+    """Quantile of the residuals that are typical of the static scene."""
+    outlier_ratio: Annotated[float, Field(ge=1)] = 3.0
+    """Residual above which a pixel is masked, as a multiple of that quantile."""
+    tail_ratio: Annotated[float, Field(ge=0)] = 6.0
+    """Size of the 99% quantile, as a multiple of that quantile, above which pixels are masked; 0: always."""
+    box_size: Annotated[float, Field(ge=0, lt=1)] = 0.04
+    """Side of the box as a share of the photograph's width, rounded to an odd number of px, at least 3."""
     decay: Annotated[float, Field(ge=0, lt=1)] = 0.95
-    """Share of the distribution that stays at a step."""
+    """Decay of the histogram, per step."""
 
     def threshold(self, scalars: Mapping[str, float], step: int) -> float | None:
-        """Return the residual from which on pixels of a global step are left out; None where all count."""
-        reached = np.cumsum([scalars.get(key, 0.0) for key in KEYS])
-        if step <= self.start or reached[-1] == 0:
+        """Return the residual above which pixels of a global step are masked; None to mask none."""
+        counts = np.cumsum([scalars.get(key, 0.0) for key in KEYS])
+        if step <= self.start or counts[-1] == 0:
             return None
-        most, tail = (_upper(int((reached < share * reached[-1]).sum())) for share in (self.quantile, TAIL))
-        return self.above * most if tail > self.tail * most else None
+        typical, tail = (_bin_end(int((counts < share * counts[-1]).sum())) for share in (self.quantile, TAIL))
+        return self.outlier_ratio * typical if tail > self.tail_ratio * typical else None
 
     def create_state(self, run: Run) -> ModuleState:
         return TransientsState(self)
 
     def learn(self, scalars: Scalars, counts: NDArray[np.uint32]) -> None:
-        """Add the residuals of a step, [BINS], to the distribution."""
+        """Add the residual counts of a step, [BINS], to the histogram."""
         for key, count in zip(KEYS, counts, strict=True):
             scalars[key] = self.decay * scalars.get(key, 0.0) + float(count)
 
 
-def _upper(bin_number: int) -> float:
-    """The least residual above a bin: its upper bits are those of the next one."""
-    return float(np.array(FIRST_BIN + bin_number + 1 << BIN_SHIFT, np.int32).view(np.float32))
+def _bin_end(index: int) -> float:
+    """Return the smallest residual above a bin; bins are the upper bits of a float32."""
+    return float(np.array(FIRST_BIN + index + 1 << BIN_SHIFT, np.int32).view(np.float32))
 
 
 class TransientsState(ModuleState):
@@ -84,7 +86,7 @@ class TransientsState(ModuleState):
         workspace, camera, planes = step.workspace, step.camera, step.planes
         residuals, counts = measure_residuals(workspace, camera, step.image, planes.colors, planes.mask)
         if (threshold := self.settings.threshold(self.scalars, step.number)) is not None:
-            reach = max(1, round(self.settings.box * camera.width / 2))
+            reach = max(1, round(self.settings.box_size * camera.width / 2))
             step.planes = replace(planes, mask=mask_transients(workspace, camera, residuals, threshold, reach))
         step.save(self, counts)
 
@@ -95,7 +97,8 @@ class TransientsState(ModuleState):
 def measure_residuals(
     workspace: Workspace, camera: DeviceCamera, image: Array, photograph: Array, mask: Array | None
 ) -> tuple[Array, Callable[[], NDArray[np.uint32]]]:
-    """Return the residuals of planes [3, rows, stride], [1, rows, stride], and a wait for their number by bin, [BINS].
+    """Return the residuals, [1, rows, stride], of planes [3, rows, stride], and a function that waits for their counts
+    by bin, [BINS].
 
     mask: [1, rows, stride], 1 in pixels that count; None: all count.
     """
@@ -118,9 +121,9 @@ def measure_residuals(
 def mask_transients(
     workspace: Workspace, camera: DeviceCamera, residuals: Array, threshold: float, reach: int
 ) -> Array:
-    """Return the mask of pixels that count, [1, rows, stride], of residuals [1, rows, stride].
+    """Return the mask of pixels that count, [1, rows, stride], from residuals, [1, rows, stride].
 
-    reach: px from the middle of a pixel's box to its edges.
+    reach: half the side of a pixel's box, px.
     """
     mask = workspace.array("counted pixels", (1, camera.rows, camera.stride))
     workspace.device.program("transients.cl").mask_transients(
