@@ -82,7 +82,7 @@ def test_the_key_takes_cells_of_each_axis():
     assert grid("{grid_shape: [16, 16, 8]}").grid_shape == [16, 16, 8]
     assert grid("{when: auto}") == BilateralGrid(when="auto")
     for wrong in ("[4, 4]", "[0, 4, 4]", "[4, 4, 17]", "4"):
-        with pytest.raises(ConfigError, match=r"bilateral_grid.*cells"):
+        with pytest.raises(ConfigError, match=r"bilateral_grid.*grid_shape"):
             grid(f"{{grid_shape: {wrong}}}")
 
 
