@@ -377,7 +377,6 @@ def convert(
     sh_degree: int | None = None,
     sh_bits: str | None = None,
     axes: Literal["spz", "ply"] = "spz",
-    spz_version: int = 3,
     quality: Literal["small", "balanced", "high"] = "balanced",
     keep_nan: bool = False,
     crop: str | Sequence[float] | None = None,
@@ -402,7 +401,7 @@ def convert(
     for file in files:
         refuse_field(file)
     box = crop if isinstance(crop, str) or crop is None else ",".join(map(str, crop))
-    options = conversion.ConversionOptions(sh_bits, axes, spz_version, quality, keep_nan)
+    options = conversion.ConversionOptions(sh_bits, axes, quality, keep_nan)
     changes = conversion.Changes(
         drop_below,
         None if transform is None else conversion.transform_of(transform),

@@ -120,7 +120,6 @@ def convert(
         Literal["spz", "ply"],
         typer.Option(help="Of SPZ files that are read, else of the one that is written: up and back, or as in a PLY."),
     ] = "spz",
-    spz_version: Annotated[int, typer.Option(metavar="3|4", help="SPZ: 4 needs the extra spz.")] = 3,
     quality: Annotated[
         Literal["small", "balanced", "high"], typer.Option(help="Of SPZ and SOG: how finely all is rounded.")
     ] = "balanced",
@@ -151,7 +150,6 @@ def convert(
         sh_degree=sh_degree,
         sh_bits=sh_bits,
         axes=axes,
-        spz_version=spz_version,
         quality=quality,
         keep_nan=keep_nan,
         crop=crop,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError, quote
+from clsplat.core.errors import DataError, one_line, quote
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file
 from clsplat.formats.packing import Output, written
@@ -45,10 +45,6 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 SHARED = 8  # times that a byte is read, on average: equal columns may be one accessor
 FLIP = np.diag([1.0, -1, -1, 1])  # between the axes of glTF and those of a PLY
-
-
-class NoIndex(ValueError):
-    """A value is no index, size or offset; the message tells it in words."""
 
 
 class Gltf:
@@ -169,27 +165,10 @@ class Gltf:
         return sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
 
 
-def fault(error: Exception) -> str:
-    """Return in words what an error of Python says about a tree."""
-    if isinstance(error, NoIndex):
-        return str(error)
-    if isinstance(error, json.JSONDecodeError):
-        return f"line {error.lineno}, column {error.colno}: {error.msg}"
-    if isinstance(error, UnicodeDecodeError):
-        return f"byte {error.start} is no UTF-8"
-    if isinstance(error, RecursionError):
-        return "nested too deeply"
-    if isinstance(error, KeyError):
-        return f"{quote(error.args[0])} is missing or unknown"
-    if isinstance(error, IndexError):
-        return "an index is beyond the end of its list"
-    return "a value is of another kind, size or shape than in glTF 2.0"
-
-
 def _index(value: Any) -> int:
-    """A whole number from 0 on.  Raises NoIndex."""
+    """Check an index, size, or offset.  Raises ValueError."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 40:
-        raise NoIndex(f"{quote(value)} where a whole number from 0 on is expected")
+        raise ValueError(f"expected a whole number from 0, got {quote(value)}")
     return value
 
 
@@ -212,7 +191,9 @@ def read_glb(path: Path) -> SplatFile:
         degrees = {part["sh_rest"].shape[1] for part in parts}
         extras = tree.get("asset", {}).get("extras")
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        raise DataError(f"{path}: its JSON is damaged ({fault(error)}); copy or export the file again") from error
+        raise DataError(
+            f"{path}: its JSON is damaged ({type(error).__name__}: {one_line(error)}); copy or export the file again"
+        ) from error
     if len(degrees) > 1:
         raise DataError(f"{path}: its parts have different SH degrees; expected one: export them apart")
     parameters = flipped({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})

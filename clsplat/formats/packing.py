@@ -157,6 +157,13 @@ class Output:
         return self._sum.hexdigest()
 
 
+def write_bytes(path: Path, data: bytes) -> str:
+    """Write a file and return its SHA-256.  Raises OutputError."""
+    with written(path) as file:
+        file.write(data)
+    return file.sha256
+
+
 @contextmanager
 def written(path: Path) -> Iterator[Output]:
     """Open a file as `open_atomic` does.  Raises OutputError."""

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_file, read_json
 from clsplat.formats import packing
-from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, written
+from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, write_bytes
 from clsplat.formats.palette import codebook, different, nearest, palette
 from clsplat.formats.ply import checked_numbers
 from clsplat.formats.sog_quantize import (
@@ -380,7 +380,7 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
     if harmonics is not None:
         meta["shN"] = _write_harmonics(harmonics, splats.sh_degree, image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
-    return _write_beside(path, images) if in_folder else _write(path, _zipped(images))
+    return _write_beside(path, images) if in_folder else write_bytes(path, _zipped(images))
 
 
 def _write_beside(path: Path, images: dict[str, bytes]) -> str:
@@ -388,7 +388,7 @@ def _write_beside(path: Path, images: dict[str, bytes]) -> str:
     before, new = set(with_images(path)), {path.with_name(name) for name in images}
     kept = before
     try:
-        sums = [_write(path.with_name(name), data) for name, data in images.items()]
+        sums = [write_bytes(path.with_name(name), data) for name, data in images.items()]
         kept = new
     finally:
         for one in (before | new) - kept - set(with_images(path)):
@@ -396,12 +396,6 @@ def _write_beside(path: Path, images: dict[str, bytes]) -> str:
                 with suppress(OSError):
                     one.unlink()
     return sums[-1]
-
-
-def _write(path: Path, data: bytes) -> str:
-    with written(path) as file:
-        file.write(data)
-    return file.sha256
 
 
 def _means(p: Parameters, image: Any) -> dict[str, Any]:

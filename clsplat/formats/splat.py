@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.core.reading import read_file
-from clsplat.formats.packing import beyond_bytes, tell_cut, written
+from clsplat.formats.packing import beyond_bytes, tell_cut, write_bytes
 from clsplat.formats.splats import (
     MAX_FILE,
     SH_C0,
@@ -91,9 +91,7 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
         )
     rows["color"] = np.clip(np.rint(255 * color), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
-    with written(path) as file:
-        file.write(rows[order].tobytes())
-    return file.sha256
+    return write_bytes(path, rows[order].tobytes())
 
 
 # `.ksplat` of GaussianSplats3D, which is read only: a header, sections, and in each its buckets and its splats.

@@ -134,7 +134,6 @@ class Writing:
 
     sh_bits: tuple[int, int] | None = None  # SPZ: bits of band 1 and of the others, from 1 to 8; None: as `quality`
     axes: Literal["spz", "ply"] = "spz"  # SPZ: as its specification says, or those of the PLY, for readers that differ
-    spz_version: Literal[3, 4] = 3
     quality: Quality = "balanced"  # SPZ and SOG
     quiet: bool = False  # no line about what the format does not keep: it was said
 

@@ -26,7 +26,14 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.reading import read_file
-from clsplat.formats.packing import beyond_bytes, from_smallest_three, morton_order, smallest_three, tell_cut, written
+from clsplat.formats.packing import (
+    beyond_bytes,
+    from_smallest_three,
+    morton_order,
+    smallest_three,
+    tell_cut,
+    write_bytes,
+)
 from clsplat.formats.sog_quantize import base_for, log_weights, rounded_rows, steps, usual_step, visible_form
 from clsplat.formats.splats import (
     MAX_DEGREE,
@@ -244,15 +251,7 @@ def _rounded_sh(
 
 # Zstandard, of Python from 3.14 on, else of the package zstandard, which is an extra.
 
-LEVEL = 12  # as SPZ's library has
 MAX_WINDOW = 27  # log2 of bytes: what a stream may ask the decoder to hold
-
-
-def compress(data: bytes) -> bytes:
-    """Return one frame.  Raises ConfigError where there is no Zstandard."""
-    module, builtin = _module()
-    packed: bytes = module.compress(data, LEVEL) if builtin else module.ZstdCompressor(LEVEL).compress(data)
-    return packed
 
 
 class ZstdFrame:
@@ -300,12 +299,12 @@ def _module() -> tuple[ModuleType, bool]:
 
         return zstandard, False
     except ImportError as error:
-        raise ConfigError(
-            "SPZ of version 4 needs Zstandard; install it: pip install 'clsplat[spz]', or use version 3"
-        ) from error
+        raise ConfigError("SPZ of version 4 needs Zstandard; install it: pip install 'clsplat[spz]'") from error
 
 
+WRITTEN_VERSION = 3  # more programs read it than version 4
 HEADER4 = 32  # bytes, of version 4
+LEVEL = 12  # of deflate
 GZIP_RATIO = 1032  # most bytes that one byte of deflate can stand for
 RATIO4 = 1024  # most bytes of positions that one byte of version 4 may stand for, as in Niantic's library
 ALIKE = 1 << 27  # bytes of all planes that a file of version 4 of any size may stand for: 0.6 GB in memory
@@ -339,25 +338,8 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     weights = log_weights(p, splats.has_sky)
     fraction = fraction_of(path, p["means"], options.quality == "high")
     planes = packed(path, flipped(p) if options.axes == "spz" else p, weights, fraction, options)
-    numbers = (options.spz_version, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
-    start = MAGIC + struct.pack("<2I3B", *numbers)
-    if options.spz_version == 3:
-        content = _gzip(start + b"\0" + b"".join(planes))
-    else:
-        streams = [plane for plane in planes if plane]
-        frames = [compress(plane) for plane in streams]
-        table = b"".join(struct.pack("<2Q", len(f), len(s)) for f, s in zip(frames, streams, strict=True))
-        content = start + struct.pack("<BI12x", len(streams), HEADER4) + table + b"".join(frames)
-        if len(planes[0]) > len(content) * RATIO4 or sum(map(len, planes)) > _most_of_4(len(content)):
-            raise DataError(f"{path}: so many equal splats are refused by readers of version 4; use version 3")
-    with written(path) as file:
-        file.write(content)
-    return file.sha256
-
-
-def _most_of_4(held: int) -> int:
-    """Bytes of all planes for which a file of version 4 with so many bytes may stand."""
-    return max(held * RATIO4, ALIKE)
+    numbers = (WRITTEN_VERSION, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
+    return write_bytes(path, _gzip(MAGIC + struct.pack("<2I4B", *numbers, 0) + b"".join(planes)))
 
 
 def _gzip(data: bytes) -> bytes:
@@ -434,7 +416,7 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
             f"{len(data)} bytes: copy or export it again"
         )
     _check_size(path, header, header.sizes[0], len(data) * RATIO4)
-    _check_size(path, header, sum(header.sizes), _most_of_4(len(data)))
+    _check_size(path, header, sum(header.sizes), max(len(data) * RATIO4, ALIKE))
     if header.flags & EXTENSIONS:
         _check_extensions(path, io.BytesIO(data[HEADER4:table]).read)
     start, frames = table + 16 * streams, []

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, quote
 from clsplat.core.files import invalid_name_reason, is_inside
 from clsplat.core.reading import read_json
-from clsplat.formats.packing import morton_order, written
+from clsplat.formats.packing import morton_order, write_bytes
 from clsplat.formats.sog import MAX_META, META, read_sog, with_images, write_as_ordered
 from clsplat.formats.sog_quantize import log_weights
 from clsplat.formats.splats import (
@@ -285,9 +285,7 @@ def write_lod(
     for name, (number, parts) in files.rows.items():
         rows = np.concatenate(parts)
         write_as_ordered(folder / name, levels[number].rows(rows), weights[number][rows], options or Writing())
-    with written(folder / LOD_META) as file:
-        file.write(json.dumps(meta, separators=(",", ":"), allow_nan=False).encode())
-    return file.sha256
+    return write_bytes(folder / LOD_META, json.dumps(meta, separators=(",", ":"), allow_nan=False).encode())
 
 
 @dataclass

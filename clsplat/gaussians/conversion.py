@@ -114,7 +114,6 @@ class ConversionOptions:
 
     sh_bits: str | None = None  # A/B
     axes: Literal["spz", "ply"] = "spz"  # of SPZ files that are read, or where none is of the one that is written
-    spz_version: int = 3
     quality: Quality = "balanced"
     keep_nan: bool = False
 
@@ -124,10 +123,8 @@ class ConversionOptions:
         for name, value, known in (("axes", self.axes, AXES), ("quality", self.quality, QUALITIES)):
             if value not in known:
                 raise ConfigError(f"--{name} {quote(value)}: expected one of {', '.join(known)}")
-        if self.spz_version not in (3, 4):
-            raise ConfigError(f"--spz-version {self.spz_version}: expected 3 or 4")
-        if not codec.has_bits and (self.sh_bits is not None or self.spz_version != 3):
-            raise ConfigError(f"{out}: --sh-bits and --spz-version are of SPZ; expected a name that ends in .spz")
+        if not codec.has_bits and self.sh_bits is not None:
+            raise ConfigError(f"{out}: --sh-bits is only for SPZ; give a name that ends in .spz")
         if self.axes != "spz" and not codec.has_axes and not reads_axes:
             raise ConfigError("--axes is of SPZ; expected an SPZ file to read or to write")
         if self.quality != "balanced" and not codec.has_quality:
@@ -135,8 +132,7 @@ class ConversionOptions:
         if self.keep_nan and not codec.keeps_nan:
             raise ConfigError(f"{out}: --keep-nan is of PLY; expected a name that ends in .ply")
         bits = None if self.sh_bits is None else sh_bits_of(self.sh_bits)
-        version: Literal[3, 4] = 4 if self.spz_version == 4 else 3
-        written = Writing(bits, "spz" if reads_axes else self.axes, version, self.quality)
+        written = Writing(bits, "spz" if reads_axes else self.axes, self.quality)
         return Reading(self.axes, "keep" if self.keep_nan else "drop"), written
 
 

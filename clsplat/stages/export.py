@@ -37,7 +37,7 @@ class Export(Scheduled):
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"file", "quality", "sky"}
 
     file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
-    """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
+    """Path inside the run folder; its ending is the format: .ply, .spz, .sog, .glb, .splat, .usda."""
     quality: Quality = "balanced"
     """Of SPZ and SOG, how finely harmonics, colors, positions and rotations are rounded."""
     sky: Literal["sidecar", "splats"] = "sidecar"

@@ -208,7 +208,7 @@ def test_an_empty_level_is_refused(written, tmp_path):
     _, made = written
     with pytest.raises(DataError, match="holds no Gaussians"):
         write_lod(tmp_path / "b", [made[0], made[1].rows([])])
-    with pytest.raises(ConfigError, match="streamed SOG is written by `clsplat lod`"):
+    with pytest.raises(ConfigError, match="streamed SOG is only written by `clsplat lod`"):
         write(tmp_path / "lod-meta.json", made[0])
 
 

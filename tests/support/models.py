@@ -2,6 +2,7 @@
 
 import json
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,20 @@ def interop(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"no file {path}")
     return path
+
+
+def spz_version_4(data: bytes) -> bytes:
+    """Return an SPZ file of version 3 as one of version 4: a Zstandard frame per plane, after a table of sizes."""
+    import zstandard
+
+    plain = zlib.decompress(data, 31)
+    (count,), degree = struct.unpack_from("<I", plain, 8), plain[12]
+    sizes = [count * width for width in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)) if width]
+    planes = [plain[end - size : end] for end, size in zip(16 + np.cumsum(sizes), sizes, strict=True)]
+    frames = [zstandard.ZstdCompressor(12).compress(plane) for plane in planes]
+    table = b"".join(struct.pack("<2Q", len(f), len(p)) for f, p in zip(frames, planes, strict=True))
+    header = plain[:4] + struct.pack("<I", 4) + plain[8:15] + struct.pack("<BI12x", len(planes), 32)
+    return header + table + b"".join(frames)
 
 
 def splats(rng: np.random.Generator, count: int = 600, degree: int = 3, mode: str = "default") -> SplatFile:

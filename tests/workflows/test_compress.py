@@ -267,7 +267,7 @@ def test_what_spz_loses_is_said_once_for_a_search(few_steps, tiny_scene, tmp_pat
     ask = {"out": tmp_path / "out", "format": "spz", "keep": KEEP, "steps": STEPS}
     clsplat.compress_model(tmp_path / "a.ply", tiny_scene, target="-90dB", **ask)
     assert len(list((tmp_path / "out" / "trials").iterdir())) > 1
-    (told,) = [text for text in caplog.messages if "does not keep" in text]
+    (told,) = [text for text in caplog.messages if "does not store" in text]
     assert told.startswith(f"{tmp_path / 'out' / 'compressed.spz'}: SPZ does not keep near = 0.05")
     assert "axes as the format says" not in caplog.text
 
