@@ -36,7 +36,7 @@ def shipped_items() -> list[tuple[str, Node]]:
     """Return all mappings in shipped files, plain 3DGS first, and on the page about pipelines, with file names."""
     files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (not file.name.startswith("splat"), file.name))
     texts = [(file.name, file.read_text("utf-8")) for file in files]
-    page = (ROOT / "docs" / "pipelines.md").read_text("utf-8")
+    page = "".join((ROOT / "docs" / name).read_text("utf-8") for name in ("pipelines.md", "training.md"))
     texts += [("", text) for text in re.findall(r"^```yaml\n(.*?)^```", page, re.M | re.S)]
     return [(name, item) for name, text in texts for item in items(YAML(typ="safe").load(text))]
 

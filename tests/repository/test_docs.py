@@ -51,7 +51,7 @@ HOW_TO = (
         "lod",
         "blocks",
     ),
-    *("formats", "viewer", "video", "live"),
+    *("formats", "viewer", "video", "live", "pipelines", "training", "moving", "nerf", "python"),
 )
 NAMED = [(base, kind) for base, kinds in families().items() for kind in kinds]
 
