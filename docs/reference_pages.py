@@ -1,6 +1,7 @@
 """Make the reference pages about keys: one for each family, one for all other settings."""
 
 import functools
+import math
 from typing import Any
 
 from families import NOTATIONS, Kind, families, family, groups, parts, tag, unnamed
@@ -107,7 +108,9 @@ def key_table(kind: Kind, without: tuple[str, ...] = ()) -> str:
         bound = next((part for part in parts(field) if isinstance(part, Bounded)), None)
         takes = expected(node)
         if bound:
-            takes = takes.replace(BY_STEP, f"{BY_STEP} {'>' if bound.exclusive else '≥'} {bound.minimum:g}")
+            limits = f"{'>' if bound.exclusive else '≥'} {bound.minimum:g}"
+            limits += f" and ≤ {bound.maximum:g}" if math.isfinite(bound.maximum) else ""
+            takes = takes.replace(BY_STEP, f"{BY_STEP} {limits}")
         cells = (f"`{name}`", takes, default, texts.get(name, ""))
         rows += "| " + " | ".join(" ".join(cell.split()).replace("|", "\\|") for cell in cells) + " |\n"
     return f"{TABLE}{rows}\n" if rows else ""
