@@ -208,8 +208,8 @@ def held_buffers() -> Iterator[None]:
 def built_once() -> Iterator[None]:
     """Every device of a session has one context, with programs that are built once: opening one more costs little."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(opencl_device, "context_of", functools.cache(opencl_device.context_of))
-        patch.setattr(program, "built", functools.cache(program.built))
+        patch.setattr(opencl_device, "create_context", functools.cache(opencl_device.create_context))
+        patch.setattr(program, "build", functools.cache(program.build))
         yield
 
 

@@ -80,7 +80,7 @@ def _run_in_process(
     info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float, variables: Mapping[str, str] | None = None
 ) -> Iterator[CheckResult]:
     """Yield the results of checks up to and including the first that ends the process: at least one."""
-    command = [sys.executable, *WORKER, *map(str, info.place), schedule]
+    command = [sys.executable, *WORKER, *map(str, info.index), schedule]
     names = [check.name for check in checks]
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         process = subprocess.Popen(

@@ -28,7 +28,7 @@ def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> No
     """Open the device and run the checks with these names."""
     threading.Thread(target=_exit_with_parent, args=(take_stdin(),), daemon=True).start()
     out = take_stdout()
-    info = next(info for info in list_devices() if info.place == (platform, number))
+    info = next(info for info in list_devices() if info.index == (platform, number))
     opened = cache(lambda: Device(info, schedule))
     for name in names:
         started = time.perf_counter()

@@ -1,6 +1,6 @@
-"""An open OpenCL device: its context, its queue, its memory and its programs.
+"""Open an OpenCL device, and use its context, queue, memory and programs.
 
-This package is the only importer of pyopencl.
+Only this package imports pyopencl.
 """
 
 import logging
@@ -34,14 +34,12 @@ import pyopencl as cl  # noqa: E402
 warnings.filterwarnings("ignore", category=cl.CompilerWarning)  # some runtimes warn at every build
 LOG = logging.getLogger("clsplat")
 
-# What a runtime refuses, as the errors of this program.
-
 
 @contextmanager
-def refusals(what: str, device_name: str) -> Iterator[None]:
-    """Raise MemoryLimitError or DeviceError, with `what` was to be done, where a runtime refuses a call in the block.
+def raising_device_errors(what: str, device_name: str) -> Iterator[None]:
+    """Convert errors of the runtime in a block that does `what` to MemoryLimitError or DeviceError.
 
-    Some runtimes take device memory when it is first used, and refuse it at a launch or a copy.
+    Some runtimes allocate device memory on first use, and run out of it only at a launch or a copy.
     """
     try:
         yield
@@ -53,9 +51,6 @@ def refusals(what: str, device_name: str) -> Iterator[None]:
         raise DeviceError(f"{what} failed on {device_name}: {error}") from error
 
 
-# The time of kernels on the device.
-
-
 class Timings:
     """Times of kernels on the device, from profiling events, while `sampling` is True.
 
@@ -65,7 +60,7 @@ class Timings:
     def __init__(self, device_name: str) -> None:
         self.device_name = device_name
         self.sampling = False
-        self.section = "other"  # part of a training step, for kernels that `profile.STAGES` does not list
+        self.section = "other"  # part of a training step, for kernels that `records.STAGES` does not list
         self._events: list[tuple[str, str, Any]] = []
 
     def add(self, name: str, event: Any) -> None:
@@ -73,13 +68,13 @@ class Timings:
             self._events.append((name, self.section, event))
 
     def take(self) -> dict[tuple[str, str], list[float]]:
-        """Return the seconds of every launch by kernel and section since the last call; waits for the launches.
+        """Return the seconds of each launch since the last call, by kernel and section; wait for the launches.
 
-        Raises MemoryLimitError or DeviceError where one has failed.
+        Raises MemoryLimitError or DeviceError if a launch failed.
         """
         seconds: dict[tuple[str, str], list[float]] = defaultdict(list)
         for name, section, event in self._events:
-            with refusals(name, self.device_name):
+            with raising_device_errors(name, self.device_name):
                 event.wait()
                 seconds[name, section].append((event.profile.end - event.profile.start) * 1e-9)
         self._events.clear()
@@ -87,7 +82,7 @@ class Timings:
 
 
 class Buffer(cl.Buffer):
-    """Device memory with weak references, which pyopencl's class does not support."""
+    """Device memory that supports weak references, unlike pyopencl's class."""
 
 
 class Array:
@@ -111,23 +106,24 @@ class Array:
         return host
 
     def get_later(self) -> Callable[[], NDArray[Any]]:
-        """Begin a copy to the host of what the array holds after all that is enqueued so far.
+        """Start a copy to the host, and return a function that waits for it and returns the values.
 
-        The result waits for that alone, not for what is enqueued later.  Raises MemoryLimitError, DeviceError.
+        The copy follows all work enqueued so far, and does not wait for later work.  Raises MemoryLimitError,
+        DeviceError.
         """
         host = np.empty(self.shape, self.dtype)
         with self.device.refusals("a copy to the host"):
-            copied = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False)
+            copy = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False)
 
-        def waited() -> NDArray[Any]:
+        def wait() -> NDArray[Any]:
             with self.device.refusals("a copy to the host"):
-                copied.wait()
+                copy.wait()
             return host
 
-        return waited
+        return wait
 
     def get_item(self, index: int) -> Any:
-        """Copy one value of a one-dimensional array to the host.  As `get`."""
+        """Copy one value of a one-dimensional array to the host.  Waits and raises as `get` does."""
         host = np.empty(1, self.dtype)
         with self.device.refusals("a copy to the host"):
             cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=index * self.dtype.itemsize)
@@ -146,38 +142,38 @@ class Array:
         """Set every value of an array of floats or 32-bit integers."""
         word = int(np.array(value, self.dtype).view(np.uint32))
         words = Array(self.device, self.buffer, self.shape, np.dtype(np.uint32))
-        lines = -(-self.nbytes // 64)  # a number of words would not fit in 32 bits from 16 GiB on
+        lines = -(-self.nbytes // 64)  # a number of words would overflow 32 bits from 16 GiB
         self.device.program("fill.cl").fill_words(items=lines, values=words, word=word, lines=lines)
 
 
 class Device:
-    """An open OpenCL device: one context, one order of commands, programs built once.
+    """An open OpenCL device: one context, in-order commands, and programs that are built once.
 
-    A `with` block waits at its end for all its work.  Memory is released with the arrays, and the device with the last
+    A `with` block waits at its end for all work.  Memory is released with the arrays, and the device with the last
     object that uses it.
 
-    `name` is a part of a runtime's or device's name, as `clsplat devices` prints them; without it CLSPLAT_DEVICE, else
-    the strongest GPU that works, else the first CPU.
-    Raises DeviceError when there is none, MemoryLimitError or DeviceError where the runtime refuses to open it,
-    KernelError where nothing can blend.
+    `name` is a part of a runtime's or device's name, as `clsplat devices` prints them.  Without it, the device is
+    CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU.
+    Raises DeviceError if there is none, MemoryLimitError or DeviceError if the runtime cannot open it, and KernelError
+    if the blending kernels do not fit.
     """
 
     def __init__(self, name: str | DeviceInfo | None = None, schedule: Schedule = "auto") -> None:
         info = name if isinstance(name, DeviceInfo) else choose(name)
-        platform, number = info.place
+        platform, number = info.index
         self.info = info
         remove_cut_kernels()
         timed = cl.command_queue_properties.PROFILING_ENABLE
         with self.refusals("opening it"):
-            self.context = context_of(platforms()[platform].get_devices()[number])
+            self.context = create_context(platforms()[platform].get_devices()[number])
             self._queues = {False: cl.CommandQueue(self.context), True: cl.CommandQueue(self.context, properties=timed)}
-        self._sampling = False  # whether the timed queue is in use: it costs the host
+        self._sampling = False  # whether the timed queue is in use: it costs host time
         self.schedule = resolve_schedule(info, schedule)
         self.tuning = tuning_of(info, self.schedule)
         self.timings = Timings(info.name)
         self.allocated = 0  # bytes of all buffers that are alive
         self.peak = 0  # largest value of `allocated`
-        self.lock = threading.Lock()  # of what threads share: the programs, and the arguments of their kernels
+        self.lock = threading.Lock()  # for what threads share: the programs, and the arguments of their kernels
         self._programs: dict[tuple[Any, ...], Program] = {}
         if self.schedule == "simt":
             self._fit_groups()
@@ -192,7 +188,7 @@ class Device:
         return f"Device({self.text!r})"
 
     def _fit_groups(self) -> None:
-        """Take tiles of 8 x 8 px where the compiler allows blending no group of 16 x 16 items."""
+        """Use tiles of 8 x 8 px if the compiler does not allow blending groups of 16 x 16 items."""
         try:
             self.program("blend_simt.cl")
         except KernelError as error:
@@ -208,7 +204,7 @@ class Device:
 
     @property
     def queue(self) -> Any:
-        """The queue of commands, the timed one while `timings` samples; at a change the device waits, not the host."""
+        """The command queue; the timed one while `timings` samples.  At a switch the device waits, not the host."""
         sampling = self.timings.sampling
         if sampling != self._sampling:
             before = cl.enqueue_marker(self._queues[self._sampling])
@@ -221,7 +217,7 @@ class Device:
         """Allocate an array with undefined values.  Raises MemoryLimitError with the sizes."""
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
-        size = _whole_lines(math.prod(shape) * kind.itemsize)
+        size = _round_up_to_lines(math.prod(shape) * kind.itemsize)
         if size > self.info.allocation:
             raise MemoryLimitError(
                 f"one buffer of {size / 2**20:.0f} MiB is more than {self.info.name} allows "
@@ -255,11 +251,10 @@ class Device:
         return array
 
     def program(self, file: str | Path, **defines: int | str) -> "Program":
-        """Build `cl_kernels/<file>`, or a file by its absolute path, with this device's tuning and `defines`, once.
+        """Build `cl_kernels/<file>`, or an absolute path, with this device's tuning and `defines`; cached.
 
-        Raises KernelError when it does not build or is missing.
+        Raises KernelError if it does not build or is missing.
         """
-
         key = (str(file), *defines.items(), *self.tuning.items())
         with self.lock:
             if key not in self._programs:
@@ -272,38 +267,38 @@ class Device:
             self.queue.finish()
 
     def refusals(self, what: str) -> AbstractContextManager[None]:
-        """Convert what the runtime refuses in a block, in which `what` is done."""
-        return refusals(what, self.info.name)
+        """Convert errors of the runtime in a block that does `what` (see `raising_device_errors`)."""
+        return raising_device_errors(what, self.info.name)
 
 
-def context_of(device: Any) -> Any:
-    """Return a new context of a device of the runtime."""
+def create_context(device: Any) -> Any:
+    """Return a new context for a device of the runtime."""
     return cl.Context([device])
 
 
 def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:
-    """Return a device that is open, or open one by a part of its name; None: as `choose` does.
+    """Return a device that is already open, or open one by a part of its name; None: the one that `choose` chooses.
 
-    Raises DeviceError when there is none, ConfigError for an open device of another schedule.
+    Raises DeviceError if there is none, and ConfigError for an open device with another schedule.
     """
     if device is None or isinstance(device, str):
         return Device(device, schedule)
     if not isinstance(device, Device):
-        raise ConfigError(f"device: is a {type(device).__name__}; expected a part of a device's name, or a Device")
+        raise ConfigError(f"device: expected a part of a device's name or a Device, got {type(device).__name__}")
     if schedule != "auto" and resolve_schedule(device.info, schedule) != device.schedule:
-        raise ConfigError(f"device: {device.text}; expected the {schedule} schedule, as the settings say: open it so")
+        raise ConfigError(f"device: {device.text}; the settings need the {schedule} schedule: open the device with it")
     return device
 
 
-def _whole_lines(size: int) -> int:
-    """Bytes rounded up to 64, at least 64: vectors may read past the last value; no buffer may be empty."""
+def _round_up_to_lines(size: int) -> int:
+    """Round bytes up to 64, at least 64: vectors may read past the last value, and no buffer may be empty."""
     return max(64, -(-size // 64) * 64)
 
 
 # Kernels by name: load a .cl file, build it, check arguments against its text, launch.
 
 
-DAMAGES = (cl.Error, sqlite3.Error, UnpicklingError)  # where a kernel is made: of a runtime's cache, and of pyopencl's
+CACHE_ERRORS = (cl.Error, sqlite3.Error, UnpicklingError)  # of a damaged cache of the runtime or of pyopencl
 BUILD_OPTIONS = ("-cl-std=CL1.2",)
 
 _INCLUDE = re.compile(r'^#include "(\w+\.h)"')
@@ -323,7 +318,7 @@ _TYPES: dict[str, np.dtype[Any]] = {
 
 
 def flatten(path: Path, seen: set[Path] | None = None) -> str:
-    """Return the source with each local header inlined once; #line keeps file and line right in compiler messages."""
+    """Return the source with each local header inlined once; #line keeps the lines in compiler messages right."""
     seen = set() if seen is None else seen
     text = [f'#line 1 "{path.name}"']
     for number, line in enumerate(path.read_text("utf-8").splitlines(), start=1):
@@ -332,7 +327,7 @@ def flatten(path: Path, seen: set[Path] | None = None) -> str:
             text.append(line)
             continue
         header = path.parent / match[1]
-        if not header.is_file():  # kernels of a plug-in may include the package's headers
+        if not header.is_file():  # a plug-in's kernels may include the package's headers
             header = resource_dir("cl_kernels") / match[1]
         if header not in seen:
             seen.add(header)
@@ -343,7 +338,7 @@ def flatten(path: Path, seen: set[Path] | None = None) -> str:
 
 @cache
 def constants(file: str = "common.h") -> dict[str, float]:
-    """Return the numeric #defines of a header, for use in Python."""
+    """Return the numeric #defines of a kernel file, for use in Python."""
     text = (resource_dir("cl_kernels") / file).read_text("utf-8")
     values = {}
     for name, value in _DEFINE.findall(text):
@@ -357,12 +352,12 @@ class Argument:
     """One parameter of a kernel."""
 
     name: str
-    dtype: np.dtype[Any] | None  # None: a struct, whose layout a test compares
+    dtype: np.dtype[Any] | None  # None: a struct, whose layout a test checks
     pointer: bool
 
 
 def parse_kernels(source: str) -> dict[str, list[Argument]]:
-    """Return the parameters of every kernel in the source text.  Raises KernelError for other declarations."""
+    """Return the parameters of each kernel in a source text.  Raises KernelError for declarations of another form."""
     kernels = {}
     for match in _KERNEL.finditer(_COMMENT.sub("", source)):
         kernels[match["name"]] = [_parse_argument(match["name"], a) for a in match["arguments"].split(",")]
@@ -379,20 +374,20 @@ def _parse_argument(kernel: str, text: str) -> Argument:
 
 
 def group_limit(kernel: Any, device: Any) -> int:
-    """Return the items of the largest work-group that the compiler allows a kernel."""
+    """Return the size of the largest work-group that the compiler allows for a kernel."""
     return int(kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device))
 
 
 def understates_groups(info: DeviceInfo, most: int, together: int) -> bool:
-    """Return whether a limit is that of rusticl, which gives the items that run together for the largest group of any
-    kernel and runs larger ones: Mesa 22.3.6 says 32 of a kernel that requires 256.
+    """Return whether rusticl reports too small a limit: it returns the number of items that run together, but runs
+    larger groups.  Mesa 22.3.6 reports 32 for a kernel that requires 256.
     https://gitlab.freedesktop.org/mesa/mesa/-/blob/mesa-22.3.6/src/gallium/frontends/rusticl/api/kernel.rs
     """
     return info.platform.startswith("rusticl") and most == together
 
 
 def group_multiple(kernel: Any, device: Any) -> int:
-    """Return the number of items that a device runs together, of whose multiples groups should be."""
+    """Return the number of items that a device runs together; group sizes should be multiples of it."""
     return int(kernel.get_work_group_info(cl.kernel_work_group_info.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, device))
 
 
@@ -408,14 +403,14 @@ class Kernel:
         items, most = math.prod(self.group), group_limit(kernel, opened)
         if items > most and not understates_groups(device.info, most, group_multiple(kernel, opened)):
             raise KernelError(
-                f"{label} has work-groups of {items} items, and {device.info.text} allows it {most}; "
+                f"{label} needs work-groups of {items} items, but {device.info.text} allows {most}; "
                 "use another device, rasterizer.schedule or rasterizer.sort"
             )
 
     def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
-        """Launch over `items`, rounded up to whole groups, or `groups` of the kernel's own size; none: no launch."""
-        amount = items or groups
-        size = (amount,) if isinstance(amount, int) else amount
+        """Launch over `items`, rounded up to whole groups, or over `groups`; if one is 0, do nothing."""
+        total = items or groups
+        size = (total,) if isinstance(total, int) else total
         local = self.group[: len(size)]
         if items:
             size = tuple(-(-n // g) * g for n, g in zip(size, local, strict=True))
@@ -424,10 +419,7 @@ class Kernel:
         if 0 in size:
             return
         arguments = self._checked(values)
-        with (
-            self._device.lock,
-            self._device.refusals(self.label),
-        ):  # the kernel holds the arguments until it is enqueued
+        with self._device.lock, self._device.refusals(self.label):  # the lock protects the arguments until enqueued
             self._kernel.set_args(*arguments)
             event = cl.enqueue_nd_range_kernel(self._device.queue, self._kernel, size, local)
         self._device.timings.add(self.label, event)
@@ -454,15 +446,15 @@ class Kernel:
             for name, value in values.items()
             if name in expected and expected[name].pointer and getattr(value, "dtype", None) != expected[name].dtype
         ]
-        parts = [f"missing {', '.join(sorted(missing))}"] if missing else []
-        parts += [f"surplus {', '.join(sorted(surplus))}"] if surplus else []
+        parts = [f"missing arguments {', '.join(sorted(missing))}"] if missing else []
+        parts += [f"unknown arguments {', '.join(sorted(surplus))}"] if surplus else []
         raise KernelError(f"{self.label}: {'; '.join(parts + wrong)}")
 
 
 class Program:
     """One .cl file, built; its kernels are attributes."""
 
-    options: ClassVar[tuple[str, ...]] = BUILD_OPTIONS  # tests add -Werror; drivers of users may warn
+    options: ClassVar[tuple[str, ...]] = BUILD_OPTIONS  # tests add -Werror; users' drivers may warn
 
     def __init__(self, device: "Device", file: str | Path, defines: dict[str, int | str]) -> None:
         path = resource_dir("cl_kernels") / file  # an absolute path stays as it is
@@ -471,7 +463,7 @@ class Program:
         source = flatten(path)
         options = [*self.options, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
         try:
-            program = built(device.context, source, tuple(options))
+            program = build(device.context, source, tuple(options))
         except cl.Error as error:
             raise KernelError(
                 f"{file} does not build on {device.text} with {' '.join(options)}: {_first_error(error)}"
@@ -481,15 +473,15 @@ class Program:
                 name: Kernel(device, f"{path.name}:{name}", cl.Kernel(program, name), arguments)
                 for name, arguments in parse_kernels(source).items()
             }
-        except DAMAGES as error:
+        except CACHE_ERRORS as error:
             raise KernelError(
-                f"{file} was built on {device.text}, and its kernels cannot be made ({error}); the cache of built "
+                f"{file} was built on {device.text}, but its kernels cannot be created ({error}); the cache of built "
                 f"kernels may be damaged: remove {kernel_caches()}"
             ) from error
         names = program.get_info(cl.program_info.KERNEL_NAMES).split(";")
         if unread := sorted({name for name in names if name} - self.kernels.keys()):
             raise KernelError(
-                f"{path}: cannot read the head of {', '.join(unread)}; expected "
+                f"{path}: cannot parse the declaration of {', '.join(unread)}; expected "
                 f"'__kernel __attribute__((reqd_work_group_size(64, 1, 1))) void {unread[0]}(' "
                 "and parameters like '__global const float *restrict means' and 'const uint count'"
             )
@@ -501,8 +493,8 @@ class Program:
         return kernels[name]
 
 
-def built(context: Any, source: str, options: tuple[str, ...]) -> Any:
-    """Return a program that is built for a context."""
+def build(context: Any, source: str, options: tuple[str, ...]) -> Any:
+    """Build a program for a context."""
     return cl.Program(context, source).build(list(options))
 
 

@@ -25,7 +25,7 @@ Schedule = Literal["auto", "wide", "simt"]
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """The properties of a device, and its place among platforms and devices."""
+    """The properties of a device, and its index among platforms and devices."""
 
     name: str
     platform: str  # name and version of the runtime
@@ -37,62 +37,62 @@ class DeviceInfo:
     local_memory: int  # bytes per work-group
     group: int  # items, largest work-group
     float_width: int  # lanes of the vector unit
-    place: tuple[int, int]  # platform and device number
-    clock: int = 0  # MHz, at most
-    unified: bool = False  # its memory is the host's: an integrated GPU
+    index: tuple[int, int]  # platform and device number
+    clock: int = 0  # MHz, maximum
+    unified: bool = False  # whether it shares the host's memory: an integrated GPU
 
     @property
     def text(self) -> str:
         return f"{self.name} ({self.kind}) on {self.platform}"
 
     def fault(self) -> str | None:
-        """Return None when the device runs a test kernel of the size needed, else a sentence about the fault."""
+        """Return None if the device is large enough and runs a test kernel, else a sentence about the fault."""
         needed = int(tuning_of(self, resolve_schedule(self, "auto"))["GROUP"])
         if self.group < needed:
-            return f"its work-groups have at most {self.group} items; expected {needed} or more"
+            return f"its work-groups have at most {self.group} items; {needed} are needed"
         if self.local_memory < LOCAL_MEMORY:
-            return f"its work-groups have {self.local_memory} bytes of local memory; expected {LOCAL_MEMORY} or more"
-        return runtimes.fault_of(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.place)
+            return f"its work-groups have {self.local_memory} bytes of local memory; {LOCAL_MEMORY} are needed"
+        return runtimes.probe_fault(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.index)
 
     def matches(self, device_name: str) -> bool:
-        """Return whether `device_name` is a part of platform, name and kind, in any case."""
+        """Return whether `device_name` is a part of platform, name and kind, ignoring case."""
         return device_name.lower() in f"{self.platform} {self.name} {self.kind}".lower()
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Return every device of every runtime, in the loader's order; a runtime may have no device.
+    """Return all devices of all runtimes, in the loader's order.
 
-    One that refuses an answer is left out, and a line says so.
+    A device that cannot be queried is left out, with a warning.
     """
-    found = []
+    infos = []
     for p, platform in enumerate(platforms()):
         devices: list[Any] = []
-        with _told(f"OpenCL platform {p}: its devices cannot be listed", "DEVICE_NOT_FOUND"):
+        with _warning(f"OpenCL platform {p}: its devices cannot be listed", "DEVICE_NOT_FOUND"):
             devices = platform.get_devices()
         for d, device in enumerate(devices):
-            with _told(f"OpenCL platform {p}: its device {d} cannot be asked"):
-                found.append(_info(platform, device, (p, d)))
-    return found
+            with _warning(f"OpenCL platform {p}: its device {d} cannot be queried"):
+                infos.append(_info(platform, device, (p, d)))
+    return infos
 
 
 def platforms() -> list[Any]:
-    """Return the platforms of the loader; none when it finds no runtime."""
-    with _told("the OpenCL loader fails", "PLATFORM_NOT_FOUND_KHR"):
+    """Return the platforms of the loader; an empty list if it finds no runtime."""
+    with _warning("the OpenCL loader fails", "PLATFORM_NOT_FOUND_KHR"):
         return list(cl.get_platforms())
     return []
 
 
 @contextmanager
-def _told(what: str, nothing_there: str = "") -> Iterator[None]:
-    """Log a refusal in the block, but for the one that says that nothing is there."""
+def _warning(message: str, expected_code: str = "") -> Iterator[None]:
+    """Log an OpenCL error in the block as a warning, unless it has the expected code."""
     try:
         yield
     except cl.Error as error:
-        if error.code != getattr(cl.status_code, nothing_there, None):
-            LOG.warning("%s (%s); its driver may need to be installed again", what, one_line(error))
+        if error.code != getattr(cl.status_code, expected_code, None):
+            LOG.warning("%s (%s); its driver may need to be reinstalled", message, one_line(error))
 
 
-def _info(platform: Any, device: Any, place: tuple[int, int]) -> DeviceInfo:
+def _info(platform: Any, device: Any, index: tuple[int, int]) -> DeviceInfo:
     kinds = cl.device_type
     return DeviceInfo(
         name=device.name.strip(),
@@ -105,7 +105,7 @@ def _info(platform: Any, device: Any, place: tuple[int, int]) -> DeviceInfo:
         local_memory=device.local_mem_size,
         group=device.max_work_group_size,
         float_width=device.native_vector_width_float,
-        place=place,
+        index=index,
         clock=device.max_clock_frequency,
         unified=bool(device.host_unified_memory),
     )
@@ -119,9 +119,9 @@ def _short(version: str) -> str:
 def choose(device_name: str | None = None) -> DeviceInfo:
     """Choose a device; log the devices that do not work.
 
-    `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, from 0.  Without it the
-    variable CLSPLAT_DEVICE holds the name, else the strongest GPU that works is chosen, else the first CPU, else
-    the first other device.  Raises DeviceError with the names of all devices.
+    `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, counted from 0.  Without it,
+    the variable CLSPLAT_DEVICE gives the name, else the choice is the strongest GPU that works, else the first CPU,
+    else the first other device.  Raises DeviceError with the names of all devices.
     """
     device_name = device_name or os.environ.get(DEVICE_VARIABLE)
     devices = list_devices()
@@ -143,10 +143,9 @@ def choose(device_name: str | None = None) -> DeviceInfo:
 
 
 def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
-    """GPUs first, those with memory of their own before integrated ones, then by units times clock; then CPUs as found,
-    then other devices as found.
+    """Return the sort key: GPUs first, discrete before integrated ones, by units times clock; then CPUs, then others.
 
-    Units alone compare badly: some vendors count whole processors, others their parts.
+    Units by themselves compare badly: some vendors count whole processors, others parts of them.
     """
     gpu = info.kind == "GPU"
     return ("GPU", "CPU", "other").index(info.kind), gpu and info.unified, -info.units * info.clock if gpu else 0
@@ -166,7 +165,7 @@ def _named(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
 
 
 def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "simt"]:
-    """Return the schedule of a device; `auto` is wide for CPUs with vectors of 8 floats or more, else simt."""
+    """Return the schedule for a device; `auto` is wide for CPUs with vectors of 8 floats or more, else simt."""
     if schedule == "auto":
         return "wide" if info.kind == "CPU" and info.float_width >= 8 else "simt"
     if schedule not in ("wide", "simt"):
@@ -175,7 +174,7 @@ def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "s
 
 
 def tuning_of(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
-    """Return the -D values for a device; cl_kernels/common.h explains them."""
+    """Return the macros that kernels are built with for a device; cl_kernels/common.h explains them."""
     if schedule == "wide":
         return {
             "LANES": 16 if info.float_width >= 16 else 8,

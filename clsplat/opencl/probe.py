@@ -1,4 +1,4 @@
-"""Build and run two small kernels on the device of two numbers; exit status 0 means that they worked."""
+"""Build and run two small kernels on a device, given by platform and device number; exit code 0 means success."""
 
 import os
 import sys
@@ -20,7 +20,7 @@ void reverse(__global const float *restrict from, __global float *restrict to)
     to[get_global_id(0)] = part[7 - get_local_id(0)];
 }
 
-// The root and the conversions of whole vectors are what a runtime lacks that does not know the processor.
+// A runtime that does not know the processor lacks the root and the conversions of whole vectors.
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void whole_root(__global float *restrict squares)
 {
@@ -28,8 +28,8 @@ void whole_root(__global float *restrict squares)
 }
 """
 
-# Of a warning of clang where kernels are compiled for a processor without the vectors that the device reports, and the
-# runtime's library for one with them: PoCL 3.0 on processors newer than it, whose compiler may then work for minutes.
+# Part of a warning of clang: kernels are compiled without the vectors that the device reports, unlike the runtime's
+# library.  PoCL 3.0 does so on newer processors, and its compiler may then run for minutes.
 WITHOUT_VECTORS = "changes the ABI"
 
 
@@ -65,4 +65,4 @@ if __name__ == "__main__":
         main(int(sys.argv[1]), int(sys.argv[2]))
     except cl.Error as error:
         print(f"error: a test kernel fails ({error})", file=sys.stderr, flush=True)
-        os._exit(1)  # a runtime whose compiler has failed may hang where it is closed
+        os._exit(1)  # a runtime whose compiler failed may hang when it is closed

@@ -1,6 +1,6 @@
 """Find OpenCL runtimes, and test whether they work.
 
-Import this module before pyopencl: the loader reads its folder of drivers once.  Each runtime is tested in a separate
+Import this module before pyopencl: the loader reads its folder of drivers only once.  Each runtime is tested in a child
 process, because some runtimes abort the process on errors (PoCL before 7.2 without a linker).
 """
 
@@ -27,7 +27,7 @@ INSTALL = (
     "your GPU's driver"
 )
 _HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
-_NO_EXECUTION = "PoCL's cache lies where nothing may be executed: mount it with `exec`, or set POCL_CACHE_DIR"
+_NO_EXECUTION = "PoCL's cache is on a file system mounted with `noexec`: mount it with `exec`, or set POCL_CACHE_DIR"
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
 _ADVICE = (  # words in the output of a failed test kernel -> remedy
     ("without the vectors", f"this runtime does not support the processor: {_OTHER_RUNTIMES}"),
@@ -39,16 +39,16 @@ _ADVICE = (  # words in the output of a failed test kernel -> remedy
 
 
 def prepare() -> None:
-    """Do what must precede the loader: let its runtimes write their caches, and add Intel's.  Raises OutputError."""
+    """Prepare the environment for the loader: make runtimes' caches writable, and add Intel's.  Raises OutputError."""
     cache_folder()
     _add_intel_runtime()
 
 
 def _add_intel_runtime() -> None:
-    """Register Intel's CPU runtime when pip installed it: its own driver file holds a placeholder path.
+    """Register Intel's CPU runtime if pip installed it: its driver file contains a placeholder path.
 
-    This writes a folder of driver files with the system's drivers and Intel's, unless OCL_ICD_VENDORS is set.  The
-    loader of Windows takes the library itself, beside the registry's, unless OCL_ICD_FILENAMES is set.
+    This writes a folder of driver files with the system's drivers and Intel's, unless OCL_ICD_VENDORS is set.  On
+    Windows, the loader takes the library in addition to the registry's, unless OCL_ICD_FILENAMES is set.
     """
     data = Path(sysconfig.get_path("data"))
     if (dll := data / "Library" / "bin" / "intelocl64.dll").exists():  # Windows
@@ -67,34 +67,33 @@ def _add_intel_runtime() -> None:
     os.environ["OCL_ICD_VENDORS"] = str(folder)
 
 
-def fault_of(key: str, platform: int, device: int) -> str | None:
-    """Return None when the device builds and runs a kernel, else one sentence with the fault and the remedy.
+def probe_fault(key: str, platform: int, device: int) -> str | None:
+    """Return None if the device builds and runs a kernel, else a sentence with the fault and the remedy.
 
-    `key` identifies the runtime.  Only successes are stored, so a runtime that was fixed is tested again.  A device
-    that fails is tried again with empty caches of built kernels.  It is tested at every
-    start where the cache cannot be written.
+    `key` identifies the runtime.  Only successes are stored, so that a runtime that was fixed is tested again.  A
+    device that fails is tested again with empty caches of built kernels.
     """
-    tested = PROBE.read_bytes() + key.encode()
-    record = cache_folder() / "probes" / hashlib.sha256(tested).hexdigest()[:16]
-    if os.path.exists(record):  # False in a folder of another user
+    content = PROBE.read_bytes() + key.encode()
+    record = cache_folder() / "probes" / hashlib.sha256(content).hexdigest()[:16]
+    if os.path.exists(record):  # unlike Path.exists, False in a folder of another user
         return None
     remove_cut_kernels()
-    fault = _probed(platform, device, {})
+    fault = _run_probe(platform, device, {})
     if fault is None:
         with suppress(OutputError):
             write_text(record, key)
     elif fault not in (_HANGS, _NO_EXECUTION):
         with empty_kernel_caches() as variables:
-            if _probed(platform, device, variables) is None:
+            if _run_probe(platform, device, variables) is None:
                 return damaged_kernels()
     return fault
 
 
-def _probed(platform: int, device: int, variables: Mapping[str, str]) -> str | None:
-    """Try a device in a process with these variables besides ours; return the fault, or None."""
+def _run_probe(platform: int, device: int, variables: Mapping[str, str]) -> str | None:
+    """Test a device in a child process with additional environment variables; return the fault, or None."""
     command = [sys.executable, "-P", "-m", "clsplat.opencl.probe", str(platform), str(device)]
     try:
-        done = subprocess.run(
+        result = subprocess.run(
             command,
             capture_output=True,
             encoding="utf-8",
@@ -105,12 +104,12 @@ def _probed(platform: int, device: int, variables: Mapping[str, str]) -> str | N
         )
     except subprocess.TimeoutExpired:
         return _HANGS
-    if done.returncode == 0:
+    if result.returncode == 0:
         return None
-    output = f"{done.stdout}\n{done.stderr}"
+    output = f"{result.stdout}\n{result.stderr}"
     if "failed to map segment" in output.lower():
         return _NO_EXECUTION
-    reason = "the runtime aborts the process" if done.returncode not in range(256) else _error_line(output)
+    reason = "the runtime aborts the process" if result.returncode not in range(256) else _error_line(output)
     for word, advice in _ADVICE:
         if word in f"{output} {reason}".lower():
             return f"{reason}; {advice}"
@@ -118,7 +117,7 @@ def _probed(platform: int, device: int, variables: Mapping[str, str]) -> str | N
 
 
 def _error_line(output: str) -> str:
-    """The line with the error in the output of a compiler or of Python."""
+    """Return the line with the error in the output of a compiler or of Python."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if line.lower().startswith("error:")]
     return (errors or lines or ["the test kernel failed without a message"])[-1 if not errors else 0]

@@ -103,8 +103,8 @@ def places(worker: str, devices: list[str] | None = None, packing: int = 1) -> l
 def word_of(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
     """Return the words that name one device of several for `--device`."""
     words = f"{info.platform} {info.name} {info.kind}"
-    same = [one.place for one in infos if one.matches(words)]
-    return f"{words}:{same.index(info.place)}"
+    same = [one.index for one in infos if one.matches(words)]
+    return f"{words}:{same.index(info.index)}"
 
 
 def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:

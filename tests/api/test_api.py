@@ -177,7 +177,7 @@ def test_a_device_is_given_by_name_or_open_everywhere(device, rng, tiny_scene, t
     model_of(case).save(tmp_path / "m.ply")
     assert clsplat.render_views(tmp_path / "m.ply", tiny_scene, tmp_path / "views", device=device) == 2
     assert clsplat.Trainer(tiny_scene, "smoke", device=name, set=schedule).evaluate("train")["views"] == 8
-    with pytest.raises(ConfigError, match="device: is a int; expected a part of a device's name, or a Device"):
+    with pytest.raises(ConfigError, match="device: expected a part of a device's name or a Device, got int"):
         Renderer(model_of(case), 0)
 
 
@@ -185,7 +185,7 @@ def test_a_device_is_given_by_name_or_open_everywhere(device, rng, tiny_scene, t
 def test_open_device_of_another_schedule_is_refused(function, device, tiny_scene):
     arguments = {"Trainer": (tiny_scene, "smoke"), "describe_run": ("smoke", tiny_scene)}[function.__name__]
     other = "simt" if device.schedule == "wide" else "wide"
-    with pytest.raises(ConfigError, match=f"expected the {other} schedule, as the settings say"):
+    with pytest.raises(ConfigError, match=f"the settings need the {other} schedule"):
         function(*arguments, device=device, set={"rasterizer.schedule": other})
 
 

@@ -148,7 +148,7 @@ def test_process_of_a_check_ends_with_its_parent(info, tmp_path):
     waits = (
         "from clsplat.conformance import supervision; from clsplat.conformance.checks import BY_NAME\n"
         "from clsplat.opencl.discovery import list_devices\n"
-        f"info = next(one for one in list_devices() if one.place == {info.place})\n"
+        f"info = next(one for one in list_devices() if one.index == {info.index})\n"
         f"supervision.WORKER = ('-c', {hangs!r}); list(supervision.run_checks(info, 'simt', [BY_NAME['scans']]))"
     )
     waiting = subprocess.Popen([sys.executable, "-c", waits])
@@ -176,7 +176,7 @@ def test_a_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_pat
     monkeypatch.chdir(tmp_path)
     (one,) = run_checks(info, resolve_schedule(info, "auto"), [BY_NAME["scans"]])
     assert one.passes, one.fault
-    assert runtimes.fault_of("key", *info.place) is None
+    assert runtimes.probe_fault("key", *info.index) is None
 
 
 @pytest.mark.parametrize(

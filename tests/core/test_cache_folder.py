@@ -199,7 +199,7 @@ def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
     assert files.keys() - left == {*cut, kernel("", "empty")}
     assert {file.name.split("-")[-2] for file in pytools.iterdir()} == {"invoker", "new", "v5"}
     (record,) = caplog.records
-    assert record.getMessage().startswith("7 files of built kernels are cut off (")
+    assert record.getMessage().startswith("removed 7 truncated files of built kernels (")
     remove_cut_kernels()
     assert len(caplog.records) == 1
 
@@ -209,7 +209,7 @@ def test_kernels_are_examined_once_after_each_boot(machine, monkeypatch):
     """Also where another folder is used than before."""
     first, second = (machine / folder / kernel("", "empty") for folder in ("first", "second"))
     start = {"now": "1"}
-    monkeypatch.setattr("clsplat.opencl.kernel_caches._start_of_the_machine", lambda: start["now"])
+    monkeypatch.setattr("clsplat.opencl.kernel_caches._boot_id", lambda: start["now"])
 
     def cut(file: Path) -> bool:
         """Whether a kernel that is cut off is found by a process that starts now."""
@@ -268,7 +268,7 @@ def test_a_device_is_tested_without_the_kernels_that_are_cut_off(broken, monkeyp
         return subprocess.CompletedProcess([], 0, "", "")
 
     monkeypatch.setattr(runtimes.subprocess, "run", probe)
-    assert runtimes.fault_of("key", 0, 0) is None
+    assert runtimes.probe_fault("key", 0, 0) is None
     assert not broken.exists()
 
 

@@ -36,7 +36,7 @@ def test_a_refused_call_has_the_code_of_its_fault(name, error, expected, code, i
     device = Device(info)
     array = device.upload(NUMBERS)
     device.timings.sampling = name == "another queue"
-    monkeypatch.setattr(device_module, "context_of", device_module.context_of.__wrapped__)  # a new one
+    monkeypatch.setattr(device_module, "create_context", device_module.create_context.__wrapped__)  # a new one
     monkeypatch.setattr(device_module.cl, function, refuse)
     with pytest.raises(expected, match=f"{re.escape(device.info.name)}.*the runtime refuses") as raised:
         call(device, array)

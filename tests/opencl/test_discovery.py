@@ -22,18 +22,18 @@ from clsplat.opencl.kernel_caches import kernel_caches
 from clsplat.render.rasterizer import Rasterizer
 
 CPU = DeviceInfo("Two Cores", "Runtime A", "CPU", "1", 2, 2**32, 2**31, 2**15, 4096, 16, (0, 0), 3000, True)
-INTEGRATED = replace(CPU, name="Small", kind="GPU", units=96, clock=1300, group=256, float_width=1, place=(1, 0))
-LARGE = replace(INTEGRATED, name="Large", units=28, clock=1800, unified=False, place=(2, 0))
-LARGER = replace(LARGE, name="Larger", units=80, clock=1700, place=(2, 1))
+INTEGRATED = replace(CPU, name="Small", kind="GPU", units=96, clock=1300, group=256, float_width=1, index=(1, 0))
+LARGE = replace(INTEGRATED, name="Large", units=28, clock=1800, unified=False, index=(2, 0))
+LARGER = replace(LARGE, name="Larger", units=80, clock=1700, index=(2, 1))
 
-OTHER = replace(CPU, name="Accelerator", kind="other", units=96, group=256, place=(3, 0))
+OTHER = replace(CPU, name="Accelerator", kind="other", units=96, group=256, index=(3, 0))
 
 
 @pytest.fixture
 def found(monkeypatch):
     """Lets the test say which devices there are; all work."""
     monkeypatch.delenv("CLSPLAT_DEVICE", raising=False)
-    monkeypatch.setattr(runtimes, "fault_of", lambda *_: None)
+    monkeypatch.setattr(runtimes, "probe_fault", lambda *_: None)
     return lambda *devices: monkeypatch.setattr(discovery, "list_devices", lambda: list(devices))
 
 
@@ -74,7 +74,7 @@ def test_the_other_gpus_are_named_in_one_line(found, caplog):
 def test_a_device_with_small_groups_does_not_work(found, info, least):
     assert replace(info, group=least).fault() is None
     small = replace(info, group=least - 1)
-    assert small.fault() == f"its work-groups have at most {least - 1} items; expected {least} or more"
+    assert small.fault() == f"its work-groups have at most {least - 1} items; {least} are needed"
     found(small)
     with pytest.raises(DeviceError, match="work-groups have at most"):
         choose()
@@ -176,7 +176,7 @@ class Platform:
 
 
 def test_a_broken_runtime_takes_no_other_down_and_is_told(monkeypatch, info, caplog):
-    platform, number = info.place
+    platform, number = info.index
     good = discovery.platforms()[platform]
     devices = [BrokenDevice(), good.get_devices()[number]]
     runtimes_found = [
@@ -186,11 +186,11 @@ def test_a_broken_runtime_takes_no_other_down_and_is_told(monkeypatch, info, cap
     ]
     monkeypatch.setattr(discovery.cl, "get_platforms", lambda: runtimes_found)
     (found,) = discovery.list_devices()
-    assert (found.name, found.place) == (info.name, (2, 1))
+    assert (found.name, found.index) == (info.name, (2, 1))
     told = [record.getMessage() for record in caplog.records]
     assert len(told) == 2, "one without a device is no fault"
     assert "OpenCL platform 1: its devices cannot be listed (clGetInfo failed: OUT_OF_HOST_MEMORY" in told[0]
-    assert "OpenCL platform 2: its device 0 cannot be asked (clGetInfo failed: INVALID_VALUE" in told[1]
+    assert "OpenCL platform 2: its device 0 cannot be queried (clGetInfo failed: INVALID_VALUE" in told[1]
 
 
 @pytest.mark.parametrize(("code", "lines"), [("PLATFORM_NOT_FOUND_KHR", 0), ("OUT_OF_HOST_MEMORY", 1)])
@@ -245,14 +245,15 @@ def test_capped_blending_gets_smaller_tiles_and_the_same_image(info, rng, monkey
     assert device.tuning["TILE"] == 8
     assert len(caplog.records) == 1
     assert (
-        "tiles of 8 x 8 px instead of 16 x 16: blend_simt.cl:blend_forward has work-groups of 256 items" in caplog.text
+        "tiles of 8 x 8 px instead of 16 x 16: blend_simt.cl:blend_forward needs work-groups of 256 items"
+        in caplog.text
     )
     np.testing.assert_array_equal(image_of(device, np.random.default_rng(1)), image)
 
 
 def test_kernel_whose_group_is_too_large_is_refused(info, monkeypatch):
     capped(monkeypatch, 63, "scan_blocks")
-    with pytest.raises(KernelError, match=r"scan.cl:scan_blocks has work-groups of 64 items, and .* allows it 63; use"):
+    with pytest.raises(KernelError, match=r"scan.cl:scan_blocks needs work-groups of 64 items, but .* allows 63; use"):
         Device(info, "simt").program("scan.cl")
 
 
@@ -261,7 +262,7 @@ def test_a_limit_that_rusticl_understates_refuses_no_kernel(info, monkeypatch):
     monkeypatch.setattr(program, "group_multiple", lambda *_: 32)
     assert Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt").tuning["TILE"] == 16
     capped(monkeypatch, 48)
-    with pytest.raises(KernelError, match="allows it 48"):
+    with pytest.raises(KernelError, match="allows 48"):
         Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt")
 
 

@@ -19,7 +19,9 @@ def test_a_missing_kernel_file_is_named(device, tmp_path):
 def test_kernel_without_a_group_size_is_refused_with_the_form(device, tmp_path):
     file = tmp_path / "own.cl"
     file.write_text("kernel void fade(global float *x) { x[0] = 1; }\n")
-    with pytest.raises(KernelError, match=r"own\.cl: cannot read the head of fade; expected .*reqd_work_group_size"):
+    with pytest.raises(
+        KernelError, match=r"own\.cl: cannot parse the declaration of fade; expected .*reqd_work_group_size"
+    ):
         device.program(file)
 
 

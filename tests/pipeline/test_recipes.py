@@ -38,7 +38,7 @@ import functools, sys
 from pathlib import Path
 from clsplat.opencl import device
 from tests.support.recipes import STEPS, short, train
-device.context_of, device.built = functools.cache(device.context_of), functools.cache(device.built)
+device.create_context, device.build = functools.cache(device.create_context), functools.cache(device.build)
 for name in sys.argv[3:]:
     train(short(name, Path(sys.argv[1]), saved=STEPS), Path(sys.argv[2]) / name)
 """

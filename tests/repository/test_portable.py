@@ -247,4 +247,4 @@ def test_a_cache_that_forbids_execution_is_named(monkeypatch, tmp_path):
     ended = subprocess.CompletedProcess([], -6, "", said)
     monkeypatch.setattr(runtimes.subprocess, "run", lambda *arguments, **values: ended)
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
-    assert "mount it with `exec`, or set POCL_CACHE_DIR" in runtimes.fault_of("key", 0, 0)
+    assert "mount it with `exec`, or set POCL_CACHE_DIR" in runtimes.probe_fault("key", 0, 0)

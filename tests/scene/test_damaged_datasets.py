@@ -269,7 +269,7 @@ def main(base: Path, count: int) -> None:
     from clsplat.core import terminal
     from clsplat.opencl import device
 
-    device.context_of, device.built = functools.cache(device.context_of), functools.cache(device.built)
+    device.create_context, device.build = functools.cache(device.create_context), functools.cache(device.build)
     terminal.ERRORS.width = 10_000
     cases = []
     for i in range(count):

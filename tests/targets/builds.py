@@ -18,7 +18,7 @@ Schedule = Literal["simt", "wide"]
 KERNELS = resource_dir("cl_kernels")
 GPU = DeviceInfo(
     name="", platform="", kind="GPU", driver="", units=16, memory=2**33, allocation=2**31, local_memory=2**15,
-    group=256, float_width=1, place=(0, 0),
+    group=256, float_width=1, index=(0, 0),
 )  # fmt: skip
 DEVICES = {"simt": [GPU, replace(GPU, group=64)], "wide": [GPU]}  # wide where somebody asks a GPU for it
 SCHEDULES: tuple[Schedule, ...] = ("simt", "wide")
