@@ -69,8 +69,8 @@ if TYPE_CHECKING:
     from clsplat.scene.scene import PointCloud as PointCloud
     from clsplat.scene.scene import Scene as Scene
     from clsplat.scene.view import View as View
-    from clsplat.scene.view_selection import Choice as Choice
     from clsplat.scene.view_selection import Split as Split
+    from clsplat.scene.view_selection import ViewSelection as ViewSelection
 
 
 class _CheckoutFinder:
@@ -105,7 +105,7 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.scene.detect": "read_scene",
     "clsplat.scene.scene": "PointCloud Scene",
     "clsplat.scene.view": "View",
-    "clsplat.scene.view_selection": "Choice Split",
+    "clsplat.scene.view_selection": "Split ViewSelection",
 }
 _PLACES = {name: room for room, names in _ROOMS.items() for name in names.split()}
 _MODULES = {"errors": "clsplat.core.errors", "metrics": "clsplat.metrics"}

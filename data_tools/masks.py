@@ -10,9 +10,9 @@ from clsplat.core.errors import DataError
 from clsplat.core.manifest import Manifest, hash_values
 from clsplat.core.progress import Count
 from clsplat.scene.colmap import ColmapReader, image_folder
-from clsplat.scene.detect import read_scene, reader_of
+from clsplat.scene.detect import find_reader, read_scene
 from clsplat.scene.images import read_image, write_image
-from clsplat.scene.photographs import mask_file
+from clsplat.scene.photographs import find_mask
 from clsplat.scene.view import View, load_mask
 
 MIN_ALPHA = 0.5  # of the largest value
@@ -29,7 +29,7 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
     """
     views = read_scene(scene, holdout=0).views
     target = out or _place(scene)
-    sources = [None if folder is None else mask_file(folder, view.name) for view in views]
+    sources = [None if folder is None else find_mask(folder, view.name) for view in views]
     missing = [view.name for view, source in zip(views, sources, strict=True) if folder and source is None]
     if missing:
         raise DataError(
@@ -50,7 +50,7 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
 
 def _place(scene: Path) -> Path:
     """The folder of masks that the reader of a scene looks into.  Raises DataError where it looks into none."""
-    reader = reader_of(scene)
+    reader = find_reader(scene)
     if reader is not None and not isinstance(reader, ColmapReader):
         raise DataError(
             f"{scene}: {reader.name} scenes have no folder of masks; train with `--set scene.alpha=mask` to take the "

@@ -26,7 +26,7 @@ class CsvReader(plugin.Reader):
             for name, *pose, fx, fy, cx, cy, width, height in filter(None, rows):
                 camera = plugin.Camera(int(width), int(height), float(fx), float(fy), float(cx), float(cy)).check()
                 matrix = plugin.pose_matrix([float(q) for q in pose[:4]], [float(t) for t in pose[4:]])
-                image = plugin.inside(path, name, f"{file}: line {rows.line_num}")
+                image = plugin.safe_join(path, name, f"{file}: line {rows.line_num}")
                 views.append(plugin.View(name, camera, matrix, image))
         except (ValueError, csv.Error) as error:
             raise plugin.DataError(f"{file}: line {rows.line_num}: {error}; expected {COLUMNS}") from error

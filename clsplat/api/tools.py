@@ -60,7 +60,7 @@ def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection"
     load_plugins()
     if page is not None:
         check_result_path(Path(page), ".html")
-    inspection = Inspection.of(photographs_of(Path(scene)))
+    inspection = Inspection.from_folder(photographs_of(Path(scene)))
     if page is not None:
         write_page(inspection, Path(page))
     return inspection

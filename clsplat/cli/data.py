@@ -11,7 +11,7 @@ from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.prepare.features import CameraModel
 from clsplat.prepare.mapping import Mapper
 from clsplat.prepare.matching import Matching
-from clsplat.prepare.undistort import Blank
+from clsplat.prepare.undistort import UndefinedPixels
 from clsplat.scene.detect import format_names
 
 DATASET = f"The folder of a dataset: {format_names()}."
@@ -120,15 +120,15 @@ def video(
 
 
 @app.command()
-def moments(
+def sync_frames(
     scene: Annotated[Path, typer.Argument(help="Folder that holds videos/NAME.mp4 of each camera.")],
-    moments_: Annotated[int, typer.Option("--moments", min=2, help="Frames of each video, evenly spaced.")] = 60,
+    frames: Annotated[int, typer.Option(min=2, help="Frames of each video, evenly spaced.")] = 60,
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
 ) -> None:
-    """Take frames of the videos of several cameras, at the same moments of each."""
-    from clsplat.data_tools.moments import write_moments
+    """Extract synchronized frames from the videos of several cameras."""
+    from clsplat.data_tools.sync_frames import write_sync_frames
 
-    print(f"{moments_} frames of each of {write_moments(scene, moments_, long_side)} cameras in {scene / 'videos'}")
+    print(f"{frames} frames from each of {write_sync_frames(scene, frames, long_side)} cameras in {scene / 'videos'}")
 
 
 @app.command()
@@ -136,12 +136,14 @@ def undistort(
     scene: Annotated[Path, typer.Argument(help=DATASET)],
     out: Annotated[Path, typer.Argument(help="Folder for the scene of pinhole cameras.")],
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
-    blank: Annotated[Blank, typer.Option(help="Cut blank pixels off, or keep and mask them.")] = "crop",
+    undefined_pixels: Annotated[
+        UndefinedPixels, typer.Option(help="Crop away pixels that no photo covers, or keep and mask them.")
+    ] = "crop",
 ) -> None:
     """Undistort the photographs of a scene, of fisheye lenses too."""
     from clsplat.prepare.undistort import undistort_scene
 
-    print(f"{undistort_scene(scene, out, long_side, blank)} images in {out}")
+    print(f"{undistort_scene(scene, out, long_side, undefined_pixels)} images in {out}")
 
 
 @app.command()

@@ -19,7 +19,7 @@ from clsplat.photos.photographs import Photograph, Photographs, unpack
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.painter import Painter
 from clsplat.render.workspace import Workspace
-from clsplat.scene.times import by_camera, camera_key, moments_of
+from clsplat.scene.times import camera_key, distinct_times, group_by_camera
 from clsplat.scene.view import View, load_mask
 
 # What should not move, measured: PSNR of the static pixels of a scene that moves, and how much its pictures flicker.
@@ -69,7 +69,7 @@ class Stillness:
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: all that are to be added, in any order."""
-        cameras = [group for group in by_camera(views) if len(moments_of(group)) >= LEAST_MOMENTS]
+        cameras = [group for group in group_by_camera(views) if len(distinct_times(group)) >= LEAST_MOMENTS]
         self._stations = {camera_key(group[0]): Station() for group in cameras[:MOST_CAMERAS]}
 
     @property
@@ -256,7 +256,7 @@ def by_moment(psnr: Mapping[str, float], views: Sequence[View], trained: Sequenc
 
     There is none where only one of both kinds is there, as where nothing moves.
     """
-    known, times = set(moments_of(trained)), {view.name: view.time for view in views}
+    known, times = set(distinct_times(trained)), {view.name: view.time for view in views}
     kinds = {name: OTHERS if time in known else HELD_OUT for name, time in times.items() if time is not None}
     if not known or {kinds.get(name) for name in psnr} != {HELD_OUT, OTHERS}:
         return {}

@@ -19,7 +19,7 @@ from clsplat.photos.photographs import Photograph
 from clsplat.render.camera import DeviceCamera
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.scene.viewpoint import center_of
+from clsplat.scene.viewpoint import scene_center
 from clsplat.training.field import Tables, TrainedField
 from clsplat.training.memory import DeviceLimits
 
@@ -258,7 +258,7 @@ def require_seen(shape: FieldShape, scene: Scene) -> None:
         fault = f"none of the scene's {len(points):,} points lies in it"
     else:
         return
-    least, most, seen = (_told(point) for point in (corner, corner + side, center_of(views)))
+    least, most, seen = (_told(point) for point in (corner, corner + side, scene_center(views)))
     raise ConfigError(
         f"train_field.field.grid: its cube is from {least} to {most}, scene units, and {fault} ({scene.path}); "
         f"expected one about what the cameras look at, near {seen}: set `corner` and `side`, and `near` and `far` "

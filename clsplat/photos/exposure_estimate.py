@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clsplat.photos.appearance import LUMINANCE, Floats
 from clsplat.photos.photographs import Mask
 from clsplat.scene.scene import Tracks
-from clsplat.scene.view import View, camera_exposures
+from clsplat.scene.view import View, load_exposures
 
 DARKEST, BRIGHTEST = 0.05, 0.95  # of values that count: beyond them noise and clipping decide
 SIDE = 3  # px, of the square about a point whose mean is its value
@@ -60,7 +60,7 @@ def noted(views: Sequence[View]) -> Exposures:
 
     Tone curves differ from that, so that it is where to begin.
     """
-    values = {view.name: one.value for view, one in zip(views, camera_exposures(views), strict=True) if one}
+    values = {view.name: one.value for view, one in zip(views, load_exposures(views), strict=True) if one}
     if not values:
         return UNKNOWN
     mean = math.fsum(values.values()) / len(values)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clsplat.gaussians.sky import corners, neighbors, places, weights
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.scene.viewpoint import upward
+from clsplat.scene.viewpoint import up_direction
 
 SIDE = 160  # px of the longer side, at which photographs are looked at
 APART = 4  # px there, from the nearest point: 20 px of a photograph of 800
@@ -64,7 +64,7 @@ class SkyEvidence:
 
 def detect_sky(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -> Iterator[SkyEvidence]:
     """Yield what photographs, [height, width, 3], show of the sky in pixels that count, [height, width]; None: all."""
-    up = upward(scene.split("train"))
+    up = up_direction(scene.split("train"))
     for view, image, counted in views:
         small = _small(image)
         counts = np.ones(small.shape[:2], bool) if counted is None else _small(255 * counted.astype(np.uint8)) == 255

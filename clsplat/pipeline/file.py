@@ -26,7 +26,7 @@ from clsplat.scene.images import Missing
 from clsplat.scene.photographs import with_masks
 from clsplat.scene.scene import HOLDOUT, Background, Scene
 from clsplat.scene.view import Alpha
-from clsplat.scene.view_selection import Choice, Chosen, ChosenOrAuto, Split
+from clsplat.scene.view_selection import Chosen, ChosenOrAuto, Split, ViewSelection
 from clsplat.stages.optimize import Optimize
 from clsplat.training.memory import Harmonics
 from clsplat.training.stage import ON_HOST, Stage, Training
@@ -55,7 +55,7 @@ class SceneSettings(Settings):
     holdout: Chosen = HOLDOUT
     """Test views: every n-th image by name, starting with the first; 0: none; or {every, offset}, {names} or {file}.
     Names replace the split of a dataset that has one."""
-    train: Choice | None = None
+    train: ViewSelection | None = None
     """Training views to use, such as {every: 4}; default: all."""
     validation: ChosenOrAuto = 0
     """Training views held out to choose the best model (`optimize.keep`), as for `holdout`; auto: every 8th, starting

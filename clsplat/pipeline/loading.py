@@ -21,7 +21,7 @@ from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
 from clsplat.pipeline.overrides import CADENCE, NoSuchKey, apply, settable, split, suggestion
 from clsplat.pipeline.yaml_file import Document, KeyPath, read_yaml, yaml_text
-from clsplat.prepare.cache import Planned, plan
+from clsplat.prepare.cache import PlannedStep, plan
 from clsplat.scene.quality import Measures
 from clsplat.training.stage import Scheduled, Stage, Training, written_twice
 
@@ -63,7 +63,7 @@ class Pipeline:
             return []
         return [key for key in adapt.keys(self.settings.optimize) if key not in adapt.keep]
 
-    def preparation(self, out: Path) -> list[Planned]:
+    def preparation(self, out: Path) -> list[PlannedStep]:
         """Return the preparation steps before a run in `out`, and why each is due.  Raises DataError or ConfigError."""
         settings, folder = self.settings, prepared_folder(out)
         if settings.prepare and settings.scene.masks is not None:

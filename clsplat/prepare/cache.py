@@ -39,7 +39,7 @@ RECORD = "record.json"
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedStep:
     """A step and the folder of its result."""
 
     step: Step
@@ -54,17 +54,17 @@ class Planned:
         return _digest([self.step.stage, self.step.version, self.step.model_dump(mode="json"), self.inputs])
 
 
-def plan(steps: Sequence[Step], source: Path, root: Path) -> list[Planned]:
+def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
     """Return the steps for the photographs in `source`, with the reasons to run them; results lie below `root`.
 
     Raises DataError when the photographs cannot be read.
     """
-    planned: list[Planned] = []
+    planned: list[PlannedStep] = []
     inputs = fingerprint(source, root.parent)
     for step in steps:
-        key = Planned(step, str(source.resolve()), inputs, Path(), "").key
+        key = PlannedStep(step, str(source.resolve()), inputs, Path(), "").key
         folder = root / f"{step.stage}-{key[:12]}"
-        planned.append(Planned(step, str(source.resolve()), inputs, folder, _why(step, inputs, folder, source)))
+        planned.append(PlannedStep(step, str(source.resolve()), inputs, folder, _why(step, inputs, folder, source)))
         inputs = key
     done = max((i for i, one in enumerate(planned) if not one.why), default=-1)
     return [
@@ -73,7 +73,7 @@ def plan(steps: Sequence[Step], source: Path, root: Path) -> list[Planned]:
 
 
 def prepare(
-    planned: Sequence[Planned],
+    planned: Sequence[PlannedStep],
     source: Path,
     root: Path,
     begun: Callable[[str], AbstractContextManager[Any]] = nullcontext,
@@ -98,7 +98,7 @@ def prepare(
 
 
 @contextmanager
-def _only_one_making(one: Planned) -> Iterator[None]:
+def _only_one_making(one: PlannedStep) -> Iterator[None]:
     """Hold a result: what an interrupted call left is gone on with by one process alone."""
     with raising_output_error(one.folder.parent):
         make_folder(one.folder.parent)
@@ -122,12 +122,12 @@ def fingerprint(folder: Path, without: Path) -> str:
     return _digest(parts)
 
 
-def note(planned: Sequence[Planned]) -> dict[str, str]:
+def make_note(planned: Sequence[PlannedStep]) -> dict[str, str]:
     """Return the note for a run folder: the hash of the prepared photographs, and their folder."""
     return {"inputs": planned[-1].key, "folder": str(planned[-1].folder)}
 
 
-def noted(out: Path) -> dict[str, str] | None:
+def read_note(out: Path) -> dict[str, str] | None:
     """Return the note of a run folder, or None."""
     try:
         text = read_json(out / PREPARE_SUMMARY)
@@ -140,7 +140,7 @@ def _same(path: Path, other: Path) -> bool:
     return path.resolve() == other.resolve()
 
 
-def _do(one: Planned, source: Path, root: Path) -> None:
+def _do(one: PlannedStep, source: Path, root: Path) -> None:
     """Make a result in a hidden folder beside its own, and rename it when it is complete and on the disk.
 
     A step that resumes finds there what an interrupted call has made of the same inputs with the same settings.
@@ -238,7 +238,7 @@ def _digest(data: Any) -> str:
 INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that are not what a step has found
 
 
-def facts(planned: Sequence[Planned]) -> dict[str, dict[str, Any]]:
+def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
     """Return what each step has found, by its name; steps whose results were removed are left out."""
     records = {one.step.stage: record_of(one.folder) for one in planned}
     return {

@@ -22,7 +22,7 @@ SHARPNESS_OF = 15  # placed photographs that the others are compared with
 
 
 @dataclass
-class Matched:
+class MatchGraph:
     """The photographs with their features, and the pairs that match."""
 
     images: Path
@@ -31,7 +31,7 @@ class Matched:
     sharpness: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, pycolmap: ModuleType, database: Path, images: Path) -> "Matched":
+    def from_database(cls, pycolmap: ModuleType, database: Path, images: Path) -> "MatchGraph":
         """Read them from COLMAP's database."""
         return cls(images, feature_counts(pycolmap, database), verified(pycolmap, database))
 
@@ -45,7 +45,7 @@ class Matched:
 
     def groups(self, fewest: int) -> list[list[str]]:
         """The photographs that pairs with so many matches join, each group sorted, the largest first."""
-        return joined(self.features, [pair for pair, count in self.pairs.items() if count >= fewest])
+        return connected_groups(self.features, [pair for pair, count in self.pairs.items() if count >= fewest])
 
     def have_nothing_in_common(self) -> bool:
         """Whether denser features are without a chance: most photographs are in no group of pairs, however few matches
@@ -64,7 +64,7 @@ class Matched:
         return self.sharpness[name]
 
 
-def joined(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> list[list[str]]:
+def connected_groups(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> list[list[str]]:
     """Return the groups of names that pairs join, each sorted, the largest first."""
     group_of = {name: {name} for name in names}
     for a, b in pairs:
@@ -75,7 +75,7 @@ def joined(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> list[list[
     return sorted(groups.values(), key=lambda group: (-len(group), group))
 
 
-def diagnosis(matched: Matched) -> str:
+def diagnose(matched: MatchGraph) -> str:
     """Return the likely reason why photographs give no model, with a remedy."""
     middle = round(median(matched.features.values()))
     if middle < FEW_FEATURES:
@@ -92,7 +92,7 @@ def diagnosis(matched: Matched) -> str:
     return "take more sharp ones, from places a step apart, of a textured scene in which nothing moves"
 
 
-def _parts(matched: Matched, groups: Sequence[list[str]]) -> str:
+def _parts(matched: MatchGraph, groups: Sequence[list[str]]) -> str:
     """Which photographs belong together, and which do not, in words."""
     alone = [name for group in groups if len(group) == 1 for name in group]
     count = len(groups) - len(alone)
@@ -103,7 +103,7 @@ def _parts(matched: Matched, groups: Sequence[list[str]]) -> str:
     return f"they do not belong together: {pluralize(count, 'group')} of good matches, the largest of {largest}{others}"
 
 
-def reasons(matched: Matched, models: Sequence[set[str]]) -> dict[str, str]:
+def explain_unplaced(matched: MatchGraph, models: Sequence[set[str]]) -> dict[str, str]:
     """Return the likely reason of each photograph that is not in the first of the models."""
     placed = models[0]
     compared = sorted(placed)[:: max(1, len(placed) // SHARPNESS_OF)]
@@ -119,7 +119,7 @@ def reasons(matched: Matched, models: Sequence[set[str]]) -> dict[str, str]:
     return found
 
 
-def _reason(matched: Matched, name: str, placed: set[str], middle: NDArray[np.float64]) -> str:
+def _reason(matched: MatchGraph, name: str, placed: set[str], middle: NDArray[np.float64]) -> str:
     matches = matched.matches[name]
     among = {other: count for other, count in matches.items() if other in placed}
     if matched.features[name] < FEW_FEATURES:

@@ -26,8 +26,8 @@ from clsplat.prepare.database import (
     require_pycolmap,
     without_features,
 )
-from clsplat.prepare.gather import gather, list_photographs, warn_of
-from clsplat.prepare.shared_intrinsics import Cameras, sharing, sharing_text
+from clsplat.prepare.gather import gather, list_photographs, log_warnings
+from clsplat.prepare.shared_intrinsics import Cameras, group_photos, shared_camera_note
 from clsplat.scene.images import read_gray
 
 LOG = logging.getLogger("clsplat")
@@ -37,7 +37,7 @@ LEVELS = 512  # of a root of a share, as COLMAP stores it; larger ones than 255 
 
 
 @dataclass(frozen=True)
-class Sought:
+class FeatureOptions:
     """Which features: at most `count` in an image of `long_side` px; `contrast` is a share of the range of gray."""
 
     long_side: int = 1600
@@ -48,7 +48,7 @@ class Sought:
 def find_features(
     photographs: Path,
     out: Path,
-    sought: Sought = Sought(),
+    sought: FeatureOptions = FeatureOptions(),
     camera_model: CameraModel = "SIMPLE_RADIAL",
     cameras: Cameras = "auto",
     without: Path | None = None,
@@ -61,10 +61,10 @@ def find_features(
     """
     pycolmap = require_pycolmap()
     names, damaged = gather(photographs, out / IMAGES, list_photographs(photographs, without))
-    groups = sharing(out / IMAGES, names, cameras)
+    groups = group_photos(out / IMAGES, names, cameras)
     figures = {"photographs": len(names), "cameras": len(groups), "damaged": damaged}
-    warn_of(figures)
-    if told := sharing_text(out / IMAGES, groups):
+    log_warnings(figures)
+    if told := shared_camera_note(out / IMAGES, groups):
         LOG.info("%s", told)
     with explained(photographs, "find features"):
         if image_names(pycolmap, out / DATABASE) != sorted(names):  # a new database, or one cut short
@@ -74,7 +74,7 @@ def find_features(
     return figures
 
 
-def add_features(images: Path, database: Path, sought: Sought) -> None:
+def add_features(images: Path, database: Path, sought: FeatureOptions) -> None:
     """Find the features of those photographs of a database that have none.  Raises DataError."""
     pycolmap = require_pycolmap()
     with explained(images, "find features"), opened(pycolmap, database) as rows:
@@ -89,7 +89,7 @@ def add_features(images: Path, database: Path, sought: Sought) -> None:
                 rows.write_descriptors(number, pycolmap.FeatureDescriptors(data=descriptors, type=kind))
 
 
-def sift(pixels: NDArray[np.uint8], sought: Sought) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def sift(pixels: NDArray[np.uint8], sought: FeatureOptions) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return features as COLMAP stores them, those of the highest contrast: x, y, scale in px and angle [M, 4], with
     the descriptors [M, 128].
 

@@ -20,10 +20,10 @@ from clsplat.scene.images import (
     JPEG,
     MAX_BYTES,
     TAIL_SIZE,
-    copied,
+    copy_exif,
     decode_image,
-    exposure_of,
     parse_header,
+    read_exif_exposure,
     read_gray,
     write_exposures,
 )
@@ -125,13 +125,13 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
             damaged[name] = why_unreadable(photographs / name, error)
             continue
         kept.append(name)
-    write_exposures(images, {name: exposure_of(photographs / name) for name in kept})  # a copy of a PNG has none
+    write_exposures(images, {name: read_exif_exposure(photographs / name) for name in kept})  # a copy of a PNG has none
     if times := read_times(photographs):
         write_times(images, {name: times[name] for name in kept if name in times})
     if len(kept) < MIN_PHOTOGRAPHS:
         faults = first_few([f"{name} ({reason})" for name, reason in damaged.items()])
         raise DataError(
-            f"{photographs}: only {len(kept)} of {len(names)} photographs can be read: {faults}; {remedy(damaged)}"
+            f"{photographs}: only {len(kept)} of {len(names)} photographs can be read: {faults}; {remedy_for(damaged)}"
         )
     return kept, damaged
 
@@ -149,7 +149,7 @@ def why_unreadable(photograph: Path, error: DataError) -> str:
     return str(error).removeprefix(f"{photograph}: ").partition(";")[0]
 
 
-def remedy(damaged: Mapping[str, str]) -> str:
+def remedy_for(damaged: Mapping[str, str]) -> str:
     """Return what makes damaged photographs readable, by the reasons that `gather` gives."""
     kinds = [kind for kind in BRANDS if NAMED_OTHERWISE.format(kind) in damaged.values()]
     texts = [f"name {kind} files so, and make JPEG files of them, such as by {CONVERTED[kind][1]}" for kind in kinds]
@@ -173,7 +173,7 @@ def _gather_one(source: Path, target: Path) -> None:
     else:
         _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(pixels[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
         with open_atomic(target) as file:
-            file.write(copied(data, encoded.tobytes()))
+            file.write(copy_exif(data, encoded.tobytes()))
 
 
 def link(source: Path, target: Path) -> None:
@@ -205,19 +205,19 @@ def _is_there(source: Path, target: Path) -> bool:
 # What steps from photographs to cameras have left out, in sentences.
 
 
-def warn_of(figures: Mapping[str, Any]) -> None:
+def log_warnings(figures: Mapping[str, Any]) -> None:
     """Log what a step has left out."""
-    for text in left_out(figures):
+    for text in warnings_for(figures):
         LOG.warning("%s", text)
 
 
-def left_out(figures: Mapping[str, Any]) -> list[str]:
+def warnings_for(figures: Mapping[str, Any]) -> list[str]:
     """Return warnings of the photographs that a step has left out, by what it returned."""
     texts = []
     if damaged := figures.get("damaged"):
         names = [f"{name} ({reason})" for name, reason in damaged.items()]
         count = figures["photographs"] + len(names)
-        texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; {remedy(damaged)}")
+        texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; {remedy_for(damaged)}")
     if missing := figures.get("not_registered"):
         reasons = figures.get("reasons", {})
         named = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])
@@ -236,7 +236,7 @@ def left_out(figures: Mapping[str, Any]) -> list[str]:
     return texts
 
 
-def photographs_text(found: Mapping[str, Mapping[str, Any]]) -> str:
+def summarize_placement(found: Mapping[str, Mapping[str, Any]]) -> str:
     """Return how many photographs have cameras, how well these fit, and which are left out; "" where it is not known.
 
     found: of `facts`; the error is the mean distance in px between points and their features.

@@ -26,17 +26,17 @@ from clsplat.prepare.database import (
     require_pycolmap,
     verified,
 )
-from clsplat.prepare.diagnosis import Matched, diagnosis, reasons
-from clsplat.prepare.features import Sought, add_features
-from clsplat.prepare.gather import MIN_PHOTOGRAPHS, link, warn_of
-from clsplat.prepare.matching import Pairing, match_pairs, match_within, more_pairs
-from clsplat.prepare.rotation_only import without_depth
+from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unplaced
+from clsplat.prepare.features import FeatureOptions, add_features
+from clsplat.prepare.gather import MIN_PHOTOGRAPHS, link, log_warnings
+from clsplat.prepare.matching import Pairing, match_database, match_pairs, more_pairs
+from clsplat.prepare.rotation_only import why_no_depth
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
 ENOUGH = 0.9  # share of the photographs: with more, no more features are looked for
 DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
-DENSER = Sought(long_side=2400, count=16384, contrast=0.01)
+DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01)
 NOT_DENSER = "denser features would not help: there are enough, and most photographs have nothing in common"
 FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap's are of the middle two
 PAIR = 2  # photographs of a point; COLMAP leaves such points out of its models
@@ -65,7 +65,7 @@ class Attempt:
         return out / DENSE if self.dense else out / WIDER if self.wider else source / DATABASE
 
 
-LATER = (
+RETRIES = (
     Attempt("smaller angles and fewer matches", loose=True),
     Attempt("more pairs", loose=True, wider=True),
     Attempt("denser features", loose=True, dense=True),
@@ -73,27 +73,32 @@ LATER = (
 )
 
 
-MOST = 1 + len(LATER)  # attempts
+MAX_ATTEMPTS = 1 + len(RETRIES)  # attempts
 
 
 def map_cameras(
-    source: Path, out: Path, mapper: Mapper = "incremental", threads: int = 1, attempts: int = MOST, fewest: int = 3
+    source: Path,
+    out: Path,
+    mapper: Mapper = "incremental",
+    threads: int = 1,
+    attempts: int = MAX_ATTEMPTS,
+    min_track_length: int = 3,
 ) -> dict[str, Any]:
     """Place cameras and points, in so many attempts at most; keep the largest model as sparse/0, tell of the others.
 
     `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
     An attempt with nothing to try, such as no more pairs, does not count.
-    fewest: photographs that show a point, 2 or 3.
+    min_track_length: the number of photographs that must show a point, 2 or 3.
     Raises DataError, with the likely reason, when no attempt gives a model of three images.
     """
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
     names = image_names(pycolmap, source / DATABASE)
-    matched = Matched.of(pycolmap, source / DATABASE, source / IMAGES)
-    if why := without_depth(pycolmap, source / DATABASE):
+    matched = MatchGraph.from_database(pycolmap, source / DATABASE, source / IMAGES)
+    if why := why_no_depth(pycolmap, source / DATABASE):
         raise DataError(f"{source / IMAGES}: the photographs {why}")
     models, used, more, made = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
-    for attempt in (first, *LATER):
+    for attempt in (first, *RETRIES):
         placed = models[0].num_reg_images() if models else 0
         if made == attempts or placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
             break
@@ -108,7 +113,7 @@ def map_cameras(
             made += 1
             found = _attempt(source, out, attempt, threads, models[:1], more)
             if attempt.wider:
-                matched = Matched.of(pycolmap, attempt.database(source, out), source / IMAGES)
+                matched = MatchGraph.from_database(pycolmap, attempt.database(source, out), source / IMAGES)
         except FAILURES as error:
             if attempt.wider:
                 LOG.warning("the attempt failed (%s); it is passed over", error)
@@ -121,20 +126,20 @@ def map_cameras(
         if found and found[0].num_reg_images() > placed:
             models, used = found, attempt
     if not models:
-        raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnosis(matched)}")
+        raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnose(matched)}")
     database = used.database(source, out)
-    if why := without_depth(pycolmap, database, _names(models[0])):
+    if why := why_no_depth(pycolmap, database, _names(models[0])):
         placed = models[0].num_reg_images()
         raise DataError(f"{source / IMAGES}: the {placed} of {len(names)} photographs that could be placed {why}")
     if used.dense:
-        matched = Matched.of(pycolmap, database, source / IMAGES)
-    if fewest == PAIR:
-        models[0] = with_pairs(models[0], database, out, threads)
+        matched = MatchGraph.from_database(pycolmap, database, source / IMAGES)
+    if min_track_length == PAIR:
+        models[0] = triangulate_pairs(models[0], database, out, threads)
     figures = {**_written(models, out, names), "attempt": used.told, "denser_tried": (out / DENSE).exists()}
-    figures["reasons"] = reasons(matched, [_names(model) for model in models])
+    figures["reasons"] = explain_unplaced(matched, [_names(model) for model in models])
     for left in out.glob(".*"):
         shutil.rmtree(left) if left.is_dir() else left.unlink()
-    warn_of(figures)
+    log_warnings(figures)
     return figures
 
 
@@ -179,7 +184,7 @@ def _filled(source: Path, out: Path, attempt: Attempt, more: Sequence[tuple[str,
 
     The pairs follow from the first database and the model before, so that they are the same after a kill.
     """
-    database, pairing = attempt.database(source, out), Pairing.beside(source)
+    database, pairing = attempt.database(source, out), Pairing.read(source)
     if not database.exists():
         half = database.with_name(f".half.{DATABASE}")
         shutil.copyfile(source / DATABASE, half)
@@ -188,7 +193,7 @@ def _filled(source: Path, out: Path, attempt: Attempt, more: Sequence[tuple[str,
         half.replace(database)
     if attempt.dense:
         add_features(source / IMAGES, database, DENSER)
-        match_within(database, pairing)
+        match_database(database, pairing)
     if attempt.dense or attempt.wider:
         match_pairs(database, more, pairing.threads)
     return database
@@ -216,7 +221,7 @@ def _names(*models: Any) -> set[str]:
     return {model.images[number].name for model in models for number in model.reg_image_ids()}
 
 
-def with_pairs(model: Any, database: Path, out: Path, threads: int = 1) -> Any:
+def triangulate_pairs(model: Any, database: Path, out: Path, threads: int = 1) -> Any:
     """Triangulate the points of a model again, of pairs too; its cameras stay.
 
     database: the features and matches that it was made of; out: the folder with the images.

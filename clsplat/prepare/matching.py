@@ -50,7 +50,7 @@ class Pairing:
     threads: int = 1
 
     @classmethod
-    def beside(cls, folder: Path) -> "Pairing":
+    def read(cls, folder: Path) -> "Pairing":
         """Return the one by which match_features made a folder.  Raises DataError where it is missing."""
         return cls(**read_json(folder / MATCHING, "how photographs were matched"))
 
@@ -72,7 +72,7 @@ def match_features(
         half.replace(database)
     pairing = Pairing(matching, neighbors, threads)
     write_text(out / MATCHING, json.dumps(asdict(pairing)) + "\n")
-    chosen = match_within(database, pairing)
+    chosen = match_database(database, pairing)
     return {"matching": chosen, "pairs": len(verified(pycolmap, database))}
 
 
@@ -83,7 +83,7 @@ def most_pairs(photographs: int, matching: Matching, neighbors: int) -> int:
     return every if is_each else min(every, 2 * neighbors * photographs)
 
 
-def match_within(database: Path, how: Pairing) -> Matching:
+def match_database(database: Path, how: Pairing) -> Matching:
     """Match the photographs of a database as match_features does, but for pairs that it holds; return how.
 
     Raises DataError.
@@ -125,7 +125,7 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
 
 
 def more_pairs(database: Path, left_out: Set[str]) -> list[tuple[str, str]]:
-    """Return pairs of photographs that are left out with any others, which `match_within` has not looked at.
+    """Return pairs of photographs that are left out with any others, which `match_database` has not looked at.
 
     They are all, where these are no more than it has looked at, so that the matching takes twice as long at most; else
     those of each photograph that is left out with the most similar ones to it: as many, but with one at least.
@@ -148,7 +148,7 @@ def more_pairs(database: Path, left_out: Set[str]) -> list[tuple[str, str]]:
             if (is_left[i] or is_left[j]) and not rows.exists_two_view_geometry(images[i].image_id, images[j].image_id)
         ]
         if len(found) > most:
-            found = _closest(found, likeness(_descriptors(rows, images)), is_left, max(1, most // sum(is_left)))
+            found = _closest(found, similarity(_descriptors(rows, images)), is_left, max(1, most // sum(is_left)))
     return [(images[i].name, images[j].name) for i, j in found]
 
 
@@ -188,7 +188,7 @@ def _alike_pairs(pycolmap: ModuleType, database: Path, neighbors: int) -> list[t
         raise DataError(
             f"'{spaced[0]}': COLMAP's lists of pairs allow no spaces in names; rename it, or match all pairs"
         )
-    return [(images[i].name, images[j].name) for i, j in alike(tables, neighbors)]
+    return [(images[i].name, images[j].name) for i, j in similar_pairs(tables, neighbors)]
 
 
 def _descriptors(rows: Any, images: Sequence[Any]) -> list[NDArray[np.float32]]:
@@ -208,15 +208,15 @@ def _counted(database: Path, pairs: int) -> Iterator[None]:
     count.reach(pairs)
 
 
-def alike(tables: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, of each photograph with the `neighbors` most similar ones, by `likeness`."""
-    close = likeness(tables)
+def similar_pairs(tables: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:
+    """Return pairs (i, j), i < j, of each photograph with the `neighbors` most similar ones, by `similarity`."""
+    close = similarity(tables)
     np.fill_diagonal(close, -1)
     nearest = np.argsort(-close, axis=1, kind="stable")[:, : min(neighbors, len(tables) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row})
 
 
-def likeness(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+def similarity(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
     """Return how alike photographs are, 0 to 1, [N, N].
 
     tables: descriptors [M, 128] of each photograph.  A word is a cell of k-means over a sample of the descriptors;

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.prepare.database import opened
-from clsplat.prepare.diagnosis import FEW_MATCHES, joined
+from clsplat.prepare.diagnosis import FEW_MATCHES, connected_groups
 
 PAIRS = 120  # that are looked at, evenly spaced from those with the most matches to those with the fewest
 NEAR = 3.0  # px: of a match that a homography explains, and of a point that has not moved
@@ -30,7 +30,7 @@ SAME = f"are all the same: nothing moves from one to the next, {WALK}"
 Floats = NDArray[np.float64]
 
 
-def without_depth(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
+def why_no_depth(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
     """Return in words why the photographs, or the named ones of them, tell no depth; "" where they may.
 
     All pairs that match well are asked: the best one of each photograph may be of one spot, where there are several.  A
@@ -46,7 +46,7 @@ def without_depth(pycolmap: ModuleType, database: Path, names: Set[str] | None =
         moving = [pair for pair in pairs if not _is_still(*pair.points())]
         if not moving:
             still = [(chosen[a], chosen[b]) for a, b in (pair.photographs for pair in pairs)]
-            return SAME if len(joined(chosen.values(), still)) == 1 else ""
+            return SAME if len(connected_groups(chosen.values(), still)) == 1 else ""
         sample = moving[:: -(-len(moving) // PAIRS)]
         found = [matrix for pair in sample if (matrix := _homography(*pair.points())) is not None]
     is_most = len(found) > 1 and len(found) >= EXPLAINED * len(sample)

@@ -6,19 +6,19 @@ from pathlib import Path
 from typing import Literal
 
 from clsplat.core.errors import pluralize
-from clsplat.scene.images import optics_of, read_header
+from clsplat.scene.images import read_exif_optics, read_header
 
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
 Key = Callable[[Path, str], object]
 KEYS: dict[Cameras, Key] = {  # what photographs that share a camera have in common, beside their size
-    "auto": lambda images, name: optics_of(images / name),
+    "auto": lambda images, name: read_exif_optics(images / name),
     "one": lambda images, name: None,
     "per_folder": lambda images, name: Path(name).parent,
     "per_image": lambda images, name: name,
 }
 
 
-def sharing(images: Path, names: Sequence[str], cameras: Cameras) -> list[list[str]]:
+def group_photos(images: Path, names: Sequence[str], cameras: Cameras) -> list[list[str]]:
     """Return the photographs in groups that share a camera, in order of their first names.
 
     Raises DataError when one cannot be read.
@@ -30,9 +30,9 @@ def sharing(images: Path, names: Sequence[str], cameras: Cameras) -> list[list[s
     return list(groups.values())
 
 
-def sharing_text(images: Path, groups: Sequence[Sequence[str]]) -> str:
+def shared_camera_note(images: Path, groups: Sequence[Sequence[str]]) -> str:
     """Return a sentence about photographs that share a camera because nothing is known of theirs; "" without them."""
-    unknown = [group for group in groups if len(group) > 1 and optics_of(images / group[0]) is None]
+    unknown = [group for group in groups if len(group) > 1 and read_exif_optics(images / group[0]) is None]
     if not unknown:
         return ""
     count = sum(map(len, unknown))

@@ -9,13 +9,13 @@ from pydantic import Field
 from clsplat.core.errors import DataError
 from clsplat.core.settings import Settings
 from clsplat.prepare.database import require_pycolmap
-from clsplat.prepare.features import CameraModel, Sought, find_features
-from clsplat.prepare.gather import left_out, photographs_text, require_photographs
-from clsplat.prepare.mapping import MOST, Mapper, map_cameras
+from clsplat.prepare.features import CameraModel, FeatureOptions, find_features
+from clsplat.prepare.gather import require_photographs, summarize_placement, warnings_for
+from clsplat.prepare.mapping import MAX_ATTEMPTS, Mapper, map_cameras
 from clsplat.prepare.matching import Matching, match_features, most_pairs
 from clsplat.prepare.shared_intrinsics import Cameras
-from clsplat.prepare.undistort import Blank, undistort_scene
-from clsplat.scene.detect import holds_scene
+from clsplat.prepare.undistort import UndefinedPixels, undistort_scene
+from clsplat.scene.detect import is_scene
 
 Positive = Annotated[int, Field(gt=0)]
 
@@ -79,24 +79,24 @@ class FindFeatures(Step):
     """Which photographs of one size share a camera; auto: those of which EXIF tells the same lens, or nothing."""
 
     def is_done_in(self, source: Path) -> bool:
-        return holds_scene(source)
+        return is_scene(source)
 
     def check(self, source: Path, without: Path) -> None:
-        if holds_scene(source):
+        if is_scene(source):
             raise DataError(f"{source}: holds cameras already; give the folder of the photographs alone")
         require_photographs(source, without.resolve())
         require_pycolmap()
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         self.check(source, without)
-        sought = Sought(self.long_side, self.features)
+        sought = FeatureOptions(self.long_side, self.features)
         return find_features(source, out, sought, self.camera_model, self.cameras, without.resolve())
 
     def told(self, figures: dict[str, Any]) -> str:
         return super().told({**figures, "damaged": ", ".join(figures.get("damaged", ()))})
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:
-        return left_out(figures)
+        return warnings_for(figures)
 
 
 class MatchFeatures(Step):
@@ -135,22 +135,22 @@ class MapCameras(Step):
     """How cameras are found first: one after the other, or all at once (global)."""
     threads: Positive = 1
     """Number of threads; more than one are faster, and the result does not repeat to the bit."""
-    attempts: Annotated[int, Field(ge=1, le=MOST)] = MOST
+    attempts: Annotated[int, Field(ge=1, le=MAX_ATTEMPTS)] = MAX_ATTEMPTS
     """Largest number of attempts that are made; 1: none but the first.  The next takes smaller angles and fewer
     matches; one more pairs of photographs that are left out, where not all were matched; two find denser features, and
     match as before."""
-    fewest_views: Literal[2, 3] = 3
+    min_track_length: Literal[2, 3] = 3
     """Number of photographs that must show a point; COLMAP leaves out those of two.  On one scene
     there are 2.5 times as many points with them."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        return map_cameras(source, out, self.mapper, self.threads, self.attempts, self.fewest_views)
+        return map_cameras(source, out, self.mapper, self.threads, self.attempts, self.min_track_length)
 
     def told(self, figures: dict[str, Any]) -> str:
-        return photographs_text({self.stage: figures})
+        return summarize_placement({self.stage: figures})
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:
-        return left_out(figures)
+        return warnings_for(figures)
 
 
 class Undistort(Step):
@@ -164,8 +164,8 @@ class Undistort(Step):
 
     long_side: Positive | None = None
     """Longer side of the new images in px; without it, that of the photographs."""
-    blank: Blank = "crop"
+    undefined_pixels: UndefinedPixels = "crop"
     """Pixels that no photograph shows; crop: cut them off; mask: keep the whole photograph and mask them."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        return {"images": undistort_scene(source, out, self.long_side, self.blank)}
+        return {"images": undistort_scene(source, out, self.long_side, self.undefined_pixels)}

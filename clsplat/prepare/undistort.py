@@ -10,20 +10,22 @@ import numpy as np
 from clsplat.core.errors import DataError
 from clsplat.core.manifest import Manifest, hash_values
 from clsplat.core.progress import Count
-from clsplat.scene.camera import shared
+from clsplat.scene.camera import intern_lens
 from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_exposures, write_image
 from clsplat.scene.times_file import write_times
-from clsplat.scene.view import View, camera_exposures, load_image, load_mask
+from clsplat.scene.view import View, load_exposures, load_image, load_mask
 
-Blank = Literal["crop", "mask"]
+UndefinedPixels = Literal["crop", "mask"]
 
 
-def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank: Blank = "crop") -> int:
+def undistort_scene(
+    source: Path, out: Path, long_side: int | None = None, undefined_pixels: UndefinedPixels = "crop"
+) -> int:
     """Write a COLMAP scene of pinhole cameras into `out`; return the number of its images.
 
-    Photographs larger than `long_side` px are reduced.  `blank: crop` keeps the largest part of a photograph
+    Photographs larger than `long_side` px are reduced.  `undefined_pixels: crop` keeps the largest part of a photograph
     without blank pixels; `mask` keeps all of it, with masks of blank pixels.  Images that an earlier call has made of
     the same photographs with the same settings stay unchanged.
     Raises DataError when the scene cannot be read, or when an image in `out` has another origin.
@@ -34,7 +36,7 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
         manifest.require_listed(out / "images" / name)
     views, count = [], Count("photographs undistorted", len(names))
     for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
-        pinhole_view = replace(_sized(_shown(view, blank), long_side), alpha="mask")
+        pinhole_view = replace(_sized(_shown(view, undefined_pixels), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
         if manifest.needs_writing(image, _source(pinhole_view), mask):
             counts = load_mask(pinhole_view)
@@ -43,7 +45,7 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
             write_image(image, load_image(pinhole_view))
         views.append(replace(pinhole_view, name=name, lens=None))
         count.reach(number)
-    write_exposures(out / "images", dict(zip(names, camera_exposures(scene.views), strict=True)))
+    write_exposures(out / "images", dict(zip(names, load_exposures(scene.views), strict=True)))
     if times := {name: view.time for view, name in zip(scene.views, names, strict=True) if view.time is not None}:
         write_times(out / "images", times)
     tracks = scene.tracks and scene.tracks.renamed({v.name: name for v, name in zip(scene.views, names, strict=True)})
@@ -58,10 +60,10 @@ def _source(view: View) -> str:
     return hash_values(*files, view.lens, view.camera)
 
 
-def _shown(view: View, blank: Blank) -> View:
-    if view.lens is None or blank == "crop":
+def _shown(view: View, undefined_pixels: UndefinedPixels) -> View:
+    if view.lens is None or undefined_pixels == "crop":
         return view
-    lens = shared(replace(view.lens, whole=True))
+    lens = intern_lens(replace(view.lens, whole=True))
     return replace(view, lens=lens, camera=lens.pinhole)
 
 

@@ -14,7 +14,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.schedule import schedule_values
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, adapted
-from clsplat.prepare.cache import Planned
+from clsplat.prepare.cache import PlannedStep
 from clsplat.scene.images import image_size
 from clsplat.scene.quality import Measures
 from clsplat.stages.densify import Densify
@@ -47,7 +47,7 @@ class Expected:
 
 def expected(
     pipeline: Pipeline,
-    planned: Sequence[Planned],
+    planned: Sequence[PlannedStep],
     names: Sequence[str],
     measures: Measures | None,
     device: Device,
@@ -71,7 +71,7 @@ def expected(
     return [total, *(one.text for one in parts)]
 
 
-def _of_preparation(planned: Sequence[Planned], photographs: int) -> Iterator[Expected]:
+def _of_preparation(planned: Sequence[PlannedStep], photographs: int) -> Iterator[Expected]:
     """The steps that are to be done."""
     for one in planned:
         if one.why and (each := one.step.seconds) is not None:
@@ -80,11 +80,11 @@ def _of_preparation(planned: Sequence[Planned], photographs: int) -> Iterator[Ex
 
 
 def _capture(
-    pipeline: Pipeline, planned: Sequence[Planned], names: Sequence[str], run: Run | None
+    pipeline: Pipeline, planned: Sequence[PlannedStep], names: Sequence[str], run: Run | None
 ) -> tuple[tuple[int, int], int] | None:
     """The size of a photograph that is trained on, px, and the Gaussians at the beginning; None: not known."""
     if run is not None:
-        views = run.scene.with_fold().split("train")
+        views = run.scene.merge_validation().split("train")
         cameras = sorted(((one.camera.width, one.camera.height) for one in views), key=lambda size: size[0] * size[1])
         begins = [one.expected_count(run.scene) for one in pipeline.settings.stages if isinstance(one, Init)]
         return cameras[len(cameras) // 2], begins[0] if begins else FEWEST

@@ -40,7 +40,7 @@ from clsplat.runs.state import has_pipeline
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import NO_FILE, View
-from clsplat.scene.viewpoint import Stand
+from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import BUDGET, Page, Which, described, is_viewer
 from clsplat.viewer.video import camera_path
@@ -210,7 +210,7 @@ def view(
 
     views = described(found, read, photographs, photograph_budget) if found else []
     start = (found.split("test") or found.views)[0] if found else None
-    stand = Stand.of(first.means, found.views if found else (), start)
+    stand = Viewpoint.from_points(first.means, found.views if found else (), start)
     title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
     if found is None:
         LOG.info("without a scene up is -y; give --scene where the picture stands on its head")

@@ -31,7 +31,7 @@ from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.loading import load as load_pipeline
-from clsplat.prepare.cache import noted
+from clsplat.prepare.cache import read_note
 from clsplat.render.painter import Painter, SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.results import read_metrics
@@ -198,7 +198,7 @@ def photographs_of(scene: Path) -> Path:
     """
     if not has_pipeline(scene):
         return scene
-    prepared = noted(scene)
+    prepared = read_note(scene)
     folder = Path(prepared["folder"]) if prepared else load_pipeline(str(scene / PIPELINE)).settings.scene.folder
     if not folder.is_dir():
         raise DataError(f"{scene}: the folder of its photographs, {folder}, is missing; give the folder of a scene")

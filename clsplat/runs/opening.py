@@ -19,17 +19,17 @@ from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.input_files import contents
 from clsplat.pipeline.loading import Pipeline, adapted, prepared_folder
 from clsplat.pipeline.stretching import map_trainings
-from clsplat.prepare.cache import Planned, facts, note, noted, prepare
+from clsplat.prepare.cache import PlannedStep, make_note, prepare, read_note, step_facts
 from clsplat.prepare.gather import list_photographs
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.run_folder import Start
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
-from clsplat.scene.identity import Identity, decode_all, require_whole
-from clsplat.scene.quality import Measures, measured, nearest_points
+from clsplat.scene.identity import Identity, decode_all, require_decodable
+from clsplat.scene.quality import Measures, measure_scene, near_depth
 from clsplat.scene.scene import SPLITS, Background, Scene, every_nth, make_scene
 from clsplat.scene.view import View
-from clsplat.scene.view_selection import OfPlaced
+from clsplat.scene.view_selection import MissingViewError
 from clsplat.stages.optimize import Optimize
 from clsplat.training.modules.sky_choice import choose_sky, sky_share
 from clsplat.training.run import Run
@@ -79,8 +79,8 @@ class RunScene:
                 *(scene.path, pluralize(len(original.train), "photograph"), FEWEST),
             )
         files = decode_all(view for one in (original, downscaled) for split in SPLITS for view in one.split(split))
-        require_whole(scene.path, files)
-        return cls(original, downscaled, background, Identity.of(original, files))
+        require_decodable(scene.path, files)
+        return cls(original, downscaled, background, Identity.from_scene(original, files))
 
 
 ReadScene = Callable[[SceneSettings, Path], RunScene]
@@ -116,7 +116,7 @@ def open_run(
         folder = prepare(planned, folder, root, status.stage)
         with status.stage(READ_SCENE):
             run = make_run(pipeline, read(pipeline.settings.scene, folder), opened, out, status)
-    run.prepared, run.preparation = note(planned) if planned else None, facts(planned)
+    run.prepared, run.preparation = make_note(planned) if planned else None, step_facts(planned)
     return run
 
 
@@ -134,7 +134,7 @@ def counts_of(status: StatusFile) -> Listener:
 
 def check_start(
     pipeline: Pipeline, out: Path, device: str | Device | None, start: Start
-) -> tuple[Device, list[Planned]]:
+) -> tuple[Device, list[PlannedStep]]:
     """Check all that can be checked before photographs are prepared; return the device and the steps of `prepare`.
 
     Nothing is written.  Raises the errors of a run.
@@ -144,14 +144,14 @@ def check_start(
         stage.check()
     opened = open_correct(device, settings.rasterizer.schedule, settings.rasterizer.sort)
     planned = check_preparation(pipeline, out)
-    if planned and start != "restart" and noted(out) not in (None, note(planned)):
+    if planned and start != "restart" and read_note(out) not in (None, make_note(planned)):
         raise ConfigError(
             f"{out}: was started with other photographs, or other settings of `prepare`; give another folder"
         )
     return opened, planned
 
 
-def listed(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[str]:
+def listed(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> list[str]:
     """Return the names of what is to be prepared; none where `prepare` finds no photographs by itself.
 
     The log says which files are left out.
@@ -164,7 +164,7 @@ def listed(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[st
         return []
 
 
-def check_preparation(pipeline: Pipeline, out: Path) -> list[Planned]:
+def check_preparation(pipeline: Pipeline, out: Path) -> list[PlannedStep]:
     """Return the steps that prepare the photographs of a run in `out`; nothing is written.
 
     Raises what is known before the first of them: ConfigError or DataError.
@@ -177,14 +177,14 @@ def check_preparation(pipeline: Pipeline, out: Path) -> list[Planned]:
     return planned
 
 
-def _check_split(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> None:
+def _check_split(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> None:
     """Raise DataError where the photographs that are to be prepared do not have the split, however many are placed."""
     with log_level(logging.ERROR):
         names = listed(pipeline, planned, out)
     if not names:
         return
     pipeline.settings.scene.split.check(pipeline.settings.scene.folder, names)
-    with suppress(OfPlaced):  # a dry run says it
+    with suppress(MissingViewError):  # a dry run says it
         _applied(pipeline, names)
 
 
@@ -193,7 +193,7 @@ def known(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
 
     None without names.  Raises DataError where the split does not fit all of them.
     """
-    return Measures(len(_applied(pipeline, names).with_fold().train)) if names else None
+    return Measures(len(_applied(pipeline, names).merge_validation().train)) if names else None
 
 
 def _applied(pipeline: Pipeline, names: Sequence[str]) -> Scene:
@@ -248,14 +248,14 @@ def settle(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> Pipeline:
     """
     with run.status.stage("choose"):
         if pipeline.undecided:
-            pipeline = adapted(pipeline, measured(run.scene, lambda: sky_share(run)))
+            pipeline = adapted(pipeline, measure_scene(run.scene, lambda: sky_share(run)))
             for reason in pipeline.reasons if log_reasons else ():
                 LOG.info("%s", reason)
         pipeline = _with_modules(pipeline, run)
         run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
         run.harmonics = pipeline.settings.harmonics
         if any(isinstance(stage, Optimize) for stage in pipeline.stages):
-            _warn_of_near(pipeline.settings.model.near, nearest_points(run.scene))
+            _warn_of_near(pipeline.settings.model.near, near_depth(run.scene))
         return pipeline
 
 

@@ -15,7 +15,7 @@ from clsplat.pipeline import plugins
 from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.prepare.cache import noted
+from clsplat.prepare.cache import read_note
 from clsplat.runs.state import RunState
 from clsplat.training.records import Records
 
@@ -99,7 +99,7 @@ class RunFolder:
     @property
     def photographs(self) -> Path:
         """The folder with the photographs that the run trained on.  Raises ConfigError when no scene is named."""
-        prepared = noted(self.path)
+        prepared = read_note(self.path)
         return Path(prepared["folder"]) if prepared else self.scene.folder
 
     @cached_property

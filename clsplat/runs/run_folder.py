@@ -29,7 +29,7 @@ from clsplat.core.files import (
 from clsplat.core.reading import read_text
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.prepare.cache import note, noted
+from clsplat.prepare.cache import make_note, read_note
 from clsplat.runs.state import Phase, RunState
 from clsplat.training.status import StatusFile
 
@@ -176,4 +176,4 @@ def is_same(pipeline: Pipeline, state: RunState) -> bool:
     """Whether a run of this pipeline and the same photographs is done; never where nothing is prepared."""
     if not pipeline.settings.prepare or state.phase is not Phase.DONE or state.difference(pipeline):
         return False
-    return noted(state.out) == note(pipeline.preparation(state.out))
+    return read_note(state.out) == make_note(pipeline.preparation(state.out))

@@ -11,7 +11,7 @@ from clsplat.core.files import END_STATES, HEARTBEAT_TIMEOUT, METRICS, PIPELINE,
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json
 from clsplat.core.settings import variants
-from clsplat.prepare.gather import photographs_text
+from clsplat.prepare.gather import summarize_placement
 from clsplat.runs.results import read_metrics
 from clsplat.runs.state import RunState
 from clsplat.training.modules.base import TrainingModule
@@ -79,7 +79,7 @@ def status_text(status: dict[str, Any]) -> str:
         lines.append(status["advice"])
     if status["last"] and status["metrics"] is None:
         lines.append("last report: " + _figures(status["last"], ("step", "loss", "psnr", "gaussians")))
-    if placed := photographs_text((status["metrics"] or {}).get("preparation", {})):
+    if placed := summarize_placement((status["metrics"] or {}).get("preparation", {})):
         lines.append(placed)
     for split in ("test", "validation", "train"):
         for downscale, figures in ((status["metrics"] or {}).get(split) or {}).items():
@@ -156,7 +156,7 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
     size = size_text(metrics["gaussians"], metrics.get("parameters"))
     yield f"{quality}{size}; {metrics['train_seconds']:.0f} s of training"
-    placed = photographs_text(metrics.get("preparation", {}))
+    placed = summarize_placement(metrics.get("preparation", {}))
     if kept := metrics.get("kept"):
         name, what = (
             ("refit", "steps on all of its photographs") if kept["refit"] else ("kept", "steps, the best model")

@@ -30,7 +30,7 @@ from clsplat.pipeline import plugins
 from clsplat.pipeline.files import origin, shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.prepare.cache import noted
+from clsplat.prepare.cache import read_note
 from clsplat.runs.outputs import declared
 from clsplat.runs.results import read_metrics, read_settings
 from clsplat.runs.state import Phase, RunState
@@ -76,7 +76,7 @@ def checkpoint_file(path: Path) -> str:
 
 
 def note_file(path: Path) -> None:
-    if noted(path.parent) is None:
+    if read_note(path.parent) is None:
         raise DataError("expected the hash and the folder of prepared photographs")
 
 

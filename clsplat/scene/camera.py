@@ -152,7 +152,7 @@ class Lens:
         return self.params[0], self.params[focals - 1], cx, cy, self.params[focals + 2 :]
 
     @property
-    def distorts(self) -> bool:
+    def has_distortion(self) -> bool:
         """Whether the lens has distortion; a fisheye always has it."""
         return "FISHEYE" in self.model or any(self._split[4])
 
@@ -264,6 +264,6 @@ def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 @lru_cache(maxsize=64)
-def shared(lens: Lens) -> Lens:
+def intern_lens(lens: Lens) -> Lens:
     """Return the first lens that equals this one, so that views share what is slow to compute: `pinhole`, `shown`."""
     return lens

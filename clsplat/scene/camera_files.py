@@ -15,18 +15,18 @@ from clsplat.core.progress import counted
 from clsplat.core.reading import open_file, read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens
 from clsplat.scene.colmap_writer import FILES, MODEL, write_colmap
-from clsplat.scene.images import BESIDE, is_image, write_exposures
+from clsplat.scene.images import EXPOSURES_FILE, is_image, write_exposures
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud, Scene, Tracks
 from clsplat.scene.transforms_json import JsonFrame, opengl_matrix
-from clsplat.scene.view import NO_FILE, Posed, View, camera_exposures
+from clsplat.scene.view import NO_FILE, PosedView, View, load_exposures
 
 # The views of a scene as files name them: unique names of images below one folder, and lenses.
 
 IMAGES = "images"  # the folder of the photographs, as COLMAP and nerfstudio have it
 
 
-def posed(scene: Scene) -> list[Posed]:
+def posed_views(scene: Scene) -> list[PosedView]:
     """Return the views in their order.  Raises DataError for names that no line of text can hold, or that repeat."""
     names = [_file_name(view) for view in scene.views]
     if all(name.startswith(f"{IMAGES}/") for name in names):
@@ -39,7 +39,7 @@ def posed(scene: Scene) -> list[Posed]:
             raise DataError(f"{scene.path}: two images would be called {quote(name)}; rename one")
         seen.add(name)
     test = set(scene.test)
-    return [Posed(name, view, i in test) for i, (name, view) in enumerate(zip(names, scene.views, strict=True))]
+    return [PosedView(name, view, i in test) for i, (name, view) in enumerate(zip(names, scene.views, strict=True))]
 
 
 def _file_name(view: View) -> str:
@@ -50,7 +50,7 @@ def _file_name(view: View) -> str:
     return f"{view.name}{view.image_path.suffix}"
 
 
-def image_files(views: list[Posed], folder: Path) -> dict[Path, Path]:
+def image_files(views: list[PosedView], folder: Path) -> dict[Path, Path]:
     """Return where each photograph lies, by where it belongs below a folder.  Raises DataError without a photograph."""
     for one in views:
         if one.view.image_path == NO_FILE:
@@ -64,7 +64,7 @@ LOG = logging.getLogger("clsplat")
 TOLERANCE = 0.5  # px: less is no more than a convention about the middle of a pixel
 
 
-def center_lost(path: Path, cameras: Sequence[Camera], readers: str) -> None:
+def warn_center_lost(path: Path, cameras: Sequence[Camera], readers: str) -> None:
     """Warn where readers of a file look for the principal point elsewhere than it is."""
     off = max(max(abs(c.cx - c.width / 2), abs(c.cy - c.height / 2)) for c in cameras)
     if off > TOLERANCE:
@@ -74,7 +74,7 @@ def center_lost(path: Path, cameras: Sequence[Camera], readers: str) -> None:
         )
 
 
-def width_lost(path: Path, cameras: Sequence[Camera], readers: str) -> None:
+def warn_width_lost(path: Path, cameras: Sequence[Camera], readers: str) -> None:
     """Warn where readers of a file that holds the vertical field of view take a wrong horizontal one."""
     off = max(c.width / 2 * abs(c.fy / c.fx - 1) for c in cameras)
     if off > TOLERANCE:
@@ -91,14 +91,14 @@ MAX_BYTES = 1 << 27
 MAX_VIEWS = 100_000
 
 
-def write_inria(out: Path, views: list[Posed], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
+def write_inria(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
     """Write out/cameras.json; return it.  Points and tracks have no place in it.  Raises OutputError."""
     write_text(out / INRIA_FILE, json.dumps([_camera(one, i) for i, one in enumerate(views)], indent=1) + "\n")
-    center_lost(out / INRIA_FILE, [one.view.camera for one in views], "other programs")
+    warn_center_lost(out / INRIA_FILE, [one.view.camera for one in views], "other programs")
     return [out / INRIA_FILE]
 
 
-def _camera(one: Posed, number: int) -> dict[str, Any]:
+def _camera(one: PosedView, number: int) -> dict[str, Any]:
     camera, pose = one.view.camera, one.view.world_to_camera
     return {
         "id": number,
@@ -114,7 +114,7 @@ def _camera(one: Posed, number: int) -> dict[str, Any]:
     }
 
 
-def read(path: Path) -> list[View]:
+def read_inria(path: Path) -> list[View]:
     """Return the views of a cameras.json, without photographs.
 
     Raises DataError for another file and for damaged numbers.
@@ -170,7 +170,7 @@ DISTORTION = {  # of COLMAP's models: the model that nerfstudio knows, and the n
 REMEDY = "write colmap, or `clsplat data undistort` first"
 
 
-def write_nerfstudio(out: Path, views: list[Posed], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
+def write_nerfstudio(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
     """Write out/transforms.json, and the points where there are some, without tracks; return the files.
 
     nerfstudio evaluates at the validation views, for which the test views are named too.
@@ -201,7 +201,7 @@ def write_nerfstudio(out: Path, views: list[Posed], points: PointCloud | None, t
     return written
 
 
-def check_nerfstudio(views: list[Posed]) -> None:
+def check_nerfstudio(views: list[PosedView]) -> None:
     """Raise DataError for a lens that nerfstudio has no name for, and for kinds of lenses that one file cannot hold."""
     kinds = {}
     for one in views:
@@ -213,7 +213,7 @@ def check_nerfstudio(views: list[Posed]) -> None:
         raise DataError(f"{name}: {model}, and others are {next(iter(kinds))}; nerfstudio takes one; {REMEDY}")
 
 
-def _lens(one: Posed) -> dict[str, Any]:
+def _lens(one: PosedView) -> dict[str, Any]:
     lens: Lens = one.lens
     model, names = DISTORTION[lens.model]
     camera, distortion = lens.camera, lens.params[len(lens.params) - len(names) :]
@@ -231,12 +231,12 @@ def _lens(one: Posed) -> dict[str, Any]:
 
 # The formats by their names.
 
-WRITERS: dict[str, Callable[[Path, list[Posed], PointCloud | None, Tracks | None], list[Path]]] = {
+WRITERS: dict[str, Callable[[Path, list[PosedView], PointCloud | None, Tracks | None], list[Path]]] = {
     "colmap": write_colmap,
     "nerfstudio": write_nerfstudio,
     "inria": write_inria,
 }
-CHECKS: dict[str, Callable[[list[Posed]], None]] = {  # what a format cannot hold
+CHECKS: dict[str, Callable[[list[PosedView]], None]] = {  # what a format cannot hold
     "nerfstudio": check_nerfstudio,
 }
 PLACES = {  # that each writes
@@ -250,9 +250,9 @@ SPLIT = "nerfstudio"  # what keeps it, and times
 TRACKS = "colmap"  # what keeps which points the photographs show
 
 
-def checked(scene: Scene, format_: str) -> list[Posed]:
+def check_cameras(scene: Scene, format_: str) -> list[PosedView]:
     """Return the views as a format names them.  Raises DataError for what it cannot hold."""
-    views = posed(scene)
+    views = posed_views(scene)
     if format_ in CHECKS:
         CHECKS[format_](views)
     return views
@@ -269,14 +269,14 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         if value not in known:
             raise ConfigError(f"no {what} {quote(value)}; there are {', '.join(known)}")
     scene = scene.in_world()
-    views = checked(scene, format_)
+    views = check_cameras(scene, format_)
     if images == "copy" and format_ in UNDISTORTED and any(one.view.lens is not None for one in views):
         raise DataError(
             f"{scene.path}: {format_} holds cameras of undistorted photographs, and these are distorted; "
             "`clsplat data undistort` first, or write the cameras alone"
         )
     copies = image_files(views, out / IMAGES) if images == "copy" else {}
-    beside = [out / IMAGES / BESIDE] if copies else []
+    beside = [out / IMAGES / EXPOSURES_FILE] if copies else []
     for path in () if over else (*(out / place for place in PLACES[format_]), *copies, *beside):
         if path_exists(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
@@ -292,6 +292,6 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         with open_file(source, "an image") as old, open_atomic(path) as new:
             shutil.copyfileobj(old, new)
     if copies:
-        found = camera_exposures([one.view for one in views])
+        found = load_exposures([one.view for one in views])
         write_exposures(out / IMAGES, {one.name: exposure for one, exposure in zip(views, found, strict=True)})
     return written

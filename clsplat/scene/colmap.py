@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, quote, shorten
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file
-from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Lens, shared
+from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Lens, intern_lens
 from clsplat.scene.camera import MODELS as LENS_MODELS
-from clsplat.scene.images import inside, present
-from clsplat.scene.photographs import mask_file
+from clsplat.scene.images import find_existing, safe_join
+from clsplat.scene.photographs import find_mask
 from clsplat.scene.points import MAX_VALUE, PointTable
 from clsplat.scene.reader import Parts, Reader
-from clsplat.scene.reprojection import misses
+from clsplat.scene.reprojection import reprojection_residuals
 from clsplat.scene.scene import PointCloud, Scene, Tracks, every_nth, make_scene
-from clsplat.scene.times_file import timed
+from clsplat.scene.times_file import add_times
 from clsplat.scene.view import View
 
 # Records of a COLMAP model, binary or text: camera models, cameras and images.
@@ -331,9 +331,9 @@ class ColmapReader(Reader):
         cameras = read_cameras(model)
         folder = image_folder(path)
         views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
-        there = present(path, [view.image_path for view in views], self.missing)
+        there = find_existing(path, [view.image_path for view in views], self.missing)
         skipped = tuple(view.name for view, found in zip(views, there, strict=True) if not found)
-        views = timed([view for view, found in zip(views, there, strict=True) if found], folder)
+        views = add_times([view for view, found in zip(views, there, strict=True) if found], folder)
         table = read_point_table(model)
         points, tracks = (table.cloud(), tracks_of(images, table, views)) if table else (None, None)
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
@@ -347,7 +347,7 @@ class ColmapReader(Reader):
         cameras = parts.attempt(read_cameras, model)
         parts.points = parts.attempt(read_point_table, model)
         parts.image_folder = folder = image_folder(parts.path)
-        files = [parts.attempt(inside, folder, image.name, image.where) for image in images]
+        files = [parts.attempt(safe_join, folder, image.name, image.where) for image in images]
         parts.expected = [file for file in files if file]
         for image in images if cameras else []:
             if view := parts.attempt(view_of, image, cameras, folder):
@@ -375,7 +375,9 @@ def tracks_of(images: Sequence[ImageRecord], table: PointTable, views: Sequence[
         known = ids[order][place] == named if len(ids) else np.zeros(len(named), bool)
         rows = seen[image.name] = order[place[known]] if len(ids) else np.empty(0, np.int64)
         if len(rows) and len(image.places) and image.name in by_name:
-            missed[image.name] = misses(by_name[image.name], positions[rows], image.places[first[known]])
+            missed[image.name] = reprojection_residuals(
+                by_name[image.name], positions[rows], image.places[first[known]]
+            )
     return Tracks(positions, seen, missed) if any(map(len, seen.values())) else None
 
 
@@ -403,7 +405,7 @@ def image_folder(path: Path) -> Path:
 
 def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) -> View:
     """Check one image and its camera.  Raises DataError."""
-    image_path = inside(folder, image.name, image.where)
+    image_path = safe_join(folder, image.name, image.where)
     if image.camera not in cameras:
         raise DataError(
             f"{image.where}: image {quote(image.name)} names camera {image.camera}; expected one of the cameras file, "
@@ -415,9 +417,9 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
         raise DataError(
             f"{image.where}: the pose of {quote(image.name)} is {error}: remove that image or {REMEDY}"
         ) from error
-    lens = shared(_lens(image.camera, cameras[image.camera]))
-    camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
-    return View(image.name, camera, pose, image_path, mask_file(folder.with_name("masks"), image.name), lens=distortion)
+    lens = intern_lens(_lens(image.camera, cameras[image.camera]))
+    camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
+    return View(image.name, camera, pose, image_path, find_mask(folder.with_name("masks"), image.name), lens=distortion)
 
 
 def _lens(number: int, camera: CameraRecord) -> Lens:

@@ -13,16 +13,16 @@ from clsplat.core.files import open_atomic
 from clsplat.core.quaternions import unit_quaternions
 from clsplat.scene.camera import Lens
 from clsplat.scene.colmap import MODELS, POINT2D
-from clsplat.scene.reprojection import projected
+from clsplat.scene.reprojection import project_points
 from clsplat.scene.scene import PointCloud, Tracks
-from clsplat.scene.view import Posed, View, lens_of
+from clsplat.scene.view import PosedView, View, photo_lens
 
 MODEL = Path("sparse/0")  # the folder of the model, beside that of the images
 FILES = ("cameras.bin", "images.bin", "points3D.bin")
 EXACTLY = np.zeros((1, 2))  # where the camera shows a point
 
 
-def write_colmap(out: Path, views: list[Posed], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
+def write_colmap(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
     """Write the model into out/sparse/0; return its files.  Raises OutputError."""
     renamed = tracks and tracks.renamed({one.view.name: one.name for one in views})
     write_model(out / MODEL, [replace(one.view, name=one.name) for one in views], points, renamed)
@@ -35,7 +35,7 @@ def write_model(folder: Path, views: Sequence[View], points: PointCloud | None, 
     tracks: which of the points, in their order, each view shows; their places in an image are where the camera projects
     them to, and as far from there as they were in the photograph.  Raises OutputError.
     """
-    lenses = [lens_of(view) for view in views]
+    lenses = [photo_lens(view) for view in views]
     numbers = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), 1)}
     shown = [_shown(points, view, tracks) for view in views]
     images = zip(views, lenses, shown, strict=True)
@@ -64,8 +64,8 @@ def _shown(points: PointCloud | None, view: View, tracks: Tracks | None) -> NDAr
     """The 2D points of a view: those of its track that lie before the camera."""
     if points is None or tracks is None or view.name not in tracks.seen:
         return np.zeros(0, POINT2D)
-    rows, missed = tracks.seen[view.name], tracks.misses.get(view.name, EXACTLY) / view.downscale
-    places = projected(view, points.positions[rows]) + np.nan_to_num(missed)
+    rows, missed = tracks.seen[view.name], tracks.residuals.get(view.name, EXACTLY) / view.downscale
+    places = project_points(view, points.positions[rows]) + np.nan_to_num(missed)
     known = np.isfinite(places).all(axis=1)
     table = np.zeros(np.count_nonzero(known), POINT2D)
     table["point"], table["xy"] = rows[known] + 1, places[known]

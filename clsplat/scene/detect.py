@@ -42,14 +42,14 @@ def format_names() -> str:
     return f"{', '.join(others)} or {last}"
 
 
-def reader_of(path: Path) -> Reader | None:
+def find_reader(path: Path) -> Reader | None:
     """Return the first reader whose format the dataset in a folder has, or None."""
     return next((reader for reader in readers() if reader.matches(path)), None)
 
 
-def holds_scene(path: Path) -> bool:
+def is_scene(path: Path) -> bool:
     """Return whether a folder holds a dataset in a format that read_scene can read."""
-    return reader_of(path) is not None
+    return find_reader(path) is not None
 
 
 def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
@@ -66,7 +66,7 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
             found = f"is a model ({model.name}), which `clsplat check` reads" if model else "is a file"
         raise DataError(f"{path}: {found}; expected the folder of a dataset")
     split = holdout if isinstance(holdout, Split) else Split(holdout)
-    if reader := reader_of(path):
+    if reader := find_reader(path):
         reader.missing = split.missing
         return split.applied(reader.read(path, split.of_reader))
     if any(is_image(file) for file in path.iterdir()):

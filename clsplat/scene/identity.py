@@ -22,7 +22,7 @@ from clsplat.core.progress import Count
 from clsplat.core.reading import read_file
 from clsplat.scene.images import MAX_BYTES, TAIL_SIZE, decode_image, parse_header
 from clsplat.scene.scene import SPLITS, PointCloud, Scene
-from clsplat.scene.view import NO_FILE, Size, View, is_turned
+from clsplat.scene.view import NO_FILE, Size, View, needs_rotation
 
 # Decode every photograph and mask of a scene once, before training: a damaged one is found while it costs nothing.
 
@@ -66,7 +66,7 @@ def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
     return found
 
 
-def require_whole(place: Path, files: Mapping[Path, ImageFile]) -> None:
+def require_decodable(place: Path, files: Mapping[Path, ImageFile]) -> None:
     """Raise DataError, naming the first ones, when image files of the scene at `place` cannot be trained on."""
     damaged = {file: found.fault.removeprefix(f"{file}: ") for file, found in files.items() if found.fault}
     if damaged:
@@ -83,7 +83,7 @@ def _examine(file: Path, views: list[View], found: ImageFile, memory: "Memory") 
             found.orientation, found.cut = header.orientation, not header.complete
         found.size = memory.size(found.digest, data, file)
         for view in views:
-            is_turned(view, file, lambda upright: memory.size(found.digest, data, file, upright))
+            needs_rotation(view, file, lambda upright: memory.size(found.digest, data, file, upright))
     except DataError as error:
         found.fault = str(error)
 
@@ -147,7 +147,7 @@ class Identity:
     validation: dict[str, Row] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, scene: Scene, files: Mapping[Path, ImageFile]) -> "Identity":
+    def from_scene(cls, scene: Scene, files: Mapping[Path, ImageFile]) -> "Identity":
         """Return the identity of a scene whose image files were decoded."""
         train, test, fold = ({view.name: _row(view, files) for view in scene.split(name)} for name in SPLITS)
         return cls(train, test, _points_hash(scene.points) if scene.points else "", fold)

@@ -53,7 +53,7 @@ def parse_header(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header
     return found if found and found.width and found.height else None
 
 
-def is_cut(data: bytes) -> bool:
+def is_truncated(data: bytes) -> bool:
     """Return whether the end of a PNG or JPEG file is missing; False for other formats."""
     header = parse_header(data, data[-TAIL_SIZE:], lambda: data)
     return header is not None and not header.complete
@@ -62,7 +62,7 @@ def is_cut(data: bytes) -> bool:
 def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None:
     """Walk the segments up to the frame header; None when the walk fails."""
     orientation = 1
-    for marker, at, length in segments(head):
+    for marker, at, length in jpeg_segments(head):
         if marker in FRAMES:
             height, width = struct.unpack_from(">HH", head, at + 5)
             # An end marker cannot be part of the pixels; that of a thumbnail lies before them.
@@ -73,12 +73,12 @@ def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None
     return None
 
 
-def exif_segment(head: bytes) -> tuple[int, int] | None:
+def find_exif_segment(head: bytes) -> tuple[int, int] | None:
     """Return the place and the length of the Exif segment in the first bytes of a JPEG file; None without one.
 
     Its block of tags begins 10 bytes behind the place.
     """
-    found = ((at, length) for marker, at, length in segments(head) if _is_exif(head, marker, at))
+    found = ((at, length) for marker, at, length in jpeg_segments(head) if _is_exif(head, marker, at))
     return next(found, None) if head.startswith(JPEG) else None
 
 
@@ -86,7 +86,7 @@ def _is_exif(head: bytes, marker: int, at: int) -> bool:
     return marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0"
 
 
-def segments(head: bytes) -> Iterator[tuple[int, int, int]]:
+def jpeg_segments(head: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield the marker, the place and the length of the segments of a JPEG file; none behind a damaged one."""
     at = 2
     while at + 9 <= len(head) and head[at] == 0xFF:
@@ -101,12 +101,12 @@ def segments(head: bytes) -> Iterator[tuple[int, int, int]]:
 
 def _orientation(exif: bytes) -> int:
     """The orientation in a TIFF block, 1 to 8; 1 where there is none."""
-    at = orientation_place(exif)
+    at = find_orientation(exif)
     value = struct.unpack_from({b"II": "<", b"MM": ">"}[exif[:2]] + "H", exif, at)[0] if at else 1
     return int(value) if 1 <= value <= 8 else 1
 
 
-def orientation_place(exif: bytes) -> int | None:
+def find_orientation(exif: bytes) -> int | None:
     """Return where the orientation, 2 bytes, lies in a TIFF block; None where there is none."""
     order = {b"II": "<", b"MM": ">"}.get(exif[:2])
     if order is None or len(exif) < 8:
@@ -125,7 +125,7 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 USED = {b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"}  # beside the critical ones, whose names begin with a capital
 
 
-def pixels_only(data: bytes) -> bytes:
+def strip_png_metadata(data: bytes) -> bytes:
     """Return a PNG without metadata; what is no PNG is returned as it is.
 
     Raises ValueError, with the place, where the file is cut or the checksum of a chunk that matters is wrong.
@@ -181,7 +181,7 @@ def image_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-def inside(folder: Path, name: str, where: str) -> Path:
+def safe_join(folder: Path, name: str, where: str) -> Path:
     """Return `folder / name`.  Raises DataError, starting with `where`, when that lies outside the folder."""
     path = PureWindowsPath(name)  # splits at both kinds of slash and at drives
     if path.anchor or ".." in path.parts or not path.parts or any(letter < " " for letter in name):
@@ -191,10 +191,10 @@ def inside(folder: Path, name: str, where: str) -> Path:
 
 def require_files(path: Path, files: Iterable[Path]) -> None:
     """Raise DataError, naming the first few, when some of the `files` of the dataset at `path` do not exist."""
-    present(path, list(files), "refuse", "")
+    find_existing(path, list(files), "refuse", "")
 
 
-def present(
+def find_existing(
     path: Path, files: Sequence[Path], missing: Missing, remedy: str = ", or --set scene.missing=skip to do without"
 ) -> list[bool]:
     """Return which of the photographs of the dataset at `path` exist.
@@ -257,11 +257,11 @@ def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]
 
 
 def _decoded(data: bytes, path: Path, flags: int) -> NDArray[Any]:
-    if is_cut(data):  # some versions of OpenCV fill the rest with gray
+    if is_truncated(data):  # some versions of OpenCV fill the rest with gray
         raise DataError(f"{path}: the end of the file is missing; copy it again")
     pixels, fault = None, ""
     try:  # not cv2.imread: that needs ASCII paths on Windows
-        pixels = cv2.imdecode(np.frombuffer(pixels_only(data), np.uint8), flags)
+        pixels = cv2.imdecode(np.frombuffer(strip_png_metadata(data), np.uint8), flags)
     except ValueError as error:
         fault = f" ({error})"
     except cv2.error:
@@ -273,7 +273,7 @@ def _decoded(data: bytes, path: Path, flags: int) -> NDArray[Any]:
 
 # What a camera noted of a photograph's exposure: Exif 2.3 in JPEG files, or a file beside images that lost it.
 
-BESIDE = "exposures.json"  # in a folder of images
+EXPOSURES_FILE = "exposures.json"  # in a folder of images
 SUB_FOLDER = 0x8769  # tags: where those of the exposure are
 SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
 MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm on film of 35 mm
@@ -296,19 +296,19 @@ class CameraExposure:
         return math.log2(self.seconds * self.iso / self.aperture**2)
 
 
-def exposure_of(path: Path) -> CameraExposure | None:
+def read_exif_exposure(path: Path) -> CameraExposure | None:
     """Return the exposure that a JPEG file tells; None where it does not.  Raises DataError when it cannot be read."""
     with open_file(path, "an image") as file:
-        return parsed(file.read(HEAD_SIZE))
+        return parse_exif_exposure(file.read(HEAD_SIZE))
 
 
-def parsed(head: bytes) -> CameraExposure | None:
+def parse_exif_exposure(head: bytes) -> CameraExposure | None:
     """Return the exposure in the first bytes of a JPEG file, or None."""
     tags = _tags(head)
-    return checked(tags.get(SECONDS), tags.get(APERTURE), tags.get(ISO))
+    return make_exposure(tags.get(SECONDS), tags.get(APERTURE), tags.get(ISO))
 
 
-def optics_of(path: Path) -> tuple[Value, ...] | None:
+def read_exif_optics(path: Path) -> tuple[Value, ...] | None:
     """Return make, model and focal lengths of the camera that took a JPEG file; None where it does not tell them.
 
     Raises DataError when it cannot be read.
@@ -319,21 +319,21 @@ def optics_of(path: Path) -> tuple[Value, ...] | None:
     return tuple(told) if any(told[2:]) else None
 
 
-def copied(head: bytes, jpeg: bytes) -> bytes:
+def copy_exif(head: bytes, jpeg: bytes) -> bytes:
     """Return a JPEG file of upright pixels with the EXIF data in the first bytes of another, but for the rotation."""
-    found = exif_segment(head)
+    found = find_exif_segment(head)
     if found is None:
         return jpeg
     at, length = found
     block = bytearray(head[at : at + 2 + length])
-    if place := orientation_place(bytes(block[10:])):
+    if place := find_orientation(bytes(block[10:])):
         block[10 + place : 12 + place] = struct.pack({b"II": "<H", b"MM": ">H"}[bytes(block[10:12])], 1)
     return jpeg[:2] + bytes(block) + jpeg[2:]
 
 
 def _tags(head: bytes) -> dict[int, Value]:
     """What the first bytes of a JPEG file tell by tag, as far as it can be read."""
-    found = exif_segment(head)
+    found = find_exif_segment(head)
     tags: dict[int, Value] = {}
     if found is None:
         return tags
@@ -365,7 +365,7 @@ def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
     return found
 
 
-def checked(seconds: object, aperture: object, iso: object) -> CameraExposure | None:
+def make_exposure(seconds: object, aperture: object, iso: object) -> CameraExposure | None:
     """Return an exposure, or None where a value is no number that a camera can have."""
     numbers = [float(one) for one in (seconds, aperture, iso) if isinstance(one, int | float)]
     possible = len(numbers) == 3 and all(low < one < high for one, (low, high) in zip(numbers, POSSIBLE, strict=True))
@@ -376,7 +376,7 @@ def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]
     """Write the exposures of the images of a folder, by name, where any is known.  Raises OutputError."""
     known = {name: asdict(exposure) for name, exposure in exposures.items() if exposure}
     if known:
-        write_text(folder / BESIDE, json.dumps(known, indent=1) + "\n")
+        write_text(folder / EXPOSURES_FILE, json.dumps(known, indent=1) + "\n")
 
 
 def read_exposures(folder: Path) -> dict[str, CameraExposure]:
@@ -384,7 +384,7 @@ def read_exposures(folder: Path) -> dict[str, CameraExposure]:
 
     Raises DataError where it is damaged.
     """
-    path = folder / BESIDE
+    path = folder / EXPOSURES_FILE
     if not path.is_file():
         return {}
     data, expected = (
@@ -395,7 +395,7 @@ def read_exposures(folder: Path) -> dict[str, CameraExposure]:
         raise DataError(f"{path}: {expected}")
     found = {}
     for name, row in data.items():
-        if not isinstance(row, dict) or not (exposure := checked(*map(row.get, ("seconds", "aperture", "iso")))):
+        if not isinstance(row, dict) or not (exposure := make_exposure(*map(row.get, ("seconds", "aperture", "iso")))):
             raise DataError(f"{path}: the exposure of one image is not three positive numbers; {expected}")
         found[name] = exposure
     return found

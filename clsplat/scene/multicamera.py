@@ -90,7 +90,7 @@ def _frames(path: Path) -> dict[str, list[Path]]:
     if packed:
         raise DataError(
             f"{packed[0]}: is a video without a folder {packed[0].with_suffix('')} of its frames; "
-            f"`clsplat data moments {shell_quote(path)}` writes the frames of all cameras"
+            f"`clsplat data sync-frames {shell_quote(path)}` writes the frames of all cameras"
         )
     if not frames:
         raise DataError(f"{path / VIDEOS}: has no folders of frames; expected {VIDEOS}/NAME/0000.png … for each camera")

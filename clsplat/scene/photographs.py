@@ -52,7 +52,7 @@ def _loaded(view: View, background: tuple[float, float, float]) -> NDArray[np.ui
 LOG = logging.getLogger("clsplat")
 
 
-def mask_file(folder: Path, name: str) -> Path | None:
+def find_mask(folder: Path, name: str) -> Path | None:
     """Return the mask of an image by name: with .png appended (COLMAP), or in place of its suffix; None without one."""
     return next((file for file in _candidates(folder, name) if os.path.isfile(file)), None)  # never raises
 
@@ -71,7 +71,7 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
             f"{scene.path}: has masks of its own, such as {own}; expected a dataset without any beside scene.masks: "
             "leave scene.masks out, or take those of the dataset away"
         )
-    views = tuple(replace(view, mask_path=mask_file(folder, view.name)) for view in scene.views)
+    views = tuple(replace(view, mask_path=find_mask(folder, view.name)) for view in scene.views)
     count, missing = len(views), [view.name for view in views if view.mask_path is None]
     if len(missing) == count:
         fault = f"holds no mask of a photograph of {scene.path}" if folder.is_dir() else "no such folder"

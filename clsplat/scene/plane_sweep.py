@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.scene.quality import spacing
+from clsplat.scene.quality import point_spacing
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View
 
@@ -77,7 +77,7 @@ def swept_points(
         depth = 1 / surface.inverse[taken]
         positions.append(_lifted(view, rows, columns, depth))
         colors.append(image[taken])
-        sizes.append(depth / view.camera.fx * spacing(chances[taken], view.camera.width))
+        sizes.append(depth / view.camera.fx * point_spacing(chances[taken], view.camera.width))
     everywhere, everything = np.concatenate(positions), np.concatenate(colors)
     chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(everywhere))[:count])
     if chance is None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clsplat.scene.images import read_gray
 from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import View, load_mask, load_transparency, some_of
+from clsplat.scene.view import View, load_mask, load_transparency, sample_views
 
 NEAREST = 0.01  # share of the points that photographs show which may lie nearer: some of them are mistaken
 
@@ -35,14 +35,14 @@ class Measures:
         return self.measure_sky()
 
 
-def measured(scene: Scene, measure_sky: Callable[[], float | None] = lambda: None) -> Measures:
+def measure_scene(scene: Scene, measure_sky: Callable[[], float | None] = lambda: None) -> Measures:
     """Return the measures of a scene, as it is trained on."""
-    views = {view.name: view for view in reversed(scene.with_fold().split("train"))}  # the largest size of each
+    views = {view.name: view for view in reversed(scene.merge_validation().split("train"))}  # the largest size of each
     errors = reprojection_errors(scene.tracks, views.values())
     return Measures(len(views), None if errors is None else float(errors.mean()), scene, measure_sky)
 
 
-def nearest_points(scene: Scene) -> float | None:
+def near_depth(scene: Scene) -> float | None:
     """Return the depth, scene units, that a hundredth of all points that training views show are nearer than.
 
     Views for validation count as training views.  None where the dataset does not tell which points views show.
@@ -51,7 +51,7 @@ def nearest_points(scene: Scene) -> float | None:
         return None
     shown = [
         (view, scene.tracks.positions[scene.tracks.seen.get(view.name, [])])
-        for view in scene.with_fold().split("train")
+        for view in scene.merge_validation().split("train")
     ]
     with np.errstate(all="ignore"):  # points of a damaged file
         depths = [points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3] for view, points in shown]
@@ -95,7 +95,7 @@ Floats = NDArray[np.floating]
 MAX_SPACING = 0.1  # by the width of the photograph (Meuleman et al. 2025)
 
 
-def laplacian_chance(image: Floats) -> Floats:
+def laplacian_probability(image: Floats) -> Floats:
     """Return the chance, [H, W], with which a pixel of a photograph, [H, W, 3] in [0, 1], becomes a point.
 
     It is min(1, ‖∇²I‖₁) with the Laplacian of five points, summed over the colors (Meuleman et al. 2025).  There it is
@@ -109,7 +109,7 @@ def laplacian_chance(image: Floats) -> Floats:
     return chance
 
 
-def spacing(chance: Floats, width: int) -> Floats:
+def point_spacing(chance: Floats, width: int) -> Floats:
     """Return the distance in pixels between points that are taken with some chances above 0: 1/√chance.
 
     It is at most MAX_SPACING by the width of the photograph, px.
@@ -125,7 +125,7 @@ LOOKED_AT = 3  # training photographs: what is shown may fill one of them
 
 def is_transparent(scene: Scene) -> bool:
     """Return whether one of some training photographs has transparent pixels that count.  Raises DataError."""
-    return any(map(_is_transparent, some_of(scene.split("train"), LOOKED_AT)))
+    return any(map(_is_transparent, sample_views(scene.split("train"), LOOKED_AT)))
 
 
 def background_shows(scene: Scene) -> bool:
@@ -133,7 +133,7 @@ def background_shows(scene: Scene) -> bool:
 
     It cannot behind those with masks.  Raises DataError.
     """
-    return any(load_transparency(view) is not None for view in some_of(scene.split("train"), LOOKED_AT))
+    return any(load_transparency(view) is not None for view in sample_views(scene.split("train"), LOOKED_AT))
 
 
 def opaque_pixels(view: View) -> NDArray[np.bool_] | None:

@@ -8,56 +8,56 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.scene.scene import PointCloud, Scene, Tracks
-from clsplat.scene.view import View, lens_of
+from clsplat.scene.view import View, photo_lens
 
 Floats = NDArray[np.float64]
 NEAR = 1.0  # px at the size of training, ours: beyond it a pixel does not show the point
 EXACT = 1e-3  # px: below it places were computed from the cameras, and tell nothing of them
 
 
-def misses(view: View, positions: NDArray[np.floating], places: Floats) -> Floats:
+def reprojection_residuals(view: View, positions: NDArray[np.floating], places: Floats) -> Floats:
     """Return the vectors, [K, 2] px, from where a view at its full size shows positions, [K, 3], to places, [K, 2] px
     of the photograph as it was taken; NaN behind the camera, and for places far outside the photograph."""
     taken = view.lens or view.camera
     size = np.array([taken.width, taken.height])
     # a place of a damaged file says nothing of cameras
     near = np.all(np.abs(places - size / 2) <= size, axis=1, keepdims=True)
-    return np.where(near, places - projected(view, positions), np.nan)
+    return np.where(near, places - project_points(view, positions), np.nan)
 
 
-def projected(view: View, positions: NDArray[np.floating]) -> Floats:
+def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
     """Return where a view at its full size shows positions, [K, 3]: [K, 2] px of the photograph as it was taken, NaN
     behind the camera."""
     points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
     points[~(points[:, 2] > 0)] = np.nan
     with np.errstate(all="ignore"):
         if view.lens is not None:
-            return lens_of(view).project(points)
+            return photo_lens(view).project(points)
         camera = view.camera
         return np.asarray(points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
 
 
-def with_cameras(scene: Scene, views: Sequence[View]) -> Scene:
+def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:
     """Return a scene, at its full size, whose views have other cameras; photographs show its points where they did."""
     tracks, missed = scene.tracks, dict[str, Floats]()
     if tracks is not None:
         for old, new in zip(scene.views, views, strict=True):
-            if old.name in tracks.misses:
+            if old.name in tracks.residuals:
                 positions = tracks.positions[tracks.seen[old.name]]
-                moved = projected(old, positions) - projected(new, positions)
-                missed[old.name] = tracks.misses[old.name] + moved
-        tracks = replace(tracks, misses={**tracks.misses, **missed})
+                moved = project_points(old, positions) - project_points(new, positions)
+                missed[old.name] = tracks.residuals[old.name] + moved
+        tracks = replace(tracks, residuals={**tracks.residuals, **missed})
     return replace(scene, views=tuple(views), tracks=tracks)
 
 
 def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats | None:
     """Return the mean distance for each point that views show, px at their sizes; None where the dataset does not tell
     it."""
-    if tracks is None or not tracks.misses:
+    if tracks is None or not tracks.residuals:
         return None
     sums, counts = np.zeros(len(tracks.positions)), np.zeros(len(tracks.positions))
     for view in views:
-        distances = np.linalg.norm(tracks.misses.get(view.name, np.empty((0, 2))), axis=1) / view.downscale
+        distances = np.linalg.norm(tracks.residuals.get(view.name, np.empty((0, 2))), axis=1) / view.downscale
         known = np.isfinite(distances)
         if known.any():
             np.add.at(sums, tracks.seen[view.name][known], distances[known])
@@ -66,19 +66,19 @@ def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats 
     return errors if len(errors) and errors.mean() > EXACT else None
 
 
-def within(tracks: Tracks, views: Iterable[View], limit: float = NEAR) -> Tracks:
+def filter_tracks(tracks: Tracks, views: Iterable[View], limit: float = NEAR) -> Tracks:
     """Return the tracks without the points that views show `limit` px or more, at their sizes, from where the cameras
     do; a view without known places keeps all of its points, and so do other views than these."""
-    seen, missed = dict(tracks.seen), dict(tracks.misses)
+    seen, missed = dict(tracks.seen), dict(tracks.residuals)
     for view in sorted(views, key=lambda view: -view.downscale):  # of a photograph in several sizes the largest one
-        if view.name in tracks.misses:
-            found = tracks.misses[view.name]
+        if view.name in tracks.residuals:
+            found = tracks.residuals[view.name]
             kept = ~(np.linalg.norm(found, axis=1) / view.downscale >= limit)  # NaN: not known
             seen[view.name], missed[view.name] = tracks.seen[view.name][kept], found[kept]
     return Tracks(tracks.positions, seen, missed)
 
 
-def require_ahead(points: PointCloud, scene: Scene) -> None:
+def require_points_in_front(points: PointCloud, scene: Scene) -> None:
     """Raise DataError when every point lies behind every training camera."""
     poses = np.stack([view.world_to_camera for view in scene.split("train")])
     if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):

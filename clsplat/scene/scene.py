@@ -33,7 +33,7 @@ class Tracks:
 
     positions: NDArray[np.floating]  # [M, 3], scene units
     seen: Mapping[str, NDArray[np.int64]]  # rows of `positions`, ascending by id of the point, by the name of a view
-    misses: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)  # of the views whose places are known:
+    residuals: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)  # of the views whose places are known:
     # [K, 2] px of the photograph as it was taken, from where the camera shows each point to where the photograph does
 
     def shifted(self, origin: Floats) -> "Tracks":
@@ -43,7 +43,7 @@ class Tracks:
     def renamed(self, names: Mapping[str, str]) -> "Tracks":
         """Return the tracks of some views under other names, by their old ones."""
         seen = {names[old]: rows for old, rows in self.seen.items() if old in names}
-        return Tracks(self.positions, seen, {names[old]: one for old, one in self.misses.items() if old in names})
+        return Tracks(self.positions, seen, {names[old]: one for old, one in self.residuals.items() if old in names})
 
 
 Background = Literal["black", "white"]
@@ -116,7 +116,7 @@ class Scene:
         tracks = self.tracks and self.tracks.shifted(-self.origin)
         return replace(self, views=views, points=points, tracks=tracks, origin=np.zeros(3))
 
-    def with_fold(self) -> "Scene":
+    def merge_validation(self) -> "Scene":
         """Return the scene with the validation views among those that are trained on."""
         return replace(self, train=tuple(sorted(self.train + self.validation)), validation=())
 
@@ -243,12 +243,12 @@ def camera_extent(views: list[View]) -> float:
 
     Cameras far away from all others do not count: one wrong pose changes every size and rate of the scene.
     """
-    centers = np.stack([v.position for v in views])[~strayed(views)]
+    centers = np.stack([v.position for v in views])[~outlier_cameras(views)]
     radius = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     return radius if radius > 0 else 1.0
 
 
-def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
+def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:
     """Return which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median center.
 
     Where that is more than MAX_STRAYED_SHARE of all, the scene has several groups of cameras, and all are False.

@@ -48,7 +48,7 @@ class Clock:
         return np.clip((np.asarray(values, np.float64) - self.first) / (self.last - self.first), 0, 1)
 
 
-def clock_of(path: object, moments: Sequence[tuple[str, float | None]]) -> Clock | None:
+def make_clock(path: object, moments: Sequence[tuple[str, float | None]]) -> Clock | None:
     """Return the clock of a dataset from the places and the moments of all its frames, or None where it has none.
 
     Raises DataError where only some frames have a moment, or all have the same.
@@ -70,7 +70,7 @@ def clock_of(path: object, moments: Sequence[tuple[str, float | None]]) -> Clock
     return Clock(first, last)
 
 
-def moments_of(views: Iterable[View]) -> list[float]:
+def distinct_times(views: Iterable[View]) -> list[float]:
     """Return the different times of views, ascending; empty where the scene does not move."""
     return sorted({view.time for view in views if view.time is not None})
 
@@ -80,7 +80,7 @@ def camera_key(view: View) -> bytes:
     return view.world_to_camera.tobytes() + repr((view.camera, view.downscale)).encode()
 
 
-def by_camera(views: Sequence[View]) -> list[list[View]]:
+def group_by_camera(views: Sequence[View]) -> list[list[View]]:
     """Return views by the camera that took them, in order of time."""
     groups: dict[bytes, list[View]] = {}
     for view in views:

@@ -10,7 +10,7 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.files import write_text
 from clsplat.core.reading import read_json
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE
-from clsplat.scene.times import clock_of
+from clsplat.scene.times import make_clock
 from clsplat.scene.view import View
 
 FILE = "times.json"
@@ -39,7 +39,7 @@ def read_times(folder: Path) -> dict[str, float] | None:
     return {name: float(value) for name, value in table.items()}
 
 
-def timed(views: list[View], folder: Path) -> list[View]:
+def add_times(views: list[View], folder: Path) -> list[View]:
     """Return views with the times of the file in their folder of photographs; without a file the same.
 
     Raises DataError as read_times and clock_of do.
@@ -47,7 +47,7 @@ def timed(views: list[View], folder: Path) -> list[View]:
     times = read_times(folder)
     if times is None:
         return views
-    clock = clock_of(folder / FILE, [(view.name, times.get(view.name)) for view in views])
+    clock = make_clock(folder / FILE, [(view.name, times.get(view.name)) for view in views])
     if clock is None:
         raise DataError(f"{folder / FILE}: names none of the {len(views)} photographs; write their names as below it")
     return [replace(view, time=float(clock(times[view.name]))) for view in views]

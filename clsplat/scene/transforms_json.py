@@ -11,12 +11,12 @@ import numpy as np
 
 from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_json
-from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, shared
-from clsplat.scene.images import Missing, image_size, inside, present, read_header, require_files
+from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, intern_lens
+from clsplat.scene.images import Missing, find_existing, image_size, read_header, require_files, safe_join
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.reader import Parts, Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
-from clsplat.scene.times import Clock, clock_of
+from clsplat.scene.times import Clock, make_clock
 from clsplat.scene.view import Floats, View
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -57,7 +57,7 @@ class JsonFrame:
             return None
         if not isinstance(value, str):
             raise DataError(f"{self.where}: {key} is {quote(value)}; expected a path below {self.folder}")
-        path = inside(self.folder, view_name(value), self.where)
+        path = safe_join(self.folder, view_name(value), self.where)
         return path if path.suffix else path.with_name(path.name + suffix)
 
 
@@ -86,7 +86,7 @@ class Transforms:
         Raises DataError for damaged numbers, missing files and paths that leave the folder.
         """
         images = [image_path_of(frame) for frame in self.frames]
-        there = present(self.path, images, missing)
+        there = find_existing(self.path, images, missing)
         frames = [frame for frame, found in zip(self.frames, there, strict=True) if found]
         lost = [frame for frame, found in zip(self.frames, there, strict=True) if not found]
         self.skipped = tuple(view_name(str(frame.value("file_path"))) for frame in lost)
@@ -113,7 +113,7 @@ def list_frames(parts: Parts, *names: str) -> None:
     """Add the frames of those of the files `names` that exist to `parts`, and the points of the first file."""
     files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
     moments = [moment for file in filter(None, files) for moment in parts.attempt(file.moments) or []]
-    clock = parts.attempt(clock_of, parts.path, moments)
+    clock = parts.attempt(make_clock, parts.path, moments)
     for transforms in filter(None, files):
         frames = [(frame, parts.attempt(image_path_of, frame)) for frame in transforms.frames]
         paths = [path for _, path in frames if path]
@@ -142,8 +142,8 @@ def view_of(frame: JsonFrame, size: tuple[int, int] | None, clock: Clock | None 
     clock: of the scene, where it moves.  Raises DataError.
     """
     image, mask = image_path_of(frame), frame.file("mask_path")
-    lens = shared(lens_of(frame, camera_of(frame, size)))
-    camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+    lens = intern_lens(lens_of(frame, camera_of(frame, size)))
+    camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
     moment, still = frame.number("time"), frame.file("static_path")
     time = None if clock is None or moment is None else float(clock(moment))
     name, matrix = view_name(frame.value("file_path")), camera_to_world_of(frame)
@@ -251,7 +251,7 @@ class BlenderReader(Reader):
     def read(self, path: Path, holdout: int) -> Scene:
         transforms = Transforms(path / TRAIN_FILE)
         held = Transforms(path / TEST_FILE) if (path / TEST_FILE).is_file() else None
-        clock = clock_of(path, transforms.moments() + (held.moments() if held else []))
+        clock = make_clock(path, transforms.moments() + (held.moments() if held else []))
         train = transforms.views(self.missing, clock)
         test = held.views(self.missing, clock) if held else []
         held_out = set(range(len(train), len(train) + len(test)))
@@ -284,7 +284,7 @@ class NerfstudioReader(Reader):
 
     def read(self, path: Path, holdout: int) -> Scene:
         transforms = Transforms(path / TRANSFORMS_FILE)
-        clock = clock_of(transforms.path, transforms.moments())
+        clock = make_clock(transforms.path, transforms.moments())
         views = sorted(transforms.views(self.missing, clock), key=lambda view: view.name)
         train, test = (_listed(transforms, key) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
@@ -335,7 +335,7 @@ class MultiscaleReader(Reader):
     def read(self, path: Path, holdout: int) -> Scene:
         splits = read_json(path / METADATA_FILE, limit=MAX_BYTES)
         train, test = (_views(path / METADATA_FILE, splits, name) for name in ("train", "test"))
-        there = present(path, [view.image_path for view in train + test], self.missing)
+        there = find_existing(path, [view.image_path for view in train + test], self.missing)
         skipped = tuple(view.name for view, found in zip(train + test, there, strict=True) if not found)
         test = [view for view, found in zip(test, there[len(train) :], strict=True) if found]
         train = [view for view, found in zip(train, there[: len(train)], strict=True) if found]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat.core.errors import DataError, PoseError, quote
 from clsplat.formats.splats import EXPECTED, is_moment
 from clsplat.scene.camera import MODELS, Camera, Lens
-from clsplat.scene.images import CameraExposure, exposure_of, read_exposures, read_image
+from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_image
 
 # What a view says of its place: a pose with a rotation, and the moment of a scene that moves.
 
@@ -22,7 +22,7 @@ Floats = NDArray[np.floating]
 ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are read to 1e-3, and an inverse has a little more
 
 
-def checked_pose(name: str, pose: ArrayLike) -> Floats:
+def validate_pose(name: str, pose: ArrayLike) -> Floats:
     """Return a world-to-camera pose, [3, 4] float64, of the view `name`.  Raises PoseError without a rotation."""
     found = np.asarray(pose, np.float64)
     if found.shape != (3, 4):
@@ -40,7 +40,7 @@ def checked_pose(name: str, pose: ArrayLike) -> Floats:
     return found
 
 
-def checked_time(name: str, time: float | None) -> float | None:
+def validate_time(name: str, time: float | None) -> float | None:
     """Return the time of the view `name`, in [0, 1], or None.  Raises PoseError for anything else."""
     if time is None:
         return None
@@ -82,8 +82,8 @@ class View:
     response: Callable[..., Any] | None = None  # workspace, camera, planes -> those as the camera takes them; measured
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "world_to_camera", checked_pose(self.name, self.world_to_camera))
-        object.__setattr__(self, "time", checked_time(self.name, self.time))
+        object.__setattr__(self, "world_to_camera", validate_pose(self.name, self.world_to_camera))
+        object.__setattr__(self, "time", validate_time(self.name, self.time))
 
     @classmethod
     def looking_at(
@@ -241,22 +241,22 @@ def _as_taken(view: View, path: Path) -> NDArray[Any]:
         height, width = decoded[upright].shape[:2]
         return width, height
 
-    pixels = decoded[is_turned(view, path, size)]
+    pixels = decoded[needs_rotation(view, path, size)]
     return view.lens.undistort_image(pixels) if view.lens else pixels
 
 
-def is_turned(view: View, path: Path, size: Callable[[bool], Size]) -> bool:
+def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool:
     """Return whether a view's photograph or mask has its camera's size only when the EXIF rotation is applied.
 
     COLMAP ignores that tag.  `size` returns (width, height) of the file as stored, or with True upright.
     Raises DataError when neither is the camera's.
     """
     found = size(False)
-    if fits(view, found):
+    if fits_camera(view, found):
         return False
-    if fits(view, found[::-1]):
+    if fits_camera(view, found[::-1]):
         found = size(True)
-        if fits(view, found):
+        if fits_camera(view, found):
             return True
     camera = view.lens or view.camera
     raise DataError(
@@ -266,14 +266,14 @@ def is_turned(view: View, path: Path, size: Callable[[bool], Size]) -> bool:
     )
 
 
-def some_of(views: Sequence[View], most: int) -> Sequence[View]:
+def sample_views(views: Sequence[View], most: int) -> Sequence[View]:
     """Return at most so many views, from the middles of as many equal parts."""
     if len(views) <= most:
         return views
     return [views[(2 * i + 1) * len(views) // (2 * most)] for i in range(most)]
 
 
-def fits(view: View, size: Size) -> bool:
+def fits_camera(view: View, size: Size) -> bool:
     """Return whether an image of `size` (width, height) fits the camera of a view."""
     if view.lens:
         return size == (view.lens.width, view.lens.height)
@@ -301,19 +301,19 @@ DEGREES: dict[str, tuple[int, ...]] = {  # n of each coefficient after the middl
 }
 
 
-def zooms(lens: Lens) -> bool:
+def can_zoom(lens: Lens) -> bool:
     """Return whether there is such a lens for any factor: a fisheye has none of its model."""
     return lens.model in DEGREES
 
 
-def zoomed(lens: Lens, factor: float) -> Lens:
+def zoom_lens(lens: Lens, factor: float) -> Lens:
     """Return a lens with the focal length times a factor, whose undistorted photograph is the same.
 
     Raises DataError where its model has none.
     """
     if factor == 1:
         return lens
-    if not zooms(lens):
+    if not can_zoom(lens):
         raise DataError(
             f"the lens {lens.model} has no form with another focal length; expected one of {', '.join(DEGREES)}: "
             "`clsplat data undistort` first"
@@ -324,7 +324,7 @@ def zoomed(lens: Lens, factor: float) -> Lens:
     return replace(lens, params=(*(factor * length for length in lengths), *middle, *scaled))
 
 
-def lens_of(view: View) -> Lens:
+def photo_lens(view: View) -> Lens:
     """Return the lens of a view's photograph as it is on disk: a pinhole where it has no distortion.
 
     Raises DataError where its focal length was learned and its model has none with another.
@@ -333,13 +333,13 @@ def lens_of(view: View) -> Lens:
     if lens is None:
         return Lens(c.width, c.height, "PINHOLE", (c.fx, c.fy, c.cx, c.cy))
     factor = c.fx / lens.pinhole.resized(c.width, c.height).fx  # 1, unless the focal length was learned
-    return lens if math.isclose(factor, 1, rel_tol=ROUNDING) else zoomed(lens, factor)
+    return lens if math.isclose(factor, 1, rel_tol=ROUNDING) else zoom_lens(lens, factor)
 
 
 # What cameras noted of the exposures of views.
 
 
-def camera_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
+def load_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
     """Return the exposure of each view: what lies beside its image, or else what its image tells; None: nothing.
 
     Raises DataError where a file cannot be read.
@@ -351,7 +351,7 @@ def camera_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
             found.append(None)
             continue
         told = (beside(folder).get(name) for folder, name in _below(view))
-        found.append(next(filter(None, told), None) or exposure_of(view.image_path))
+        found.append(next(filter(None, told), None) or read_exif_exposure(view.image_path))
     return found
 
 
@@ -364,7 +364,7 @@ def _below(view: View) -> Iterator[tuple[Path, str]]:
 
 
 @dataclass(frozen=True)
-class Posed:
+class PosedView:
     """A view with the name of its image below the folder of all images, and its lens with distortion."""
 
     name: str
@@ -374,4 +374,4 @@ class Posed:
     @property
     def lens(self) -> Lens:
         """The lens of the photograph as it is on disk: that of the view, or its pinhole camera."""
-        return lens_of(self.view)
+        return photo_lens(self.view)

@@ -31,11 +31,11 @@ def _text(value: Any) -> Any:
     return value
 
 
-class OfPlaced(DataError):
+class MissingViewError(DataError):
     """A fault of a choice that follows from which photographs are there: fewer of them may not have it."""
 
 
-class Choice(Settings):
+class ViewSelection(Settings):
     """Views by name: every n-th from one on, or those of a list, or of a file with a name a line.
 
     A listed name is that of the view, or its end: `0042`, `0042.jpg` and `images/0042.jpg` name the same photograph.
@@ -67,7 +67,7 @@ class Choice(Settings):
         return value
 
     @model_validator(mode="after")
-    def _of_one_kind(self) -> "Choice":
+    def _of_one_kind(self) -> "ViewSelection":
         given = [self.every, self.names, self.file]
         if sum(value is not None for value in given) != 1 or (self.offset and self.every is None):
             raise ValueError(NOTATIONS)
@@ -79,7 +79,7 @@ class Choice(Settings):
         place = super().input_path(key, scene)
         return place and Path(scene or "") / place
 
-    def of(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
+    def select(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
         """Return the indices of the chosen ones of `names`.
 
         folders: where a relative file is looked for, in order; others: names that may not be chosen, and those whose
@@ -132,8 +132,8 @@ class Choice(Settings):
 
 
 Number = Annotated[int, Field(ge=0)]
-Chosen = Annotated[Number | Choice, in_one_sentence(NOTATIONS)]
-ChosenOrAuto = Annotated[Number | Choice | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
+Chosen = Annotated[Number | ViewSelection, in_one_sentence(NOTATIONS)]
+ChosenOrAuto = Annotated[Number | ViewSelection | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
 
 
 def _taken(place: str, name: str, key: TakenBy) -> DataError:
@@ -143,15 +143,17 @@ def _taken(place: str, name: str, key: TakenBy) -> DataError:
         "train": ("is left out by scene.train", "put it into scene.train"),
     }[key]
     told = f"{quote(name)} {why}; expected training photographs: take it out of this list, or {remedy}"
-    return OfPlaced(f"{place}: {told}")
+    return MissingViewError(f"{place}: {told}")
 
 
-def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
+def choose(
+    choice: int | ViewSelection, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE
+) -> set[int]:
     """Return the indices of the chosen names; a number chooses every n-th from the first on, 0 none.
 
-    Raises DataError as Choice.of does.
+    Raises DataError as ViewSelection.select does.
     """
-    return choice.of(names, folders, others) if isinstance(choice, Choice) else every_nth(names, choice)
+    return choice.select(names, folders, others) if isinstance(choice, ViewSelection) else every_nth(names, choice)
 
 
 class _Ends:
@@ -202,14 +204,14 @@ def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -
         return found[0]
     if found:
         both = " and ".join(quote(names[i]) for i in found[:2])
-        raise OfPlaced(f"{place}: {quote(listed)} means {both}; give more of the path")
+        raise MissingViewError(f"{place}: {quote(listed)} means {both}; give more of the path")
     raise _unknown(listed, names, place)
 
 
 def _unknown(listed: str, names: Sequence[str], place: str) -> DataError:
     near = get_close_matches(listed, [*names, *(PurePosixPath(name).name for name in names)], 1)
     more = f"did you mean {quote(near[0])}?" if near else f"the first is {quote(names[0])}: correct or remove the name"
-    return OfPlaced(f"{place}: no photograph is called {quote(listed)}; {more}")
+    return MissingViewError(f"{place}: no photograph is called {quote(listed)}; {more}")
 
 
 # Which views of a scene are for training, for validation and for testing, and which are left out.
@@ -222,9 +224,9 @@ LEAST = 4  # training views that can be divided
 class Split:
     """What of a dataset a run trains on, chooses by and is tested on; fields as in the table `scene` of a pipeline."""
 
-    holdout: int | Choice = HOLDOUT
-    train: Choice | None = None
-    validation: int | Choice | Literal["auto"] = 0
+    holdout: int | ViewSelection = HOLDOUT
+    train: ViewSelection | None = None
+    validation: int | ViewSelection | Literal["auto"] = 0
     missing: Missing = "refuse"
     folder: Path | None = None  # where lists of names are that the dataset's own folder does not have
 
@@ -239,7 +241,9 @@ class Split:
         Raises DataError where names are wrong, or a split takes every view.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
-        if isinstance(self.holdout, Choice) and not (self.holdout.every and scene.test):  # the dataset says which
+        if isinstance(self.holdout, ViewSelection) and not (
+            self.holdout.every and scene.test
+        ):  # the dataset says which
             names = [view.name for view in scene.views]
             test = _chosen(scene, "holdout", self.holdout, names, folders, {"missing": scene.skipped})
             if len(test) == len(names):
@@ -272,7 +276,7 @@ class Split:
         one photograph for testing and not, or for validation and not for training."""
         others: dict[TakenBy, list[str]] = {}
         for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
-            if isinstance(choice, Choice):
+            if isinstance(choice, ViewSelection):
                 try:
                     listed = {*choice.check(names, [folder], others)}
                 except DataError as error:
@@ -286,7 +290,7 @@ class Split:
     def _counted_out(self, names: Sequence[str]) -> set[str]:
         """Names that a number holds out for testing, where all are placed."""
         every, offset = self.of_reader, 0
-        if isinstance(self.holdout, Choice):
+        if isinstance(self.holdout, ViewSelection):
             every, offset = self.holdout.every or 0, self.holdout.offset
         return {sorted(names)[i] for i in every_nth(sorted(names), every, offset)}
 
@@ -317,7 +321,7 @@ def _with_test(scene: Scene, test: set[int]) -> Scene:
 
 
 def _of(
-    scene: Scene, key: str, choice: int | Choice, folders: Sequence[Path], left_out: Sequence[str] = ()
+    scene: Scene, key: str, choice: int | ViewSelection, folders: Sequence[Path], left_out: Sequence[str] = ()
 ) -> set[int]:
     """The indices of the chosen ones of the training views; key: the setting that chooses."""
     names = [scene.views[i].name for i in scene.train]
@@ -329,7 +333,7 @@ def _of(
 def _chosen(
     scene: Scene,
     key: str,
-    choice: int | Choice,
+    choice: int | ViewSelection,
     names: Sequence[str],
     folders: Sequence[Path],
     others: Taken = NONE,

@@ -21,7 +21,7 @@ DISTANCE = 2.2  # of that start from its middle, in halves of its diagonal
 
 
 @dataclass(frozen=True)
-class Stand:
+class Viewpoint:
     """The frame of all motion of one who looks, in scene units."""
 
     pivot: NDArray[np.floating]  # [3]
@@ -31,7 +31,7 @@ class Stand:
     start: View
 
     @classmethod
-    def of(cls, points: NDArray[np.floating], views: Sequence[View], first: View | None) -> "Stand":
+    def from_points(cls, points: NDArray[np.floating], views: Sequence[View], first: View | None) -> "Viewpoint":
         """Look from `first`, else at most of the points from outside.  points: [N, 3], what is to be seen."""
         means = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         low, high = np.quantile(means, SHARES, axis=0) if len(means) else np.zeros((2, 3))
@@ -43,12 +43,12 @@ class Stand:
             return cls(middle, up, radius, START.fx, View.looking_at(eye, middle, up, START, "start"))
         poses = np.stack([view.world_to_camera for view in views])
         centers = np.stack([view.position for view in views])
-        pivot = closest_point(centers, poses[:, 2, :3], middle)
+        pivot = nearest_to_axes(centers, poses[:, 2, :3], middle)
         radius = float(np.median(np.linalg.norm(centers - pivot, axis=1))) or spread or 1.0
-        return cls(pivot, upward(views), radius, float(np.median([view.camera.fx for view in views])), first)
+        return cls(pivot, up_direction(views), radius, float(np.median([view.camera.fx for view in views])), first)
 
 
-def upward(views: Sequence[View]) -> NDArray[np.float64]:
+def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
     """Return what is up, unit, [3].
 
     Where cameras turn, and are held level, it is what their rightward axes are across; else the mean of their upward
@@ -67,23 +67,23 @@ def upward(views: Sequence[View]) -> NDArray[np.float64]:
     return np.asarray(axis / np.linalg.norm(axis), np.float64)
 
 
-def across(up: NDArray[np.floating]) -> NDArray[np.float64]:
+def perpendicular(up: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return a unit direction across a unit one, both [3]."""
     found = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     return np.asarray(found / np.linalg.norm(found), np.float64)
 
 
-def closest_point(
+def nearest_to_axes(
     centers: NDArray[np.floating], axes: NDArray[np.floating], prior: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Return the point, [3], with the least squared distances to lines; weakly drawn to `prior`.
 
     centers, axes: [V, 3], a point of each line and its unit direction.
     """
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    planes = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     weight = PRIOR * len(centers)
-    matrix = across.sum(axis=0) + weight * np.eye(3)
-    return np.asarray(np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centers) + weight * prior))
+    matrix = planes.sum(axis=0) + weight * np.eye(3)
+    return np.asarray(np.linalg.solve(matrix, np.einsum("vij,vj->i", planes, centers) + weight * prior))
 
 
 # What the cameras of a scene look at: a point, a box around it, and random points in the box.
@@ -93,26 +93,26 @@ RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: the value of
 
 def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
     """Return gray points, uniform in a box around the point that the training cameras look at."""
-    center, half_side = looked_at_box(scene)
+    center, half_side = scene_box(scene)
     rng = np.random.default_rng([seed, count])
     spread = rng.uniform(-half_side, half_side, (count, 3))
     return PointCloud((center + spread).astype(np.float32), np.full((count, 3), 127 / 255, np.float32))
 
 
-def looked_at_box(scene: Scene) -> tuple[NDArray[np.floating], float]:
+def scene_box(scene: Scene) -> tuple[NDArray[np.floating], float]:
     """Return the center, [3], and half the side of a box around the point that the training cameras look at."""
     views = scene.split("train")
-    positions, center = np.stack([view.position for view in views]), center_of(views)
+    positions, center = np.stack([view.position for view in views]), scene_center(views)
     return center, RANDOM_BOX * float(np.median(np.linalg.norm(positions - center, axis=1)))
 
 
-def center_of(views: Sequence[View]) -> NDArray[np.floating]:
+def scene_center(views: Sequence[View]) -> NDArray[np.floating]:
     """Return the point that the cameras look at, [3] scene units."""
     return looked_at(np.stack([v.position for v in views]), np.stack([v.world_to_camera[2, :3] for v in views]))
 
 
 def looked_at(positions: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the point nearest to all optical axes, in least squares, [3] scene units."""
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    point, *_ = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, positions), rcond=None)
+    planes = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    point, *_ = np.linalg.lstsq(planes.sum(axis=0), np.einsum("nij,nj->i", planes, positions), rcond=None)
     return np.asarray(point)

@@ -12,7 +12,7 @@ from clsplat.gaussians.model import load
 from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
 from clsplat.metrics.views import mean, measure, tell_of_colors
 from clsplat.render.painter import Painter, SplatPainter
-from clsplat.scene.view import some_of
+from clsplat.scene.view import sample_views
 from clsplat.training.modules.base import color_model, learned_scene
 from clsplat.training.run import Run
 from clsplat.training.stage import CADENCE, Scheduled
@@ -90,7 +90,7 @@ class Evaluate(Scheduled):
         perceptual, painter = self._perceptual(), self._painter(run)
         for downscale in self.downscales or [run.downscale]:
             found = learned_scene(run).downscaled(downscale).split(self.split)
-            views = some_of(found, self.max_views or len(found))
+            views = sample_views(found, self.max_views or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
             trained, colors = run.scene.split("train"), color_model(run)

@@ -14,7 +14,7 @@ from clsplat.formats.table import endings, for_writing
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import load
 from clsplat.gaussians.sky import sky_file
-from clsplat.scene.camera_files import checked, write_cameras
+from clsplat.scene.camera_files import check_cameras, write_cameras
 from clsplat.training import checkpoint
 from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model
@@ -106,7 +106,7 @@ class Cameras(Stage):
 
     def check_run(self, run: Run) -> None:
         for name in self.formats:
-            checked(run.original, name)
+            check_cameras(run.original, name)
 
     def run(self, run: Run) -> None:
         for name in self.formats:

@@ -16,11 +16,11 @@ from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import load
 from clsplat.scene.plane_sweep import swept_points
-from clsplat.scene.quality import is_transparent, laplacian_chance, opaque_pixels
-from clsplat.scene.reprojection import require_ahead
+from clsplat.scene.quality import is_transparent, laplacian_probability, opaque_pixels
+from clsplat.scene.reprojection import require_points_in_front
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View, load_image, load_rgba
-from clsplat.scene.viewpoint import center_of, looked_at_box, random_points
+from clsplat.scene.viewpoint import random_points, scene_box, scene_center
 from clsplat.scene.visual_hull import hull_points
 from clsplat.stages.init_motion import moving, require_times, with_motion
 from clsplat.training.memory import first_tables, last_place
@@ -40,14 +40,14 @@ def own_points(scene: Scene) -> PointCloud:
     """Return the points of a scene.  Raises DataError where it has none, or all lie behind its cameras."""
     if scene.points is None:
         raise DataError(f"{scene.path}: has no points to start from; use init: {{source: sweep}}")
-    require_ahead(scene.points, scene)
+    require_points_in_front(scene.points, scene)
     return scene.points
 
 
 def swept(run: Run, count: int, chance: Chance | None) -> PointCloud:
     """Return at most `count` points of a sweep over the training photographs; `chance` as of `swept_points`."""
     views = _views(run)
-    return swept_points(views, center_of(views), load_image, count, run.seed, chance)
+    return swept_points(views, scene_center(views), load_image, count, run.seed, chance)
 
 
 def points_and_sweep(run: Run, count: int, chance: Chance | None) -> PointCloud:
@@ -57,7 +57,7 @@ def points_and_sweep(run: Run, count: int, chance: Chance | None) -> PointCloud:
     """
     own, views = own_points(run.scene), _views(run)
     beside = own.positions.astype(np.float64)
-    new = swept_points(views, center_of(views), load_image, count, run.seed, chance, beside, opaque_pixels)
+    new = swept_points(views, scene_center(views), load_image, count, run.seed, chance, beside, opaque_pixels)
     if not len(new):
         LOG.warning("the photographs agree on no points beside the scene's; starting from these alone")
     return own.joined(new)
@@ -75,7 +75,7 @@ def enough_swept(run: Run, count: int, chance: Chance | None) -> PointCloud | No
 
 def on_hull(run: Run, count: int) -> PointCloud | None:
     """Return at most `count` points on the hull of the silhouettes, or None, with a warning, where they are too few."""
-    points = hull_points(_views(run), *looked_at_box(run.scene), load_rgba, count, run.seed)
+    points = hull_points(_views(run), *scene_box(run.scene), load_rgba, count, run.seed)
     if len(points) < MIN_USABLE:
         remedy = "they need transparency around what they show, and no masks; or use init: {source: sweep}"
         LOG.warning(
@@ -90,7 +90,7 @@ def _views(run: Run) -> list[View]:
     return [view for view in run.scene.split("train") if view.downscale == run.downscale]
 
 
-CHANCES = {"uniform": None, "laplacian": laplacian_chance}  # of a pixel to become a point of a sweep
+CHANCES = {"uniform": None, "laplacian": laplacian_probability}  # of a pixel to become a point of a sweep
 
 
 class Init(Stage):

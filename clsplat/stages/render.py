@@ -16,7 +16,7 @@ from clsplat.metrics.views import render_view
 from clsplat.render.camera import upload_camera
 from clsplat.scene.images import is_image, write_image
 from clsplat.scene.view import View
-from clsplat.scene.viewpoint import Stand
+from clsplat.scene.viewpoint import Viewpoint
 from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model
 from clsplat.training.stage import Stage, path_in_run
@@ -97,7 +97,7 @@ class Viewer(Stage):
             return run.status.counted(run.until_interrupted(views), "views", len(scene.views))
 
         views = described(scene, read, self.photographs, self.photograph_budget, through)
-        stand = Stand.of(model.means, scene.views, (scene.split("test") or scene.views)[0])
+        stand = Viewpoint.from_points(model.means, scene.views, (scene.split("test") or scene.views)[0])
         page = Page(f"{run.name} · {run.scene_name}", {run.name: pack(shown)}, stand, name, views)
         if page.size > MAX_SIZE and page.fitting:  # else the photographs are the fault, which the page says
             LOG.warning(

@@ -19,10 +19,10 @@ from clsplat.core.page import data_url, duration_text, render, safe_charts
 from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import SHARES, Gains, ViewMetrics, measure, render_view
-from clsplat.prepare.gather import photographs_text
+from clsplat.prepare.gather import summarize_placement
 from clsplat.scene.scene import SPLITS
-from clsplat.scene.view import View, some_of
-from clsplat.scene.viewpoint import across, closest_point, upward
+from clsplat.scene.view import View, sample_views
+from clsplat.scene.viewpoint import nearest_to_axes, perpendicular, up_direction
 from clsplat.training.best_model import Measured
 from clsplat.training.modules.base import color_model, learned_scene
 from clsplat.training.modules.sky_choice import sky_advice
@@ -48,7 +48,7 @@ UNEVEN = 3.0  # times the median gap
 def advice(run: Run) -> list[str]:
     """Return sentences, or none where nothing stands out.  Renders at most MOST training views."""
     views = learned_scene(run).downscaled(run.downscale).split("train")
-    chosen = some_of(views, MOST)
+    chosen = sample_views(views, MOST)
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
     found = measure(run.painter(), chosen, run.photographs, colors=Gains(), counted=counted)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
@@ -108,9 +108,9 @@ def widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
         return None
     centers = np.stack([view.position for view in views])
     axes = np.stack([view.world_to_camera[2, :3] for view in views])
-    from_middle = centers - closest_point(centers, axes, centers.mean(axis=0))
+    from_middle = centers - nearest_to_axes(centers, axes, centers.mean(axis=0))
     distances = np.linalg.norm(from_middle, axis=1)
-    angles, aside = _around(from_middle, upward(views))
+    angles, aside = _around(from_middle, up_direction(views))
     aimed = -(axes * from_middle).sum(axis=1) / np.maximum(distances, 1e-12)
     if aimed.mean() < AIMED or np.median(aside / np.maximum(distances, 1e-12)) < AROUND:
         return None
@@ -125,7 +125,7 @@ def widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
 
 def _around(offsets: NDArray[np.floating], up: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Angles around the upward axis, radians, and distances from it, of offsets, [V, 3]."""
-    ahead = across(up)
+    ahead = perpendicular(up)
     x, y = offsets @ ahead, offsets @ np.cross(up, ahead)
     return np.arctan2(y, x), np.hypot(x, y)
 
@@ -378,7 +378,7 @@ class HtmlReport(Stage):
             main=_main(run),
             overfitting_note=overfitting_note(run),
             advice=advised,
-            photographs=photographs_text(run.preparation) or f"{pluralize(len(run.original.views), 'photograph')}",
+            photographs=summarize_placement(run.preparation) or f"{pluralize(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
             models=_addresses(run, "export", run.out / self.file),
             views=views(run),

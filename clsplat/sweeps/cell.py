@@ -75,7 +75,7 @@ def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple
     scene, _ = settings.applied(read_scene(settings.folder, settings.split))
     paths = dict.fromkeys(path for view in scene.views for path in (view.image_path, view.mask_path))
     files = {path: ImageFile(digest=digest_of(path)) for path in paths if path is not None and path != NO_FILE}
-    return scene, Identity.of(scene, files)
+    return scene, Identity.from_scene(scene, files)
 
 
 class Scenes:

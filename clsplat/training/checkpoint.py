@@ -453,7 +453,7 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.during_index, run.edited, run.is_consistent, run.scalars = state.during_index, state.edited, True, state.scalars
     run.best = state.best
     if run.is_refit:
-        run.use_split(run.original.with_fold())
+        run.use_split(run.original.merge_validation())
     restore_tables(run, state, tables)
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.model_hashes = state.records, state.inputs, state.model_hashes

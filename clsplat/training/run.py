@@ -149,7 +149,7 @@ class Run:
         self.best = best
         self.best_tables = {}
         self.next_stage(0)
-        self.use_split(self.original.with_fold())
+        self.use_split(self.original.merge_validation())
 
     def use_split(self, original: Scene) -> None:
         """Replace the original scene by one with another split of its views."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.scene.view import View
-from clsplat.scene.viewpoint import across, upward
+from clsplat.scene.viewpoint import perpendicular, up_direction
 
 WIDTH, HEIGHT = 460, 220  # px
 LEFT, BOTTOM, TOP, RIGHT = 56, 30, 26, 12
@@ -196,8 +196,8 @@ def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floatin
     everything = [view for of_kind in views.values() for view in of_kind]
     if len(everything) < 2:
         return []
-    up = upward(everything)
-    right = across(up)
+    up = up_direction(everything)
+    right = perpendicular(up)
     centers = np.stack([view.position for view in everything])
     reach = MAX_POINT_DISTANCE * float(np.abs(centers - centers.mean(axis=0)).max())
     some = points[:: max(1, len(points) // MAX_PLAN_POINTS)].astype(np.float64)

@@ -16,13 +16,13 @@ from clsplat.core.page import data_url, inline, render, shrink
 from clsplat.core.reading import read_file
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.scene.viewpoint import Stand
+from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import Packed
 
 # Cameras as the scripts of a page read them.
 
 
-def stand_data(stand: Stand) -> dict[str, Any]:
+def stand_data(stand: Viewpoint) -> dict[str, Any]:
     """Return where a page begins to look, as main.js reads it."""
     return {
         "pivot": rounded(stand.pivot),
@@ -64,7 +64,7 @@ class Page:
 
     title: str
     models: Mapping[str, Packed]
-    stand: Stand
+    stand: Viewpoint
     background: str = "black"
     views: Sequence[dict[str, Any]] = field(default_factory=list)
 

@@ -34,7 +34,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.model_file import ModelFile, ModelSource
 from clsplat.runs.run_folder import Start
 from clsplat.runs.state import RunState
-from clsplat.scene.identity import Identity, decode_all, require_whole
+from clsplat.scene.identity import Identity, decode_all, require_decodable
 from clsplat.sweeps.experiment import run_pipeline
 from clsplat.sweeps.store import CellAttempt, whole
 
@@ -217,8 +217,8 @@ class Measurer:
         """Return a hash of the photographs, cameras and points.  Raises DataError where a photograph is damaged."""
         scene = self.opened.scene
         files = decode_all(scene.views)
-        require_whole(scene.path, files)
-        return Identity.of(scene, files).digest
+        require_decodable(scene.path, files)
+        return Identity.from_scene(scene, files).digest
 
     def figures(self, model: Model) -> tuple[float, float]:
         """Return PSNR, dB, and SSIM."""

@@ -17,7 +17,7 @@ from clsplat.core.files import append, open_atomic, write_text
 from clsplat.core.manifest import RECORD as RECORD_OF_A_TOOL
 from clsplat.core.manifest import Manifest
 from clsplat.core.settings import Settings
-from clsplat.prepare.cache import RECORD, STEPS, Planned, _show, prepare
+from clsplat.prepare.cache import RECORD, STEPS, PlannedStep, _show, prepare
 from clsplat.prepare.steps import Step
 from clsplat.runs import run_folder
 from clsplat.runs.state import RunState
@@ -158,7 +158,7 @@ def test_preparation_result_is_synced_before_it_is_trusted(tmp_path, calls):
 
     Settings.defined.remove(Write)  # not a step in other tests
     root = tmp_path / "prepared"
-    planned = [Planned(Write(stage="write"), "", "", root / "write-1", "no result yet")]
+    planned = [PlannedStep(Write(stage="write"), "", "", root / "write-1", "no result yet")]
     prepare(planned, tmp_path, root)
     order = [call for call in calls if ".lock" not in call[1]]
     places = [order.index(call) for call in (("sync", "x.png"), ("sync", "deep"), ("replace", RECORD))]

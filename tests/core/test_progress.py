@@ -8,8 +8,8 @@ import pytest
 
 from clsplat.core import progress, terminal
 from clsplat.core.progress import Count, Progress, clock, listening, polled
-from clsplat.prepare.cache import Planned, prepare
-from clsplat.prepare.gather import photographs_text
+from clsplat.prepare.cache import PlannedStep, prepare
+from clsplat.prepare.gather import summarize_placement
 from clsplat.prepare.steps import FindFeatures, MapCameras
 from clsplat.runs.opening import READ_SCENE, counts_of
 from clsplat.training.status import StatusFile
@@ -55,7 +55,7 @@ def test_nothing_to_count_is_not_heard(tmp_path):
         prepare([], tmp_path, tmp_path)
         Count("photographs", 0).reach(0)
         assert heard == []
-        planned = [Planned(MapCameras(), "", "", tmp_path, "")] * 2
+        planned = [PlannedStep(MapCameras(), "", "", tmp_path, "")] * 2
         prepare(planned, tmp_path, tmp_path)
     assert heard == [("steps of the preparation", done, 2, None) for done in (0, 0, 1)]
 
@@ -192,9 +192,9 @@ def test_photographs_that_cannot_be_read_are_counted():
     features = {"photographs": 4, "damaged": {"b.jpg": "not an image"}}
     assert FindFeatures(stage="find_features").told(features) == "photographs 4, damaged b.jpg"
     cameras = {"registered": 3, "not_registered": ["c.jpg"], "error_px": 0.5}
-    text = photographs_text({"find_features": features, "map_cameras": cameras})
+    text = summarize_placement({"find_features": features, "map_cameras": cameras})
     assert text == "3 of 5 photographs placed, 0.50 px; left out: b.jpg (not an image), c.jpg"
-    assert photographs_text({"find_features": "damaged", "map_cameras": cameras}) == ""
+    assert summarize_placement({"find_features": "damaged", "map_cameras": cameras}) == ""
 
 
 def test_times_are_read_as_on_a_clock():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.scene import camera_files
-from clsplat.scene.camera_files import posed
+from clsplat.scene.camera_files import posed_views
 from clsplat.scene.scene import make_scene
 from clsplat.viewer.video import camera_path
 from clsplat.viewer.video.paths import MAX_FRAMES, SIDES
@@ -22,7 +22,7 @@ WORDS = ['"camera_path"', '"camera_to_world"', '"fov"', '"fisheye"', "179.9", '"
 @pytest.fixture(scope="module")
 def seeds(folder):
     camera_path.write(folder / "a.json", VIEWS, 24)
-    camera_files.write_inria(folder, posed(make_scene(folder, VIEWS, set(), None)), None, None)
+    camera_files.write_inria(folder, posed_views(make_scene(folder, VIEWS, set(), None)), None, None)
     moved = json.loads((folder / "a.json").read_text())
     del moved["world"], moved["keyframes"]
     return [(folder / "a.json").read_bytes(), (folder / "cameras.json").read_bytes(), json.dumps(moved).encode()]
@@ -33,7 +33,7 @@ def test_a_damaged_path_is_read_or_refused(seeds, folder):
     def reads(data):
         (folder / "b.json").write_bytes(data)
         found = outcome(camera_path.read, folder / "b.json")
-        outcome(camera_files.read, folder / "b.json")
+        outcome(camera_files.read_inria, folder / "b.json")
         if found is not None:
             assert 1 <= len(found.views) <= MAX_FRAMES
             assert all(view.camera.check() and max(found.size) <= SIDES[1] for view in found.views)

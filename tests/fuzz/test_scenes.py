@@ -36,7 +36,7 @@ def read_and_inspect(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         scene = outcome(read_scene, path)
-        inspection = outcome(Inspection.of, path)
+        inspection = outcome(Inspection.from_folder, path)
     assert inspection is not None
     json.dumps(inspection.data())
     assert len(inspection.verdict) < 2000

@@ -15,13 +15,13 @@ from clsplat.prepare import diagnosis as reasons_tool
 from clsplat.prepare import mapping
 from clsplat.prepare.cache import fingerprint
 from clsplat.prepare.database import image_names, opened
-from clsplat.prepare.diagnosis import Matched, diagnosis, reasons
-from clsplat.prepare.features import Sought, find_features, sift
-from clsplat.prepare.gather import gather, left_out, list_photographs
+from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unplaced
+from clsplat.prepare.features import FeatureOptions, find_features, sift
+from clsplat.prepare.gather import gather, list_photographs, warnings_for
 from clsplat.prepare.mapping import map_cameras
 from clsplat.prepare.matching import match_features
-from clsplat.prepare.rotation_only import without_depth
-from clsplat.scene.images import copied, exposure_of, optics_of, read_gray, read_header, read_image
+from clsplat.prepare.rotation_only import why_no_depth
+from clsplat.scene.images import copy_exif, read_exif_exposure, read_exif_optics, read_gray, read_header, read_image
 from tests.support.pictures import blocks
 from tests.support.refusals import refusal
 
@@ -36,8 +36,8 @@ def test_exif_that_is_damaged_tells_no_lens(tmp_path, damage):
     if damage == "no focal length":
         segment[-4:] = bytes(4)  # its divisor
     path = take(tmp_path / "a.jpg", (16, 16), bytes(segment[:60] if damage == "cut" else segment))
-    assert optics_of(path) is None
-    assert (exposure_of(path) is None) == (damage != "no focal length")
+    assert read_exif_optics(path) is None
+    assert (read_exif_exposure(path) is None) == (damage != "no focal length")
 
 
 def exif(orientation: int = 1, focal: float = 4.2, model: str = "Phone 1") -> bytes:
@@ -78,9 +78,9 @@ def test_turned_photographs_keep_exif_except_for_the_rotation(tmp_path):
     assert not turned.is_symlink()
     assert (read_header(source).orientation, read_header(turned).orientation) == (6, 1)
     assert (read_header(turned).width, read_header(turned).height) == (48, 64)
-    assert optics_of(turned) == optics_of(source) == ("Maker", "Phone 1", 4.2, "")
-    assert exposure_of(turned) == exposure_of(source)
-    assert exposure_of(turned).value == pytest.approx(math.log2(100 / 50 / 1.8**2))
+    assert read_exif_optics(turned) == read_exif_optics(source) == ("Maker", "Phone 1", 4.2, "")
+    assert read_exif_exposure(turned) == read_exif_exposure(source)
+    assert read_exif_exposure(turned).value == pytest.approx(math.log2(100 / 50 / 1.8**2))
     assert np.abs(read_image(turned).astype(int) - read_image(source, upright=True)).max() < 12
 
 
@@ -88,10 +88,10 @@ def test_exif_of_the_other_byte_order_and_none_at_all(tmp_path):
     _, jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
     block = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, 3, 0, 0)
     head = jpeg.tobytes()[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block
-    (tmp_path / "a.jpg").write_bytes(copied(head, jpeg.tobytes()))
+    (tmp_path / "a.jpg").write_bytes(copy_exif(head, jpeg.tobytes()))
     assert read_header(tmp_path / "a.jpg").orientation == 1
     assert b"MM\0*" in (tmp_path / "a.jpg").read_bytes()
-    assert copied(jpeg.tobytes(), jpeg.tobytes()) == jpeg.tobytes()
+    assert copy_exif(jpeg.tobytes(), jpeg.tobytes()) == jpeg.tobytes()
 
 
 @pytest.mark.parametrize(("cameras", "groups"), [("auto", 4), ("one", 2), ("per_folder", 3), ("per_image", 8)])
@@ -104,7 +104,7 @@ def test_which_photographs_share_a_camera(tmp_path, cameras, groups, caplog):
     for i, segment in enumerate((exif(focal=9.0), exif(focal=9.0), b"", b"")):
         take(tmp_path / "p" / "b" / f"{i}.jpg", (96, 72), segment, seed=9 + i)
     (tmp_path / "out").mkdir()
-    figures = find_features(tmp_path / "p", tmp_path / "out", Sought(96, 50), cameras=cameras)
+    figures = find_features(tmp_path / "p", tmp_path / "out", FeatureOptions(96, 50), cameras=cameras)
     assert figures["cameras"] == groups
     with opened(pycolmap, tmp_path / "out" / "database.db") as rows:
         images, cameras_found = rows.read_all_images(), rows.read_all_cameras()
@@ -141,13 +141,13 @@ def test_features_lie_where_spots_are():
     spots = [(40.0, 30.0), (110.25, 70.75), (60.5, 95.0)]
     for at in spots:
         pixels += 120 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * 3.0**2))
-    keypoints, descriptors = sift(np.rint(pixels).astype(np.uint8), Sought(count=50))
+    keypoints, descriptors = sift(np.rint(pixels).astype(np.uint8), FeatureOptions(count=50))
     for at in spots:
         assert np.linalg.norm(keypoints[:, :2] - at, axis=1).min() < 0.1
     assert descriptors.dtype == np.uint8
     assert descriptors.shape == (len(keypoints), 128)
     np.testing.assert_allclose((descriptors.astype(float) ** 2).sum(axis=1), 512**2, rtol=0.1)
-    assert len(sift(np.rint(pixels).astype(np.uint8), Sought(count=2))[0]) == 2
+    assert len(sift(np.rint(pixels).astype(np.uint8), FeatureOptions(count=2))[0]) == 2
 
 
 # ---- photographs that cannot be placed
@@ -179,11 +179,11 @@ def test_files_named_as_another_kind_come_with_how_to_convert(tmp_path):
         "v.png": "AVIF by its content",
         "o.jpg": "not an image, or a damaged one",
     }
-    (told,) = left_out({"photographs": 3, "damaged": damaged})
+    (told,) = warnings_for({"photographs": 3, "damaged": damaged})
     assert "name HEIC files so, and make JPEG files of them, such as by heif-convert" in told
     assert "such as by ffmpeg" in told
     assert told.endswith("; export the others again")
-    assert left_out({"photographs": 3, "damaged": {"a": "cut"}})[0].endswith("(cut); export them again")
+    assert warnings_for({"photographs": 3, "damaged": {"a": "cut"}})[0].endswith("(cut); export them again")
     (tmp_path / "p" / "0.jpg").unlink()
     text = refusal(gather, tmp_path / "p", tmp_path / "images", ["1.jpg", "2.jpg", "h.jpg"])
     assert "only 2 of 3 photographs can be read: h.jpg (HEIC by its content); name HEIC files so" in text
@@ -199,7 +199,7 @@ def test_video_given_as_a_folder_comes_with_what_makes_one(tmp_path, read):
     assert "no such folder" in refusal(read, tmp_path / "none.avi")
 
 
-def matched(tmp_path: Path) -> Matched:
+def matched(tmp_path: Path) -> MatchGraph:
     """Photographs of which three are in the model, and three are soft: two of its place, and one of another."""
     names = ["a", "b", "c", "blurred", "soft", "elsewhere", "plain", "alone", "pair", "other", "few", "many"]
     soft = ("blurred", "soft", "elsewhere")
@@ -209,11 +209,11 @@ def matched(tmp_path: Path) -> Matched:
         (tmp_path / f"{name}.png").rename(tmp_path / name)
     pairs = {("a", "b"): 200, ("b", "c"): 150, ("pair", "other"): 90, ("few", "a"): 18, ("many", "a"): 80}
     pairs |= {("blurred", "a"): 60, ("soft", "a"): 20}
-    return Matched(tmp_path, {name: 40 if name == "plain" else 3000 for name in names}, pairs)
+    return MatchGraph(tmp_path, {name: 40 if name == "plain" else 3000 for name in names}, pairs)
 
 
 def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
-    found = reasons(matched(tmp_path), [{"a", "b", "c"}])
+    found = explain_unplaced(matched(tmp_path), [{"a", "b", "c"}])
     assert found == {
         "blurred": "blurred",
         "soft": "few matches, at most 20, with a; it may be blurred",
@@ -225,29 +225,32 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
         "few": "few matches, at most 18, with a",
         "many": "80 matches with a, but too few on points of the model",
     }
-    assert reasons(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"] == "in another model, with other"
+    assert (
+        explain_unplaced(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"]
+        == "in another model, with other"
+    )
     figures = {"registered": 3, "not_registered": ["plain"], "reasons": found, "other_models": [2]}
-    missing, others = left_out(figures)
+    missing, others = warnings_for(figures)
     assert "1 of 4 photographs could not be placed: plain (only 40 features: blurred" in missing
     assert missing.endswith("places between, or find more features (find_features.long_side)")
     assert others == "1 smaller model, of 2 photographs, is left out: add photographs that join it to the largest"
-    missing, others = left_out({**figures, "other_models": [3, 1], "denser_tried": True})
+    missing, others = warnings_for({**figures, "other_models": [3, 1], "denser_tried": True})
     assert missing.endswith("places between")
     assert others.startswith("2 smaller models, of 3, 1 photograph, are left out: add photographs that join them")
 
 
 def test_set_without_a_model_is_described_by_its_groups(tmp_path):
     found = matched(tmp_path)
-    assert diagnosis(found) == (
+    assert diagnose(found) == (
         "they do not belong together: 2 groups of good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
         "without a good match (alone, elsewhere, few, plain, soft); take photographs of one scene, with more overlap"
     )
     joined = replace(found, pairs={**found.pairs, ("a", "pair"): 30})
-    assert diagnosis(joined).startswith("take more sharp ones"), "seven of twelve belong together"
+    assert diagnose(joined).startswith("take more sharp ones"), "seven of twelve belong together"
     weak = replace(found, pairs={("a", "b"): 20, ("b", "c"): 29})
-    assert diagnosis(weak).startswith("no two of them show enough of the same: 29 matches at most; take")
-    two = Matched(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
-    assert "the largest of 2 (a, b), and 1 without a good match (c); take" in diagnosis(two)
+    assert diagnose(weak).startswith("no two of them show enough of the same: 29 matches at most; take")
+    two = MatchGraph(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
+    assert "the largest of 2 (a, b), and 1 without a good match (c); take" in diagnose(two)
 
 
 def test_blur_is_told_from_an_equally_soft_photograph_elsewhere(tmp_path):
@@ -260,10 +263,10 @@ def test_blur_is_told_from_an_equally_soft_photograph_elsewhere(tmp_path):
         (tmp_path / name).mkdir()
     for name, pixels in pictures.items():
         cv2.imwrite(str(tmp_path / "photographs" / name), pixels)
-    find_features(tmp_path / "photographs", tmp_path / "features", Sought(700, 3000))
+    find_features(tmp_path / "photographs", tmp_path / "features", FeatureOptions(700, 3000))
     match_features(tmp_path / "features", tmp_path / "matches")
-    found = Matched.of(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
-    assert reasons(found, [{"0.png", "1.png", "2.png"}]) == {
+    found = MatchGraph.from_database(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
+    assert explain_unplaced(found, [{"0.png", "1.png", "2.png"}]) == {
         "blurred.png": "blurred",
         "elsewhere.png": "shows nothing that another photograph shows; it may be blurred",
     }
@@ -292,14 +295,14 @@ def prepared(tmp_path: Path, pictures: list[np.ndarray], **matching: object) -> 
         (tmp_path / name).mkdir()
     for number, picture in enumerate(pictures):
         cv2.imwrite(str(tmp_path / "photographs" / f"{number:02}.png"), picture)
-    find_features(tmp_path / "photographs", tmp_path / "features", Sought(240, 600))
+    find_features(tmp_path / "photographs", tmp_path / "features", FeatureOptions(240, 600))
     match_features(tmp_path / "features", tmp_path / "matches", **matching)
     return tmp_path / "matches", tmp_path / "cameras"
 
 
 @pytest.fixture
 def dense(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapping, "DENSER", Sought(240, 1000, 0.01))
+    monkeypatch.setattr(mapping, "DENSER", FeatureOptions(240, 1000, 0.01))
 
 
 @pytest.mark.parametrize(
@@ -343,8 +346,8 @@ def test_copies_among_photographs_tell_nothing_of_the_camera(tmp_path, dense):
     wide = blocks(1, 400, 180)
     matches, _ = prepared(tmp_path, [wide[:, 30 * (number // 3) :][:, :240] for number in range(9)])
     pycolmap = pytest.importorskip("pycolmap")
-    assert without_depth(pycolmap, matches / "database.db") == ""
-    assert "all the same" in without_depth(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
+    assert why_no_depth(pycolmap, matches / "database.db") == ""
+    assert "all the same" in why_no_depth(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
 
 
 def test_model_counts_only_photographs_in_no_larger_model(tmp_path):
@@ -400,11 +403,11 @@ def test_features_are_not_sought_again_for_unrelated_photographs(tmp_path, dense
 )
 def test_when_photographs_have_nothing_in_common(tmp_path, features, pairs, expected):
     """Ten photographs; however few matches a pair has."""
-    found = Matched(tmp_path, dict.fromkeys("abcdefghij", features), {(a, b): 15 for a, b in pairs.split()})
+    found = MatchGraph(tmp_path, dict.fromkeys("abcdefghij", features), {(a, b): 15 for a, b in pairs.split()})
     assert found.have_nothing_in_common() == expected
 
 
 @pytest.mark.parametrize(("names", "pairs"), [("abc", "ab"), ("abcd", "ab cd")], ids=["one is loose", "two pairs"])
 def test_few_photographs_are_related_where_two_match(tmp_path, names, pairs):
-    found = Matched(tmp_path, dict.fromkeys(names, 3000), {(a, b): 200 for a, b in pairs.split()})
+    found = MatchGraph(tmp_path, dict.fromkeys(names, 3000), {(a, b): 200 for a, b in pairs.split()})
     assert not found.have_nothing_in_common()

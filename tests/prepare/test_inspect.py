@@ -21,7 +21,7 @@ from clsplat.prepare.inspect.page import MAX_NAMES, inspection_page
 from clsplat.scene.camera import Lens
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import CameraExposure, write_exposures
-from clsplat.scene.reprojection import require_ahead
+from clsplat.scene.reprojection import require_points_in_front
 from clsplat.scene.view import load_image, load_mask
 from tests.support.colmap_writer import (
     ImageEntry,
@@ -52,7 +52,7 @@ def changed(images: list[ImageEntry], index: int, **changes: object) -> list[Ima
 
 
 def test_a_healthy_scene_is_ready(scene):
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     facts = inspection.facts
     assert (inspection.verdict, inspection.findings) == ("ready to train", [])
     assert (facts.kind, facts.registered, facts.on_disk, facts.train, facts.test) == ("COLMAP", 24, 24, 21, 3)
@@ -65,7 +65,7 @@ def test_a_healthy_scene_is_ready(scene):
 
 @pytest.mark.parametrize("name", ["fox_opencv", "fox_nerfstudio", "lego_200", "lund"])
 def test_real_sets_are_ready(name):
-    inspection = Inspection.of(data_set(name))
+    inspection = Inspection.from_folder(data_set(name))
     assert inspection.verdict == "ready to train", [finding.text for finding in inspection.findings]
     scene = read_scene(data_set(name))
     assert (inspection.facts.train, inspection.facts.test) == (len(scene.train), len(scene.test))
@@ -74,7 +74,7 @@ def test_real_sets_are_ready(name):
 
 def test_observations_and_errors_of_a_real_model():
     pycolmap = pytest.importorskip("pycolmap")
-    facts = Inspection.of(data_set("kitchen")).facts
+    facts = Inspection.from_folder(data_set("kitchen")).facts
     theirs = pycolmap.Reconstruction(data_set("kitchen") / "sparse" / "0")
     assert facts.seen == {image.name: image.num_points3D for image in theirs.images.values()}
     errors = [point.error for point in theirs.points3D.values()]
@@ -85,13 +85,13 @@ def test_observations_and_errors_of_a_real_model():
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 def test_text_and_binary_models_see_the_same_points(kind):
     folder = data_set("colmap_models/statue_OPENCV")
-    seen = Inspection.of(folder / "text" if kind == "txt" else folder).facts.seen
+    seen = Inspection.from_folder(folder / "text" if kind == "txt" else folder).facts.seen
     assert len(seen) == 9
-    assert seen == Inspection.of(folder).facts.seen
+    assert seen == Inspection.from_folder(folder).facts.seen
 
 
 def test_blender_and_nerfstudio(tiny_scene):
-    facts = Inspection.of(tiny_scene).facts
+    facts = Inspection.from_folder(tiny_scene).facts
     assert (facts.kind, facts.registered, facts.train, facts.test) == ("Blender", 10, 8, 2)
     assert facts.points.count > 0
 
@@ -102,7 +102,7 @@ def test_blurred_or_differently_exposed_photographs_are_named(scene, tmp_path):
     cv2.imwrite(str(images[9]), cv2.imread(str(images[5])) ^ 1)
     seconds = {image.name: 0.01 * (4 if i > 11 else 1) for i, image in enumerate(images)}
     write_exposures(scene / "images", {name: CameraExposure(one, 2.0, 100.0) for name, one in seconds.items()})
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     assert said(inspection, "warning").startswith(f"1 photograph is blurred ({images[3].name}): leave them out")
     notes = [finding.text for finding in inspection.findings if finding.level == "note"]
     assert notes[0].startswith(f"{images[5].name}, {images[9].name} look the same")
@@ -122,7 +122,7 @@ def test_distortion_is_the_displacement_at_the_corner():
 
 def test_a_missing_image(scene):
     (scene / "images" / "03.png").unlink()
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     assert inspection.facts.missing == ["images/03.png"]
     assert "1 of 24 registered images are missing on disk (images/03.png): put" in said(inspection, "error")
     assert inspection.verdict.startswith("cannot train: 1 of 24 registered images")
@@ -134,7 +134,7 @@ def test_a_missing_image(scene):
 def test_pipe_named_as_an_image_is_not_reported_as_missing(scene):
     (scene / "images" / "03.png").unlink()
     os.mkfifo(scene / "images" / "03.png")
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     assert inspection.facts.missing == []
     assert "decoded (03.png): cannot be read (it is a pipe); copy or export" in said(inspection, "error")
 
@@ -144,7 +144,7 @@ def test_pipe_named_as_an_image_is_not_reported_as_missing(scene):
 )
 def test_images_of_another_size(scene, size, word):
     photograph(scene / "images" / "05.png", size)
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     assert word in said(inspection, "error")
     assert f"05.png is {size[0]}x{size[1]}, its camera 64x48" in said(inspection, "error")
     with pytest.raises(DataError):  # as training would
@@ -152,14 +152,14 @@ def test_images_of_another_size(scene, size, word):
 
 
 def test_larger_images_of_the_same_shape_are_allowed(tmp_path):
-    inspection = Inspection.of(write(tmp_path, orbit(), size=(128, 96)))
+    inspection = Inspection.from_folder(write(tmp_path, orbit(), size=(128, 96)))
     assert inspection.verdict == "ready to train"
     assert "24 image files are larger than the camera" in said(inspection, "note")
 
 
 def test_an_unreadable_image(scene):
     (scene / "images" / "05.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
-    assert "1 image file cannot be decoded (05.png)" in said(Inspection.of(scene), "error")
+    assert "1 image file cannot be decoded (05.png)" in said(Inspection.from_folder(scene), "error")
 
 
 def test_a_test_view_whose_pixels_are_damaged(scene):
@@ -167,7 +167,7 @@ def test_a_test_view_whose_pixels_are_damaged(scene):
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 255  # headers and end stay as they are
     file.write_bytes(content)
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     assert "08.png" in {view.name for view in read_scene(scene).split("test")}
     assert inspection.verdict == "cannot train: 1 image file cannot be decoded (08.png)"
     done = clsplat("inspect", scene, expect=3)
@@ -179,7 +179,7 @@ def test_a_test_view_whose_pixels_are_damaged(scene):
 def test_a_pose_that_is_not_finite_in_a_text_model(tmp_path):
     model = orbit()
     model = replace(model, images=changed(model.images, 2, translation=(0.0, float("nan"), 4.0)))
-    inspection = Inspection.of(write(tmp_path, model, "txt"))
+    inspection = Inspection.from_folder(write(tmp_path, model, "txt"))
     assert "the pose of '02.png' is quaternion" in said(inspection, "error")
     assert (len(inspection.parts.views), inspection.facts.registered) == (23, 24)
 
@@ -188,7 +188,7 @@ def test_a_pose_that_is_not_finite_in_a_text_model(tmp_path):
 def test_a_truncated_file_is_one_error_and_the_rest_is_inspected(scene, stem):
     file = scene / "sparse" / "0" / f"{stem}.bin"
     file.write_bytes(file.read_bytes()[:-5])
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     assert f"{stem}.bin: byte " in said(inspection, "error")
     assert len(inspection.parts.views) == (24 if stem == "points3D" else 0)
     assert inspection.facts.on_disk == 24
@@ -198,14 +198,14 @@ def test_a_truncated_file_is_one_error_and_the_rest_is_inspected(scene, stem):
 
 def test_photographs_without_poses(tmp_path):
     photograph(tmp_path / "a.png")
-    inspection = Inspection.of(tmp_path)
+    inspection = Inspection.from_folder(tmp_path)
     assert "holds 1 photograph but no camera poses" in said(inspection, "error")
 
 
 def test_an_empty_folder(tmp_path):
-    assert "no dataset found" in said(Inspection.of(tmp_path), "error")
+    assert "no dataset found" in said(Inspection.from_folder(tmp_path), "error")
     with pytest.raises(DataError, match="no such folder"):
-        Inspection.of(tmp_path / "nowhere")
+        Inspection.from_folder(tmp_path / "nowhere")
 
 
 def test_damaged_frames_are_named_one_by_one(tiny_scene, tmp_path):
@@ -214,7 +214,7 @@ def test_damaged_frames_are_named_one_by_one(tiny_scene, tmp_path):
     table["frames"][1]["transform_matrix"][0][3] = float("nan")
     del table["frames"][2]["file_path"]
     (folder / "transforms_train.json").write_text(json.dumps(table))
-    inspection = Inspection.of(folder)
+    inspection = Inspection.from_folder(folder)
     faults = [finding.text for finding in inspection.findings if finding.level == "error"]
     assert len(faults) == 2
     assert "frames[1]: transform_matrix" in "".join(faults)
@@ -233,7 +233,7 @@ def test_trainable_is_what_the_readers_can_read(tmp_path_factory, kind: str, dat
     for _ in range(data.draw(st.integers(1, 4))):
         content[data.draw(st.integers(0, min(len(content) - 1, 400)))] = data.draw(st.integers(0, 255))
     file.write_bytes(content)
-    inspection = Inspection.of(path)
+    inspection = Inspection.from_folder(path)
     json.dumps(inspection.data(), allow_nan=False)
     inspection_page(inspection)
     try:
@@ -241,7 +241,7 @@ def test_trainable_is_what_the_readers_can_read(tmp_path_factory, kind: str, dat
         for view in scene.views:
             load_image(view)
         if scene.points is not None:
-            require_ahead(scene.points, scene)
+            require_points_in_front(scene.points, scene)
     except DataError:
         assert not inspection.trainable
     else:
@@ -253,20 +253,20 @@ def test_trainable_is_what_the_readers_can_read(tmp_path_factory, kind: str, dat
 
 def test_an_unregistered_image(scene):
     photograph(scene / "images" / "other.png")
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     assert inspection.facts.unregistered == ["images/other.png"]
     assert inspection.verdict == "ready to train"
     assert "1 of 25 images on disk have no pose" in said(inspection, "note")
     for i in range(5):
         photograph(scene / "images" / f"other{i}.png")
-    assert Inspection.of(scene).verdict.startswith("trains, but 6 of 30 images on disk have no pose")
+    assert Inspection.from_folder(scene).verdict.startswith("trains, but 6 of 30 images on disk have no pose")
 
 
 def test_a_stray_camera(tmp_path):
     model = orbit()
     model = replace(model, images=changed(model.images, 4, translation=(0.0, 0.0, 4000.0)))
-    inspection = Inspection.of(write(tmp_path, model))
-    assert inspection.facts.strayed == ["04.png"]
+    inspection = Inspection.from_folder(write(tmp_path, model))
+    assert inspection.facts.outlier_cameras == ["04.png"]
     assert "1 camera is far away from all others (04.png)" in said(inspection, "warning")
     assert inspection.verdict.startswith("trains, but 1 camera is far away")
     assert "far away from all others" in inspection_page(inspection)
@@ -276,7 +276,7 @@ def test_two_models(scene):
     model = orbit()
     write_model(scene / "sparse" / "1", replace(model, images=model.images[:6]))
     write_model(scene / "sparse" / "2", replace(model, images=model.images[:1]))
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     assert inspection.facts.submodels == {"sparse/0": 24, "sparse/1": 6, "sparse/2": 1}
     assert "COLMAP made 3 models and only sparse/0 (24 images) is used" in said(inspection, "warning")
 
@@ -285,7 +285,7 @@ def test_names_that_differ_in_case_and_names_in_several_folders(tmp_path):
     model = orbit()
     images = changed(model.images, 1, name="A.png")
     images = changed(changed(changed(images, 2, name="a.png"), 3, name="left/x.png"), 4, name="right/x.png")
-    inspection = Inspection.of(write(tmp_path, replace(model, images=images)))
+    inspection = Inspection.from_folder(write(tmp_path, replace(model, images=images)))
     assert "A.png and a.png differ only in upper and lower case" in said(inspection, "warning")
     assert "1 file name is in several folders" in said(inspection, "note")
     assert inspection.facts.folders == 3
@@ -294,7 +294,7 @@ def test_names_that_differ_in_case_and_names_in_several_folders(tmp_path):
 def test_equal_poses(tmp_path):
     model = orbit()
     images = changed(model.images, 1, quaternion=model.images[0].quaternion)
-    inspection = Inspection.of(write(tmp_path, replace(model, images=images)))
+    inspection = Inspection.from_folder(write(tmp_path, replace(model, images=images)))
     assert inspection.facts.same_pose == [["00.png", "01.png"]]
     assert "00.png, 01.png have exactly the same pose" in said(inspection, "note")
 
@@ -303,18 +303,18 @@ def test_all_cameras_in_one_place(tmp_path):
     model = orbit()
     images = [replace(model.images[0], name=image.name) for image in model.images]
     assert "all cameras are at the same place" in said(
-        Inspection.of(write(tmp_path, replace(model, images=images))), "warning"
+        Inspection.from_folder(write(tmp_path, replace(model, images=images))), "warning"
     )
 
 
 def test_points_behind_all_cameras(tmp_path):
     model = orbit()
     flipped = [replace(image, translation=(0.0, 0.0, -4.0)) for image in model.images]  # all look outwards
-    inspection = Inspection.of(write(tmp_path, replace(model, images=flipped)))
+    inspection = Inspection.from_folder(write(tmp_path, replace(model, images=flipped)))
     assert inspection.facts.points.behind == 1.0
     assert "all 200 points lie behind all training cameras" in said(inspection, "error")
     moved = replace(flipped[4], translation=(0.0, 0.0, 0.0))  # stands in the middle and sees some
-    inspection = Inspection.of(write(tmp_path, replace(model, images=[*flipped[:4], moved, *flipped[5:]])))
+    inspection = Inspection.from_folder(write(tmp_path, replace(model, images=[*flipped[:4], moved, *flipped[5:]])))
     assert 0.1 < inspection.facts.points.behind < 0.9
     assert "% of the points lie behind all cameras" in said(inspection, "warning")
 
@@ -322,14 +322,14 @@ def test_points_behind_all_cameras(tmp_path):
 def test_points_beside_all_images(tmp_path):
     model = orbit()
     above = [replace(point, position=(0, 0, 4 + i % 7)) for i, point in enumerate(model.points)]
-    inspection = Inspection.of(write(tmp_path, replace(model, points=above)))
+    inspection = Inspection.from_folder(write(tmp_path, replace(model, points=above)))
     assert "only 0 % of the points lie in the image of two views" in said(inspection, "warning")
 
 
 def test_points_that_are_not_finite_or_very_far(tmp_path):
     model = orbit()
     points = [*model.points, PointEntry((float("nan"), 0, 0)), PointEntry((1e5, 0, 0)), PointEntry((0, 1e300, 0))]
-    inspection = Inspection.of(write(tmp_path, replace(model, points=points)))
+    inspection = Inspection.from_folder(write(tmp_path, replace(model, points=points)))
     assert (inspection.facts.points.not_finite, inspection.facts.points.distant) == (2, 1)
     assert "2 points are not finite" in said(inspection, "warning")
     assert "1 point is more than 100 times" in said(inspection, "note")
@@ -345,7 +345,7 @@ def test_views_that_see_few_points(scene):
         file.unlink()
     write_model(scene / "sparse" / "0", orbit(), "txt")
     (scene / "sparse" / "0" / "images.txt").write_text("\n".join(lines) + "\n")
-    inspection = Inspection.of(scene)
+    inspection = Inspection.from_folder(scene)
     assert inspection.facts.seen == {f"{i:02}.png": 5 if i == 3 else 50 for i in range(COUNT)}
     assert "fewer than 30 points are seen by 1 view (03.png: 5)" in said(inspection, "warning")
 
@@ -353,7 +353,7 @@ def test_views_that_see_few_points(scene):
 def test_imprecise_poses(scene):
     rows = [struct.pack("<Q3d3BdQ", i, 0.1, 0.1, i / 200, 9, 9, 9, 2 + i / 100, 0) for i in range(200)]
     (scene / "sparse" / "0" / "points3D.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
-    assert "the mean reprojection error of the points is 3.00 px" in said(Inspection.of(scene), "warning")
+    assert "the mean reprojection error of the points is 3.00 px" in said(Inspection.from_folder(scene), "warning")
 
 
 def test_a_cut_image_and_one_on_its_side(tmp_path):
@@ -362,7 +362,7 @@ def test_a_cut_image_and_one_on_its_side(tmp_path):
     whole = (path / "images" / "05.jpg").read_bytes()
     (path / "images" / "05.jpg").write_bytes(whole[: len(whole) // 2])
     (path / "images" / "06.jpg").write_bytes(with_exif(whole, ">", 6))
-    inspection = Inspection.of(path)
+    inspection = Inspection.from_folder(path)
     assert "the end is missing from 1 image file (05.jpg): copy" in said(inspection, "error")
     assert "1 photograph is rotated by the EXIF data" in said(inspection, "note")
 
@@ -372,27 +372,27 @@ def test_images_on_their_side_that_the_reader_turns(tmp_path):
     path = write(tmp_path, replace(model, images=[replace(i, name=i.name[:2] + ".jpg") for i in model.images]))
     photograph(path / "images" / "06.jpg", SIZE[::-1])
     file = path / "images" / "06.jpg"
-    assert "width and height are swapped" in said(Inspection.of(path), "error")
+    assert "width and height are swapped" in said(Inspection.from_folder(path), "error")
     file.write_bytes(with_exif(file.read_bytes(), "<", 6))
-    assert Inspection.of(path).findings == []
+    assert Inspection.from_folder(path).findings == []
     assert load_image(read_scene(path).views[6]).shape == (48, 64, 3)
 
 
 def test_masks(scene):
     (scene / "masks").mkdir()
     photograph(scene / "masks" / "00.png")
-    assert (Inspection.of(scene).facts.photos.masks, Inspection.of(scene).findings) == (1, [])
+    assert (Inspection.from_folder(scene).facts.photos.masks, Inspection.from_folder(scene).findings) == (1, [])
     photograph(scene / "masks" / "01.png", (32, 20))
-    assert "mask of 01.png is 32x20, its camera 64x48" in said(Inspection.of(scene), "error")
+    assert "mask of 01.png is 32x20, its camera 64x48" in said(Inspection.from_folder(scene), "error")
     with pytest.raises(DataError):
         load_mask(read_scene(scene).views[1])
     (scene / "masks" / "01.png").write_bytes(b"no image")
-    assert "1 image file cannot be decoded (mask of 01.png)" in said(Inspection.of(scene), "error")
+    assert "1 image file cannot be decoded (mask of 01.png)" in said(Inspection.from_folder(scene), "error")
 
 
 def test_few_views(tmp_path):
     model = orbit()
-    inspection = Inspection.of(write(tmp_path, replace(model, images=model.images[:5])))
+    inspection = Inspection.from_folder(write(tmp_path, replace(model, images=model.images[:5])))
     assert inspection.verdict == "trains, but there are only 4 training views"
 
 
@@ -427,7 +427,7 @@ def test_markup_in_names_is_shown_as_text(tmp_path):
     name = f"</script>{HOSTILE}.png"
     path = write_scene(tmp_path / HOSTILE, replace(model, images=changed(model.images, 3, name=name)))
     photograph(path / "images" / f"{HOSTILE}.png")
-    inspection = Inspection.of(path)
+    inspection = Inspection.from_folder(path)
     page = Page(inspection_page(inspection))
     assert page.elements["script"] == 0
     assert f"images/{HOSTILE}.png" in page.text, "in the list of images without a pose"
@@ -440,7 +440,7 @@ def test_long_lists_of_names_are_cut(tmp_path):
     path = write(tmp_path, orbit())
     for i in range(MAX_NAMES + 5):
         photograph(path / "images" / f"more{i:03}.png", (4, 4))
-    text = Page(inspection_page(Inspection.of(path))).text
+    text = Page(inspection_page(Inspection.from_folder(path))).text
     assert f"on disk but without a pose ({MAX_NAMES + 5})" in text
     assert f"more{MAX_NAMES - 1:03}.png" in text
     assert f"more{MAX_NAMES:03}.png" not in text
@@ -457,7 +457,9 @@ def test_a_model_is_no_dataset(tmp_path, rng):
 
 
 def test_a_run_warns_of_few_views_as_inspect_does(tiny_scene, tmp_path, caplog):
-    warned = [finding.text for finding in Inspection.of(tiny_scene).findings if "training views" in finding.fault]
+    warned = [
+        finding.text for finding in Inspection.from_folder(tiny_scene).findings if "training views" in finding.fault
+    ]
     caplog.clear()
     train(tiny_scene, tmp_path / "run", "optimize.steps=2", "optimize.during=[]")
     assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == warned

@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import DataError
 from clsplat.prepare.gather import list_photographs
-from clsplat.prepare.inspect.facts import looks
+from clsplat.prepare.inspect.facts import compare_photos
 from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene.images import CameraExposure
 from tests.support.orbit_scene import photograph, said
@@ -24,7 +24,7 @@ def test_inspected_folder_is_named_as_a_shell_reads_it(tmp_path):
     for name in ("one/a.png", "one/b.png", "two/c.png"):
         (scene / name).parent.mkdir(parents=True, exist_ok=True)
         photograph(scene / name)
-    assert said(Inspection.of(scene), "error") == (
+    assert said(Inspection.from_folder(scene), "error") == (
         f"{scene} holds 3 photographs but no camera poses: `clsplat run photos --scene '{scene}'` finds the cameras"
     )
 
@@ -35,7 +35,7 @@ def test_files_left_out_by_preparation_are_reported_alike(tmp_path, caplog):
     for name in ("d.heic", "e.dng", "f.cr2"):
         (tmp_path / name).write_bytes(b"raw")
     (tmp_path / "g.jpg").write_text("text")
-    inspection = Inspection.of(tmp_path)
+    inspection = Inspection.from_folder(tmp_path)
     assert not caplog.records, "findings have it"
     list_photographs(tmp_path)
     warned = [record.getMessage().removeprefix(f"{tmp_path}: ") for record in caplog.records]
@@ -48,7 +48,7 @@ def test_files_left_out_by_preparation_are_reported_alike(tmp_path, caplog):
 def test_too_few_are_refused_as_a_preparation_refuses_them(tmp_path, names):
     for name in names:
         photograph(tmp_path / name) if name.endswith("png") else (tmp_path / name).write_bytes(b"raw")
-    inspection = Inspection.of(tmp_path)
+    inspection = Inspection.from_folder(tmp_path)
     with pytest.raises(DataError) as refused:
         list_photographs(tmp_path)
     assert said(inspection, "error").endswith(str(refused.value).removeprefix(str(tmp_path)))
@@ -59,7 +59,7 @@ def test_three_of_which_one_is_damaged_are_too_few(tmp_path):
     for name in ("a.png", "b.png"):
         photograph(tmp_path / name)
     (tmp_path / "c.jpg").write_text("text")
-    inspection = Inspection.of(tmp_path)
+    inspection = Inspection.from_folder(tmp_path)
     assert said(inspection, "error").endswith("only 2 of 3 photographs can be read; export them again")
     assert said(inspection, "warning").startswith("1 of 3 photographs cannot be read: c.jpg")
 
@@ -75,10 +75,10 @@ def shown(folder: Path, factors: list[float]) -> dict[str, Path]:
 
 def test_dark_photograph_is_not_blurred_but_a_dark_blurred_is(tmp_path):
     files = shown(tmp_path, [1, 0.3, 1, 0.3, 1, 0.3])
-    assert looks(files).blurred == []
+    assert compare_photos(files).blurred == []
     pixels = cv2.imread(str(files["3.png"]))
     cv2.imwrite(str(files["3.png"]), cv2.GaussianBlur(pixels, (0, 0), 1))
-    assert looks(files).blurred == ["3.png"]
+    assert compare_photos(files).blurred == ["3.png"]
 
 
 def test_close_photograph_of_a_thing_on_black_is_not_blurred(tmp_path):
@@ -87,20 +87,22 @@ def test_close_photograph_of_a_thing_on_black_is_not_blurred(tmp_path):
         pixels = cv2.imread(str(files[name]))
         pixels[:, 10:] = 0
         cv2.imwrite(str(files[name]), pixels)
-    assert looks(files).blurred == []
+    assert compare_photos(files).blurred == []
 
 
 def test_step_in_brightness_is_a_hint_without_exif_exposure(tmp_path):
     files = shown(tmp_path, [1, 0.9, 0.4, 0.6, 0.7, 1])
-    ((a, b, ratio),) = looks(files).steps
+    ((a, b, ratio),) = compare_photos(files).steps
     assert (a, b, ratio) == ("1.png", "2.png", pytest.approx(0.4 / 0.9, abs=0.02))
-    (note,) = texts(Inspection.of(tmp_path), "note")
+    (note,) = texts(Inspection.from_folder(tmp_path), "note")
     assert note.startswith("1 photograph is more than twice as bright or dark as the one before (1.png to 2.png: 0.45")
     told = CameraExposure(0.01, 2.0, 100.0)
-    found = looks(files, dict.fromkeys(files, told) | {"2.png": replace(told, seconds=0.001)})
+    found = compare_photos(files, dict.fromkeys(files, told) | {"2.png": replace(told, seconds=0.001)})
     assert not found.steps
     assert [(a, b) for a, b, _ in found.jumps] == [("1.png", "2.png"), ("2.png", "3.png")]
-    assert [(a, b) for a, b, _ in looks(files, {"1.png": told}).steps] == [("1.png", "2.png")], "one alone tells none"
+    assert [(a, b) for a, b, _ in compare_photos(files, {"1.png": told}).steps] == [("1.png", "2.png")], (
+        "one alone tells none"
+    )
 
 
 def test_larger_thing_on_black_is_no_step_in_brightness(tmp_path):
@@ -109,4 +111,4 @@ def test_larger_thing_on_black_is_no_step_in_brightness(tmp_path):
         pixels = cv2.imread(str(files[name]))
         pixels[:, wide:] = 0
         cv2.imwrite(str(files[name]), pixels)
-    assert looks(files).steps == []
+    assert compare_photos(files).steps == []

@@ -11,7 +11,7 @@ import pytest
 
 from clsplat.core.errors import DataError
 from clsplat.prepare import mapping
-from clsplat.prepare.features import Sought, find_features
+from clsplat.prepare.features import FeatureOptions, find_features
 from clsplat.prepare.mapping import map_cameras
 from clsplat.prepare.matching import match_features, match_pairs, more_pairs
 from clsplat.scene.detect import read_scene
@@ -37,7 +37,7 @@ def matches(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number in (7, 8):
         cv2.imwrite(str(folder / "photographs" / f"{number}.jpg"), blocks(number, width, height))
     shutil.copy(walk[3], folder / "photographs" / LAST)
-    find_features(folder / "photographs", folder / "features", Sought(480, 1200))
+    find_features(folder / "photographs", folder / "features", FeatureOptions(480, 1200))
     match_features(folder / "features", folder / "matches", "sequential", 2)
     return folder / "matches"
 
@@ -86,7 +86,7 @@ def test_failing_expansion_loses_neither_model_nor_features(matches, tmp_path, m
 
     caplog.set_level("INFO")
     monkeypatch.setattr(mapping, step, fail)
-    monkeypatch.setattr(mapping, "DENSER", Sought(480, 1400))
+    monkeypatch.setattr(mapping, "DENSER", FeatureOptions(480, 1400))
     figures = map_cameras(matches, tmp_path, attempts=3 if step == "more_pairs" else 4)
     assert figures["registered"] >= 7
     assert f"the attempt failed ({error}); it is passed over" in caplog.text

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clsplat.prepare.database import opened
-from clsplat.prepare.rotation_only import without_depth
+from clsplat.prepare.rotation_only import why_no_depth
 
 WIDTH, HEIGHT, FOCAL = 1000, 750, 800.0
 
@@ -42,7 +42,7 @@ def matches_of(folder: Path, cameras: Sequence[tuple[float, float]]) -> Path:
 
 
 def told(folder: Path, cameras: Sequence[tuple[float, float]]) -> str:
-    return without_depth(pytest.importorskip("pycolmap"), matches_of(folder, cameras))
+    return why_no_depth(pytest.importorskip("pycolmap"), matches_of(folder, cameras))
 
 
 def test_a_camera_that_turns_on_one_spot_tells_no_depth(tmp_path):

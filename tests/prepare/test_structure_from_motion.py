@@ -19,10 +19,10 @@ from clsplat.core.progress import listening
 from clsplat.prepare import features as features_tool
 from clsplat.prepare import mapping as mapping_tool
 from clsplat.prepare import undistort as undistort_tool
-from clsplat.prepare.features import Sought, find_features
+from clsplat.prepare.features import FeatureOptions, find_features
 from clsplat.prepare.gather import list_photographs
-from clsplat.prepare.mapping import map_cameras, with_pairs
-from clsplat.prepare.matching import Pairing, alike, match_features
+from clsplat.prepare.mapping import map_cameras, triangulate_pairs
+from clsplat.prepare.matching import Pairing, match_features, similar_pairs
 from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.camera import Camera, Lens
 from clsplat.scene.colmap_writer import write_model
@@ -40,7 +40,7 @@ ROOT = Path(__file__).parents[2]
 def place(photos: Path, out: Path, **matching: object) -> Path:
     for name in ("features", "matches", "cameras"):
         (out / name).mkdir(parents=True)
-    find_features(photos, out / "features", Sought(480, 2048))
+    find_features(photos, out / "features", FeatureOptions(480, 2048))
     match_features(out / "features", out / "matches", **matching)
     map_cameras(out / "matches", out / "cameras")
     return out / "cameras"
@@ -94,7 +94,7 @@ def test_the_same_photographs_give_the_same_cameras(photos, placed, tmp_path):
 
 def test_points_that_two_photographs_show(placed, tmp_path):
     """The cameras stay, and the points of three photographs; those of pairs come with them."""
-    map_cameras(placed.with_name("matches"), tmp_path, fewest=2)
+    map_cameras(placed.with_name("matches"), tmp_path, min_track_length=2)
     model, before = read_model(tmp_path / "sparse" / "0"), read_model(placed / "sparse" / "0")
     assert not list(tmp_path.glob(".*"))
     for number, image in before.images.items():
@@ -107,7 +107,7 @@ def test_points_that_two_photographs_show(placed, tmp_path):
     assert (views == 2).sum() > 0.5 * known
     assert errors[views == 2].max() <= 1.0
     once, again = (
-        with_pairs(read_model(placed / "sparse" / "0"), placed.with_name("matches") / "database.db", tmp_path)
+        triangulate_pairs(read_model(placed / "sparse" / "0"), placed.with_name("matches") / "database.db", tmp_path)
         for _ in range(2)
     )
     points = [{number: point.xyz.tobytes() for number, point in found.points3D.items()} for found in (once, again)]
@@ -135,10 +135,10 @@ def test_photographs_that_show_nothing(tmp_path):
 @pytest.mark.parametrize(("few", "attempt"), [(40, "smaller angles and fewer matches"), (16, "denser features")])
 def test_another_attempt_places_what_the_first_does_not(photos, tmp_path, monkeypatch, few, attempt):
     """With so few features of each photograph."""
-    monkeypatch.setattr(mapping_tool, "DENSER", Sought(480, 1500))
+    monkeypatch.setattr(mapping_tool, "DENSER", FeatureOptions(480, 1500))
     for name in ("features", "matches", "cameras"):
         (tmp_path / name).mkdir()
-    find_features(photos, tmp_path / "features", Sought(480, few))
+    find_features(photos, tmp_path / "features", FeatureOptions(480, few))
     match_features(tmp_path / "features", tmp_path / "matches")
     figures = map_cameras(tmp_path / "matches", tmp_path / "cameras")
     assert figures["attempt"] == attempt
@@ -148,10 +148,10 @@ def test_another_attempt_places_what_the_first_does_not(photos, tmp_path, monkey
 
 
 def test_further_attempts_match_as_the_first_and_can_be_off(photos, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(mapping_tool, "DENSER", Sought(320, 300))
+    monkeypatch.setattr(mapping_tool, "DENSER", FeatureOptions(320, 300))
     for name in ("features", "matches", "cameras", "once"):
         (tmp_path / name).mkdir()
-    find_features(photos, tmp_path / "features", Sought(240, 16))
+    find_features(photos, tmp_path / "features", FeatureOptions(240, 16))
     match_features(tmp_path / "features", tmp_path / "matches", "sequential", 2)
     caplog.set_level("INFO")
     with pytest.raises(DataError, match="could not be placed"):
@@ -192,7 +192,7 @@ def test_features_are_found_once_each_also_after_a_kill(few, tmp_path, monkeypat
     pytest.importorskip("pycolmap")
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
-    find_features(few, tmp_path / "whole", Sought(320, 500))
+    find_features(few, tmp_path / "whole", FeatureOptions(320, 500))
     killed = f"""
 import os, signal
 from pathlib import Path
@@ -202,12 +202,12 @@ def counted(*a):
     calls.append(a)
     return find(*a) if len(calls) < 3 else os.kill(os.getpid(), signal.SIGKILL)
 features.sift = counted
-features.find_features(Path({str(few)!r}), Path({str(tmp_path / "half")!r}), features.Sought(320, 500))
+features.find_features(Path({str(few)!r}), Path({str(tmp_path / "half")!r}), features.FeatureOptions(320, 500))
 """
     assert subprocess.run([sys.executable, "-c", killed], cwd=ROOT).returncode == -signal.SIGKILL
     sift, sizes = features_tool.sift, []
     monkeypatch.setattr(features_tool, "sift", lambda *a: (sizes.append(a[0].shape), sift(*a))[1])
-    find_features(few, tmp_path / "half", Sought(320, 500))
+    find_features(few, tmp_path / "half", FeatureOptions(320, 500))
     assert len(sizes) == 3, "two of five were kept"
     assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
     for file in sorted((tmp_path / "whole" / "images").iterdir()):
@@ -218,7 +218,7 @@ def test_a_database_without_all_photographs_starts_again(few, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
-    find_features(few, tmp_path / "whole", Sought(320, 500))
+    find_features(few, tmp_path / "whole", FeatureOptions(320, 500))
     first = sorted(path.name for path in few.iterdir())[:2]
     (tmp_path / "half" / "images").mkdir()
     for name in first:
@@ -226,7 +226,7 @@ def test_a_database_without_all_photographs_starts_again(few, tmp_path):
     database = str(tmp_path / "half" / "database.db")
     pycolmap.Database.open(database).close()
     pycolmap.import_images(database, str(few), image_names=first)
-    find_features(few, tmp_path / "half", Sought(320, 500))
+    find_features(few, tmp_path / "half", FeatureOptions(320, 500))
     assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
 
 
@@ -311,12 +311,12 @@ def test_features_are_counted_while_they_are_found(few, tmp_path):
             heard.append(done)
 
     with listening(hear):
-        find_features(few, tmp_path, Sought(320, 500))
+        find_features(few, tmp_path, FeatureOptions(320, 500))
     assert heard == [0, 1, 2, 3, 4, 5]
 
 
-@pytest.mark.parametrize("blank", ["crop", "mask"])
-def test_undistortion_goes_on(tmp_path, monkeypatch, blank):
+@pytest.mark.parametrize("undefined", ["crop", "mask"])
+def test_undistortion_goes_on(tmp_path, monkeypatch, undefined):
     source, written = shutil.copytree(data_set("fox_opencv"), tmp_path / "source"), []
     write = undistort_tool.write_image
 
@@ -327,24 +327,24 @@ def test_undistortion_goes_on(tmp_path, monkeypatch, blank):
             written.append(path.name)
         write(path, pixels)
 
-    undistort_scene(source, tmp_path / "whole", 120, blank)
+    undistort_scene(source, tmp_path / "whole", 120, undefined)
     monkeypatch.setattr(undistort_tool, "write_image", counted)
     with pytest.raises(KeyboardInterrupt):
-        undistort_scene(source, tmp_path / "half", 120, blank)
+        undistort_scene(source, tmp_path / "half", 120, undefined)
     first = list(written)
     written.clear()
     monkeypatch.setattr(undistort_tool, "write_image", lambda path, image: (written.append(path), write(path, image)))
-    undistort_scene(source, tmp_path / "half", 120, blank)
+    undistort_scene(source, tmp_path / "half", 120, undefined)
     again = [path.name for path in written if path.parent.name == "images"]
     assert sorted(first + again) == sorted(path.name for path in (tmp_path / "half" / "images").iterdir())
     assert contents(tmp_path / "half") == contents(tmp_path / "whole")
     changed = sorted((source / "images").iterdir())[0]
     shutil.copy(sorted((source / "images").iterdir())[1], changed)
     written.clear()
-    undistort_scene(source, tmp_path / "half", 120, blank)
+    undistort_scene(source, tmp_path / "half", 120, undefined)
     assert {path.stem for path in written} == {changed.stem}
     written.clear()
-    undistort_scene(source, tmp_path / "half", 90, blank)
+    undistort_scene(source, tmp_path / "half", 90, undefined)
     assert len([path for path in written if path.parent.name == "images"]) == 50
 
 
@@ -394,9 +394,9 @@ def test_alike_photographs(rng):
     """Each shares half of its features with the next one, in a ring."""
     halves = rng.random((6, 300, 128), dtype=np.float32)
     tables = [np.concatenate([halves[i], halves[(i + 1) % 6]]) for i in range(6)]
-    assert alike(tables, 2) == [(0, 1), (0, 5), (1, 2), (2, 3), (3, 4), (4, 5)]
-    assert alike([*tables[:2], np.empty((0, 128), np.float32)], 1)[0] == (0, 1)
-    assert alike([np.empty((0, 128), np.float32)] * 3, 1) == [(0, 1), (0, 2)], "of plain ones, the first"
+    assert similar_pairs(tables, 2) == [(0, 1), (0, 5), (1, 2), (2, 3), (3, 4), (4, 5)]
+    assert similar_pairs([*tables[:2], np.empty((0, 128), np.float32)], 1)[0] == (0, 1)
+    assert similar_pairs([np.empty((0, 128), np.float32)] * 3, 1) == [(0, 1), (0, 2)], "of plain ones, the first"
 
 
 # ---- the scene written
@@ -427,20 +427,20 @@ BENT = [
 ]
 
 
-@pytest.mark.parametrize(("lens", "blank"), list(zip(BENT, cycle(("crop", "mask")), strict=False)))
-def test_undistorted_scene(tmp_path, lens, blank):
-    """A pattern that depends on the ray is seen along the pinhole's own rays; what is blank is masked."""
+@pytest.mark.parametrize(("lens", "undefined"), list(zip(BENT, cycle(("crop", "mask")), strict=False)))
+def test_undistorted_scene(tmp_path, lens, undefined):
+    """A pattern that depends on the ray is seen along the pinhole's own rays; what is undefined is masked."""
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     (tmp_path / "images").mkdir()
     photograph = np.nan_to_num(pattern(*lens.undistort(columns, rows)))
     cv2.imwrite(str(tmp_path / "images" / "a.png"), np.rint(photograph).astype(np.uint8))
     entry = CameraEntry(1, lens.model, lens.width, lens.height, lens.params)
     write_test_model(tmp_path / "sparse" / "0", ColmapModel([entry], [ImageEntry("a.png")], [PointEntry((0, 0, 3))]))
-    assert undistort_scene(tmp_path, tmp_path / "out", blank=blank) == 1
+    assert undistort_scene(tmp_path, tmp_path / "out", undefined_pixels=undefined) == 1
     (view,) = read_scene(tmp_path / "out", 0).views
     assert view.lens is None
     shown, mask = load_image(view), load_mask(view)
-    if blank == "crop":
+    if undefined == "crop":
         assert mask is None
         mask = np.ones(shown.shape[:2], bool)
     else:

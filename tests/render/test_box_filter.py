@@ -17,7 +17,7 @@ from clsplat.formats.table import read, write
 from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.gaussians.validate import examine
 from clsplat.pipeline.loading import load as load_pipeline
-from clsplat.scene.viewpoint import Stand
+from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
 from tests.support.models import splats
@@ -106,7 +106,7 @@ def test_check_and_the_page_of_the_viewer_name_it(rng, tmp_path):
     header = pack(boxed(rng)).header
     assert (header["variance"], header["compensate"], header["box"]) == (1 / 12, 1.0, 1)
     assert "box" not in pack(replace(boxed(rng), rendering=Rendering())).header
-    stand = Stand.of(boxed(rng).means, (), None)
+    stand = Viewpoint.from_points(boxed(rng).means, (), None)
     text = Page("a", {"a": pack(boxed(rng))}, stand).text()
     assert "the pixel&#39;s box, drawn here as a blur of 0.0833333 px², keeps the energy" in text
 

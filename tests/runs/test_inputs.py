@@ -20,7 +20,7 @@ from clsplat.pipeline.loading import load
 from clsplat.runs import opening
 from clsplat.scene import identity as decoding
 from clsplat.scene.detect import read_scene
-from clsplat.scene.identity import Identity, decode_all, require_whole
+from clsplat.scene.identity import Identity, decode_all, require_decodable
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View
 from tests.support.colmap_writer import tiny_model
@@ -109,7 +109,7 @@ def test_masks_are_decoded_too(tmp_path):
     (folder / "masks").mkdir()
     (folder / "masks" / "03.png").write_bytes(b"nothing")
     with pytest.raises(DataError, match=r"1 of 25 image files .*masks/03\.png"):
-        require_whole(folder, decode_all(views(folder)))
+        require_decodable(folder, decode_all(views(folder)))
 
 
 def test_jpeg_without_its_end_is_damaged_whatever_decoders_say(tmp_path, monkeypatch):
@@ -231,7 +231,7 @@ def test_the_log_gets_a_line_now_and_then(scene, monkeypatch, caplog):
 
 def identity(scene: Scene | Path) -> Identity:
     opened = read_scene(scene) if isinstance(scene, Path) else scene
-    return Identity.of(opened, decode_all(opened.views))
+    return Identity.from_scene(opened, decode_all(opened.views))
 
 
 def edited(path: Path, change: Callable[[dict], None]) -> None:

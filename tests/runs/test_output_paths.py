@@ -23,7 +23,7 @@ READ = {  # text that is read, or compared, and never the name of something that
     "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
     "SceneSettings.masks", "InverseDepth.folder",
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",
-    "Video.path", "Video.size", "Choice.names", "Choice.file", "Execution.engine",
+    "Video.path", "Video.size", "ViewSelection.names", "ViewSelection.file", "Execution.engine",
     "Execution.devices", "Tls.ca", "Tls.cert", "Tls.key",
 }  # fmt: skip
 NAMES = {"PipelineFile.name", "MatrixFile.name", "Execution.store"}  # of folders

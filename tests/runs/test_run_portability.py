@@ -9,7 +9,7 @@ import pytest
 import clsplat
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.gaussians.model import load
-from clsplat.prepare.gather import photographs_text
+from clsplat.prepare.gather import summarize_placement
 from clsplat.runs.model_file import ModelSource, photographs_of, run_of
 from clsplat.runs.status import summary
 from clsplat.sweeps.experiment import Job
@@ -103,10 +103,10 @@ def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
 
 
 def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):
-    assert photographs_text(FOUND) == "32 of 33 photographs placed, 1.27 px; left out: IMG_0034.jpg"
-    assert photographs_text({}) == photographs_text({"map_cameras": {"registered": "x"}}) == ""
+    assert summarize_placement(FOUND) == "32 of 33 photographs placed, 1.27 px; left out: IMG_0034.jpg"
+    assert summarize_placement({}) == summarize_placement({"map_cameras": {"registered": "x"}}) == ""
     many = {"map_cameras": {**FOUND["map_cameras"], "not_registered": [f"{i}.jpg" for i in range(10)]}}
-    assert photographs_text(many).endswith("7.jpg, and 2 more")
+    assert summarize_placement(many).endswith("7.jpg, and 2 more")
     metrics = json.loads((done / "metrics.json").read_text())
     (tmp_path / "metrics.json").write_text(
         json.dumps({**metrics, "preparation": FOUND | {"undistort": {"seconds": 7.2}}})

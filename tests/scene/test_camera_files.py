@@ -21,9 +21,9 @@ from clsplat.scene.camera import MODELS, Lens
 from clsplat.scene.camera_files import DISTORTION
 from clsplat.scene.colmap import read_cameras, read_images
 from clsplat.scene.images import CameraExposure, write_exposures
-from clsplat.scene.reprojection import with_cameras
+from clsplat.scene.reprojection import replace_cameras
 from clsplat.scene.scene import PointCloud, Tracks, make_scene
-from clsplat.scene.view import View, camera_exposures
+from clsplat.scene.view import View, load_exposures
 from clsplat.stages.export import Cameras
 from tests.support.commands import clsplat as command
 from tests.support.data_sets import data_set
@@ -64,7 +64,7 @@ def scene_of(rng, tmp_path):
             file = tmp_path / "photographs" / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(f"photograph {i}".encode())
-            camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+            camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
             views.append(View(name, camera, pose, file, lens=distortion))
         points = PointCloud(rng.normal(size=(7, 3)).astype(np.float32), np.float32(rng.integers(0, 256, (7, 3)) / 255))
         return make_scene(tmp_path / "photographs", views, {0, 3}, points)
@@ -143,7 +143,7 @@ def test_cameras_json_holds_the_undistorted_cameras(model, scene_of, tmp_path, c
     with caplog.at_level(logging.WARNING, "clsplat"):
         clsplat.write_cameras(scene, tmp_path, "inria")
     assert "the middle of the image for the principal point, which is up to" in caplog.text
-    found = camera_files.read(tmp_path / "cameras.json")
+    found = camera_files.read_inria(tmp_path / "cameras.json")
     for a, b in zip(scene.views, found, strict=True):
         assert (b.name, b.camera) == (a.name, a.camera)
         np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-14)
@@ -178,7 +178,7 @@ def test_a_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
     file = tmp_path / "cameras.json"
     file.write_text(json.dumps(change(json.loads(file.read_text()))))
     with pytest.raises(DataError, match=message):
-        camera_files.read(file)
+        camera_files.read_inria(file)
 
 
 @pytest.mark.parametrize(("form", "lines"), [("colmap", 1), ("inria", 1), ("nerfstudio", 0)])
@@ -234,7 +234,7 @@ def test_colmap_keeps_which_points_photographs_show_and_where(model, scene_of, t
     np.testing.assert_array_equal(found.positions, scene.tracks.positions)
     for view in scene.views:
         np.testing.assert_array_equal(found.seen[view.name], scene.tracks.seen[view.name])
-        np.testing.assert_allclose(found.misses[view.name], scene.tracks.misses[view.name], atol=1e-9)
+        np.testing.assert_allclose(found.residuals[view.name], scene.tracks.residuals[view.name], atol=1e-9)
     data, at, images = (tmp_path / "out/sparse/0/points3D.bin").read_bytes(), 8, read_images(tmp_path / "out/sparse/0")
     while at < len(data):
         (point,), (count,) = struct.unpack_from("<Q", data, at), struct.unpack_from("<Q", data, at + 43)
@@ -254,12 +254,12 @@ def test_learned_cameras_show_points_where_photographs_did(model, scene_of, tmp_
         )
         for view in scene.views
     ]
-    for name, one in (("a", scene), ("b", with_cameras(scene, learned))):
+    for name, one in (("a", scene), ("b", replace_cameras(scene, learned))):
         clsplat.write_cameras(one, tmp_path / name, "colmap", images="copy")
     places = [[image.places for image in read_images(tmp_path / name / "sparse/0")] for name in "ab"]
     np.testing.assert_allclose(places[1], places[0], atol=1e-9)
     (one, *_), found = scene.views, clsplat.read_scene(tmp_path / "b").tracks
-    assert np.abs(found.misses[one.name] - scene.tracks.misses[one.name]).max() > 1, "px"
+    assert np.abs(found.residuals[one.name] - scene.tracks.residuals[one.name]).max() > 1, "px"
 
 
 @pytest.mark.parametrize("form", ["colmap", "nerfstudio"])
@@ -269,7 +269,7 @@ def test_exposures_lie_beside_copied_photographs(form, scene_of, tmp_path, rng, 
     write_exposures(tmp_path / "photographs", noted)
     clsplat.write_cameras(scene, tmp_path / "out", form, images="copy")
     found = clsplat.read_scene(tmp_path / "out")
-    told = dict(zip([view.name for view in found.views], camera_exposures(found.views), strict=True))
+    told = dict(zip([view.name for view in found.views], load_exposures(found.views), strict=True))
     prefix = "images/" if form == "nerfstudio" else ""
     assert told == {prefix + view.name: noted.get(view.name) for view in scene.views}
     assert (found.tracks is None) == (form == "nerfstudio")

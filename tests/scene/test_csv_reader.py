@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene import Reader
-from clsplat.scene.detect import holds_scene, read_scene
+from clsplat.scene.detect import is_scene, read_scene
 from tests.support.orbit_scene import orbit, said, write
 from tests.support.refusals import refusal
 
@@ -49,7 +49,7 @@ def test_the_example_is_short():
 @pytest.mark.usefixtures("_plugin")
 def test_a_scene_reads_as_it_does_from_colmap(scene):
     original, read = read_scene(scene), read_scene(scene / "images")
-    assert holds_scene(scene / "images")
+    assert is_scene(scene / "images")
     assert (read.train, read.test, read.points) == (original.train, original.test, None)
     assert read.extent == pytest.approx(original.extent)
     for one, other in zip(read.views, original.views, strict=True):
@@ -59,7 +59,7 @@ def test_a_scene_reads_as_it_does_from_colmap(scene):
 
 @pytest.mark.usefixtures("_plugin")
 def test_an_inspection_agrees_with_that_of_colmap(scene):
-    expected, found = Inspection.of(scene), Inspection.of(scene / "images")
+    expected, found = Inspection.from_folder(scene), Inspection.from_folder(scene / "images")
     assert (found.facts.kind, found.verdict) == ("CSV", "ready to train")
     for name in ("registered", "train", "test", "on_disk", "missing", "unregistered", "cameras", "photos"):
         assert getattr(found.facts, name) == getattr(expected.facts, name), name
@@ -71,7 +71,7 @@ def test_an_inspection_agrees_with_that_of_colmap(scene):
 def test_a_missing_photograph_is_named(scene):
     (scene / "images" / "03.png").unlink()
     assert "03.png" in refusal(read_scene, scene / "images")
-    assert "03.png" in said(Inspection.of(scene / "images"), "error")
+    assert "03.png" in said(Inspection.from_folder(scene / "images"), "error")
 
 
 @pytest.mark.usefixtures("_plugin")
@@ -98,7 +98,7 @@ def test_damage_is_named_by_file_and_line(scene, line, old, new):
     file.write_text("\n".join(lines) + "\n")
     message = refusal(read_scene, scene / "images")
     assert f"{file}: line {line}: " in message
-    assert not Inspection.of(scene / "images").trainable
+    assert not Inspection.from_folder(scene / "images").trainable
 
 
 @pytest.mark.usefixtures("_plugin")

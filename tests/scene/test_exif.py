@@ -12,8 +12,15 @@ from clsplat.core.errors import DataError
 from clsplat.photos.exposure_estimate import noted
 from clsplat.prepare.gather import gather
 from clsplat.scene.camera import Camera
-from clsplat.scene.images import BESIDE, CameraExposure, checked, exposure_of, read_exposures, write_exposures
-from clsplat.scene.view import View, camera_exposures
+from clsplat.scene.images import (
+    EXPOSURES_FILE,
+    CameraExposure,
+    make_exposure,
+    read_exif_exposure,
+    read_exposures,
+    write_exposures,
+)
+from clsplat.scene.view import View, load_exposures
 
 CAMERA = Camera(4, 3, 4, 4, 2, 1.5)
 EXPOSURE = CameraExposure(seconds=0.01, aperture=2.0, iso=100.0)
@@ -37,14 +44,14 @@ def with_exposure(order: str = "<", seconds=(1, 100), aperture=(2, 1), iso: int 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_a_jpeg_tells_its_exposure(tmp_path, order):
     (tmp_path / "a.jpg").write_bytes(with_exposure(order))
-    assert exposure_of(tmp_path / "a.jpg") == EXPOSURE
+    assert read_exif_exposure(tmp_path / "a.jpg") == EXPOSURE
     assert EXPOSURE.value == pytest.approx(np.log2(0.01 * 100 / 4))
 
 
 @pytest.mark.parametrize("change", [{"seconds": (1, 0)}, {"aperture": (0, 1)}, {"iso": 0}])
 def test_values_that_are_no_positive_numbers_are_none(tmp_path, change):
     (tmp_path / "a.jpg").write_bytes(with_exposure(**change))
-    assert exposure_of(tmp_path / "a.jpg") is None
+    assert read_exif_exposure(tmp_path / "a.jpg") is None
 
 
 def test_every_cut_or_changed_exif_block_is_an_exposure_or_none(tmp_path):
@@ -52,7 +59,7 @@ def test_every_cut_or_changed_exif_block_is_an_exposure_or_none(tmp_path):
     for at in range(2, 130):
         for damaged in (data[:at], data[:at] + b"\xff" + data[at + 1 :], data[:at] + b"\0" + data[at + 1 :]):
             (tmp_path / "a.jpg").write_bytes(damaged)
-            found = exposure_of(tmp_path / "a.jpg")
+            found = read_exif_exposure(tmp_path / "a.jpg")
             assert found is None or np.isfinite(found.value)
 
 
@@ -66,16 +73,16 @@ def test_a_file_beside_the_images_holds_what_they_lost(tmp_path):
 
 @pytest.mark.parametrize("text", ["[]", '{"a": 1}', '{"a": {"seconds": 1e999, "aperture": 2, "iso": 3}}', "{"])
 def test_a_damaged_file_is_refused_in_one_line(tmp_path, text):
-    (tmp_path / BESIDE).write_text(text)
-    with pytest.raises(DataError, match=BESIDE) as refused:
+    (tmp_path / EXPOSURES_FILE).write_text(text)
+    with pytest.raises(DataError, match=EXPOSURES_FILE) as refused:
         read_exposures(tmp_path)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("numbers", [(1e9, 2, 100), (0.01, 1e200, 100), (0.01, 2, 1e-300), (0.01, 0, 100), (0.01, 2)])
 def test_what_no_camera_can_have_is_no_exposure(numbers):
-    assert checked(*numbers, *[None] * (3 - len(numbers))) is None
-    assert checked(0.01, 2, 100) is not None
+    assert make_exposure(*numbers, *[None] * (3 - len(numbers))) is None
+    assert make_exposure(0.01, 2, 100) is not None
 
 
 def test_a_photograph_that_is_turned_keeps_its_exposure(tmp_path):
@@ -83,7 +90,7 @@ def test_a_photograph_that_is_turned_keeps_its_exposure(tmp_path):
     for number, orientation in enumerate((1, 6, 1)):
         (tmp_path / f"{number}.jpg").write_bytes(with_exposure(iso=100 * (number + 1), orientation=orientation))
     gather(tmp_path, tmp_path / "images", ["0.jpg", "1.jpg", "2.jpg"])
-    assert exposure_of(tmp_path / "images" / "1.jpg").iso == 200
+    assert read_exif_exposure(tmp_path / "images" / "1.jpg").iso == 200
     assert {name: one.iso for name, one in read_exposures(tmp_path / "images").items()} == {
         "0.jpg": 100,
         "1.jpg": 200,
@@ -99,10 +106,10 @@ def test_what_lies_beside_comes_before_the_images_own(tmp_path):
     (tmp_path / "in").mkdir()
     for name in ("in/a.jpg", "b.jpg"):
         (tmp_path / name).write_bytes(with_exposure())
-    (tmp_path / BESIDE).write_text(json.dumps({"in/a.jpg": {"seconds": 1, "aperture": 1, "iso": 1}}))
+    (tmp_path / EXPOSURES_FILE).write_text(json.dumps({"in/a.jpg": {"seconds": 1, "aperture": 1, "iso": 1}}))
     by_hand = View("c", CAMERA, np.eye(3, 4))
     views = [view(tmp_path, "in/a.jpg"), view(tmp_path, "b.jpg"), by_hand]
-    assert camera_exposures(views) == [CameraExposure(1, 1, 1), EXPOSURE, None]
+    assert load_exposures(views) == [CameraExposure(1, 1, 1), EXPOSURE, None]
 
 
 def test_camera_gains_are_light_ratios_to_the_display_power(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.scene.camera import Camera
-from clsplat.scene.scene import camera_extent, strayed
+from clsplat.scene.scene import camera_extent, outlier_cameras
 from clsplat.scene.view import View
 
 
@@ -23,7 +23,7 @@ def test_a_far_camera_does_not_change_the_extent(distance):
     """Nor, therefore, any learning rate or threshold."""
     healthy = orbit()
     assert camera_extent(views_at([*healthy, (distance, 0, 0)])) == camera_extent(views_at(healthy))
-    assert strayed(views_at([*healthy, (distance, 0, 0)])).tolist() == [False] * 24 + [True]
+    assert outlier_cameras(views_at([*healthy, (distance, 0, 0)])).tolist() == [False] * 24 + [True]
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_a_far_camera_does_not_change_the_extent(distance):
 )
 def test_healthy_cameras_all_count(centers):
     views = views_at(centers)
-    assert not strayed(views).any()
+    assert not outlier_cameras(views).any()
     points = np.asarray(centers, float)
     radius = 1.1 * np.linalg.norm(points - points.mean(axis=0), axis=1).max()
     assert camera_extent(views) == pytest.approx(radius or 1.0)

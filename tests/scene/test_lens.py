@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import DataError
 from clsplat.scene import camera as lens_room
-from clsplat.scene.camera import MAX_ROUNDS, MODELS, Lens, shared
+from clsplat.scene.camera import MAX_ROUNDS, MODELS, Lens, intern_lens
 from tests.support.camera_rings import FISHEYE, STRONG
 from tests.support.data_sets import data_set
 
@@ -51,7 +51,7 @@ def test_photographs_of_one_camera_share_one_map(monkeypatch):
     monkeypatch.setattr(Lens, "distort", lambda self, u, v: (computed.append(u.size), distort(self, u, v))[1])
     photograph = np.zeros((STRONG.height, STRONG.width, 3), np.uint8)
     for _ in range(3):
-        one = shared(replace(STRONG, params=(161.0, *STRONG.params[1:]), whole=True))  # a lens of this test alone
+        one = intern_lens(replace(STRONG, params=(161.0, *STRONG.params[1:]), whole=True))  # a lens of this test alone
         one.undistort_image(photograph)
         assert one.shown.any()
     assert drawn[0] is drawn[1] is drawn[2]
@@ -112,9 +112,9 @@ def test_no_pixel_of_the_pinhole_is_blank(lens):
 
 def test_a_lens_without_distortion_changes_nothing(rng):
     lens = Lens(40, 30, "OPENCV", (50.0, 51.0, 19.0, 16.0, 0.0, 0.0, 0.0, 0.0))
-    assert not lens.distorts
+    assert not lens.has_distortion
     assert (lens.pinhole.width, lens.pinhole.height) in [(40, 30), (39, 29), (40, 29), (39, 30)]
-    assert FISHEYE.distorts
+    assert FISHEYE.has_distortion
 
 
 def test_a_lens_that_cannot_be_inverted_is_refused():

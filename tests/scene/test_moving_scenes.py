@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import DataError
-from clsplat.data_tools.moments import write_moments
 from clsplat.data_tools.moving import STANDING, Moving, shapes_at
+from clsplat.data_tools.sync_frames import write_sync_frames
 from clsplat.data_tools.synthetic import write_dataset
 from clsplat.prepare.inspect.findings import Inspection, figures
 from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.camera_files import write_cameras
 from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.detect import read_scene
-from clsplat.scene.identity import decode_all, require_whole
+from clsplat.scene.identity import decode_all, require_decodable
 from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud, Scene
-from clsplat.scene.times import Clock, by_camera, moments_of
+from clsplat.scene.times import Clock, distinct_times, group_by_camera
 from clsplat.scene.times_file import write_times
 from tests.support.refusals import refusal
 from tests.support.transforms_scene import LENS, frames, several_cameras, write
@@ -53,10 +53,10 @@ def tiny_colmap(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_no_training_view_shares_a_held_out_camera_or_moment(scene):
     train, test = (scene.split(name) for name in ("train", "test"))
     assert (len(train), len(test)) == (2 * 5, 6)
-    assert moments_of(train) == pytest.approx([0, 0.2, 0.6, 0.8, 1])
-    assert moments_of(test) == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 1])
+    assert distinct_times(train) == pytest.approx([0, 0.2, 0.6, 0.8, 1])
+    assert distinct_times(test) == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 1])
     assert not {view.world_to_camera.tobytes() for view in train} & {view.world_to_camera.tobytes() for view in test}
-    assert [len(group) for group in by_camera(scene.views)] == [5, 5, 6]
+    assert [len(group) for group in group_by_camera(scene.views)] == [5, 5, 6]
 
 
 def test_photographs_are_equal_in_static_pixels_only(folder, scene):
@@ -83,7 +83,7 @@ def test_points_have_the_moment_at_which_they_were_seen(scene):
     points = scene.points
     assert points is not None
     assert points.times is not None
-    assert set(points.times) == {np.float32(time) for time in moments_of(scene.split("train"))}
+    assert set(points.times) == {np.float32(time) for time in distinct_times(scene.split("train"))}
     red = (points.colors[:, 0] > 0.5) & (points.colors[:, 1:].max(axis=1) < 0.25) & (points.positions[:, 2] > 0.03)
     ball = red & (points.positions[:, 1] < -0.2)
     assert ball.sum() > 5
@@ -100,7 +100,7 @@ def test_the_folder_is_the_same_each_time(folder, tmp_path):
 
 
 def test_inspect_tells_the_moments_and_the_places(folder):
-    found = Inspection.of(folder)
+    found = Inspection.from_folder(folder)
     assert figures(found.facts)["times"] == "6 moments, seen from 3 places"
     assert not found.facts.same_pose
     assert found.trainable
@@ -125,7 +125,7 @@ def test_a_blender_scene_has_one_clock_for_both_files(tmp_path):
 def test_a_scene_without_times_does_not_move(tmp_path):
     path = write(tmp_path / "a", **LENS, frames=frames("0.png", "1.png"))
     assert [view.time for view in read_scene(path).views] == [None, None]
-    assert "times" not in figures(Inspection.of(path).facts)
+    assert "times" not in figures(Inspection.from_folder(path).facts)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_wrong_times_are_refused_with_their_place(tmp_path, times, message):
     path = write(tmp_path / "a", **LENS, frames=table)
     fault = refusal(read_scene, path)
     assert all(part in fault for part in message.split(".*")), fault
-    found = Inspection.of(path)
+    found = Inspection.from_folder(path)
     assert not found.trainable
     assert any(message.split(".*")[-1] in finding.text for finding in found.findings)
 
@@ -182,7 +182,7 @@ def test_times_of_points_in_another_unit_are_refused(tmp_path, caplog):
     fault = refusal(read_scene, path)
     assert "points3d.ply: its points have times from 0 to 1; expected the unit of the frames" in fault
     assert "10 to 30" in fault
-    assert fault in [finding.text for finding in Inspection.of(path).findings]
+    assert fault in [finding.text for finding in Inspection.from_folder(path).findings]
 
 
 def test_damaged_static_mask_is_found_before_training(tmp_path):
@@ -192,8 +192,8 @@ def test_damaged_static_mask_is_found_before_training(tmp_path):
     path = write(tmp_path / "a", **LENS, frames=table)
     cv2.imwrite(str(path / "still.png"), np.zeros((5, 7), np.uint8))
     with pytest.raises(DataError, match=r"1 of 4 image files cannot be trained on: .*still.png"):
-        require_whole(path, decode_all(read_scene(path).views))
-    assert any("static mask" in finding.text for finding in Inspection.of(path).findings)
+        require_decodable(path, decode_all(read_scene(path).views))
+    assert any("static mask" in finding.text for finding in Inspection.from_folder(path).findings)
 
 
 def test_folder_of_frames_per_camera_is_a_moving_scene(tmp_path):
@@ -207,8 +207,8 @@ def test_folder_of_frames_per_camera_is_a_moving_scene(tmp_path):
         ("right/0002.png", 1.0),
     ]
     assert [view.static_path for view in scene.split("test")] == [folder / "static" / "left.png"] * 3
-    assert figures(Inspection.of(folder).facts)["times"] == "3 moments, seen from 2 places"
-    assert len(by_camera(scene.views)) == 2
+    assert figures(Inspection.from_folder(folder).facts)["times"] == "3 moments, seen from 2 places"
+    assert len(group_by_camera(scene.views)) == 2
 
 
 def test_frames_are_in_the_order_of_the_numbers_in_their_names(tmp_path):
@@ -272,15 +272,15 @@ def test_frames_of_videos_are_taken_at_the_same_moments(tmp_path, caplog):
         for file in (folder / "videos" / name).iterdir():
             file.unlink()
         (folder / "videos" / name).rmdir()
-    assert f"`clsplat data moments {folder}`" in refusal(read_scene, folder)
-    assert write_moments(folder, 3) == 2
+    assert f"`clsplat data sync-frames {folder}`" in refusal(read_scene, folder)
+    assert write_sync_frames(folder, 3) == 2
     assert "the end of b.avi is left out" in caplog.text
     views = read_scene(folder, 0).views
     assert [view.time for view in views] == [0, 0.5, 1] * 2
     levels = [cv2.imread(str(view.image_path)).mean() for view in views]
     assert levels == pytest.approx([0, 80, 140] * 2, abs=4)
-    assert write_moments(folder, 3) == 2
-    assert "expected 2 to 8" in refusal(write_moments, folder, 9)
+    assert write_sync_frames(folder, 3) == 2
+    assert "expected 2 to 8" in refusal(write_sync_frames, folder, 9)
 
 
 def test_a_colmap_folder_with_times_moves(tiny_colmap, tmp_path):

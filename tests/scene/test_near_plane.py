@@ -9,14 +9,14 @@ from clsplat.pipeline.loading import load
 from clsplat.runs.describe import describe
 from clsplat.runs.state import RunState
 from clsplat.scene.detect import read_scene
-from clsplat.scene.quality import measured, nearest_points
+from clsplat.scene.quality import measure_scene, near_depth
 from clsplat.scene.scene import Tracks
 from tests.support.outdoor_scene import Yard
 
 
 def test_each_training_photograph_counts_once(tiny_scene):
     scene = read_scene(tiny_scene)
-    assert measured(scene.downscaled(1, 2)).photographs == len(scene.split("train"))
+    assert measure_scene(scene.downscaled(1, 2)).photographs == len(scene.split("train"))
 
 
 def test_nearest_points_are_before_any_training_photograph(tiny_scene):
@@ -35,12 +35,12 @@ def test_nearest_points_are_before_any_training_photograph(tiny_scene):
 
     def nearest(*views):
         tracks = Tracks(points, {view.name: seen[view.name] for view in views})
-        return nearest_points(replace(scene, tracks=tracks))
+        return near_depth(replace(scene, tracks=tracks))
 
     assert nearest(*trained, tested) == pytest.approx(1.505), "of 102 points; one shows one alone"
     assert nearest(trained[0]) == pytest.approx(2), "one in a hundred may be mistaken"
     assert nearest(tested) is None
-    assert nearest_points(scene) is None
+    assert near_depth(scene) is None
 
 
 @pytest.mark.slow

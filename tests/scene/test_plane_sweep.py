@@ -19,10 +19,10 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.plane_sweep import MAX_DEPTH, MIN_DEPTH, PLANES, Surface, swept_points
-from clsplat.scene.quality import MAX_SPACING, laplacian_chance, opaque_pixels, spacing
+from clsplat.scene.quality import MAX_SPACING, laplacian_probability, opaque_pixels, point_spacing
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View, load_image
-from clsplat.scene.viewpoint import center_of
+from clsplat.scene.viewpoint import scene_center
 from clsplat.stages.init import Init
 from tests.support.data_sets import data_set
 from tests.support.runs import train
@@ -99,7 +99,7 @@ def before_a_sky(view):
     return load_image(view, (0.55, 0.7, 0.9))
 
 
-def detailed(table, shown, chance=laplacian_chance):
+def detailed(table, shown, chance=laplacian_probability):
     return swept_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, chance, shown=shown)
 
 
@@ -113,7 +113,7 @@ def test_pixels_of_detail_lie_at_exact_depths(table):
     step = (1 / MIN_DEPTH - 1 / MAX_DEPTH) / (PLANES - 1) / CAMERA_DISTANCE
     exact = depths["2"][row, column]
     assert np.median(np.abs(1 / place[:, 2] - 1 / exact)) < step / 2
-    chance = laplacian_chance(before_a_sky(views[2]) / 255)[row, column]
+    chance = laplacian_probability(before_a_sky(views[2]) / 255)[row, column]
     sizes = place[:, 2] / views[2].camera.fx * np.minimum(1 / np.sqrt(chance), SIDE / 10)
     np.testing.assert_allclose(points.sizes, sizes, rtol=1e-4)
 
@@ -157,13 +157,13 @@ def test_detail_gets_more_points(rng):
     def shares(chance):
         return [len(swept_points(views, center, load, 10**6, 0, chance, shown=lambda view, s=s: s)) for s in sides]
 
-    (sharp, soft), (all_sharp, all_soft) = shares(laplacian_chance), shares(None)
+    (sharp, soft), (all_sharp, all_soft) = shares(laplacian_probability), shares(None)
     assert sharp / all_sharp > 3 * soft / all_soft > 0
 
 
 def test_the_chance_of_a_pixel(rng):
     image = rng.random((5, 7, 3)) * 0.3
-    chance = laplacian_chance(image)
+    chance = laplacian_probability(image)
     for row, column in np.ndindex(5, 7):
         around = [
             (max(row - 1, 0), column),
@@ -174,8 +174,8 @@ def test_the_chance_of_a_pixel(rng):
         sums = [sum(image[place][k] for place in around) - 4 * image[row, column][k] for k in range(3)]
         assert chance[row, column] == pytest.approx(min(1, sum(map(abs, sums))))
     assert 0 < chance.min() < 1 == chance.max()
-    assert not laplacian_chance(np.full((4, 4, 3), 0.4)).any()
-    np.testing.assert_allclose(spacing(np.array([1, 0.25, 1e-9]), 160), [1, 2, MAX_SPACING * 160])
+    assert not laplacian_probability(np.full((4, 4, 3), 0.4)).any()
+    np.testing.assert_allclose(point_spacing(np.array([1, 0.25, 1e-9]), 160), [1, 2, MAX_SPACING * 160])
 
 
 def test_what_the_scene_has_is_not_new():
@@ -203,7 +203,7 @@ def test_points_of_detail_are_the_same_every_time(table, everywhere):
     first, second = everywhere, detailed(table, lambda view: None)
     for name in ("positions", "colors", "sizes"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    some = swept_points(table[0], LOOK_AT, before_a_sky, 700, 0, laplacian_chance)
+    some = swept_points(table[0], LOOK_AT, before_a_sky, 700, 0, laplacian_probability)
     assert len(some) == len(some.sizes) == 700 < len(first)
     assert np.median(some.sizes) > 1.5 * np.median(first.sizes), "fewer points are larger"
 
@@ -220,7 +220,7 @@ def test_real_surfaces():
     """Nine tenths of what structure from motion found has a swept point within three hundredths of its distance."""
     scene = read_scene(data_set("fox"))
     views = scene.split("train")
-    center = center_of(views)
+    center = scene_center(views)
     points = swept_points(views, center, load_image, 100_000, 0)
     distance = np.median([np.linalg.norm(view.position - center) for view in views])
     gaps, _ = cKDTree(points.positions).query(scene.points.positions)

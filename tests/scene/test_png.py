@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import DataError
-from clsplat.scene.images import pixels_only, read_image
+from clsplat.scene.images import read_image, strip_png_metadata
 
 RNG = np.random.default_rng(0)
 KINDS = {
@@ -58,15 +58,15 @@ def test_metadata_change_no_pixel_and_print_nothing(kind, what, wrong, tmp_path,
 
 def test_what_a_valid_file_shows_is_independent_of_cut_metadata():
     data = with_chunk(encoded(KINDS["color"]), chunk(*METADATA["a gamma"]) + chunk(*METADATA["primaries"]))
-    whole, cut = (cv2.imdecode(np.frombuffer(one, np.uint8), -1) for one in (data, pixels_only(data)))
+    whole, cut = (cv2.imdecode(np.frombuffer(one, np.uint8), -1) for one in (data, strip_png_metadata(data)))
     np.testing.assert_array_equal(whole, cut)
-    assert len(pixels_only(data)) < len(data)
+    assert len(strip_png_metadata(data)) < len(data)
 
 
 def test_transparency_of_a_palette_and_orientation_stay():
     for kind in (b"tRNS", b"eXIf"):
         data = with_chunk(encoded(KINDS["color"]), chunk(kind, b"\0\1\0\1\0\1"))
-        assert pixels_only(data) == data
+        assert strip_png_metadata(data) == data
 
 
 @pytest.mark.parametrize("name", ["IHDR", "IDAT"])
@@ -93,4 +93,4 @@ def test_a_cut_image_prints_nothing(suffix, tmp_path: Path, capfd):
 
 def test_a_chunk_whose_name_is_no_text_is_named_in_one_line():
     with pytest.raises(ValueError, match=r"the checksum of the chunk 'A\\r\\n ' is wrong"):
-        pixels_only(with_chunk(encoded(KINDS["gray"]), chunk(b"A\r\n ", b"", wrong=1)))
+        strip_png_metadata(with_chunk(encoded(KINDS["gray"]), chunk(b"A\r\n ", b"", wrong=1)))

@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.prepare.inspect.findings import Inspection
 from clsplat.scene import Camera, PointCloud, Reader, Scene, View, make_scene
 from clsplat.scene.colmap import ColmapReader
-from clsplat.scene.detect import format_names, holds_scene, read_scene, readers
+from clsplat.scene.detect import format_names, is_scene, read_scene, readers
 from tests.support.orbit_scene import orbit, photograph, write
 from tests.support.refusals import refusal
 
@@ -95,7 +95,7 @@ def grid(tmp_path: Path) -> Path:
 
 
 def test_matching_and_reading_are_enough_for_inspection(grid):
-    assert not holds_scene(grid)
+    assert not is_scene(grid)
 
     class Grid(OneFile):
         name, expects = "grid", "grid.txt"
@@ -110,17 +110,17 @@ def test_matching_and_reading_are_enough_for_inspection(grid):
             cloud = PointCloud(np.float32([[0, 0, 5], [1, 0, 5]]), np.float32([[1, 0, 0.2], [0, 0, 0]]))
             return make_scene(path, views, {0}, cloud)
 
-    assert holds_scene(grid)
-    inspection = Inspection.of(grid)
+    assert is_scene(grid)
+    inspection = Inspection.from_folder(grid)
     facts, parts = inspection.facts, inspection.parts
     assert inspection.trainable
     assert (facts.kind, facts.registered, facts.on_disk, facts.train, facts.test) == ("grid", 4, 4, 3, 1)
     assert (facts.points.count, facts.points.error_mean) == (2, None)
     assert parts.points.rgb.tolist() == [[255, 0, 51], [0, 0, 0]]
     (grid / "3.png").unlink()
-    assert Inspection.of(grid).facts.missing == ["3.png"]
+    assert Inspection.from_folder(grid).facts.missing == ["3.png"]
     (grid / "grid.txt").write_text("")
-    inspection = Inspection.of(grid)
+    inspection = Inspection.from_folder(grid)
     assert (inspection.facts.kind, inspection.facts.registered) == ("grid", 0)
     assert "grid.txt: is empty" in inspection.verdict
 
@@ -134,7 +134,7 @@ def test_the_first_reader_that_matches_is_taken(tmp_path):
     path = write(tmp_path / "scene", orbit())
     (path / "transforms.json").write_text("damaged")
     assert len(read_scene(path).views) == 24
-    assert Inspection.of(path).facts.kind == "COLMAP"
+    assert Inspection.from_folder(path).facts.kind == "COLMAP"
 
 
 @pytest.mark.parametrize("changes", [{"width": 0}, {"fx": -1.0}, {"fy": float("nan")}, {"cx": float("inf")}])

@@ -13,8 +13,8 @@ from clsplat.runs.describe import describe
 from clsplat.runs.state import RunState
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
-from clsplat.scene.quality import Measures, measured
-from clsplat.scene.reprojection import misses, reprojection_errors, within
+from clsplat.scene.quality import Measures, measure_scene
+from clsplat.scene.reprojection import filter_tracks, reprojection_errors, reprojection_residuals
 from clsplat.scene.scene import Tracks
 from clsplat.scene.view import View
 from clsplat.sweeps.experiment import run_pipeline
@@ -38,11 +38,11 @@ def test_distances_are_from_where_the_camera_shows_a_point(rng, lens):
     straight = seen[:, :2] / seen[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     places = lens.project(seen) if lens else straight
     points[3, 2] = -5
-    found = misses(view, points, places + VECTOR)
+    found = reprojection_residuals(view, points, places + VECTOR)
     assert np.isnan(found[3]).all(), "behind the camera"
     np.testing.assert_allclose(np.delete(found, 3, axis=0), np.tile(VECTOR, (6, 1)), atol=1e-9)
     straight[:4] = [[1e7, 1e7], [-1e308, 0], [np.inf, 0], [np.nan, 1]]
-    assert np.isnan(misses(view, points, straight)[:4]).all(), "outside the photograph"
+    assert np.isnan(reprojection_residuals(view, points, straight)[:4]).all(), "outside the photograph"
 
 
 def test_the_mean_is_over_points_and_then_over_their_photographs():
@@ -52,7 +52,7 @@ def test_the_mean_is_over_points_and_then_over_their_photographs():
     assert reprojection_errors(tracks, [view, replace(view, name="b")]) == pytest.approx([5, 2])
     assert reprojection_errors(tracks, [replace(view, name="b").resized(2)]) == pytest.approx([1.5]), "at its size"
     assert reprojection_errors(tracks, [replace(view, name="c")]) is None
-    assert reprojection_errors(replace(tracks, misses={}), [view]) is None
+    assert reprojection_errors(replace(tracks, residuals={}), [view]) is None
     assert reprojection_errors(None, [view]) is None
 
 
@@ -61,25 +61,27 @@ def test_points_a_pixel_away_or_more_tell_no_depth():
     view, rows = View("a", STRONG.pinhole, np.eye(3, 4)), np.array([1, 3, 5, 6])
     missed = {"a": np.array([[0.6, 0.8], [0.5, 0], [np.nan, 0], [0, 2.1]]), "b": np.array([[9.0, 9]])}
     tracks = Tracks(np.zeros((7, 3)), {"a": rows, "b": rows[:1], "c": rows}, missed)
-    found = within(tracks, [view, replace(view, name="c")])
+    found = filter_tracks(tracks, [view, replace(view, name="c")])
     assert {name: seen.tolist() for name, seen in found.seen.items()} == {"a": [3, 5], "b": [1], "c": [1, 3, 5, 6]}
-    np.testing.assert_array_equal(found.misses["a"], missed["a"][1:3])
-    assert within(tracks, [view.resized(2)]).seen["a"].tolist() == [1, 3, 5]
-    assert within(tracks, [view.resized(2), view, view.resized(4)]).seen["a"].tolist() == [3, 5], "in several sizes"
+    np.testing.assert_array_equal(found.residuals["a"], missed["a"][1:3])
+    assert filter_tracks(tracks, [view.resized(2)]).seen["a"].tolist() == [1, 3, 5]
+    assert filter_tracks(tracks, [view.resized(2), view, view.resized(4)]).seen["a"].tolist() == [3, 5], (
+        "in several sizes"
+    )
 
 
 def test_it_is_reported_at_training_size_without_test_views(tmp_path, rng):
     plain = read_scene(Yard(rng).write(tmp_path / "plain"), 6)
     tested = tuple(view.name for view in plain.split("test"))
     again = read_scene(missing(tmp_path / "again", VECTOR, rng, exact=tested), 6)
-    assert measured(again).reprojection_error == pytest.approx(1.5, rel=1e-5)
-    assert measured(again.downscaled(2)).reprojection_error == pytest.approx(0.75, rel=1e-5)
-    assert measured(plain).reprojection_error is None, "places that were computed from cameras tell nothing"
+    assert measure_scene(again).reprojection_error == pytest.approx(1.5, rel=1e-5)
+    assert measure_scene(again.downscaled(2)).reprojection_error == pytest.approx(0.75, rel=1e-5)
+    assert measure_scene(plain).reprojection_error is None, "places that were computed from cameras tell nothing"
 
 
 def test_undistorted_scenes_keep_it(tmp_path, rng):
     undistort_scene(missing(tmp_path / "scene", VECTOR, rng), tmp_path / "small", 32)
-    assert measured(read_scene(tmp_path / "small", 0)).reprojection_error == pytest.approx(0.75, rel=1e-5)
+    assert measure_scene(read_scene(tmp_path / "small", 0)).reprojection_error == pytest.approx(0.75, rel=1e-5)
 
 
 def test_places_in_text_that_are_no_numbers_are_not_known(tmp_path):
@@ -90,7 +92,7 @@ def test_places_in_text_that_are_no_numbers_are_not_known(tmp_path):
     tracks = read_scene(tmp_path, 0).tracks
     assert tracks is not None
     assert tracks.seen["a.png"].tolist() == [1, 0]
-    np.testing.assert_array_equal(tracks.misses["a.png"], [[np.nan, np.nan], [3, 0]])
+    np.testing.assert_array_equal(tracks.residuals["a.png"], [[np.nan, np.nan], [3, 0]])
 
 
 @pytest.mark.parametrize(("error", "learned"), [(0.4, False), (0.99, False), (1.0, True), (3.0, True)])
@@ -108,7 +110,7 @@ def test_the_recipe_for_photographs_learns_poses_from_a_pixel_on(error, learned)
 
 @pytest.mark.parametrize(("length", "level"), [(0.5, None), (1.5, "note"), (2.5, "warning")])
 def test_inspect_says_what_to_set(tmp_path, rng, length, level):
-    inspection = Inspection.of(missing(tmp_path / "scene", length * VECTOR / 1.5, rng))
+    inspection = Inspection.from_folder(missing(tmp_path / "scene", length * VECTOR / 1.5, rng))
     assert inspection.facts.points is not None
     assert inspection.facts.points.error_mean == pytest.approx(length, rel=1e-5)
     found = [one for one in inspection.findings if "reprojection" in one.fault]

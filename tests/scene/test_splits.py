@@ -17,7 +17,7 @@ from clsplat.runs.state import RunState
 from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene, Tracks
-from clsplat.scene.view_selection import Choice, Split
+from clsplat.scene.view_selection import Split, ViewSelection
 from tests.support.transforms_scene import LENS, frames, write
 
 LETTERS = "abcdefghijklmnopqrstuvwx"
@@ -35,14 +35,14 @@ def letters(scene: Scene, split: str) -> str:
 
 
 def test_every_nth_from_an_offset_on_is_for_testing(folder):
-    scene = read_scene(folder, Split(Choice(every=8, offset=4)))
+    scene = read_scene(folder, Split(ViewSelection(every=8, offset=4)))
     assert letters(scene, "test") == "emu"
     assert len(scene.train) == 21
     assert scene.extent == pytest.approx(read_scene(folder, 8).extent, rel=1)
 
 
 @pytest.mark.parametrize(
-    "split", [{"holdout": Choice(every=3, offset=1)}, {"train": Choice(every=2)}, {"validation": 2}]
+    "split", [{"holdout": ViewSelection(every=3, offset=1)}, {"train": ViewSelection(every=2)}, {"validation": 2}]
 )
 def test_a_split_leaves_the_rest_of_a_scene_as_it_is(folder, split):
     scene = replace(read_scene(folder), tracks=Tracks(np.zeros((1, 3)), {}))
@@ -53,55 +53,55 @@ def test_a_split_leaves_the_rest_of_a_scene_as_it_is(folder, split):
 
 @pytest.mark.parametrize("listed", ["b", "images/b.png", "images\\b.png", "b.jpg", "images/b.JPG"])
 def test_a_listed_name_may_be_the_end_of_a_path(folder, listed):
-    assert letters(read_scene(folder, Split(Choice(names=[listed, "q"]))), "test") == "bq"
+    assert letters(read_scene(folder, Split(ViewSelection(names=[listed, "q"]))), "test") == "bq"
 
 
 def test_a_photograph_is_meant_before_one_of_another_kind(tmp_path):
     write(tmp_path, **LENS, frames=frames("a/1.png", "a/1.jpg", "c.png"))
-    scene = read_scene(tmp_path, Split(Choice(names=["1.jpg"])))
+    scene = read_scene(tmp_path, Split(ViewSelection(names=["1.jpg"])))
     assert [view.name for view in scene.split("test")] == ["a/1.jpg"]
 
 
 @pytest.mark.parametrize("listed", ["1.jpg", "1", "1.png"])
 def test_a_whole_path_is_meant_before_the_end_of_another(tmp_path, listed):
     write(tmp_path, **LENS, frames=frames("1.png", "a/1.png", "c.png"))
-    scene = read_scene(tmp_path, Split(Choice(names=[listed])))
+    scene = read_scene(tmp_path, Split(ViewSelection(names=[listed])))
     assert [view.name for view in scene.split("test")] == ["1.png"]
 
 
 def test_a_name_that_means_one_elsewhere_of_another_kind_is_told(tmp_path, caplog):
     write(tmp_path, **LENS, frames=frames("a/1.png", "c.png"))
     caplog.set_level("INFO", "clsplat")
-    scene = read_scene(tmp_path, Split(Choice(names=["1.jpg"])))
+    scene = read_scene(tmp_path, Split(ViewSelection(names=["1.jpg"])))
     assert [view.name for view in scene.split("test")] == ["a/1.png"]
     assert "'1.jpg' means 'a/1.png'" in caplog.text
     caplog.clear()
-    read_scene(tmp_path, Split(Choice(names=["c.jpg"])))
+    read_scene(tmp_path, Split(ViewSelection(names=["c.jpg"])))
     assert "means" not in caplog.text
 
 
 def test_a_file_lists_test_views(folder):
     (folder / "test.txt").write_text("# of the paper\nc.png\n\n x.png \n")
-    assert letters(read_scene(folder, Split(Choice(file="test.txt"))), "test") == "cx"
+    assert letters(read_scene(folder, Split(ViewSelection(file="test.txt"))), "test") == "cx"
 
 
 def test_file_may_lie_with_the_photographs_before_preparation(folder, tmp_path_factory):
     lists = tmp_path_factory.mktemp("photographs")
     (lists / "test.txt").write_text("d\n")
-    assert letters(read_scene(folder, Split(Choice(file="test.txt"), folder=lists)), "test") == "d"
+    assert letters(read_scene(folder, Split(ViewSelection(file="test.txt"), folder=lists)), "test") == "d"
 
 
 @pytest.mark.parametrize(
     ("choice", "fault"),
     [
-        (Choice(names=["bb.png"]), "no photograph is called 'bb.png'; did you mean 'b.png'?"),
-        (Choice(names=["b.gif"]), "no photograph is called 'b.gif'"),
-        (Choice(file="test.txt"), "test.txt: cannot be read"),
+        (ViewSelection(names=["bb.png"]), "no photograph is called 'bb.png'; did you mean 'b.png'?"),
+        (ViewSelection(names=["b.gif"]), "no photograph is called 'b.gif'"),
+        (ViewSelection(file="test.txt"), "test.txt: cannot be read"),
         (
-            Choice(names=list(LETTERS)),
+            ViewSelection(names=list(LETTERS)),
             "scene.holdout takes all 24 photographs for testing; expected some to train with",
         ),
-        (Choice(every=1), "scene.holdout takes all 24 photographs"),
+        (ViewSelection(every=1), "scene.holdout takes all 24 photographs"),
     ],
 )
 def test_a_list_that_is_wrong_is_refused(folder, choice, fault):
@@ -109,7 +109,9 @@ def test_a_list_that_is_wrong_is_refused(folder, choice, fault):
         read_scene(folder, Split(choice))
 
 
-@pytest.mark.parametrize("split", [Split(8, Choice(names=["a", "i"])), Split(8, None, Choice(names=["a", "b"]))])
+@pytest.mark.parametrize(
+    "split", [Split(8, ViewSelection(names=["a", "i"])), Split(8, None, ViewSelection(names=["a", "b"]))]
+)
 def test_a_test_photograph_in_another_list_is_named(folder, split):
     with pytest.raises(
         DataError, match=r"scene\.(train|validation): the list of names: '[ai]' is held out for testing"
@@ -119,34 +121,34 @@ def test_a_test_photograph_in_another_list_is_named(folder, split):
 
 def test_a_photograph_that_is_left_out_is_named_in_another_list(folder):
     fault = "scene.validation: the list of names: 'c' is left out by scene.train; .* or put it into scene.train"
-    for train in (Choice(every=2), Choice(names=["b", "d"])):
+    for train in (ViewSelection(every=2), ViewSelection(names=["b", "d"])):
         with pytest.raises(DataError, match=fault):
-            read_scene(folder, Split(8, train, Choice(names=["c"])))
+            read_scene(folder, Split(8, train, ViewSelection(names=["c"])))
 
 
 def test_photograph_held_out_by_number_is_not_called_left_out(folder):
     names = [f"images/{letter}.jpg" for letter in LETTERS]
-    Split(8, Choice(names=["b", "d"]), Choice(names=["a"])).check(folder, names)  # the placed ones decide
+    Split(8, ViewSelection(names=["b", "d"]), ViewSelection(names=["a"])).check(folder, names)  # the placed ones decide
     with pytest.raises(DataError, match=r"'c' is left out by scene\.train"):
-        Split(8, Choice(names=["b", "d"]), Choice(names=["c"])).check(folder, names)
+        Split(8, ViewSelection(names=["b", "d"]), ViewSelection(names=["c"])).check(folder, names)
 
 
 def test_a_name_that_two_photographs_end_in_is_refused(tmp_path):
     write(tmp_path, **LENS, frames=frames("a/1.png", "b/1.png", "c.png"))
     with pytest.raises(DataError, match=r"'1.png' means 'a/1.png' and 'b/1.png'; give more of the path"):
-        read_scene(tmp_path, Split(Choice(names=["1.png"])))
+        read_scene(tmp_path, Split(ViewSelection(names=["1.png"])))
 
 
 def test_the_split_of_a_dataset_stands_unless_names_are_given(folder):
     table = json.loads((folder / "transforms.json").read_text())
     (folder / "transforms.json").write_text(json.dumps({**table, "test_filenames": ["images/a.png"]}))
-    assert letters(read_scene(folder, Split(Choice(every=8, offset=4))), "test") == "a"
-    assert letters(read_scene(folder, Split(Choice(names=["b"]))), "test") == "b"
+    assert letters(read_scene(folder, Split(ViewSelection(every=8, offset=4))), "test") == "a"
+    assert letters(read_scene(folder, Split(ViewSelection(names=["b"]))), "test") == "b"
 
 
 def test_a_sparse_capture_is_every_nth_of_the_training_views(folder):
     whole = read_scene(folder, 8)
-    scene = read_scene(folder, Split(8, Choice(every=4)))
+    scene = read_scene(folder, Split(8, ViewSelection(every=4)))
     assert letters(scene, "test") == letters(whole, "test") == "aiq"
     assert letters(scene, "train") == letters(whole, "train")[::4] == "bfkotx"
     assert len(scene.views) == 9, "the others are no views of the scene"
@@ -154,7 +156,7 @@ def test_a_sparse_capture_is_every_nth_of_the_training_views(folder):
 
 @pytest.mark.parametrize(
     ("train", "fold"),
-    [(None, "fox"), (Choice(every=4), "ft"), (Choice(names=["b", "c", "d", "e"]), "ce")],
+    [(None, "fox"), (ViewSelection(every=4), "ft"), (ViewSelection(names=["b", "c", "d", "e"]), "ce")],
     ids=["21 training views", "6", "4"],
 )
 def test_fold_is_every_8th_training_view_and_at_least_two(folder, train, fold):
@@ -163,27 +165,27 @@ def test_fold_is_every_8th_training_view_and_at_least_two(folder, train, fold):
     assert not {*scene.train} & {*scene.validation}
     assert not {*scene.test} & {*scene.validation}
     without = read_scene(folder, Split(8, train))
-    assert letters(scene.with_fold(), "train") == letters(without, "train")
-    assert scene.with_fold().validation == ()
+    assert letters(scene.merge_validation(), "train") == letters(without, "train")
+    assert scene.merge_validation().validation == ()
     assert scene.extent == without.extent, "the cameras are known, and only photographs are kept out"
     halved = scene.downscaled(2)
     assert letters(halved, "validation") == fold
 
 
 def test_a_fold_may_be_given(folder):
-    assert letters(read_scene(folder, Split(0, None, Choice(every=8, offset=4))), "validation") == "emu"
+    assert letters(read_scene(folder, Split(0, None, ViewSelection(every=8, offset=4))), "validation") == "emu"
     assert letters(read_scene(folder, Split(0, None, 12)), "validation") == "am"
 
 
 def test_a_fold_of_three_photographs_or_of_all_is_refused(folder):
     with pytest.raises(DataError, match="has 3 training photographs; expected 4 or more to keep some for validation"):
-        read_scene(folder, Split(8, Choice(names=["b", "c", "d"]), "auto"))
+        read_scene(folder, Split(8, ViewSelection(names=["b", "c", "d"]), "auto"))
     with pytest.raises(DataError, match="takes 24 of 24 training photographs"):
         read_scene(folder, Split(0, None, 1))
 
 
 def test_a_run_knows_a_scene_whose_fold_is_another(folder):
-    whole, fold = (Identity.of(read_scene(folder, Split(8, None, one)), {}) for one in (0, "auto"))
+    whole, fold = (Identity.from_scene(read_scene(folder, Split(8, None, one)), {}) for one in (0, "auto"))
     assert whole.digest != fold.digest
     assert fold.changes(whole) == ["the split of 3 views (images/f.png, images/o.png, images/x.png)"]
     assert Identity.from_data(json.loads(json.dumps(fold.data()))) == fold
@@ -194,7 +196,7 @@ def test_listed_names_of_missing_photographs_are_skipped(folder, caplog):
     for letter in "cx":
         (folder / f"images/{letter}.png").unlink()
     (folder / "names.txt").write_text("a\nc\nimages/x.jpg\nd\n")
-    for choice in (Choice(names=["a", "c", "c", "x.png", "d"]), Choice(file="names.txt")):
+    for choice in (ViewSelection(names=["a", "c", "c", "x.png", "d"]), ViewSelection(file="names.txt")):
         caplog.clear()
         scene = read_scene(folder, Split(choice, missing="skip"))
         assert letters(scene, "test") == "ad"
@@ -202,11 +204,11 @@ def test_listed_names_of_missing_photographs_are_skipped(folder, caplog):
         assert letters(read_scene(folder, Split(0, validation=choice, missing="skip")), "validation") == "ad"
         assert letters(read_scene(folder, Split(0, train=choice, missing="skip")), "train") == "ad"
     with pytest.raises(DataError, match="no photograph is called 'z'"):
-        read_scene(folder, Split(Choice(names=["a", "c", "z"]), missing="skip"))
+        read_scene(folder, Split(ViewSelection(names=["a", "c", "z"]), missing="skip"))
     with pytest.raises(DataError, match=r"scene\.holdout takes 0 of .* name others, whose photographs are there"):
-        read_scene(folder, Split(Choice(names=["c"]), missing="skip"))
+        read_scene(folder, Split(ViewSelection(names=["c"]), missing="skip"))
     with pytest.raises(DataError, match=r"scene\.train leaves no photograph"):
-        read_scene(folder, Split(0, train=Choice(names=["c"]), missing="skip"))
+        read_scene(folder, Split(0, train=ViewSelection(names=["c"]), missing="skip"))
 
 
 def test_missing_photographs_are_refused_with_the_skip_setting(folder, caplog):
@@ -262,7 +264,7 @@ def test_fewer_than_three_photographs_give_a_warning_first(tiny_scene, caplog, c
 
 def test_every_nth_that_takes_none_for_testing_is_refused(folder):
     with pytest.raises(DataError, match=r"scene\.holdout takes 0 of 24 photographs .* lower its offset, or set"):
-        read_scene(folder, Split(Choice(every=100, offset=99)))
+        read_scene(folder, Split(ViewSelection(every=100, offset=99)))
 
 
 def test_without_test_views_a_dry_run_has_no_lines_of_them(folder, tmp_path):

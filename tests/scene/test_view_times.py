@@ -47,7 +47,7 @@ def test_what_copies_a_view_keeps_its_time(tmp_path):
 
 
 def test_scenes_that_differ_in_a_time_are_two_scenes(tmp_path):
-    one, other = (Identity.of(scene_at(tmp_path, 0.0, time), {}) for time in (0.5, 0.75))
+    one, other = (Identity.from_scene(scene_at(tmp_path, 0.0, time), {}) for time in (0.5, 0.75))
     assert one.digest != other.digest
     assert other.changes(one) == ["the time of 1 view (v1)"]
     assert Identity.from_data(other.data()) == other
@@ -55,6 +55,8 @@ def test_scenes_that_differ_in_a_time_are_two_scenes(tmp_path):
 
 def test_a_scene_that_does_not_move_is_the_scene_that_it_was(tmp_path):
     still_one = scene_at(tmp_path, None, None)
-    assert set(Identity.of(still_one, {}).train["v0"]) == {"photograph", "mask", "camera"}
+    assert set(Identity.from_scene(still_one, {}).train["v0"]) == {"photograph", "mask", "camera"}
     moving = replace(still_one, views=tuple(replace(view, time=0.5) for view in still_one.views))
-    assert Identity.of(moving, {}).changes(Identity.of(still_one, {})) == ["the time of 2 views (v0, v1)"]
+    assert Identity.from_scene(moving, {}).changes(Identity.from_scene(still_one, {})) == [
+        "the time of 2 views (v0, v1)"
+    ]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from clsplat.prepare.inspect import page
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
-from clsplat.scene.viewpoint import Stand, across, closest_point, upward
+from clsplat.scene.viewpoint import Viewpoint, nearest_to_axes, perpendicular, up_direction
 from clsplat.stages import report
 from clsplat.viewer.video.paths import Rig
 
@@ -19,7 +19,7 @@ UP = np.array([0.0, -0.8, 0.6])
 
 def orbit(pitch, angles, up=UP):
     """Views to the sides, by angles in degrees around an axis, that look down by a pitch."""
-    side = across(up)
+    side = perpendicular(up)
     around = [np.cos(a) * side + np.sin(a) * np.cross(up, side) for a in np.radians(angles)]
     aheads = [np.cos(np.radians(pitch)) * one - np.sin(np.radians(pitch)) * up for one in around]
     return [
@@ -62,11 +62,11 @@ CASES = {  # views, and what is up within so many degrees
 @pytest.mark.parametrize("case", CASES)
 def test_all_take_the_same_way_for_up(case):
     views, expected, degrees = CASES[case]
-    up, points = upward(views), np.zeros((9, 3), np.float32)
+    up, points = up_direction(views), np.zeros((9, 3), np.float32)
     assert np.linalg.norm(up) == pytest.approx(1)
     assert np.degrees(np.arccos(min(1, up @ expected))) < degrees
     np.testing.assert_allclose(Rig.of(views, points).up, up, atol=1e-12)
-    np.testing.assert_allclose(Stand.of(points, views, views[0]).up, up, atol=1e-12)
+    np.testing.assert_allclose(Viewpoint.from_points(points, views, views[0]).up, up, atol=1e-12)
     np.testing.assert_allclose(page._axes(views)[2], up, atol=1e-12)
     np.testing.assert_allclose(np.cross(*report._axes(views)), -up, atol=1e-12)
 
@@ -74,17 +74,17 @@ def test_all_take_the_same_way_for_up(case):
 def test_all_on_their_side_have_the_mean_of_their_upward_axes():
     views = [rolled(view, 90) for view in orbit(0, range(0, 100, 10))]
     mean = np.mean([-view.world_to_camera[1, :3] for view in views], axis=0)
-    np.testing.assert_allclose(upward(views), mean / np.linalg.norm(mean), atol=1e-6)
+    np.testing.assert_allclose(up_direction(views), mean / np.linalg.norm(mean), atol=1e-6)
 
 
 def test_the_pivot_is_where_the_axes_meet():
     center = np.array([1.0, -2.0, 3.0])
     places = np.random.default_rng(0).normal(0, 4, (12, 3))
     axes = (center - places) / np.linalg.norm(center - places, axis=1, keepdims=True)
-    np.testing.assert_allclose(closest_point(places, axes, center + 5), center, atol=0.02)
+    np.testing.assert_allclose(nearest_to_axes(places, axes, center + 5), center, atol=0.02)
 
 
 def test_parallel_axes_meet_at_the_depth_of_the_splats():
     places = np.array([[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [2, 2, 0]])
-    found = closest_point(places, np.tile([0.0, 0, 1], (4, 1)), np.array([9.0, 9, 7]))
+    found = nearest_to_axes(places, np.tile([0.0, 0, 1], (4, 1)), np.array([9.0, 9, 7]))
     np.testing.assert_allclose(found, [1, 1, 7], atol=0.02)

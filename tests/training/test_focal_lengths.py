@@ -13,10 +13,10 @@ from clsplat.pipeline.loading import load
 from clsplat.render.camera import camera_values, moved_camera, upload_camera
 from clsplat.runs.model_file import evaluate, write_cameras
 from clsplat.scene.camera import Camera, Lens
-from clsplat.scene.camera_files import posed
+from clsplat.scene.camera_files import posed_views
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import DEGREES, View, zoomed
+from clsplat.scene.view import DEGREES, View, zoom_lens
 from clsplat.training.modules.base import attach_modules, learned_scene
 from clsplat.training.modules.camera_optimizer import (
     CameraOptimizer,
@@ -41,7 +41,7 @@ PARAMS = {  # after focal lengths and middle
 def test_lens_of_another_focal_length_undistorts_to_same_pixels(model):
     focals = (160.0,) if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else (160.0, 165.0)
     lens = Lens(200, 150, model, (*focals, 97.0, 80.0, *PARAMS[model]))
-    other = zoomed(lens, 1.03)
+    other = zoom_lens(lens, 1.03)
     u, v = np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.5, 0.5, 7))
     for one, same in zip(lens.distort(u, v), other.distort(u / 1.03, v / 1.03), strict=True):
         np.testing.assert_allclose(same, one, rtol=0, atol=1e-10)
@@ -51,9 +51,9 @@ def test_lens_of_another_focal_length_undistorts_to_same_pixels(model):
 
 
 def test_a_fisheye_has_no_other_focal_length():
-    assert zoomed(FISHEYE, 1.0) is FISHEYE
+    assert zoom_lens(FISHEYE, 1.0) is FISHEYE
     with pytest.raises(DataError, match=r"OPENCV_FISHEYE has no form with another focal length.*undistort"):
-        zoomed(FISHEYE, 1.01)
+        zoom_lens(FISHEYE, 1.01)
 
 
 def test_focal_length_that_cannot_be_written_is_not_learned(tiny_scene):
@@ -65,9 +65,11 @@ def test_focal_length_that_cannot_be_written_is_not_learned(tiny_scene):
 def test_views_are_written_with_the_lens_of_their_focal_length(tmp_path):
     view = View("a.png", STRONG.pinhole, np.eye(3, 4), tmp_path / "a.png", lens=STRONG)
     scene = replace(_scene_of([view, replace(view, name="b.png")]), path=tmp_path)
-    assert posed(scene)[0].lens is STRONG
+    assert posed_views(scene)[0].lens is STRONG
     moved = replace(view, camera=view.camera.zoomed(1.02))
-    assert posed(replace(scene, views=(moved,), test=()))[0].lens.params == pytest.approx(zoomed(STRONG, 1.02).params)
+    assert posed_views(replace(scene, views=(moved,), test=()))[0].lens.params == pytest.approx(
+        zoom_lens(STRONG, 1.02).params
+    )
 
 
 def _scene_of(views: list[View]) -> Scene:

@@ -115,7 +115,7 @@ def test_every_status_of_a_matrix_fits_the_schema(written, tiny_scene, tmp_path)
 
 
 def test_steps_of_the_preparation_are_stages(written, tmp_path):
-    from clsplat.prepare.cache import Planned, prepare
+    from clsplat.prepare.cache import PlannedStep, prepare
     from clsplat.prepare.steps import Step
 
     class Wait(Step):
@@ -127,7 +127,7 @@ def test_steps_of_the_preparation_are_stages(written, tmp_path):
     status = StatusFile(tmp_path)
     status.begin()
     status.enter("preparing")
-    planned = [Planned(Wait(stage="wait"), "", "", tmp_path / "prepared" / "wait", "no result yet")]
+    planned = [PlannedStep(Wait(stage="wait"), "", "", tmp_path / "prepared" / "wait", "no result yet")]
     prepare(planned, tmp_path, tmp_path / "prepared", status.stage)
     status.end("done", 0)
     assert ("preparing", "wait") in {(one["state"], one.get("stage")) for one in written}

@@ -12,7 +12,7 @@ import pytest
 
 import clsplat
 from clsplat.metrics.images import psnr, to_8_bits
-from clsplat.scene.viewpoint import Stand
+from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page, described
 from tests.support.browser import CHROMIUM, Browser
@@ -45,7 +45,7 @@ def render(model, view):
 def write_page(folder: Path, model, **names) -> Path:
     """Write a page whose photographs are renders of its model, as JPEG."""
     found = scene(folder)
-    stand = Stand.of(model.means, found.views, found.views[0])
+    stand = Viewpoint.from_points(model.means, found.views, found.views[0])
     views = described(found, lambda view: render(model, view), "test")
     for view, name in zip(views, names.get("views", ()), strict=False):
         view["name"] = name
@@ -311,7 +311,7 @@ def test_hostile_names_are_text(browser, tmp_path):
 
 def test_two_models_share_a_camera(browser, tmp_path):
     model, other = cloud(300), cloud(300, seed=3)
-    stand = Stand.of(model.means, (), None)
+    stand = Viewpoint.from_points(model.means, (), None)
     Page("two", {"a": pack(model), "b": pack(other)}, stand, "black").write(tmp_path / "page.html")
     browser.open(tmp_path / "page.html")
     picture = shown(browser)[70:400]
@@ -326,7 +326,7 @@ def test_two_models_share_a_camera(browser, tmp_path):
 
 
 def test_nothing_to_show_and_damaged_bytes(browser, tmp_path):
-    stand = Stand.of(cloud(4)[:0].means, (), None)
+    stand = Viewpoint.from_points(cloud(4)[:0].means, (), None)
     page = tmp_path / "page.html"
     Page("nothing", {"a": pack(cloud(4)[:0])}, stand, "black").write(page)
     browser.open(page)

@@ -10,7 +10,7 @@ import clsplat
 from clsplat.formats.splats import MOTION, fields_of, width_of
 from clsplat.gaussians.motion import at_time
 from clsplat.metrics.images import psnr, to_8_bits
-from clsplat.scene.viewpoint import Stand
+from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page, described
 from tests.support.browser import CHROMIUM, Browser
@@ -36,7 +36,7 @@ def page_of(folder, model) -> Page:
     """A page whose photographs are renders at four moments."""
     found = scene(folder)
     found = replace(found, views=tuple(replace(v, time=t) for v, t in zip(found.views, MOMENTS, strict=True)))
-    stand = Stand.of(model.means, found.views, found.views[0])
+    stand = Viewpoint.from_points(model.means, found.views, found.views[0])
     renderer = clsplat.Renderer(model)
     views = described(found, lambda view: to_8_bits(renderer.render(view).image), "none")
     return Page("demo", {"demo": pack(model)}, stand, "white", views)

@@ -12,7 +12,7 @@ import pytest
 
 from clsplat.core.errors import OutputError
 from clsplat.core.page import inline, shrink
-from clsplat.scene.viewpoint import Stand
+from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer import page as module
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import FOLDER, SCRIPTS, Page, camera_data, described, left_out, script
@@ -29,7 +29,7 @@ def flat(view):
 @pytest.fixture
 def page(tmp_path) -> Page:
     found, model = scene(tmp_path), cloud(60)
-    stand = Stand.of(model.means, found.views, found.views[0])
+    stand = Viewpoint.from_points(model.means, found.views, found.views[0])
     return Page("demo", {"model": pack(model)}, stand, "white", described(found, flat, "test"))
 
 
@@ -163,17 +163,17 @@ def test_thumbnails_keep_their_aspect(shape, after):
 
 def test_where_a_page_begins(tmp_path):
     model, found = cloud(200), views()
-    stand = Stand.of(model.means, found, found[2])
+    stand = Viewpoint.from_points(model.means, found, found[2])
     assert stand.start is found[2]
     assert stand.focal == 85.0
     assert stand.up @ [0, -1, 0] > 0.8
-    alone = Stand.of(model.means, (), None)
+    alone = Viewpoint.from_points(model.means, (), None)
     forward = alone.start.world_to_camera[2, :3]
     toward = alone.pivot - alone.start.position
     np.testing.assert_allclose(forward, toward / np.linalg.norm(toward), atol=1e-9)
-    assert Stand.of(model.means[:0], (), None).radius > 0
+    assert Viewpoint.from_points(model.means[:0], (), None).radius > 0
     model.means[::3] = np.nan
-    assert np.isfinite(Stand.of(model.means, (), None).start.world_to_camera).all()
+    assert np.isfinite(Viewpoint.from_points(model.means, (), None).start.world_to_camera).all()
 
 
 def test_a_camera_keeps_its_digits():

@@ -18,16 +18,16 @@ from clsplat.core.errors import DataError
 from clsplat.core.progress import captured_log, counted, log_level
 from clsplat.prepare.gather import list_photographs, why_unreadable
 from clsplat.scene.camera import BORDER_POINTS, Lens
-from clsplat.scene.detect import read_scene, reader_of
+from clsplat.scene.detect import find_reader, read_scene
 from clsplat.scene.identity import ImageFile, decode_all
-from clsplat.scene.images import CameraExposure, exposure_of, is_image, read_gray
+from clsplat.scene.images import CameraExposure, is_image, read_exif_exposure, read_gray
 from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.quality import SIDE, both_sharpnesses, is_blurred
 from clsplat.scene.reader import Parts
-from clsplat.scene.reprojection import reprojection_errors, require_ahead
-from clsplat.scene.scene import camera_extent, strayed
-from clsplat.scene.times import by_camera, moments_of
-from clsplat.scene.view import NO_FILE, View, camera_exposures, fits
+from clsplat.scene.reprojection import reprojection_errors, require_points_in_front
+from clsplat.scene.scene import camera_extent, outlier_cameras
+from clsplat.scene.times import distinct_times, group_by_camera
+from clsplat.scene.view import NO_FILE, View, fits_camera, load_exposures
 
 # What photographs look like beside each other: blurred ones, the same one twice, exposures that jump.
 
@@ -61,15 +61,17 @@ def looks_of(parts: Parts, missing: Container[Path]) -> LookFacts:
     """Compare the photographs of the views of a dataset, or where it has no views, all of its folder."""
     shown = [view for view in parts.views if view.image_path != NO_FILE and view.image_path not in missing]
     if not shown:
-        return looks({os.path.relpath(file, parts.path).replace(os.sep, "/"): file for file in parts.on_disk})
+        return compare_photos({os.path.relpath(file, parts.path).replace(os.sep, "/"): file for file in parts.on_disk})
     exposures: list[CameraExposure | None] = [None] * len(shown)
     with suppress(DataError):
-        exposures = camera_exposures(shown)
+        exposures = load_exposures(shown)
     files = {view.name: view.image_path for view in shown}
-    return looks(files, {view.name: one for view, one in zip(shown, exposures, strict=True)})
+    return compare_photos(files, {view.name: one for view, one in zip(shown, exposures, strict=True)})
 
 
-def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | None] | None = None) -> LookFacts:
+def compare_photos(
+    files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | None] | None = None
+) -> LookFacts:
     """Compare photographs, by name; those that cannot be read are left out.  Without `exposures`, EXIF tells them."""
     names = sorted(files)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8), "looking") as pool:
@@ -77,7 +79,7 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
         looked = dict(zip(names, read, strict=True))
     found = {name: look for name, look in looked.items() if not isinstance(look, DataError)}
     if exposures is None:
-        exposures = {name: exposure_of(files[name]) for name in found}
+        exposures = {name: read_exif_exposure(files[name]) for name in found}
     values = [(name, exposure.value) for name in names if (exposure := exposures.get(name))]
     steps = [(a, b, round(abs(y - x), 2)) for (a, x), (b, y) in pairwise(values)]
     middle = np.median([look.sharpness for look in found.values()], axis=0) if found else np.zeros(2)
@@ -149,7 +151,7 @@ class PointFacts:
     behind: float | None  # share that lies behind all cameras
 
 
-def points_of(parts: Parts, extent: float | None, centers: NDArray[np.floating]) -> PointFacts:
+def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.floating]) -> PointFacts:
     """Measure the points of a dataset that has some.  extent: of its cameras; centers: of these, [N, 3]."""
     assert parts.points is not None
     positions = parts.points.positions
@@ -241,11 +243,11 @@ class Facts:
     submodels: dict[str, int]  # images of each COLMAP model; the first is used
     cameras: list[CameraFacts]
     photos: PhotographFacts
-    looks: LookFacts
+    comparison: LookFacts
     points: PointFacts | None
     seen: dict[str, int]  # points seen by each view; empty where the dataset has no such counts
     extent: float | None  # scene units
-    strayed: list[str]
+    outlier_cameras: list[str]
     moments: int  # different times of the views; 0 where the scene does not move
     stations: int  # different cameras that took the views, where the scene moves
     one_place: bool  # all cameras have the same center
@@ -262,7 +264,7 @@ class Facts:
         return sorted((name for name, count in self.seen.items() if count < MIN_SEEN), key=lambda name: self.seen[name])
 
 
-def survey(parts: Parts) -> Facts:
+def measure_dataset(parts: Parts) -> Facts:
     """Measure a dataset that was read in pieces."""
     views, expected = parts.views, parts.expected
     missing = [file for file in expected if not os.path.exists(file)]  # never raises
@@ -283,13 +285,15 @@ def survey(parts: Parts) -> Facts:
         submodels=parts.submodels,
         cameras=_cameras(parts),
         photos=_photographs(views, set(missing)),
-        looks=looks_of(parts, set(missing)),
-        points=points_of(parts, extent, centers) if parts.points else None,
+        comparison=looks_of(parts, set(missing)),
+        points=measure_points(parts, extent, centers) if parts.points else None,
         seen=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
-        strayed=[view.name for view, far in zip(views, strayed(views), strict=True) if far] if views else [],
-        moments=len(moments_of(views)),
-        stations=len(by_camera(views)) if moments_of(views) else 0,
+        outlier_cameras=[view.name for view, far in zip(views, outlier_cameras(views), strict=True) if far]
+        if views
+        else [],
+        moments=len(distinct_times(views)),
+        stations=len(group_by_camera(views)) if distinct_times(views) else 0,
         one_place=len(views) > 1 and bool(np.allclose(centers, centers[0], rtol=0, atol=1e-9)),
         same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
@@ -359,12 +363,12 @@ def _photograph(facts: PhotographFacts, view: View, name: str, path: Path, file:
         facts.cut.append(name)
     elif file.size is None:
         facts.unreadable[name] = file.fault.removeprefix(f"{path}: ")
-    elif file.fault and not fits(view, file.size):
+    elif file.fault and not fits_camera(view, file.size):
         facts.misfits[name] = f"{file.size[0]}x{file.size[1]}, its camera {camera.width}x{camera.height}"
-        if fits(view, file.size[::-1]):
+        if fits_camera(view, file.size[::-1]):
             facts.on_side.append(name)
     else:
-        turned = not fits(view, file.size)  # the reader rotates it
+        turned = not fits_camera(view, file.size)  # the reader rotates it
         if file.orientation > 1 and not turned:
             facts.exif_turned.append(name)
         if (file.size[::-1] if turned else file.size) != (camera.width, camera.height):
@@ -383,12 +387,12 @@ def read_parts(path: Path) -> Parts:
         try:
             parts.scene = read_scene(path)
             if parts.scene.points:
-                require_ahead(parts.scene.points, parts.scene)
+                require_points_in_front(parts.scene.points, parts.scene)
         except DataError as error:
             if not path.is_dir():
                 raise
             parts.refusal = str(error)
-        if reader := reader_of(path):
+        if reader := find_reader(path):
             parts.kind = reader.name
             reader.list_parts(parts)
             if parts.scene and parts.points:

@@ -11,9 +11,16 @@ from rich.table import Table
 from rich.text import Text
 
 from clsplat.core.errors import pluralize, shell_quote, shorten
-from clsplat.prepare.gather import MIN_PHOTOGRAPHS, left_out
-from clsplat.prepare.gather import remedy as remedy_of
-from clsplat.prepare.inspect.facts import MAX_DISTANCE, MIN_SEEN, CameraFacts, Facts, PointFacts, read_parts, survey
+from clsplat.prepare.gather import MIN_PHOTOGRAPHS, remedy_for, warnings_for
+from clsplat.prepare.inspect.facts import (
+    MAX_DISTANCE,
+    MIN_SEEN,
+    CameraFacts,
+    Facts,
+    PointFacts,
+    measure_dataset,
+    read_parts,
+)
 from clsplat.scene.reader import Parts
 
 # What is wrong with a dataset, and its remedy.
@@ -41,7 +48,7 @@ class Finding:
 
 def unprepared(facts: Facts) -> Iterator[Finding]:
     """Yield that there are no cameras, and how to find them; then the files that a preparation leaves out."""
-    count, damaged = facts.on_disk, facts.looks.unreadable
+    count, damaged = facts.on_disk, facts.comparison.unreadable
     if facts.kind != "none" or not (count or facts.left_out):
         return
     held = f"{pluralize(count, 'photograph')} but" if count else "no photographs that can be read, and"
@@ -51,9 +58,9 @@ def unprepared(facts: Facts) -> Iterator[Finding]:
     else:
         remedy, texts = f"`clsplat run photos --scene {shell_quote(facts.path)}` finds the cameras", facts.left_out
         if readable < MIN_PHOTOGRAPHS:
-            remedy = f"only {readable} of {count} photographs can be read; {remedy_of(damaged)}"
+            remedy = f"only {readable} of {count} photographs can be read; {remedy_for(damaged)}"
     yield Finding("error", f"{facts.path} holds {held} no camera poses", remedy)
-    for text in texts + left_out({"damaged": damaged, "photographs": readable}):
+    for text in texts + warnings_for({"damaged": damaged, "photographs": readable}):
         yield Finding("warning", text.removeprefix(f"{facts.path}: "))
 
 
@@ -155,17 +162,17 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
 
 
 def _looks(facts: Facts) -> Iterator[Finding]:
-    blurred, jumps = facts.looks.blurred, facts.looks.jumps
+    blurred, jumps = facts.comparison.blurred, facts.comparison.jumps
     if blurred:
         fault = f"{_are(len(blurred), 'photograph')} blurred ({_listed(blurred)})"
         yield Finding("warning", fault, "leave them out, or take them again: the model learns the blur")
-    for names in facts.looks.same[:MAX_NAMES]:
+    for names in facts.comparison.same[:MAX_NAMES]:
         yield Finding("note", f"{_listed(names)} look the same", "one of them is enough")
     if jumps:
         named = _listed([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
         fault = f"the exposure jumps by more than a stop {pluralize(len(jumps), 'time')} ({named})"
         yield Finding("note", fault, "--set optimize.modules.exposure={} gives each photograph its own")
-    if steps := facts.looks.steps:
+    if steps := facts.comparison.steps:
         named = _listed([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
         fault = f"{_are(len(steps), 'photograph')} more than twice as bright or dark as the one before ({named})"
         remedy = "EXIF does not tell both; if exposures changed, --set optimize.modules.exposure={} gives each its own"
@@ -204,8 +211,10 @@ def _poses(facts: Facts) -> Iterator[Finding]:
     if facts.one_place:
         fault = "all cameras are at the same place"
         yield Finding("warning", fault, "they show no depth; take photographs from different places")
-    if facts.strayed:
-        fault = f"{_are(len(facts.strayed), 'camera')} far away from all others ({_listed(facts.strayed)})"
+    if facts.outlier_cameras:
+        fault = (
+            f"{_are(len(facts.outlier_cameras), 'camera')} far away from all others ({_listed(facts.outlier_cameras)})"
+        )
         yield Finding(
             "warning", fault, "the pose is probably wrong; remove the image from the dataset or place it again"
         )
@@ -281,10 +290,10 @@ class Inspection:
     findings: list[Finding]
 
     @classmethod
-    def of(cls, path: Path) -> "Inspection":
+    def from_folder(cls, path: Path) -> "Inspection":
         """Inspect the dataset in a folder.  Raises DataError only where there is no such folder."""
         parts = read_parts(path)
-        facts = survey(parts)
+        facts = measure_dataset(parts)
         return cls(parts, facts, findings(facts))
 
     @property
@@ -323,8 +332,8 @@ def figures(facts: Facts) -> dict[str, str]:
         lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_line(camera)
     if facts.extent is not None:
         lines["extent"] = f"{facts.extent:.4g} scene units around the cameras"
-        if facts.strayed:
-            lines["extent"] += f", without {len(facts.strayed)} that are far away from all others"
+        if facts.outlier_cameras:
+            lines["extent"] += f", without {len(facts.outlier_cameras)} that are far away from all others"
     if points := facts.points:
         lines["points"] = f"{points.count:,}"
         if points.error_mean is not None:

@@ -36,7 +36,7 @@ def inspection_page(inspection: Inspection) -> str:
         findings=inspection.findings,
         figures=figures(inspection.facts),
         cameras=_cameras(inspection),
-        far=pluralize(len(inspection.facts.strayed), "camera") if inspection.facts.strayed else "",
+        far=pluralize(len(inspection.facts.outlier_cameras), "camera") if inspection.facts.outlier_cameras else "",
         seen=_seen(inspection),
         lists=_lists(inspection),
     )
@@ -44,7 +44,7 @@ def inspection_page(inspection: Inspection) -> str:
 
 def _cameras(inspection: Inspection) -> list[Markup]:
     """Draw training and test cameras without outliers, and points, from above and from the side."""
-    far, scene, table = set(inspection.facts.strayed), inspection.parts.scene, inspection.parts.points
+    far, scene, table = set(inspection.facts.outlier_cameras), inspection.parts.scene, inspection.parts.points
     test = {view.name for view in scene.split("test")} if scene else set()
     near = [view for view in inspection.parts.views if view.name not in far]
     views = {
@@ -75,7 +75,7 @@ def _lists(inspection: Inspection) -> list[tuple[str, list[str], int]]:
         "not of the camera's size": [f"{name}: {size}" for name, size in photographs.misfits.items()],
         "end of the file is missing": photographs.cut,
         "rotated by the EXIF data": photographs.exif_turned,
-        "far away from all others": facts.strayed,
+        "far away from all others": facts.outlier_cameras,
         "same pose": [" = ".join(names) for names in facts.same_pose],
         "few points": facts.few_seen,
     }

@@ -24,7 +24,7 @@ from clsplat.formats.splats import EXPECTED, is_moment
 from clsplat.runs.live.preview import Credit, Desk, Kind, Pace, PageCamera, ShownRun
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
-from clsplat.scene.viewpoint import Stand
+from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.page import camera_data, joined, stand_data, style
 
 # What a browser asks, and who may ask: GET alone, by a name of this machine, below a secret path.
@@ -202,7 +202,7 @@ def page() -> bytes:
     return text.encode()
 
 
-def scene_data(number: int, title: str, views: Sequence[View], test: set[str], stand: Stand) -> dict[str, Any]:
+def scene_data(number: int, title: str, views: Sequence[View], test: set[str], stand: Viewpoint) -> dict[str, Any]:
     """Return what live.js reads of a run: its views and the frame of motion."""
 
     def described(index: int, view: View) -> dict[str, Any]:

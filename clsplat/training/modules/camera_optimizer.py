@@ -23,9 +23,9 @@ from clsplat.photos.appearance import ViewTable, adam_step
 from clsplat.render.camera import moved_camera
 from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.render.workspace import Workspace
-from clsplat.scene.reprojection import with_cameras
+from clsplat.scene.reprojection import replace_cameras
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import View, zooms
+from clsplat.scene.view import View, can_zoom
 from clsplat.training.modules.base import ModuleState, Scalars, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
@@ -122,7 +122,7 @@ class CameraOptimizer(TrainingModule):
         rows = data.get("photographs") if isinstance(data, dict) else None
         if not isinstance(rows, dict):
             raise DataError(f"{path}: expected a mapping 'photographs'; train again, or remove the file")
-        return with_cameras(scene, [_with_pose(path, view, rows.get(view.name)) for view in scene.views])
+        return replace_cameras(scene, [_with_pose(path, view, rows.get(view.name)) for view in scene.views])
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ class CameraState(ModuleState):
             return np.column_stack([rotation, -rotation @ (new_center + scale * (view.position - center))])
 
         views = (replace(view, camera=view.camera.zoomed(self.factor(view.name))) for view in scene.views)
-        return with_cameras(scene, [replace(view, world_to_camera=pose(view)) for view in views])
+        return replace_cameras(scene, [replace(view, world_to_camera=pose(view)) for view in views])
 
     def write(self, run: Run) -> None:
         """Write the pose of each photograph, and log how far cameras moved."""
@@ -309,7 +309,7 @@ class CameraState(ModuleState):
 def require_zoom(scene: Scene) -> None:
     """Raise DataError if a view has a lens whose focal length cannot be changed."""
     for view in scene.views:
-        if view.lens is not None and not zooms(view.lens):
+        if view.lens is not None and not can_zoom(view.lens):
             raise DataError(
                 f"{scene.path}: camera_optimizer.focal: the focal length of {quote(view.name)}'s lens, "
                 f"{view.lens.model}, cannot be optimized; run `clsplat data undistort` first, or leave out this key"

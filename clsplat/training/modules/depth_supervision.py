@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.losses.depth import InverseDepth
 from clsplat.photos.depths import DepthMaps, PointDepths
-from clsplat.scene.reprojection import within
+from clsplat.scene.reprojection import filter_tracks
 from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
@@ -46,7 +46,7 @@ class DepthSupervision(TrainingModule):
         self.check_run(run)
         assert run.scene.tracks is not None
         views = run.scene.split("train")
-        tracks, names = within(run.scene.tracks, views), [view.name for view in views]
+        tracks, names = filter_tracks(run.scene.tracks, views), [view.name for view in views]
         return DepthSupervisionState(PointDepths(run.device, tracks, names, run.scene.extent, self._maps))
 
 

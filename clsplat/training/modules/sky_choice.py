@@ -89,7 +89,7 @@ def _reason_unknown(run: Run) -> str:
 
 def _count(run: Run, share: float) -> tuple[int, int]:
     """Count the photographs with at least this share of sky in their upper third, and all photographs."""
-    evidence = _evidence(run, run.scene.with_fold())
+    evidence = _evidence(run, run.scene.merge_validation())
     return sum(one.share >= share for one in evidence), len(evidence)
 
 

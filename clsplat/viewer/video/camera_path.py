@@ -22,7 +22,7 @@ from clsplat.core.reading import read_json
 from clsplat.formats.splats import is_moment
 from clsplat.scene import camera_files
 from clsplat.scene.camera import Camera
-from clsplat.scene.camera_files import center_lost, width_lost
+from clsplat.scene.camera_files import warn_center_lost, warn_width_lost
 from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
 from clsplat.scene.transforms_json import JsonFrame, camera_to_world_of, opengl_matrix
 from clsplat.scene.view import View
@@ -84,7 +84,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
 
 def _of_cameras(path: Path) -> CameraPath:
     """The cameras of a cameras.json as frames, each fitted into the size of the first."""
-    views = camera_files.read(path)
+    views = camera_files.read_inria(path)
     size = even_size(views[0].camera)
     frames = [replace(view, name=f"frame_{i:05d}", camera=around(view.camera, size)) for i, view in enumerate(views, 1)]
     return CameraPath(frames, 30.0, size)
@@ -122,7 +122,7 @@ def write(path: Path, views: Sequence[View], fps: float) -> None:
         "camera_path": frames,
     }
     write_text(path, json.dumps(table, indent=1) + "\n")
-    for warn in (center_lost, width_lost):
+    for warn in (warn_center_lost, warn_width_lost):
         warn(path, [view.camera for view in views], "its readers")
 
 

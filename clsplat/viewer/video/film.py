@@ -12,7 +12,7 @@ from clsplat.core.files import check_result_path
 from clsplat.formats.splats import is_moment
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
-from clsplat.scene.view_selection import Choice, choose
+from clsplat.scene.view_selection import ViewSelection, choose
 from clsplat.viewer.video import camera_path, encoding
 from clsplat.viewer.video.paths import (
     PATHS,
@@ -161,7 +161,7 @@ def _path(wish: Wish, scene: Scene | None, points: Floats) -> Film:
     size = wish.size or even_size(rig.camera)
     if FROM in wish.path:
         names = [view.name for view in scene.views]
-        (chosen,) = choose(Choice(names=[wish.path.partition(FROM)[2]]), names, [])
+        (chosen,) = choose(ViewSelection(names=[wish.path.partition(FROM)[2]]), names, [])
         return Film(stay(scene.views[chosen], wish.frames or FRAMES, size), wish.fps or FPS)
     return Film(PATHS[wish.path](rig, wish.frames or FRAMES, size), wish.fps or FPS)
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, DataError, quote
 from clsplat.scene.camera import Camera
-from clsplat.scene.scene import strayed
+from clsplat.scene.scene import outlier_cameras
 from clsplat.scene.view import View
-from clsplat.scene.viewpoint import closest_point, upward
+from clsplat.scene.viewpoint import nearest_to_axes, up_direction
 
 # What a camera path is made from: where the photographs were taken, what they look at, and which way is up.
 
@@ -45,7 +45,7 @@ class Rig:
         """
         if not views:
             raise DataError("a camera path needs the cameras of a scene; there is none")
-        stray = strayed(views)
+        stray = outlier_cameras(views)
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         step = -(-len(finite) // MOST_POINTS) or 1
         return cls([view for view, far in zip(views, stray, strict=True) if not far], finite[::step])
@@ -68,7 +68,7 @@ class Rig:
     @cached_property
     def up(self) -> Floats:
         """What is up, [3], unit."""
-        return upward(self.views)
+        return up_direction(self.views)
 
     @cached_property
     def focus(self) -> Floats:
@@ -77,7 +77,7 @@ class Rig:
         Raises DataError where most cameras look away from it.
         """
         middle = np.median(self.points, axis=0) if len(self.points) else self.positions.mean(axis=0)
-        focus = closest_point(self.positions, self.forwards, middle)
+        focus = nearest_to_axes(self.positions, self.forwards, middle)
         forward, (near, far) = self.forwards.mean(axis=0), self.depths
         ahead = float(np.median(self._before(focus)))
         if np.linalg.norm(forward) > PARALLEL and not near / BEYOND < ahead < far * BEYOND:

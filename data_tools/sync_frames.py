@@ -19,7 +19,7 @@ from .video import decoded, limited
 LOG = logging.getLogger("clsplat")
 
 
-def write_moments(scene: Path, moments: int, long_side: int | None = None) -> int:
+def write_sync_frames(scene: Path, moments: int, long_side: int | None = None) -> int:
     """Write frames of `scene/videos/NAME.mp4` into `scene/videos/NAME/`, evenly spaced; return the number of cameras.
 
     The moments are the same of all cameras: the videos start together and have one rate.  Of a video with more frames
