@@ -1,4 +1,4 @@
-"""Run each step of `prepare:` once: its result lies in a folder whose name is the hash of everything it depends on."""
+"""Run each step of `prepare:` once and keep its result in a folder named by the hash of everything it depends on."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ from clsplat.core.files import (
     write_error,
     write_text,
 )
-from clsplat.core.progress import Count
+from clsplat.core.progress import Count, counts_as_debug
 from clsplat.core.reading import read_json, sha256
 from clsplat.prepare.database import IMAGES, MODEL
 from clsplat.prepare.features import CameraModel
@@ -36,26 +36,27 @@ from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step
 
 LOG = logging.getLogger("clsplat")
 RECORD = "record.json"
+NO_RESULT = "no result yet"
 
 
 @dataclass(frozen=True)
 class PlannedStep:
-    """A step and the folder of its result."""
+    """A step, the folder of its result, and the reason to run it."""
 
     step: Step
-    origin: str  # folder of the photographs, which the first step reads
+    origin: str  # folder of the photographs, which is the input of the first step
     inputs: str  # hash of its inputs
     folder: Path
-    why: str  # reason to run the step; "" when its result exists
+    why: str  # reason to run the step; "" when its result is there already
 
     @property
     def key(self) -> str:
-        """Hash of everything that the result depends on."""
+        """The hash of everything that the result depends on."""
         return _digest([self.step.stage, self.step.version, self.step.model_dump(mode="json"), self.inputs])
 
 
 def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
-    """Return the steps for the photographs in `source`, with the reasons to run them; results lie below `root`.
+    """Return the steps for the photographs in `source`, with the reason to run each; results are kept below `root`.
 
     Raises DataError when the photographs cannot be read.
     """
@@ -66,40 +67,41 @@ def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
         folder = root / f"{step.stage}-{key[:12]}"
         planned.append(PlannedStep(step, str(source.resolve()), inputs, folder, _why(step, inputs, folder, source)))
         inputs = key
-    done = max((i for i, one in enumerate(planned) if not one.why), default=-1)
-    return [
-        replace(one, why="") if i < done else one for i, one in enumerate(planned)
-    ]  # not needed: a later result exists
+    # A step whose result is missing need not run when the result of a later one is there.
+    done = max((i for i, step in enumerate(planned) if not step.why), default=-1)
+    return [replace(step, why="") if i < done else step for i, step in enumerate(planned)]
 
 
 def prepare(
     planned: Sequence[PlannedStep],
     source: Path,
     root: Path,
-    begun: Callable[[str], AbstractContextManager[Any]] = nullcontext,
+    stage: Callable[[str], AbstractContextManager[Any]] = nullcontext,
 ) -> Path:
-    """Run the steps that have a reason, each inside of `begun(name)`, and return the last result.
+    """Run the steps that have a reason to run, each inside `stage(name)`, and return the folder of the last result.
 
-    Raises OutputError where another process makes one of the results, and the errors of the steps.
+    Raises OutputError when another process is making one of the results, and the errors of the steps.
     """
     count = Count("steps of the preparation", len(planned), is_even=False)
+    if reused := [one.step.stage for one in planned if not one.why]:
+        LOG.info("reusing the results of %s in %s", ", ".join(reused), root)
     for number, one in enumerate(planned):
-        count.reach(number)
-        with _only_one_making(one) if one.why else nullcontext():
-            if one.why and _fault(one.folder):  # or made by another process since
-                with begun(one.step.stage):
-                    _do(one, source, root)
+        with counts_as_debug():  # each step logs its own progress
+            count.reach(number)
+        with _exclusive(one) if one.why else nullcontext():
+            if one.why and _fault(one.folder):  # another process may have made it since
+                with stage(one.step.stage):
+                    _run_step(one, source, root)
             else:
-                LOG.info("%s: exists in %s", one.step.stage, one.folder)
-                for text in one.step.warnings(record_of(one.folder)):
+                for text in one.step.warnings(read_record(one.folder)):
                     LOG.warning("%s", text)
         source = one.folder
     return source
 
 
 @contextmanager
-def _only_one_making(one: PlannedStep) -> Iterator[None]:
-    """Hold a result: what an interrupted call left is gone on with by one process alone."""
+def _exclusive(one: PlannedStep) -> Iterator[None]:
+    """Lock a result, so that only one process continues what an interrupted call left."""
     with raising_output_error(one.folder.parent):
         make_folder(one.folder.parent)
     with lock.lock_folder(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
@@ -107,14 +109,15 @@ def _only_one_making(one: PlannedStep) -> Iterator[None]:
 
 
 def fingerprint(folder: Path, without: Path) -> str:
-    """Return a hash of names and contents of all files below a folder, without hidden ones and those below `without`.
+    """Return a hash of the names and contents of the files below a folder, except hidden ones and those in `without`.
 
     Raises DataError when there is no such folder, or a file in it cannot be read.
     """
     require_folder(folder)
     parts = []
     for base, folders, files in os.walk(folder):
-        folders[:] = sorted(name for name in folders if name[0] != "." and not _same(Path(base) / name, without))
+        below = {name: (Path(base) / name).resolve() for name in folders if name[0] != "."}
+        folders[:] = sorted(name for name, path in below.items() if path != without.resolve())
         for name in sorted(files):
             path = Path(base) / name
             if name[0] != "." and path.is_file():
@@ -136,17 +139,14 @@ def read_note(out: Path) -> dict[str, str] | None:
         return None
 
 
-def _same(path: Path, other: Path) -> bool:
-    return path.resolve() == other.resolve()
+def _run_step(one: PlannedStep, source: Path, root: Path) -> None:
+    """Make a result in a hidden folder, and rename the folder when it is complete and synced to the disk.
 
-
-def _do(one: PlannedStep, source: Path, root: Path) -> None:
-    """Make a result in a hidden folder beside its own, and rename it when it is complete and on the disk.
-
-    A step that resumes finds there what an interrupted call has made of the same inputs with the same settings.
+    A step that can resume finds there what an interrupted call made from the same inputs with the same settings.
     """
     temporary = one.folder.with_name(f".{one.folder.name}")
-    LOG.info("%s: %s", one.step.stage, one.why)
+    if one.why != NO_RESULT:
+        LOG.info("%s runs again: %s", one.step.stage, one.why)
     start = time.perf_counter()
     try:
         if one.step.resumes:
@@ -157,47 +157,47 @@ def _do(one: PlannedStep, source: Path, root: Path) -> None:
         summary = one.step.make(source.resolve(), temporary, root.parent)
         seconds = round(time.perf_counter() - start, 1)
         settings = one.step.model_dump(mode="json")
-        made = {"origin": one.origin, "inputs": one.inputs, "settings": settings, "seconds": seconds, **summary}
+        record = {"origin": one.origin, "inputs": one.inputs, "settings": settings, "seconds": seconds, **summary}
         sync_below(temporary)
-        write_text(temporary / RECORD, json.dumps({**made, "files": _sizes(temporary)}, indent=1) + "\n")
+        write_text(temporary / RECORD, json.dumps({**record, "files": _sizes(temporary)}, indent=1) + "\n")
         if one.folder.exists():  # a damaged result
             shutil.rmtree(one.folder)
         os.replace(temporary, one.folder)
         sync_folder(one.folder.parent)
     except BaseException as error:
-        if isinstance(error, DataError) or not one.step.resumes:  # the same data would be refused again
+        if isinstance(error, DataError) or not one.step.resumes:  # the same data would fail again
             shutil.rmtree(temporary, ignore_errors=True)
         if isinstance(error, OSError):
             raise write_error(one.folder, error) from error
-        if isinstance(error, DataError) and str(source.resolve()) != one.origin:  # it is the result of a step before
+        if isinstance(error, DataError) and str(source.resolve()) != one.origin:  # name the user's folder, not a result
             raise DataError(str(error).replace(str(source.resolve() / IMAGES), one.origin)) from error
         raise
-    LOG.info("%s: %s  %.0f s", one.step.stage, one.step.told(summary), seconds)
+    LOG.info("%s (%.0f s)", one.step.summary(summary), seconds)
 
 
-def record_of(folder: Path) -> dict[str, Any]:
-    """The record of a result; empty where there is none, or a damaged one."""
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return the record of a result; empty when it is missing or damaged."""
     try:
         record = read_json(folder / RECORD)
     except DataError:
         return {}
-    is_one = isinstance(record, dict) and isinstance(record.get("settings"), dict)
-    return record if is_one and isinstance(record.get("files", {}), dict) else {}
+    is_record = isinstance(record, dict) and isinstance(record.get("settings"), dict)
+    return record if is_record and isinstance(record.get("files", {}), dict) else {}
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    """The bytes of each file below a folder, by its name there, but for a record that a killed call left.
+    """The size of each file below a folder in bytes, by relative path, without a record that a killed call left.
 
-    Files behind links, such as photographs, count too.
+    Links, such as those to photographs, are followed.
     """
     files = (Path(base, name) for base, _, names in os.walk(folder, followlinks=True) for name in names)
-    found = {path.relative_to(folder).as_posix(): path.stat().st_size for path in sorted(files) if path.is_file()}
-    return {name: size for name, size in found.items() if name != RECORD}
+    sizes = {path.relative_to(folder).as_posix(): path.stat().st_size for path in sorted(files) if path.is_file()}
+    return {name: size for name, size in sizes.items() if name != RECORD}
 
 
 def _fault(folder: Path) -> str:
-    """What is wrong with a result, "" where it has its record, and all the files that it lists with their sizes."""
-    record = record_of(folder)
+    """What is wrong with a result; "" when it has its record and every listed file has its size."""
+    record = read_record(folder)
     if not record:
         return f"{RECORD} is missing or damaged"
     files = record.get("files", {})
@@ -211,18 +211,18 @@ def _fault(folder: Path) -> str:
 
 
 def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
-    """The reason to run a step, "" when its result exists: the difference from the newest result."""
+    """The reason to run a step, as the difference from the newest result; "" when the result is there."""
     if folder.exists():
         fault = _fault(folder)
         return fault and f"{fault}; the result is made again"
-    found = []
+    results = []
     for other in folder.parent.glob(f"{step.stage}-*"):
-        record = record_of(other)
+        record = read_record(other)
         if record.get("origin") == str(source.resolve()):
-            found.append((other.stat().st_mtime, record))
-    if not found:
-        return "no result yet"
-    before = max(found, key=lambda pair: pair[0])[1]
+            results.append((other.stat().st_mtime, record))
+    if not results:
+        return NO_RESULT
+    before = max(results, key=lambda pair: pair[0])[1]
     for name, value in step.model_dump(mode="json").items():
         if before["settings"].get(name) != value:
             return f"{name} is {value}, was {before['settings'].get(name)}"
@@ -233,14 +233,12 @@ def _digest(data: Any) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-# What the steps of `prepare` have found, as their records tell.
-
-INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that are not what a step has found
+INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that are no figures of the step
 
 
 def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
-    """Return what each step has found, by its name; steps whose results were removed are left out."""
-    records = {one.step.stage: record_of(one.folder) for one in planned}
+    """Return the figures of each step, by its name, without steps whose results were removed."""
+    records = {one.step.stage: read_record(one.folder) for one in planned}
     return {
         stage: {key: value for key, value in record.items() if key not in INTERNAL}
         for stage, record in records.items()
@@ -248,9 +246,9 @@ def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
     }
 
 
-# Make a COLMAP folder from photographs, without a pipeline: the command `clsplat data photos`.
+# Make a COLMAP folder from photographs without a pipeline, for the command `clsplat data photos`.
 
-STEPS = ".steps"  # in the folder of the scene: results from which an interrupted call continues
+STEPS = ".steps"  # in the folder of the scene: results, from which an interrupted call continues
 
 
 def place_photographs(
@@ -261,10 +259,10 @@ def place_photographs(
     matching: Matching = "auto",
     mapper: Mapper = "incremental",
 ) -> int:
-    """Find the cameras of the photographs in `source`, write a COLMAP folder `out`; return the number of its images.
+    """Find the cameras of the photographs in `source`, write a COLMAP folder `out`, and return the number of images.
 
-    Raises DataError when `out` holds a model or images of another origin, OutputError when another process uses it,
-    and the errors of the steps.
+    Raises DataError when `out` contains other images or a model, OutputError when another process uses it, and the
+    errors of the steps.
     """
     _require_free(out)
     steps: list[Step] = [
@@ -275,23 +273,23 @@ def place_photographs(
     with raising_output_error(out):
         make_folder(out / STEPS)
     with lock.lock_folder(out, out / STEPS / LOCK):
-        _require_free(out)  # again: another call may have ended since
+        _require_free(out)  # again, since another call may have finished meanwhile
         result = prepare(plan(steps, source, out / STEPS), source, out / STEPS)
-        _show(result, out)
+        _publish(result, out)
     return int(read_json(result / RECORD)["registered"])
 
 
 def _require_free(out: Path) -> None:
-    """Raise DataError where the folder holds what would be written there."""
+    """Raise DataError when the folder already contains what would be written there."""
     images = out / IMAGES
     if (out / MODEL).exists():
-        raise DataError(f"{out}: holds a model already, `{MODEL}`; remove it, or give another folder")
+        raise DataError(f"{out}: already contains a model, `{MODEL}`; remove it or choose another folder")
     if images.exists() and not images.is_symlink():
-        raise DataError(f"{out}: holds `{IMAGES}` already; give another folder")
+        raise DataError(f"{out}: already contains `{IMAGES}`; choose another folder")
 
 
-def _show(result: Path, out: Path) -> None:
-    """Let `out` be a COLMAP folder: link the images of the last step, copy its model.  Raises OutputError."""
+def _publish(result: Path, out: Path) -> None:
+    """Link the images of the last step into `out`, and copy its model.  Raises OutputError."""
     with raising_output_error(out):
         (out / IMAGES).unlink(missing_ok=True)
         link(result / IMAGES, out / IMAGES)

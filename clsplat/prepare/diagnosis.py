@@ -1,4 +1,4 @@
-"""Why photographs could not be placed: what their features and matches tell."""
+"""Explain why photographs could not be placed, from their features and matches."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -15,57 +15,56 @@ from clsplat.prepare.database import feature_counts, verified
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS
 from clsplat.scene.quality import is_blurred, sharpness_of
 
-FEW_FEATURES = 300  # of a photograph: a wall of one color has tens, a garden thousands
-TEXTURED = 1000  # features: photographs with as many are not weakly textured; three times FEW_FEATURES
-FEW_MATCHES = 30  # of a photograph with the points of a model: COLMAP places none with fewer
-SHARPNESS_OF = 15  # placed photographs that the others are compared with
+FEW_FEATURES = 300  # per photograph: a plain wall has tens, a garden thousands
+TEXTURED = 1000  # features per photograph, from which it has enough texture
+FEW_MATCHES = 30  # matches with the points of a model: COLMAP places no photograph with fewer
+SHARPNESS_OF = 15  # placed photographs whose sharpness the others are compared with
 
 
 @dataclass
 class MatchGraph:
-    """The photographs with their features, and the pairs that match."""
+    """The photographs, their numbers of features, and the pairs that match."""
 
     images: Path
     features: dict[str, int]
-    pairs: dict[tuple[str, str], int]  # matches that pass verification
+    pairs: dict[tuple[str, str], int]  # geometrically verified matches
     sharpness: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @classmethod
     def from_database(cls, pycolmap: ModuleType, database: Path, images: Path) -> "MatchGraph":
-        """Read them from COLMAP's database."""
+        """Read the graph from COLMAP's database."""
         return cls(images, feature_counts(pycolmap, database), verified(pycolmap, database))
 
     @cached_property
     def matches(self) -> dict[str, dict[str, int]]:
-        """The number of verified matches of each photograph with others."""
-        found: dict[str, dict[str, int]] = {name: {} for name in self.features}
+        """The number of verified matches of each photograph with each other one."""
+        matches: dict[str, dict[str, int]] = {name: {} for name in self.features}
         for (a, b), count in self.pairs.items():
-            found[a][b] = found[b][a] = count
-        return found
+            matches[a][b] = matches[b][a] = count
+        return matches
 
-    def groups(self, fewest: int) -> list[list[str]]:
-        """The photographs that pairs with so many matches join, each group sorted, the largest first."""
-        return connected_groups(self.features, [pair for pair, count in self.pairs.items() if count >= fewest])
+    def groups(self, min_matches: int) -> list[list[str]]:
+        """Return the groups that pairs with at least `min_matches` connect, each sorted, the largest first."""
+        return connected_groups(self.features, [pair for pair, count in self.pairs.items() if count >= min_matches])
 
     def have_nothing_in_common(self) -> bool:
-        """Whether denser features are without a chance: most photographs are in no group of pairs, however few matches
-        these have, although there are features enough.
+        """Return whether denser features would not help: most photographs match no others in spite of many features.
 
-        Photographs of one scene match here and there, by fewer than a camera needs; photographs of plain surfaces have
-        no features, until more are looked for.
+        Photographs of one scene have at least some matches, even if too few to place a camera; photographs of plain
+        surfaces have too few features, and denser ones may help.
         """
         is_textured = median(self.features.values()) >= TEXTURED
         return is_textured and len(self.groups(1)[0]) < len(self.features) / 2
 
     def sharpness_of(self, name: str) -> NDArray[np.float64]:
-        """Both sharpnesses of a photograph, measured once."""
+        """Return both sharpness values of a photograph, measured once."""
         if name not in self.sharpness:
             self.sharpness[name] = sharpness_of(self.images / name)
         return self.sharpness[name]
 
 
 def connected_groups(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> list[list[str]]:
-    """Return the groups of names that pairs join, each sorted, the largest first."""
+    """Return the groups of names that pairs connect, each sorted, the largest first."""
     group_of = {name: {name} for name in names}
     for a, b in pairs:
         if group_of[a] is not group_of[b]:
@@ -76,61 +75,61 @@ def connected_groups(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> 
 
 
 def diagnose(matched: MatchGraph) -> str:
-    """Return the likely reason why photographs give no model, with a remedy."""
+    """Return the likely reason why no photographs could be placed, with a remedy."""
     middle = round(median(matched.features.values()))
     if middle < FEW_FEATURES:
         few = f"half of them have {f'at most {middle}' if middle else 'no'} features"
         return (
             f"{few if any(matched.features.values()) else 'none has features'}, where thousands are usual: they are "
-            "blurred, dark, or show plain surfaces; take sharp ones, of things with texture"
+            "blurred, dark, or show plain surfaces; take sharp photographs of textured objects"
         )
     if not matched.pairs:
-        return "no two of them show the same features; take some with more overlap, of a scene in which nothing moves"
+        return "no two of them show the same features; take photographs with more overlap, of a static scene"
     groups = matched.groups(FEW_MATCHES)
     if len(groups[0]) < max(MIN_PHOTOGRAPHS, len(matched.features) / 2):
         return f"{_parts(matched, groups)}; take photographs of one scene, with more overlap"
-    return "take more sharp ones, from places a step apart, of a textured scene in which nothing moves"
+    return "take more sharp photographs, a step apart, of a textured, static scene"
 
 
 def _parts(matched: MatchGraph, groups: Sequence[list[str]]) -> str:
-    """Which photographs belong together, and which do not, in words."""
-    alone = [name for group in groups if len(group) == 1 for name in group]
-    count = len(groups) - len(alone)
+    """Which photographs match one another, and which match none, in words."""
+    single = [name for group in groups if len(group) == 1 for name in group]
+    count = len(groups) - len(single)
     if not count:
-        return f"no two of them show enough of the same: {max(matched.pairs.values())} matches at most"
-    others = f", and {len(alone)} without a good match ({first_few(alone)})" if alone else ""
+        return f"no two of them overlap enough: {max(matched.pairs.values())} matches at most"
+    others = f", and {len(single)} without a good match ({first_few(single)})" if single else ""
     largest = f"{len(groups[0])} ({first_few(groups[0])})"
-    return f"they do not belong together: {pluralize(count, 'group')} of good matches, the largest of {largest}{others}"
+    return f"they do not connect: {pluralize(count, 'group')} with good matches, the largest of {largest}{others}"
 
 
 def explain_unplaced(matched: MatchGraph, models: Sequence[set[str]]) -> dict[str, str]:
-    """Return the likely reason of each photograph that is not in the first of the models."""
+    """Return the likely reason why each photograph is not in the first of the models."""
     placed = models[0]
     compared = sorted(placed)[:: max(1, len(placed) // SHARPNESS_OF)]
     middle = np.median([matched.sharpness_of(name) for name in compared], axis=0)
-    found = {}
+    reasons = {}
     for name in sorted(set(matched.features) - placed):
         other = next((model for model in models[1:] if name in model), None)
-        found[name] = (
+        reasons[name] = (
             f"in another model, with {first_few(sorted(other - {name}))}"
             if other
             else _reason(matched, name, placed, middle)
         )
-    return found
+    return reasons
 
 
 def _reason(matched: MatchGraph, name: str, placed: set[str], middle: NDArray[np.float64]) -> str:
     matches = matched.matches[name]
     among = {other: count for other, count in matches.items() if other in placed}
     if matched.features[name] < FEW_FEATURES:
-        return f"only {pluralize(matched.features[name], 'feature')}: blurred, dark, or of a plain surface"
+        return f"only {pluralize(matched.features[name], 'feature')}: blurred, dark, or a plain surface"
     is_soft = is_blurred(matched.sharpness_of(name), middle)
     may_be = "; it may be blurred" if is_soft else ""
-    if not matches:  # no more is known: one of broad shapes is as soft as a blurred one
-        return f"shows nothing that another photograph shows{may_be}"
+    if not matches:  # only a guess: a photograph without fine detail measures like a blurred one
+        return f"matches no other photograph{may_be}"
     best = max(matches, key=lambda other: (matches[other], other))
     if not among:
-        return f"matches {best} alone, which is not placed either"
+        return f"matches only {best}, which is not placed either"
     if max(among.values()) < FEW_MATCHES:
         return f"few matches, at most {max(among.values())}, with {max(among, key=lambda o: (among[o], o))}{may_be}"
     return "blurred" if is_soft else f"{matches[best]} matches with {best}, but too few on points of the model"

@@ -1,7 +1,7 @@
-"""SIFT features of photographs (Lowe 2004): found by OpenCV at the size asked for, kept in COLMAP's database.
+"""Find SIFT features of photographs (Lowe 2004) with OpenCV, and store them in COLMAP's database.
 
-The database has the images in order of their names, so that the same photographs give the same rows.  Each photograph's
-features are written at once: a call that is killed goes on with the next one.
+The database has the images in order of their names, so that the same photographs give the same rows.  The features of
+each photograph are written in one transaction, so a killed call can be resumed with the next photograph.
 """
 
 import logging
@@ -33,12 +33,12 @@ from clsplat.scene.images import read_gray
 LOG = logging.getLogger("clsplat")
 CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
 LAYERS, MAX_EDGE, BLUR = 3, 10.0, 1.6  # Lowe 2004: scales of an octave, ratio of curvatures, px
-LEVELS = 512  # of a root of a share, as COLMAP stores it; larger ones than 255 are cut
+LEVELS = 512  # scale of RootSIFT values, as COLMAP stores them; values above 255 are clipped
 
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """Which features: at most `count` in an image of `long_side` px; `contrast` is a share of the range of gray."""
+    """Find at most `count` features in an image of `long_side` px; `contrast` is a fraction of the gray range."""
 
     long_side: int = 1600
     count: int = 12288
@@ -48,40 +48,40 @@ class FeatureOptions:
 def find_features(
     photographs: Path,
     out: Path,
-    sought: FeatureOptions = FeatureOptions(),
+    options: FeatureOptions = FeatureOptions(),
     camera_model: CameraModel = "SIMPLE_RADIAL",
     cameras: Cameras = "auto",
     without: Path | None = None,
 ) -> dict[str, Any]:
-    """Find features in photographs; return their number, that of their cameras, and why some cannot be read.
+    """Find features; return the number of photographs and cameras, and why some photographs cannot be read.
 
-    Photographs with an EXIF rotation are copied upright, others are linked.  With `cameras: auto`, photographs of one
-    size share a camera where EXIF tells the same lens of them, or nothing.  Raises DataError when fewer than three
-    can be read.
+    Photographs with an EXIF rotation are copied upright, others are linked.  With `cameras: auto`, photographs of the
+    same size share a camera if EXIF has the same lens for them, or none.  Raises DataError when fewer than three
+    photographs can be read.
     """
     pycolmap = require_pycolmap()
     names, damaged = gather(photographs, out / IMAGES, list_photographs(photographs, without))
     groups = group_photos(out / IMAGES, names, cameras)
     figures = {"photographs": len(names), "cameras": len(groups), "damaged": damaged}
     log_warnings(figures)
-    if told := shared_camera_note(out / IMAGES, groups):
-        LOG.info("%s", told)
+    if note := shared_camera_note(out / IMAGES, groups):
+        LOG.info("%s", note)
     with explained(photographs, "find features"):
-        if image_names(pycolmap, out / DATABASE) != sorted(names):  # a new database, or one cut short
+        if image_names(pycolmap, out / DATABASE) != sorted(names):  # a new or an incomplete database
             remove(out / DATABASE)
             _register(pycolmap, out, groups, camera_model)
-    add_features(out / IMAGES, out / DATABASE, sought)
+    add_features(out / IMAGES, out / DATABASE, options)
     return figures
 
 
-def add_features(images: Path, database: Path, sought: FeatureOptions) -> None:
-    """Find the features of those photographs of a database that have none.  Raises DataError."""
+def add_features(images: Path, database: Path, options: FeatureOptions) -> None:
+    """Find features of the photographs in a database that have none.  Raises DataError."""
     pycolmap = require_pycolmap()
     with explained(images, "find features"), opened(pycolmap, database) as rows:
         missing = without_features(rows)
         for number, name in counted(missing.items(), "photographs with features", len(missing)):
-            pixels, (across, down) = read_gray(images / name, sought.long_side)
-            keypoints, descriptors = sift(pixels, sought)
+            pixels, (across, down) = read_gray(images / name, options.long_side)
+            keypoints, descriptors = sift(pixels, options)
             keypoints[:, :3] *= across, down, (across + down) / 2
             with pycolmap.DatabaseTransaction(rows):
                 rows.write_keypoints(number, keypoints)
@@ -89,32 +89,32 @@ def add_features(images: Path, database: Path, sought: FeatureOptions) -> None:
                 rows.write_descriptors(number, pycolmap.FeatureDescriptors(data=descriptors, type=kind))
 
 
-def sift(pixels: NDArray[np.uint8], sought: FeatureOptions) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return features as COLMAP stores them, those of the highest contrast: x, y, scale in px and angle [M, 4], with
-    the descriptors [M, 128].
+def sift(pixels: NDArray[np.uint8], options: FeatureOptions) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Return the features with the highest contrast as COLMAP stores them: x, y, scale in px and angle, [M, 4], and
+    the descriptors, [M, 128].
 
     Pixel (0, 0) has its center at (0.5, 0.5).  Descriptors are RootSIFT (Arandjelović and Zisserman 2012).
     """
     detector = cv2.SIFT.create(
-        nfeatures=sought.count,
+        nfeatures=options.count,
         nOctaveLayers=LAYERS,
-        contrastThreshold=sought.contrast,
+        contrastThreshold=options.contrast,
         edgeThreshold=MAX_EDGE,
         sigma=BLUR,
         enable_precise_upscale=True,
     )
-    found, described = detector.detectAndCompute(pixels, None)
-    if not found:
+    points, described = detector.detectAndCompute(pixels, None)
+    if not points:
         return np.empty((0, 4), np.float32), np.empty((0, 128), np.uint8)
-    best = np.argsort([-one.response for one in found], kind="stable")[: sought.count]
-    keypoints = [(one.pt[0] + 0.5, one.pt[1] + 0.5, one.size / 2, np.deg2rad(one.angle)) for one in found]
+    best = np.argsort([-point.response for point in points], kind="stable")[: options.count]
+    keypoints = [(p.pt[0] + 0.5, p.pt[1] + 0.5, p.size / 2, np.deg2rad(p.angle)) for p in points]
     shares = described / np.maximum(described.sum(axis=1, keepdims=True), 1.0e-6)
     descriptors = np.clip(np.rint(LEVELS * np.sqrt(shares)), 0, 255).astype(np.uint8)
     return np.array(keypoints, np.float32)[best], descriptors[best]
 
 
 def _register(pycolmap: ModuleType, out: Path, groups: Sequence[Sequence[str]], camera_model: CameraModel) -> None:
-    """Write the images into a new database, each group with a camera of its own, whose focal length EXIF tells."""
+    """Write the images into a new database, with one camera per group and its focal length from EXIF."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
     camera_of: Mapping[str, int] = {name: number for number, group in enumerate(groups, 1) for name in group}

@@ -1,4 +1,4 @@
-"""Find the photographs below a folder, and link them into another."""
+"""Find the photographs in a folder and link them into another; describe what is left out."""
 
 import logging
 import os
@@ -31,7 +31,7 @@ from clsplat.scene.multicamera import VIDEO_SUFFIXES
 from clsplat.scene.times_file import read_times, write_times
 
 LOG = logging.getLogger("clsplat")
-CONVERTED = {  # photographs that OpenCV cannot read, and what makes JPEG files of them
+CONVERTED = {  # photographs that OpenCV cannot read, and commands that convert them to JPEG
     "HEIC": ({".heic", ".heif"}, "heif-convert d.heic d.jpg, or sips -s format jpeg *.heic --out . on a Mac"),
     "AVIF": ({".avif"}, "ffmpeg -i d.avif d.jpg"),
     "DNG": ({".dng"}, "darktable-cli d.dng d.jpg"),
@@ -42,17 +42,17 @@ BRANDS = {  # at byte 8, behind `ftyp`: of HEIF (ISO/IEC 23008-12) and of the AV
     "AVIF": {b"avif", b"avis"},
 }
 UNREADABLE_SUFFIXES = {suffix for suffixes, _ in CONVERTED.values() for suffix in suffixes}
-NAMED_OTHERWISE = "{} by its content"  # why a photograph is damaged
+NAMED_OTHERWISE = "contains {} data"  # why a photograph cannot be read
 MIN_PHOTOGRAPHS = 3  # in a folder, and in a model
-CHECKED_SIDE = 64  # px: a photograph that is linked is decoded as small as it can be, to know that it is one
+CHECKED_SIDE = 64  # px: linked photographs are decoded at the smallest size, only to check them
 
 
 def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
-    """Return the names of the photographs below a folder, sorted, without hidden ones and those below `without`.
+    """Return the names of the photographs below a folder, sorted, except hidden ones and those below `without`.
 
-    Raises DataError when there are too few of them.
+    Raises DataError when there are too few.
     """
-    names, unreadable = _found(folder, without)
+    names, unreadable = _photo_names(folder, without)
     for text in _how_to_convert(unreadable):
         LOG.warning("%s: %s", folder, text)
     require_photographs(folder, without)
@@ -60,41 +60,40 @@ def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
 
 
 def require_folder(folder: Path) -> None:
-    """Raise DataError where there is no such folder of photographs; of a video, with what makes one."""
+    """Raise DataError unless `folder` is a folder; for a video, name the command that extracts photographs."""
     if folder.suffix.lower() in VIDEO_SUFFIXES and folder.is_file():
         raise DataError(
-            f"{folder}: is a video; `clsplat data video {shell_quote(folder)} FOLDER` extracts photographs from it"
+            f"{folder}: is a video; run `clsplat data video {shell_quote(folder)} FOLDER` to extract photographs"
         )
     if not folder.is_dir():
-        found = "is a file" if folder.is_file() else "no such folder"
-        raise DataError(f"{folder}: {found}; expected a folder with photographs")
+        fault = "is a file" if folder.is_file() else "no such folder"
+        raise DataError(f"{folder}: {fault}; expected a folder of photographs")
 
 
 def require_photographs(folder: Path, without: Path | None = None) -> None:
     """Raise DataError when there are too few photographs below a folder."""
-    names, unreadable = _found(folder, without)
+    names, unreadable = _photo_names(folder, without)
     if len(names) < MIN_PHOTOGRAPHS:
         suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
         more = "".join(f"; {text}" for text in _how_to_convert(unreadable))
         raise DataError(
-            f"{folder}: found {pluralize(len(names), 'photograph')}; expected at least {MIN_PHOTOGRAPHS}, "
-            f"of {suffixes}{more}"
+            f"{folder}: has {pluralize(len(names), 'photograph')}; "
+            f"expected at least {MIN_PHOTOGRAPHS} ({suffixes}){more}"
         )
 
 
 def _how_to_convert(unreadable: list[str]) -> list[str]:
-    """A sentence for each kind of photographs that are left out."""
+    """A sentence for each kind of photographs that cannot be read."""
     texts = []
     for kind, (suffixes, command) in CONVERTED.items():
-        if found := [name for name in unreadable if Path(name).suffix.lower() in suffixes]:
-            are = "is" if len(found) == 1 else "are"
-            named = f"{pluralize(len(found), f'{kind} file')} such as {found[0]} {are} left out"
-            texts.append(f"{named}: make JPEG files of them, such as by {command}")
+        if names := [name for name in unreadable if Path(name).suffix.lower() in suffixes]:
+            named = f"{pluralize(len(names), f'{kind} file')} cannot be read ({first_few(names)})"
+            texts.append(f"{named}: convert to JPEG, for example with {command}")
     return texts
 
 
-def _found(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
-    """The names of photographs, sorted, and of those that cannot be read."""
+def _photo_names(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
+    """The names of the readable photographs, sorted, and of those in other formats."""
     require_folder(folder)
     names: list[str] = []
     unreadable: list[str] = []
@@ -109,38 +108,37 @@ def _found(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
 
 
 def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str], dict[str, str]]:
-    """Link photographs into a folder, or copy them upright.
+    """Link photographs into the folder `images`, or copy them upright; keep what an interrupted call put there.
 
-    Return the names of those that can be read, and why the others cannot; what an interrupted call has put there stays.
+    Return the names of the readable photographs, and why the others cannot be read.
     """
-    kept, damaged, count = [], dict[str, str](), Count("photographs read", len(names))
+    readable, damaged, count = [], dict[str, str](), Count("photographs read", len(names))
     for number, name in enumerate(names, 1):
         count.reach(number)
         if _is_there(photographs / name, images / name):
-            kept.append(name)
+            readable.append(name)
             continue
         try:
             _gather_one(photographs / name, images / name)
         except DataError as error:
             damaged[name] = why_unreadable(photographs / name, error)
             continue
-        kept.append(name)
-    write_exposures(images, {name: read_exif_exposure(photographs / name) for name in kept})  # a copy of a PNG has none
+        readable.append(name)
+    # written separately, since a copy of a PNG has no EXIF data
+    write_exposures(images, {name: read_exif_exposure(photographs / name) for name in readable})
     if times := read_times(photographs):
-        write_times(images, {name: times[name] for name in kept if name in times})
-    if len(kept) < MIN_PHOTOGRAPHS:
+        write_times(images, {name: times[name] for name in readable if name in times})
+    if len(readable) < MIN_PHOTOGRAPHS:
         faults = first_few([f"{name} ({reason})" for name, reason in damaged.items()])
         raise DataError(
-            f"{photographs}: only {len(kept)} of {len(names)} photographs can be read: {faults}; {remedy_for(damaged)}"
+            f"{photographs}: only {len(readable)} of {len(names)} photographs can be read: {faults}; "
+            f"{remedy_for(damaged)}"
         )
-    return kept, damaged
+    return readable, damaged
 
 
 def why_unreadable(photograph: Path, error: DataError) -> str:
-    """Return why a photograph cannot be read, in a few words: what it is by its content, or what its decoder says.
-
-    error: what reading it raised.
-    """
+    """Return why a photograph cannot be read, in a few words: its actual format, or the message of `error`."""
     with suppress(OSError), open_regular(photograph) as file:
         head = file.read(12)
         for kind, brands in BRANDS.items():
@@ -150,16 +148,16 @@ def why_unreadable(photograph: Path, error: DataError) -> str:
 
 
 def remedy_for(damaged: Mapping[str, str]) -> str:
-    """Return what makes damaged photographs readable, by the reasons that `gather` gives."""
+    """Return how to make damaged photographs readable.  damaged: the reasons that `gather` returns, by name."""
     kinds = [kind for kind in BRANDS if NAMED_OTHERWISE.format(kind) in damaged.values()]
-    texts = [f"name {kind} files so, and make JPEG files of them, such as by {CONVERTED[kind][1]}" for kind in kinds]
+    texts = [f"convert {kind} files to JPEG, for example with {CONVERTED[kind][1]}" for kind in kinds]
     if {NAMED_OTHERWISE.format(kind) for kind in kinds} != set(damaged.values()):
         texts.append("export the others again" if kinds else "export them again")
     return "; ".join(texts)
 
 
 def _gather_one(source: Path, target: Path) -> None:
-    """Link a photograph, or write it upright, with its EXIF data.  Raises DataError where it cannot be read."""
+    """Link a photograph, or write it upright with its EXIF data.  Raises DataError when it cannot be read."""
     target.parent.mkdir(parents=True, exist_ok=True)
     data = read_file(source, "an image", limit=MAX_BYTES)
     if data.startswith(JPEG) and (header := parse_header(data, data[-TAIL_SIZE:], lambda: data)):
@@ -177,17 +175,17 @@ def _gather_one(source: Path, target: Path) -> None:
 
 
 def link(source: Path, target: Path) -> None:
-    """Link a file or folder, or copy it where links are not supported; what is there already stays.
+    """Link a file or folder, or copy it where links are not supported; keep an existing one.
 
-    The link is relative: moved together, both are found.
+    The link is relative, so it stays valid when both are moved together.
     """
     if _is_there(source, target):
         return
     try:
         target.unlink(missing_ok=True)
-        there = os.path.relpath(source.resolve(), target.parent.resolve())
-        target.symlink_to(there, target_is_directory=source.is_dir())
-    except (OSError, ValueError):  # no path leads to another drive of Windows
+        relative = os.path.relpath(source.resolve(), target.parent.resolve())
+        target.symlink_to(relative, target_is_directory=source.is_dir())
+    except (OSError, ValueError):  # Windows has no relative path to another drive
         half = target.with_name(f".{target.name}")
         if source.is_dir():
             shutil.rmtree(half, ignore_errors=True)
@@ -198,21 +196,18 @@ def link(source: Path, target: Path) -> None:
 
 
 def _is_there(source: Path, target: Path) -> bool:
-    """Whether a target is a copy, which is complete, or a link to this source."""
+    """Whether the target is a complete copy, or a link to this source."""
     return target.exists() and (not target.is_symlink() or target.resolve() == source.resolve())
 
 
-# What steps from photographs to cameras have left out, in sentences.
-
-
 def log_warnings(figures: Mapping[str, Any]) -> None:
-    """Log what a step has left out."""
+    """Log the warnings about what a step left out."""
     for text in warnings_for(figures):
         LOG.warning("%s", text)
 
 
 def warnings_for(figures: Mapping[str, Any]) -> list[str]:
-    """Return warnings of the photographs that a step has left out, by what it returned."""
+    """Return warnings about the photographs that a step left out, from the figures that it returned."""
     texts = []
     if damaged := figures.get("damaged"):
         names = [f"{name} ({reason})" for name, reason in damaged.items()]
@@ -223,31 +218,31 @@ def warnings_for(figures: Mapping[str, Any]) -> list[str]:
         named = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])
         more = "" if figures.get("denser_tried") else ", or find more features (find_features.long_side)"
         texts.append(
-            f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed: {named}; "
-            f"the scene is made of the others: for more, add photographs from places between{more}"
+            f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed and are not "
+            f"used: {named}; to place them, add photographs from viewpoints in between{more}"
         )
     if others := figures.get("other_models"):
-        are = "is" if len(others) == 1 else "are"
         sizes = ", ".join([*map(str, others[:-1]), pluralize(others[-1], "photograph")])
         texts.append(
-            f"{pluralize(len(others), 'smaller model')}, of {sizes}, {are} left out: add photographs that join "
-            f"{'it' if len(others) == 1 else 'them'} to the largest"
+            f"only the largest model is used, without {pluralize(len(others), 'smaller model')} of {sizes}: add "
+            "photographs that connect them"
         )
     return texts
 
 
-def summarize_placement(found: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return how many photographs have cameras, how well these fit, and which are left out; "" where it is not known.
+def summarize_placement(figures: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return how many photographs were placed, their mean reprojection error, and which are left out; "" if unknown.
 
-    found: of `facts`; the error is the mean distance in px between points and their features.
+    figures: those of each step, as `step_facts` returns them.
     """
-    cameras = found.get("map_cameras", {})
+    cameras = figures.get("map_cameras", {})
     try:
-        damaged = [f"{name} ({reason})" for name, reason in found.get("find_features", {}).get("damaged", {}).items()]
+        damaged = [f"{name} ({reason})" for name, reason in figures.get("find_features", {}).get("damaged", {}).items()]
         why = cameras.get("reasons", {})
         missing = [f"{name} ({why[name]})" if name in why else str(name) for name in cameras["not_registered"]]
         placed, lost = int(cameras["registered"]), [*damaged, *missing]
-        text = f"{placed} of {placed + len(lost)} photographs placed, {float(cameras['error_px']):.2f} px"
+        error = float(cameras["error_px"])
+        text = f"{placed} of {placed + len(lost)} photographs placed, reprojection error {error:.2f} px"
     except (AttributeError, KeyError, TypeError, ValueError):
         return ""
     return text + (f"; left out: {first_few(lost)}" if lost else "")

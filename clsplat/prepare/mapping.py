@@ -1,7 +1,7 @@
-"""Cameras and points from matches, by pycolmap: several attempts, until all photographs are placed or none is left.
+"""Find cameras and points from matches with pycolmap, in several attempts until all photographs are placed.
 
-The next attempt is made where one leaves photographs out.  What is kept is the model with the most photographs, the
-first of those that have as many.
+Another attempt follows when one leaves photographs out.  The model with the most photographs is kept; of equal ones,
+the first.
 """
 
 import logging
@@ -34,15 +34,14 @@ from clsplat.prepare.rotation_only import why_no_depth
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
-ENOUGH = 0.9  # share of the photographs: with more, no more features are looked for
+ENOUGH = 0.9  # fraction of the photographs: when more are placed, no attempt finds denser features
 DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
 DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01)
-NOT_DENSER = "denser features would not help: there are enough, and most photographs have nothing in common"
-FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap's are of the middle two
-PAIR = 2  # photographs of a point; COLMAP leaves such points out of its models
-PAIR_ERROR = 1.0  # px at the size of the features, mean of both: any two places that match are near rays of a point
-PAIR_ANGLE = 1.5  # degrees between two rays; as COLMAP asks of all points
-LOOSE = {  # COLMAP's own values: 100 matches, 16 and 1.5 degrees, 30 matches, a quarter of them
+FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap raises the middle two
+PAIR = 2  # track length of points that COLMAP drops from its models
+PAIR_ERROR = 1.0  # px, mean reprojection error: stricter, since two rays nearly meet for any pair of features
+PAIR_ANGLE = 1.5  # degrees between two rays, as COLMAP requires for all points
+LOOSE = {  # COLMAP's defaults: 100 matches, 16 degrees, 30 matches, a quarter of them
     "init_min_num_inliers": 50,
     "init_min_tri_angle": 5.0,
     "abs_pose_min_num_inliers": 15,
@@ -52,16 +51,16 @@ LOOSE = {  # COLMAP's own values: 100 matches, 16 and 1.5 degrees, 30 matches, a
 
 @dataclass(frozen=True)
 class Attempt:
-    """How cameras are looked for; `told` in words."""
+    """How an attempt finds cameras; `label` describes it in the log."""
 
-    told: str
+    label: str
     mapper: Mapper = "incremental"
-    loose: bool = False  # fewer matches and smaller angles are enough
-    wider: bool = False  # photographs that are left out are matched with more others, where not all pairs were matched
-    dense: bool = False  # with more features, matched as those of the attempts before are
+    loose: bool = False  # accept fewer matches and smaller angles
+    wider: bool = False  # match unplaced photographs with more others, unless all pairs were matched
+    dense: bool = False  # find more features, and match the same pairs
 
     def database(self, source: Path, out: Path) -> Path:
-        """The database of its features and matches."""
+        """Return the path of the database with its features and matches."""
         return out / DENSE if self.dense else out / WIDER if self.wider else source / DATABASE
 
 
@@ -71,9 +70,7 @@ RETRIES = (
     Attempt("denser features", loose=True, dense=True),
     Attempt("denser features, all cameras at once", "global", dense=True),
 )
-
-
-MAX_ATTEMPTS = 1 + len(RETRIES)  # attempts
+MAX_ATTEMPTS = 1 + len(RETRIES)
 
 
 def map_cameras(
@@ -84,12 +81,12 @@ def map_cameras(
     attempts: int = MAX_ATTEMPTS,
     min_track_length: int = 3,
 ) -> dict[str, Any]:
-    """Place cameras and points, in so many attempts at most; keep the largest model as sparse/0, tell of the others.
+    """Place cameras and points in at most `attempts` attempts, write the largest model as sparse/0, return figures.
 
-    `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
-    An attempt with nothing to try, such as no more pairs, does not count.
-    min_track_length: the number of photographs that must show a point, 2 or 3.
-    Raises DataError, with the likely reason, when no attempt gives a model of three images.
+    `mapper: global` is faster for many photographs; more than one thread is faster but not bit-identical.
+    An attempt that has nothing to try, such as no further pairs, does not count.
+    min_track_length: the number of photographs in which a point must be seen, 2 or 3.
+    Raises DataError, with the likely reason, when no attempt places three photographs.
     """
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
@@ -97,45 +94,44 @@ def map_cameras(
     matched = MatchGraph.from_database(pycolmap, source / DATABASE, source / IMAGES)
     if why := why_no_depth(pycolmap, source / DATABASE):
         raise DataError(f"{source / IMAGES}: the photographs {why}")
-    models, used, more, made = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
+    models, used, more, count = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
     for attempt in (first, *RETRIES):
         placed = models[0].num_reg_images() if models else 0
-        if made == attempts or placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
+        if count == attempts or placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
             break
         if attempt.dense and not models and matched.have_nothing_in_common():
-            LOG.info("%s", NOT_DENSER)
-            break
+            break  # denser features would not help: most photographs have nothing in common
         try:
             if attempt.wider and not (more := more_pairs(source / DATABASE, set(names) - _names(*models[:1]))):
                 continue
             if attempt is not first:
-                LOG.info("%d of %d photographs are placed; another attempt: %s", placed, len(names), attempt.told)
-            made += 1
-            found = _attempt(source, out, attempt, threads, models[:1], more)
+                LOG.info("placed %d of %d photographs; trying again with %s", placed, len(names), attempt.label)
+            count += 1
+            candidates = _run_attempt(source, out, attempt, threads, models[:1], more)
             if attempt.wider:
                 matched = MatchGraph.from_database(pycolmap, attempt.database(source, out), source / IMAGES)
         except FAILURES as error:
             if attempt.wider:
-                LOG.warning("the attempt failed (%s); it is passed over", error)
+                LOG.warning("the attempt failed and is skipped: %s", error)
                 more = []
                 continue
             if not models:
                 raise
-            LOG.warning("the attempt failed (%s); the model from before stays", error)
+            LOG.warning("the attempt failed; keeping the earlier model: %s", error)
             break
-        if found and found[0].num_reg_images() > placed:
-            models, used = found, attempt
+        if candidates and candidates[0].num_reg_images() > placed:
+            models, used = candidates, attempt
     if not models:
         raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnose(matched)}")
     database = used.database(source, out)
     if why := why_no_depth(pycolmap, database, _names(models[0])):
         placed = models[0].num_reg_images()
-        raise DataError(f"{source / IMAGES}: the {placed} of {len(names)} photographs that could be placed {why}")
+        raise DataError(f"{source / IMAGES}: the {placed} of {len(names)} photographs that were placed {why}")
     if used.dense:
         matched = MatchGraph.from_database(pycolmap, database, source / IMAGES)
     if min_track_length == PAIR:
         models[0] = triangulate_pairs(models[0], database, out, threads)
-    figures = {**_written(models, out, names), "attempt": used.told, "denser_tried": (out / DENSE).exists()}
+    figures = {**_write_best(models, out, names), "attempt": used.label, "denser_tried": (out / DENSE).exists()}
     figures["reasons"] = explain_unplaced(matched, [_names(model) for model in models])
     for left in out.glob(".*"):
         shutil.rmtree(left) if left.is_dir() else left.unlink()
@@ -143,12 +139,12 @@ def map_cameras(
     return figures
 
 
-def _attempt(
+def _run_attempt(
     source: Path, out: Path, attempt: Attempt, threads: int, before: Sequence[Any], more: Sequence[tuple[str, str]]
 ) -> list[Any]:
-    """The models of an attempt, the largest first; one of the same features goes on with the model from before."""
+    """The models of an attempt, the largest first; with the same features, it extends the earlier model."""
     pycolmap = require_pycolmap()
-    database, work = _filled(source, out, attempt, more), out / ".models"
+    database, work = _fill_database(source, out, attempt, more), out / ".models"
     if not verified(pycolmap, database):
         return []
     shutil.rmtree(work, ignore_errors=True)
@@ -168,21 +164,21 @@ def _attempt(
         def placed() -> None:
             count.reach(min(max(2, count.done) + 1, count.total))
 
-        given: dict[str, Any] = {} if is_global else {"next_image_callback": placed}
+        arguments: dict[str, Any] = {} if is_global else {"next_image_callback": placed}
         if attempt.loose and not attempt.dense and before:
             (out / ".before").mkdir(exist_ok=True)
             before[0].write(str(out / ".before"))
-            given["input_path"] = str(out / ".before")
+            arguments["input_path"] = str(out / ".before")
             count.reach(before[0].num_reg_images())
-        found = function(str(database), str(out / IMAGES), str(work), options=options, **given).values()
-    models = [model for model in found if model.num_reg_images() >= MIN_PHOTOGRAPHS and model.num_points3D()]
+        results = function(str(database), str(out / IMAGES), str(work), options=options, **arguments).values()
+    models = [model for model in results if model.num_reg_images() >= MIN_PHOTOGRAPHS and model.num_points3D()]
     return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
-def _filled(source: Path, out: Path, attempt: Attempt, more: Sequence[tuple[str, str]]) -> Path:
-    """The database of an attempt, with its features and matches; one that was begun is gone on with.
+def _fill_database(source: Path, out: Path, attempt: Attempt, more: Sequence[tuple[str, str]]) -> Path:
+    """Fill the database of an attempt with features and matches, or continue one; return its path.
 
-    The pairs follow from the first database and the model before, so that they are the same after a kill.
+    The pairs follow from the first database and the earlier model, so they are the same after a killed call.
     """
     database, pairing = attempt.database(source, out), Pairing.read(source)
     if not database.exists():
@@ -199,8 +195,8 @@ def _filled(source: Path, out: Path, attempt: Attempt, more: Sequence[tuple[str,
     return database
 
 
-def _written(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Write the first model; return figures of it, and of the others."""
+def _write_best(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Write the first model; return its figures, and the sizes of the others."""
     best = models[0]
     (out / MODEL / "0").mkdir(parents=True, exist_ok=True)
     best.write(str(out / MODEL / "0"))
@@ -211,7 +207,7 @@ def _written(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[str
     return {
         "registered": len(placed),
         "not_registered": [name for name in names if name not in placed],
-        "other_models": [count for count in others[1:] if count],  # photographs that are in no larger one
+        "other_models": [count for count in others[1:] if count],  # photographs that are in no larger model
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
     }
@@ -222,9 +218,9 @@ def _names(*models: Any) -> set[str]:
 
 
 def triangulate_pairs(model: Any, database: Path, out: Path, threads: int = 1) -> Any:
-    """Triangulate the points of a model again, of pairs too; its cameras stay.
+    """Triangulate the points of a model again, including points seen in only two photographs; keep its cameras.
 
-    database: the features and matches that it was made of; out: the folder with the images.
+    database: the features and matches of the model; out: the folder with the images.
     """
     pycolmap = require_pycolmap()
     options = pycolmap.IncrementalPipelineOptions()
@@ -234,13 +230,10 @@ def triangulate_pairs(model: Any, database: Path, out: Path, threads: int = 1) -
     options.triangulation.min_angle = options.mapper.filter_min_tri_angle = PAIR_ANGLE
     pycolmap.set_random_seed(0)
     with tempfile.TemporaryDirectory(dir=out) as work, explained(out / IMAGES, "triangulate the points"):
-        found = pycolmap.triangulate_points(
+        points = pycolmap.triangulate_points(
             model, str(database), str(out / IMAGES), work, clear_points=True, options=options
         )
-    for number in [number for number, point in found.points3D.items() if _is_loose(point)]:
-        found.delete_point3D(number)
-    return found
-
-
-def _is_loose(point: Any) -> bool:
-    return bool(point.track.length() == PAIR and point.error > PAIR_ERROR)
+    loose = [i for i, p in points.points3D.items() if p.track.length() == PAIR and p.error > PAIR_ERROR]
+    for number in loose:
+        points.delete_point3D(number)
+    return points

@@ -1,4 +1,4 @@
-"""Which features of two photographs show the same point: found and verified by pycolmap, kept in its database."""
+"""Match features between photographs, and verify the matches, with pycolmap in its database."""
 
 import json
 import logging
@@ -35,15 +35,15 @@ from clsplat.prepare.gather import link
 
 LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
-MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
+MAX_EXHAUSTIVE = 200  # photographs up to which `auto` matches all pairs: the time grows with the square
 WORDS = 1024  # of a vocabulary learned from the photographs (Sivic and Zisserman 2003)
-SAMPLES = 40  # descriptors for each word, from which the words are learned
-ROUNDS = 10  # of k-means
+SAMPLES = 40  # descriptors per word that k-means sees
+ROUNDS = 10  # iterations of k-means
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """Which pairs are matched, and by how many threads: see match_features."""
+    """Which pairs are matched, and with how many threads; see match_features."""
 
     matching: Matching = "auto"
     neighbors: int = 10
@@ -51,22 +51,23 @@ class Pairing:
 
     @classmethod
     def read(cls, folder: Path) -> "Pairing":
-        """Return the one by which match_features made a folder.  Raises DataError where it is missing."""
+        """Read the pairing that match_features used for a folder.  Raises DataError when it is missing."""
         return cls(**read_json(folder / MATCHING, "how photographs were matched"))
 
 
 def match_features(
     source: Path, out: Path, matching: Matching = "auto", neighbors: int = 10, threads: int = 1
 ) -> dict[str, Any]:
-    """Match features between photographs: all pairs, each with the `neighbors` next ones by name, or similar ones.
+    """Match features between photographs: of all pairs, or of each with its next `neighbors` by name or similarity.
 
-    `auto` matches all pairs of up to 200 photographs; of more, each with the most similar ones.  More than one thread
-    is faster and not repeatable to the bit: in one call of a hundred, pycolmap 4.2 finds other matches of two pairs.
+    `auto` matches all pairs of up to 200 photographs, and otherwise each photograph with the most similar ones.  More
+    than one thread is faster but not bit-identical: about one call in a hundred of pycolmap 4.2 gives two pairs other
+    matches.
     """
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
     database = out / DATABASE
-    if not database.exists():  # pairs that it holds are not matched again
+    if not database.exists():  # an existing one continues: its pairs are not matched again
         half = out / f".{DATABASE}"
         shutil.copyfile(source / DATABASE, half)
         half.replace(database)
@@ -77,14 +78,14 @@ def match_features(
 
 
 def most_pairs(photographs: int, matching: Matching, neighbors: int) -> int:
-    """Return the largest number of pairs that match_features looks at."""
+    """Return the largest number of pairs that match_features matches."""
     every = photographs * (photographs - 1) // 2
-    is_each = matching == "exhaustive" or (matching == "auto" and photographs <= MAX_EXHAUSTIVE)
-    return every if is_each else min(every, 2 * neighbors * photographs)
+    is_exhaustive = matching == "exhaustive" or (matching == "auto" and photographs <= MAX_EXHAUSTIVE)
+    return every if is_exhaustive else min(every, 2 * neighbors * photographs)
 
 
 def match_database(database: Path, how: Pairing) -> Matching:
-    """Match the photographs of a database as match_features does, but for pairs that it holds; return how.
+    """Match the pairs of a database that are not matched yet, as match_features does; return the matching used.
 
     Raises DataError.
     """
@@ -92,26 +93,28 @@ def match_database(database: Path, how: Pairing) -> Matching:
     count, matching, neighbors = len(image_names(pycolmap, database)), how.matching, how.neighbors
     chosen = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
     common = _options(pycolmap, how.threads)
-    LOG.info("matching %d photographs, %s", count, chosen)
     with explained(database, "match photographs"):
         if chosen == "sequential":
             pairing = pycolmap.SequentialPairingOptions()
             pairing.overlap, pairing.quadratic_overlap = neighbors, True
+            LOG.info("matching %d photographs, each with the next %d by name", count, neighbors)
             steps = {*range(1, neighbors + 1), *(1 << power for power in range(neighbors))}
             with _counted(database, sum(max(0, count - step) for step in steps)):
                 pycolmap.match_sequential(str(database), pairing_options=pairing, **common)
         elif chosen == "vocabulary":
+            LOG.info("matching %d photographs, each with the %d most similar", count, 2 * neighbors)
             pairs = _alike_pairs(pycolmap, database, 2 * neighbors)
             with _counted(database, len(pairs)):
                 _match_listed(database, pairs, common)
         else:
+            LOG.info("matching all pairs of %d photographs", count)
             with _counted(database, count * (count - 1) // 2):
                 pycolmap.match_exhaustive(str(database), **common)
     return chosen
 
 
 def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) -> None:
-    """Match these photographs of a database, but for pairs that it holds.  Raises DataError."""
+    """Match the given pairs of a database that are not matched yet.  Raises DataError."""
     pycolmap = require_pycolmap()
     with opened(pycolmap, database) as rows:
         numbers = {image.name: image.image_id for image in rows.read_all_images()}
@@ -119,16 +122,16 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
         done = rows.num_matched_image_pairs()
     if not missing:
         return
-    LOG.info("matching %s more, of photographs that are left out", pluralize(len(missing), "pair"))
+    LOG.info("matching %s of photographs that are not placed yet", pluralize(len(missing), "more pair"))
     with explained(database, "match photographs"), _counted(database, done + len(missing)):
         _match_listed(database, missing, _options(pycolmap, threads))
 
 
 def more_pairs(database: Path, left_out: Set[str]) -> list[tuple[str, str]]:
-    """Return pairs of photographs that are left out with any others, which `match_database` has not looked at.
+    """Return further pairs, each with a photograph of `left_out`, that `match_database` has not matched.
 
-    They are all, where these are no more than it has looked at, so that the matching takes twice as long at most; else
-    those of each photograph that is left out with the most similar ones to it: as many, but with one at least.
+    Matching at most doubles the number of matched pairs: when there are more candidates, each unplaced photograph is
+    paired only with the most similar ones, at least one.
     """
     pycolmap = require_pycolmap()
     with opened(pycolmap, database) as rows:
@@ -138,30 +141,31 @@ def more_pairs(database: Path, left_out: Set[str]) -> list[tuple[str, str]]:
             return []
         if spaced := [image.name for image in images if _is_spaced(image.name)]:
             LOG.warning(
-                "'%s': a name with spaces, which COLMAP's lists of pairs do not allow: no more pairs", spaced[0]
+                "'%s': COLMAP's lists of pairs allow no spaces in names, so no further pairs are matched", spaced[0]
             )
             images = [image for image in images if not _is_spaced(image.name)]
         is_left = [image.name in left_out for image in images]
-        found = [
+        candidates = [
             (i, j)
             for i, j in combinations(range(len(images)), 2)
             if (is_left[i] or is_left[j]) and not rows.exists_two_view_geometry(images[i].image_id, images[j].image_id)
         ]
-        if len(found) > most:
-            found = _closest(found, similarity(_descriptors(rows, images)), is_left, max(1, most // sum(is_left)))
-    return [(images[i].name, images[j].name) for i, j in found]
+        if len(candidates) > most:
+            close = similarity(_descriptors(rows, images))
+            candidates = _closest(candidates, close, is_left, max(1, most // sum(is_left)))
+    return [(images[i].name, images[j].name) for i, j in candidates]
 
 
 def _closest(
     pairs: Sequence[tuple[int, int]], close: NDArray[np.float64], is_left: Sequence[bool], count: int
 ) -> list[tuple[int, int]]:
-    """Those of the pairs in which a photograph that is left out is with one of the `count` most similar ones to it."""
-    taken, chosen = [0] * len(is_left), []
+    """The pairs of each left-out photograph with the `count` photographs most similar to it."""
+    counts, chosen = [0] * len(is_left), []
     for i, j in sorted(pairs, key=lambda pair: -close[pair]):
-        if any(is_left[one] and taken[one] < count for one in (i, j)):
+        if any(is_left[k] and counts[k] < count for k in (i, j)):
             chosen.append((i, j))
-            taken[i] += 1
-            taken[j] += 1
+            counts[i] += 1
+            counts[j] += 1
     return sorted(chosen)
 
 
@@ -201,7 +205,7 @@ def _is_spaced(name: str) -> bool:
 
 @contextmanager
 def _counted(database: Path, pairs: int) -> Iterator[None]:
-    """Count the pairs that pycolmap looks at in the block."""
+    """Count the pairs that pycolmap matches in the block."""
     count = Count("pairs matched", pairs)
     with polled(count, lambda: pairs_done(database)):
         yield
@@ -209,7 +213,7 @@ def _counted(database: Path, pairs: int) -> Iterator[None]:
 
 
 def similar_pairs(tables: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, of each photograph with the `neighbors` most similar ones, by `similarity`."""
+    """Return the pairs (i, j), i < j, of each photograph with the `neighbors` most similar ones."""
     close = similarity(tables)
     np.fill_diagonal(close, -1)
     nearest = np.argsort(-close, axis=1, kind="stable")[:, : min(neighbors, len(tables) - 1)]
@@ -217,10 +221,10 @@ def similar_pairs(tables: Sequence[NDArray[np.float32]], neighbors: int) -> list
 
 
 def similarity(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
-    """Return how alike photographs are, 0 to 1, [N, N].
+    """Return the similarity of photographs, [N, N], from 0 to 1.
 
-    tables: descriptors [M, 128] of each photograph.  A word is a cell of k-means over a sample of the descriptors;
-    photographs are compared by the cosine of their TF-IDF vectors.  Photographs without descriptors are like none.
+    tables: descriptors [M, 128] of each photograph.  Words are the cells of k-means over a sample of the descriptors
+    (Sivic and Zisserman 2003), and the similarity is the cosine of TF-IDF vectors.  It is 0 without descriptors.
     """
     rng = np.random.default_rng(0)
     sample = np.concatenate(

@@ -1,8 +1,8 @@
-"""Whether a camera only turned on the spot: then no depth can be known, and a model of it would be made up.
+"""Detect cameras that only rotated in place: their photographs have no parallax, and any depth would be invented.
 
-Photographs of a camera that turns by R are related by the homography H = K R K⁻¹ (Hartley and Zisserman 2004, 13.2), so
-that K⁻¹ H K is a rotation for one focal length and all pairs.  A plane that fills the photographs gives homographies
-too, but R + t nᵀ/d is no rotation.
+Photographs of a camera that rotates by R are related by the homography H = K R K⁻¹ (Hartley and Zisserman 2004, 13.2),
+so K⁻¹ H K is a rotation for all pairs, with one focal length.  A plane that fills the photographs also gives
+homographies, but R + t nᵀ/d is not a rotation.
 """
 
 from collections.abc import Callable, Sequence, Set
@@ -19,23 +19,23 @@ from numpy.typing import NDArray
 from clsplat.prepare.database import opened
 from clsplat.prepare.diagnosis import FEW_MATCHES, connected_groups
 
-PAIRS = 120  # that are looked at, evenly spaced from those with the most matches to those with the fewest
-NEAR = 3.0  # px: of a match that a homography explains, and of a point that has not moved
-EXPLAINED = 0.9  # share of the matches of a pair, and of the pairs
-FOCALS = np.geomspace(0.4, 4.0, 47)  # of the longer side
-MADE_UP = 0.1  # how far K⁻¹ H K may be from a rotation, by how far that is from no turn at all
-WALK = "which tells no depth; walk around the scene, a step between photographs"
-TURNED = f"match like those of a camera that only turned on the spot, {WALK}"
-SAME = f"are all the same: nothing moves from one to the next, {WALK}"
+MAX_PAIRS = 120  # tested pairs, evenly spaced from the most matches to the fewest
+NEAR = 3.0  # px: largest residual of a match that a homography explains, and motion of a static point
+EXPLAINED = 0.9  # fraction of the matches of a pair, and of the pairs
+FOCALS = np.geomspace(0.4, 4.0, 47)  # focal lengths to try, as fractions of the longer side
+MAX_DEVIATION = 0.1  # of K⁻¹ H K from a rotation, relative to its deviation from the identity
+WALK = "so depth cannot be estimated; walk around the scene, taking a photograph every step"
+ROTATED = f"look as if the camera only rotated in place, {WALK}"
+SAME = f"are all the same, {WALK}"
 Floats = NDArray[np.float64]
 
 
 def why_no_depth(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
-    """Return in words why the photographs, or the named ones of them, tell no depth; "" where they may.
+    """Return why depth cannot be estimated from all or the named photographs, in words; "" if it may be possible.
 
-    All pairs that match well are asked: the best one of each photograph may be of one spot, where there are several.  A
-    model is not: of a camera that only turned, COLMAP makes one up, whose points have angles of some degrees.
-    Where the pairs are of fewer than half of the photographs, they tell nothing: further attempts may find more.
+    It tests all good pairs, since the best pair of each photograph may come from one of several viewpoints.  It does
+    not test a model, since COLMAP invents one for a rotating camera, whose points have angles of a few degrees.
+    Pairs of less than half of the photographs decide nothing, since further attempts may find more pairs.
     """
     with opened(pycolmap, database) as rows:
         images = {image.image_id: image.name for image in rows.read_all_images()}
@@ -47,28 +47,29 @@ def why_no_depth(pycolmap: ModuleType, database: Path, names: Set[str] | None = 
         if not moving:
             still = [(chosen[a], chosen[b]) for a, b in (pair.photographs for pair in pairs)]
             return SAME if len(connected_groups(chosen.values(), still)) == 1 else ""
-        sample = moving[:: -(-len(moving) // PAIRS)]
-        found = [matrix for pair in sample if (matrix := _homography(*pair.points())) is not None]
-    is_most = len(found) > 1 and len(found) >= EXPLAINED * len(sample)
-    return TURNED if is_most and min(_from_turns(found, focal) for focal in FOCALS) < MADE_UP else ""
+        sample = moving[:: -(-len(moving) // MAX_PAIRS)]
+        matrices = [matrix for pair in sample if (matrix := _homography(*pair.points())) is not None]
+    if len(matrices) < 2 or len(matrices) < EXPLAINED * len(sample):
+        return ""
+    return ROTATED if min(_rotation_deviation(matrices, focal) for focal in FOCALS) < MAX_DEVIATION else ""
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two photographs with their matches, [M, 2], and a function of the points of a photograph and its pixel."""
+    """Two photographs, their matches, [M, 2], and a function for the points of a photograph and the size of a pixel."""
 
     photographs: tuple[int, int]
     matches: NDArray[np.uint32]
     points_of: Callable[[int], tuple[Floats, float]]
 
     def points(self) -> tuple[Floats, Floats, float]:
-        """The matched points of both, and the size of a pixel."""
+        """Return the matched points of both, and the size of a pixel."""
         (first, _), (second, pixel) = map(self.points_of, self.photographs)
         return first[self.matches[:, 0]], second[self.matches[:, 1]], pixel
 
 
 def _good_pairs(pycolmap: ModuleType, rows: Any, chosen: Set[int]) -> list[_Pair]:
-    """The pairs of the chosen photographs with matches enough, those with the most first."""
+    """The pairs of the chosen photographs with enough matches, the most first."""
     sizes = {camera.camera_id: np.array([camera.width, camera.height]) for camera in rows.read_all_cameras()}
 
     @cache
@@ -76,35 +77,34 @@ def _good_pairs(pycolmap: ModuleType, rows: Any, chosen: Set[int]) -> list[_Pair
         size = sizes[rows.read_image(number).camera_id]
         return (rows.read_keypoints(number)[:, :2] - size / 2) / size.max(), 1 / float(size.max())
 
-    read = zip(*rows.read_two_view_geometries(), strict=True)
-    found = [
+    pairs = [
         _Pair(pycolmap.pair_id_to_image_pair(pair), np.asarray(geometry.inlier_matches), points_of)
-        for pair, geometry in read
+        for pair, geometry in zip(*rows.read_two_view_geometries(), strict=True)
     ]
-    good = [pair for pair in found if len(pair.matches) >= FEW_MATCHES and set(pair.photographs) <= chosen]
+    good = [pair for pair in pairs if len(pair.matches) >= FEW_MATCHES and set(pair.photographs) <= chosen]
     return sorted(good, key=lambda pair: -len(pair.matches))
 
 
 def _is_still(first: Floats, second: Floats, pixel: float) -> bool:
-    """Whether nothing moves between two photographs, such as copies, which tell nothing of a camera."""
+    """Whether two photographs show no motion, such as copies, which say nothing about the camera."""
     return bool(np.median(np.linalg.norm(second - first, axis=1)) < NEAR * pixel)
 
 
 def _homography(first: Floats, second: Floats, pixel: float) -> Floats | None:
-    """The homography that explains nearly all matches of a pair, in units of the longer side from the middle."""
+    """The homography that explains nearly all matches of a pair, in units of the longer side from the center."""
     matrix, explained = cv2.findHomography(first, second, cv2.RANSAC, NEAR * pixel)
     if matrix is None or explained.mean() < EXPLAINED:
         return None
     return np.asarray(matrix, np.float64)
 
 
-def _from_turns(homographies: Sequence[Floats], focal: float) -> float:
-    """The middle distance of homographies from turns, by that from no turn, for a focal length."""
+def _rotation_deviation(homographies: Sequence[Floats], focal: float) -> float:
+    """The median deviation of homographies from rotations for a focal length, relative to that from the identity."""
     scale = np.diag([focal, focal, 1.0])
-    found = []
+    deviations = []
     for matrix in homographies:
-        turn = np.linalg.inv(scale) @ matrix @ scale
-        turn /= np.cbrt(np.linalg.det(turn))
-        off = float(np.linalg.norm(turn @ turn.T - np.eye(3)))
-        found.append(off / max(float(np.linalg.norm(turn - np.eye(3))), 1e-9))
-    return float(np.median(found))
+        rotation = np.linalg.inv(scale) @ matrix @ scale
+        rotation /= np.cbrt(np.linalg.det(rotation))
+        deviation = float(np.linalg.norm(rotation @ rotation.T - np.eye(3)))
+        deviations.append(deviation / max(float(np.linalg.norm(rotation - np.eye(3))), 1e-9))
+    return float(np.median(deviations))

@@ -1,4 +1,4 @@
-"""Which photographs were taken with one camera: by what EXIF tells of it, and by their size."""
+"""Group photographs that were taken with the same camera, by their EXIF data and size."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from clsplat.scene.images import read_exif_optics, read_header
 
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
 Key = Callable[[Path, str], object]
-KEYS: dict[Cameras, Key] = {  # what photographs that share a camera have in common, beside their size
+KEYS: dict[Cameras, Key] = {  # what photographs that share a camera have in common besides their size
     "auto": lambda images, name: read_exif_optics(images / name),
     "one": lambda images, name: None,
     "per_folder": lambda images, name: Path(name).parent,
@@ -21,7 +21,7 @@ KEYS: dict[Cameras, Key] = {  # what photographs that share a camera have in com
 def group_photos(images: Path, names: Sequence[str], cameras: Cameras) -> list[list[str]]:
     """Return the photographs in groups that share a camera, in order of their first names.
 
-    Raises DataError when one cannot be read.
+    Raises DataError when a photograph cannot be read.
     """
     groups: dict[object, list[str]] = defaultdict(list)
     for name in sorted(names):
@@ -31,12 +31,11 @@ def group_photos(images: Path, names: Sequence[str], cameras: Cameras) -> list[l
 
 
 def shared_camera_note(images: Path, groups: Sequence[Sequence[str]]) -> str:
-    """Return a sentence about photographs that share a camera because nothing is known of theirs; "" without them."""
+    """Return a sentence about photographs that share a camera because EXIF lacks their lens; "" when there are none."""
     unknown = [group for group in groups if len(group) > 1 and read_exif_optics(images / group[0]) is None]
     if not unknown:
         return ""
-    count = sum(map(len, unknown))
     return (
-        f"{count} photographs have no EXIF data of their lens: those of one size share a camera, "
-        f"{pluralize(len(unknown), 'camera')} in all; --set find_features.cameras=per_image gives each its own"
+        f"{sum(map(len, unknown))} photographs have no lens data in EXIF, so those of the same size share a camera "
+        f"({pluralize(len(unknown), 'camera')} in total); --set find_features.cameras=per_image calibrates each one"
     )

@@ -1,4 +1,4 @@
-"""The steps of `prepare:` in pipeline files.  Each makes a folder from a folder, on the host."""
+"""The steps of `prepare:` in pipeline files.  Each makes an output folder from an input folder, on the host."""
 
 from abc import abstractmethod
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from clsplat.core.errors import DataError
+from clsplat.core.errors import DataError, pluralize
 from clsplat.core.settings import Settings
 from clsplat.prepare.database import require_pycolmap
 from clsplat.prepare.features import CameraModel, FeatureOptions, find_features
@@ -21,42 +21,42 @@ Positive = Annotated[int, Field(gt=0)]
 
 
 class Step(Settings):
-    """A step from a folder to a folder.  Inputs, settings and `version` identify its result."""
+    """A step that makes a folder from a folder.  Its inputs, settings and `version` identify the result."""
 
     version: ClassVar[int] = 1  # increase it when the result changes
-    resumes: ClassVar[bool] = False  # whether `make` goes on with what an interrupted call left in `out`
-    seconds: ClassVar[tuple[float, float] | None] = None  # of a piece of its work, at least and at most: a guess
+    resumes: ClassVar[bool] = False  # whether `make` continues what an interrupted call left in `out`
+    seconds: ClassVar[tuple[float, float] | None] = None  # least and most time per item, a guess for estimates
 
     stage: str
     """Name of the step."""
 
     def check(self, source: Path, without: Path) -> None:
-        """Raise what `make` would raise, where that can be known at once: of the first step, before anything is made.
+        """Raise the errors of `make` that can be known at once, without writing anything.
 
-        Nothing is written.
+        Only the first step is checked, before any step runs.
         """
 
     def is_done_in(self, source: Path) -> bool:
-        """Return whether `source` needs neither this step nor those after it: such as a scene that holds cameras."""
+        """Return whether `source` needs neither this step nor later ones, as a scene that already has cameras."""
         return False
 
     def pieces(self, photographs: int) -> tuple[int, str]:
-        """Return the number of pieces of its work on so many photographs, and their name."""
+        """Return how many items the step processes for a number of photographs, and what they are called."""
         return photographs, "photographs"
 
     @abstractmethod
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         """Fill the folder `out` from `source`, without reading below `without`; return figures for the log.
 
-        `out` is empty, or of a step that `resumes` holds what an interrupted call of the same inputs and settings made.
+        `out` is empty, or, for a step that `resumes`, holds what an interrupted call with the same inputs left.
         """
 
-    def told(self, figures: dict[str, Any]) -> str:
-        """Return what `make` returned in words."""
-        return ", ".join(f"{name} {value}" for name, value in figures.items() if value not in ([], {}, ""))
+    def summary(self, figures: dict[str, Any]) -> str:
+        """Return a line of the log about the figures that `make` returned."""
+        return ", ".join([f"{self.stage} finished", *(f"{value} {name}" for name, value in figures.items())])
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:
-        """Return what `make` has warned of when it returned these figures, for calls that find its result."""
+        """Return the warnings that `make` logged with these figures, to repeat them when its result is reused."""
         return []
 
 
@@ -70,30 +70,31 @@ class FindFeatures(Step):
     stage: Literal["find_features"] = "find_features"
 
     long_side: Positive = 1600
-    """Longer side in px of the images in which features are found; larger photographs are made smaller."""
+    """Longer side in px of the images in which features are detected; larger photographs are reduced."""
     features: Positive = 12288
-    """Largest number of features of a photograph."""
+    """Maximum number of features per photograph."""
     camera_model: CameraModel = "SIMPLE_RADIAL"
-    """Camera model of COLMAP; OPENCV_FISHEYE for fisheye lenses."""
+    """COLMAP camera model; OPENCV_FISHEYE for fisheye lenses."""
     cameras: Cameras = "auto"
-    """Which photographs of one size share a camera; auto: those of which EXIF tells the same lens, or nothing."""
+    """Which photographs of the same size share a camera; auto: those with the same lens in EXIF, or with none."""
 
     def is_done_in(self, source: Path) -> bool:
         return is_scene(source)
 
     def check(self, source: Path, without: Path) -> None:
         if is_scene(source):
-            raise DataError(f"{source}: holds cameras already; give the folder of the photographs alone")
+            raise DataError(f"{source}: already contains cameras; give a folder that contains only photographs")
         require_photographs(source, without.resolve())
         require_pycolmap()
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         self.check(source, without)
-        sought = FeatureOptions(self.long_side, self.features)
-        return find_features(source, out, sought, self.camera_model, self.cameras, without.resolve())
+        options = FeatureOptions(self.long_side, self.features)
+        return find_features(source, out, options, self.camera_model, self.cameras, without.resolve())
 
-    def told(self, figures: dict[str, Any]) -> str:
-        return super().told({**figures, "damaged": ", ".join(figures.get("damaged", ()))})
+    def summary(self, figures: dict[str, Any]) -> str:
+        photographs = pluralize(figures["photographs"], "photograph")
+        return f"features found in {photographs} from {pluralize(figures['cameras'], 'camera')}"
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:
         return warnings_for(figures)
@@ -103,16 +104,16 @@ class MatchFeatures(Step):
     """Match features between pairs of photographs."""
 
     resumes: ClassVar[bool] = True
-    seconds: ClassVar[tuple[float, float]] = 0.05, 1.0  # of a pair
+    seconds: ClassVar[tuple[float, float]] = 0.05, 1.0  # per pair
 
     stage: Literal["match_features"] = "match_features"
 
     matching: Matching = "auto"
-    """Which pairs of photographs are matched; auto: exhaustive, and vocabulary for more than 200 photographs."""
+    """Which pairs of photographs are matched; auto: exhaustive, or vocabulary for more than 200 photographs."""
     neighbors: Positive = 10
-    """Number of photographs that each is matched with, where not with all."""
+    """Number of photographs that each is matched with, unless matching is exhaustive."""
     threads: Positive = 1
-    """Number of threads; more than one are faster, and the result does not always repeat to the bit."""
+    """Number of threads; more than one is faster, but results are not always bit-identical."""
 
     def pieces(self, photographs: int) -> tuple[int, str]:
         return most_pairs(photographs, self.matching, self.neighbors), "pairs"
@@ -120,33 +121,38 @@ class MatchFeatures(Step):
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return match_features(source, out, self.matching, self.neighbors, self.threads)
 
+    def summary(self, figures: dict[str, Any]) -> str:
+        return f"{pluralize(figures['pairs'], 'pair')} of photographs match"
+
 
 class MapCameras(Step):
-    """Find cameras and points from matches; where photographs are left out, again with other settings, and matched with
-    more others where `match_features` has not matched all pairs."""
+    """Find cameras and points from matches.
 
-    version: ClassVar[int] = 2  # more pairs of photographs that are left out
+    When photographs cannot be placed, it tries again with looser settings, with more pairs unless `match_features`
+    matched all of them, and with more features.
+    """
+
+    version: ClassVar[int] = 2  # matches more pairs of unplaced photographs
     resumes: ClassVar[bool] = True
-    seconds: ClassVar[tuple[float, float]] = 0.1, 4.0  # further attempts take more
+    seconds: ClassVar[tuple[float, float]] = 0.1, 4.0  # more for further attempts
 
     stage: Literal["map_cameras"] = "map_cameras"
 
     mapper: Mapper = "incremental"
-    """How cameras are found first: one after the other, or all at once (global)."""
+    """How cameras are placed in the first attempt: one after another, or all at once (global)."""
     threads: Positive = 1
-    """Number of threads; more than one are faster, and the result does not repeat to the bit."""
+    """Number of threads; more than one is faster, but results are not bit-identical."""
     attempts: Annotated[int, Field(ge=1, le=MAX_ATTEMPTS)] = MAX_ATTEMPTS
-    """Largest number of attempts that are made; 1: none but the first.  The next takes smaller angles and fewer
-    matches; one more pairs of photographs that are left out, where not all were matched; two find denser features, and
-    match as before."""
+    """Maximum number of attempts.  The second accepts smaller angles and fewer matches; the third matches more pairs of
+    the unplaced photographs, unless all pairs were matched; the last two find more features."""
     min_track_length: Literal[2, 3] = 3
-    """Number of photographs that must show a point; COLMAP leaves out those of two.  On one scene
-    there are 2.5 times as many points with them."""
+    """Number of photographs in which a point must be seen.  COLMAP drops points seen in only two; keeping them gave 2.5
+    times as many points on one scene."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return map_cameras(source, out, self.mapper, self.threads, self.attempts, self.min_track_length)
 
-    def told(self, figures: dict[str, Any]) -> str:
+    def summary(self, figures: dict[str, Any]) -> str:
         return summarize_placement({self.stage: figures})
 
     def warnings(self, figures: dict[str, Any]) -> list[str]:
@@ -154,18 +160,21 @@ class MapCameras(Step):
 
 
 class Undistort(Step):
-    """Undistort photographs, as of a pinhole camera, at the training size."""
+    """Undistort photographs to pinhole images at the size of training."""
 
-    version: ClassVar[int] = 3  # the tracks of points, how far these are from their places, and the exposures
+    version: ClassVar[int] = 3  # keeps point tracks, reprojection residuals and exposures
     resumes: ClassVar[bool] = True
     seconds: ClassVar[tuple[float, float]] = 0.05, 1.0
 
     stage: Literal["undistort"] = "undistort"
 
     long_side: Positive | None = None
-    """Longer side of the new images in px; without it, that of the photographs."""
+    """Longer side of the undistorted images in px; default: that of the photographs."""
     undefined_pixels: UndefinedPixels = "crop"
-    """Pixels that no photograph shows; crop: cut them off; mask: keep the whole photograph and mask them."""
+    """Pixels that the photograph does not cover; crop: crop the image; mask: keep all of it and mask them."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.undefined_pixels)}
+
+    def summary(self, figures: dict[str, Any]) -> str:
+        return f"{pluralize(figures['images'], 'photograph')} undistorted"

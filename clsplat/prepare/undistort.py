@@ -1,4 +1,4 @@
-"""Convert a scene to pinhole cameras: undistorted photographs, smaller on request, and their masks."""
+"""Convert a scene to pinhole cameras: undistort its photographs, and optionally reduce them."""
 
 from collections import Counter
 from dataclasses import replace
@@ -36,7 +36,7 @@ def undistort_scene(
         manifest.require_listed(out / "images" / name)
     views, count = [], Count("photographs undistorted", len(names))
     for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
-        pinhole_view = replace(_sized(_shown(view, undefined_pixels), long_side), alpha="mask")
+        pinhole_view = replace(_reduced(_with_lens(view, undefined_pixels), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
         if manifest.needs_writing(image, _source(pinhole_view), mask):
             counts = load_mask(pinhole_view)
@@ -55,29 +55,29 @@ def undistort_scene(
 
 
 def _source(view: View) -> str:
-    """A hash of all that decides over the pixels of an undistorted image and its mask."""
+    """A hash of everything that the pixels of an undistorted image and its mask depend on."""
     files = [view.image_path, *([view.mask_path] if view.mask_path else [])]
     return hash_values(*files, view.lens, view.camera)
 
 
-def _shown(view: View, undefined_pixels: UndefinedPixels) -> View:
+def _with_lens(view: View, undefined_pixels: UndefinedPixels) -> View:
     if view.lens is None or undefined_pixels == "crop":
         return view
     lens = intern_lens(replace(view.lens, whole=True))
     return replace(view, lens=lens, camera=lens.pinhole)
 
 
-def _sized(view: View, long_side: int | None) -> View:
+def _reduced(view: View, long_side: int | None) -> View:
     """The view with no side longer than `long_side` px."""
     longest = max(view.camera.width, view.camera.height)
     return view if long_side is None else view.resized(max(1.0, longest / long_side))
 
 
 def _png_names(names: list[str]) -> list[str]:
-    """The names with .png for their suffix, or behind it where names would be the same."""
+    """The names with .png as their suffix, or appended where two names would be equal."""
     short = [Path(name).with_suffix(".png").as_posix() for name in names]
-    taken = Counter(short)
-    chosen = [one if taken[one] == 1 else f"{name}.png" for one, name in zip(short, names, strict=True)]
+    counts = Counter(short)
+    chosen = [png if counts[png] == 1 else f"{name}.png" for png, name in zip(short, names, strict=True)]
     if len(set(chosen)) < len(chosen):
         raise DataError(f"two images would be called '{Counter(chosen).most_common(1)[0][0]}'; rename one")
     return chosen

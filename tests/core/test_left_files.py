@@ -17,7 +17,7 @@ from clsplat.core.files import append, open_atomic, write_text
 from clsplat.core.manifest import RECORD as RECORD_OF_A_TOOL
 from clsplat.core.manifest import Manifest
 from clsplat.core.settings import Settings
-from clsplat.prepare.cache import RECORD, STEPS, PlannedStep, _show, prepare
+from clsplat.prepare.cache import RECORD, STEPS, PlannedStep, _publish, prepare
 from clsplat.prepare.steps import Step
 from clsplat.runs import run_folder
 from clsplat.runs.state import RunState
@@ -173,7 +173,7 @@ def test_photograph_model_is_synced_before_it_is_renamed(tmp_path, calls):
         (result / name).mkdir(parents=True)
     (result / "sparse" / "cameras.bin").write_bytes(b"x")
     (tmp_path / "out" / STEPS).mkdir(parents=True)
-    _show(result, tmp_path / "out")
+    _publish(result, tmp_path / "out")
     assert calls == [("sync", "cameras.bin"), ("sync", ".sparse"), ("rename", "sparse"), ("sync", "out")]
 
 

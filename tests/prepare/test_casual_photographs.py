@@ -115,7 +115,7 @@ def test_which_photographs_share_a_camera(tmp_path, cameras, groups, caplog):
         assert shared["0.jpg"] == shared["2.jpg"] != shared["1.jpg"] == shared["3.jpg"]
         assert {(one.width, one.height) for one in cameras_found} == {(96, 72), (72, 96)}
         assert (
-            "2 photographs have no EXIF data of their lens: those of one size share a camera, 1 camera" in caplog.text
+            "2 photographs have no lens data in EXIF, so those of the same size share a camera (1 camera" in caplog.text
         )
 
 
@@ -157,11 +157,11 @@ def test_files_that_cannot_be_read_come_with_how_to_convert_them(tmp_path, caplo
     for name in ("a.jpg", "b.jpg", "c.jpg", "d.HEIC", "e.dng"):
         (tmp_path / name).touch()
     assert len(list_photographs(tmp_path)) == 3
-    assert "1 HEIC file such as d.HEIC is left out" in caplog.text
-    assert "1 DNG file such as e.dng is left out" in caplog.text
+    assert "1 HEIC file cannot be read (d.HEIC)" in caplog.text
+    assert "1 DNG file cannot be read (e.dng)" in caplog.text
     (tmp_path / "a.jpg").unlink()
     text = refusal(list_photographs, tmp_path)
-    assert "found 2 photographs" in text
+    assert "has 2 photographs" in text
     assert "heif-convert" in text
 
 
@@ -174,19 +174,19 @@ def test_files_named_as_another_kind_come_with_how_to_convert(tmp_path):
     kept, damaged = gather(tmp_path / "p", tmp_path / "images", list_photographs(tmp_path / "p"))
     assert kept == ["0.jpg", "1.jpg", "2.jpg"]
     assert damaged == {
-        "h.jpg": "HEIC by its content",
-        "m.JPG": "HEIC by its content",
-        "v.png": "AVIF by its content",
+        "h.jpg": "contains HEIC data",
+        "m.JPG": "contains HEIC data",
+        "v.png": "contains AVIF data",
         "o.jpg": "not an image, or a damaged one",
     }
     (told,) = warnings_for({"photographs": 3, "damaged": damaged})
-    assert "name HEIC files so, and make JPEG files of them, such as by heif-convert" in told
-    assert "such as by ffmpeg" in told
+    assert "convert HEIC files to JPEG, for example with heif-convert" in told
+    assert "for example with ffmpeg" in told
     assert told.endswith("; export the others again")
     assert warnings_for({"photographs": 3, "damaged": {"a": "cut"}})[0].endswith("(cut); export them again")
     (tmp_path / "p" / "0.jpg").unlink()
     text = refusal(gather, tmp_path / "p", tmp_path / "images", ["1.jpg", "2.jpg", "h.jpg"])
-    assert "only 2 of 3 photographs can be read: h.jpg (HEIC by its content); name HEIC files so" in text
+    assert "only 2 of 3 photographs can be read: h.jpg (contains HEIC data); convert HEIC files" in text
 
 
 @pytest.mark.parametrize("read", [list_photographs, lambda path: fingerprint(path, path)])
@@ -195,7 +195,7 @@ def test_video_given_as_a_folder_comes_with_what_makes_one(tmp_path, read):
     (tmp_path / "notes").touch()
     command = f"`clsplat data video {shell_quote(tmp_path / 'my walk.AVI')} FOLDER`"
     assert command in refusal(read, tmp_path / "my walk.AVI")
-    assert "is a file; expected a folder with photographs" in refusal(read, tmp_path / "notes")
+    assert "is a file; expected a folder of photographs" in refusal(read, tmp_path / "notes")
     assert "no such folder" in refusal(read, tmp_path / "none.avi")
 
 
@@ -217,11 +217,11 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     assert found == {
         "blurred": "blurred",
         "soft": "few matches, at most 20, with a; it may be blurred",
-        "elsewhere": "shows nothing that another photograph shows; it may be blurred",
-        "plain": "only 40 features: blurred, dark, or of a plain surface",
-        "alone": "shows nothing that another photograph shows",
-        "pair": "matches other alone, which is not placed either",
-        "other": "matches pair alone, which is not placed either",
+        "elsewhere": "matches no other photograph; it may be blurred",
+        "plain": "only 40 features: blurred, dark, or a plain surface",
+        "alone": "matches no other photograph",
+        "pair": "matches only other, which is not placed either",
+        "other": "matches only pair, which is not placed either",
         "few": "few matches, at most 18, with a",
         "many": "80 matches with a, but too few on points of the model",
     }
@@ -231,24 +231,27 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     )
     figures = {"registered": 3, "not_registered": ["plain"], "reasons": found, "other_models": [2]}
     missing, others = warnings_for(figures)
-    assert "1 of 4 photographs could not be placed: plain (only 40 features: blurred" in missing
-    assert missing.endswith("places between, or find more features (find_features.long_side)")
-    assert others == "1 smaller model, of 2 photographs, is left out: add photographs that join it to the largest"
+    assert "1 of 4 photographs could not be placed and are not used: plain (only 40 features: blurred" in missing
+    assert missing.endswith("viewpoints in between, or find more features (find_features.long_side)")
+    assert (
+        others
+        == "only the largest model is used, without 1 smaller model of 2 photographs: add photographs that connect them"
+    )
     missing, others = warnings_for({**figures, "other_models": [3, 1], "denser_tried": True})
-    assert missing.endswith("places between")
-    assert others.startswith("2 smaller models, of 3, 1 photograph, are left out: add photographs that join them")
+    assert missing.endswith("viewpoints in between")
+    assert others.startswith("only the largest model is used, without 2 smaller models of 3, 1 photograph: add")
 
 
 def test_set_without_a_model_is_described_by_its_groups(tmp_path):
     found = matched(tmp_path)
     assert diagnose(found) == (
-        "they do not belong together: 2 groups of good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
+        "they do not connect: 2 groups with good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
         "without a good match (alone, elsewhere, few, plain, soft); take photographs of one scene, with more overlap"
     )
     joined = replace(found, pairs={**found.pairs, ("a", "pair"): 30})
-    assert diagnose(joined).startswith("take more sharp ones"), "seven of twelve belong together"
+    assert diagnose(joined).startswith("take more sharp photographs"), "seven of twelve belong together"
     weak = replace(found, pairs={("a", "b"): 20, ("b", "c"): 29})
-    assert diagnose(weak).startswith("no two of them show enough of the same: 29 matches at most; take")
+    assert diagnose(weak).startswith("no two of them overlap enough: 29 matches at most; take")
     two = MatchGraph(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
     assert "the largest of 2 (a, b), and 1 without a good match (c); take" in diagnose(two)
 
@@ -268,7 +271,7 @@ def test_blur_is_told_from_an_equally_soft_photograph_elsewhere(tmp_path):
     found = MatchGraph.from_database(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
     assert explain_unplaced(found, [{"0.png", "1.png", "2.png"}]) == {
         "blurred.png": "blurred",
-        "elsewhere.png": "shows nothing that another photograph shows; it may be blurred",
+        "elsewhere.png": "matches no other photograph; it may be blurred",
     }
 
 
@@ -308,10 +311,10 @@ def dense(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("pixels", "sentence"),
     [
-        (turned, "match like those of a camera that only turned on the spot"),
-        (lambda number: (turned if number else stranger)(number), "match like those of a camera that only turned"),
+        (turned, "look as if the camera only rotated in place"),
+        (lambda number: (turned if number else stranger)(number), "look as if the camera only rotated"),
         (stranger, "no two of them show the same features"),
-        (lambda number: turned(1), "photographs are all the same: nothing moves from one to the next"),
+        (lambda number: turned(1), "photographs are all the same"),
         (lambda number: np.full((180, 240, 3), 180 + number, np.uint8), "none has features, where thousands"),
         (lambda number: np.full((180, 240, 3), 9, np.uint8) if number else turned(1), "half of them have no features"),
     ],
@@ -337,7 +340,7 @@ def test_only_attempts_that_are_made_count(tmp_path, dense, caplog):
     matches, cameras = prepared(tmp_path, [stranger(number) for number in range(4)])
     with pytest.raises(DataError, match="no two of them show the same features"):
         map_cameras(matches, cameras, attempts=3)
-    tried = [text.rpartition(": ")[2] for text in caplog.messages if "another attempt" in text]
+    tried = [text.rpartition(" with ")[2] for text in caplog.messages if "trying again" in text]
     assert tried == ["smaller angles and fewer matches", "denser features"]
 
 
@@ -368,7 +371,7 @@ def test_model_counts_only_photographs_in_no_larger_model(tmp_path):
             return 0.5
 
     models = [Model(1, 2, 3, 4), Model(3, 4, 5), Model(2, 4, 5)]
-    figures = mapping._written(models, tmp_path, [f"{number}.jpg" for number in range(1, 7)])
+    figures = mapping._write_best(models, tmp_path, [f"{number}.jpg" for number in range(1, 7)])
     assert figures["other_models"] == [1]
     assert figures["not_registered"] == ["5.jpg", "6.jpg"]
 
@@ -376,7 +379,7 @@ def test_model_counts_only_photographs_in_no_larger_model(tmp_path):
 def test_model_of_a_turning_camera_is_refused_among_strangers(tmp_path, dense):
     """Before there is one, too few photographs match to know."""
     matches, cameras = prepared(tmp_path, [turned(number) if number < 6 else stranger(number) for number in range(14)])
-    with pytest.raises(DataError, match=r"the \d of 14 photographs that could be placed match like those"):
+    with pytest.raises(DataError, match=r"the \d of 14 photographs that were placed look as if"):
         map_cameras(matches, cameras)
     assert not (cameras / "sparse").exists()
 
@@ -387,8 +390,7 @@ def test_features_are_not_sought_again_for_unrelated_photographs(tmp_path, dense
     matches, cameras = prepared(tmp_path, [stranger(number) for number in range(6)])
     with pytest.raises(DataError, match="no two of them show the same features"):
         map_cameras(matches, cameras)
-    assert "denser features would not help" in caplog.text
-    assert "another attempt: denser" not in caplog.text
+    assert "with denser features" not in caplog.text
 
 
 @pytest.mark.parametrize(

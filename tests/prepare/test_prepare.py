@@ -67,13 +67,13 @@ def test_what_was_left_out_is_told_again(photos, tmp_path, monkeypatch, caplog):
     figures = {"photographs": 4, "damaged": {"b.jpg": "not an image"}, "registered": 3, "not_registered": ["c.jpg"]}
     for step in (prepare_steps.FindFeatures, prepare_steps.MapCameras):
         monkeypatch.setattr(step, "make", lambda *_: figures)
-        monkeypatch.setattr(step, "told", lambda *_: "")
+        monkeypatch.setattr(step, "summary", lambda *_: "")
     steps = [prepare_steps.FindFeatures(), prepare_steps.MapCameras()]
     prepare(plan(steps, photos, tmp_path / "prepared"), photos, tmp_path / "prepared")
     caplog.clear()
     prepare(plan(steps, photos, tmp_path / "prepared"), photos, tmp_path / "prepared")
     assert "1 of 5 photographs cannot be read: b.jpg (not an image)" in caplog.text
-    assert "1 of 4 photographs could not be placed: c.jpg" in caplog.text
+    assert "1 of 4 photographs could not be placed and are not used: c.jpg" in caplog.text
 
 
 def test_what_depends_on_a_change_is_redone(photos, tmp_path):
@@ -144,7 +144,7 @@ def test_a_damaged_result_is_made_again(photos, tmp_path, fault, caplog):
     assert [one.why for one in plan(steps, photos, root)] == ["", why]
     assert plan([steps[0], Copy(letter="z")], photos, root)[1].why.startswith("letter is z")
     assert do(steps, photos, root) == ("pab", ["b"])
-    assert f"copy: {why}" in caplog.messages
+    assert f"copy runs again: {why}" in caplog.messages
     assert do(steps, photos, root) == ("pab", [])
 
 
@@ -283,7 +283,7 @@ def pipeline(photos: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest
 
     def make(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
         shutil.copytree(tiny_scene, out, dirs_exist_ok=True)
-        return {}
+        return {"photographs": 3, "cameras": 1}
 
     text = Path(load("smoke").path).read_text()
     file = tmp_path / "p.yaml"
@@ -387,7 +387,7 @@ def test_a_restarted_run_may_have_other_photographs(pipeline, photos, tmp_path):
 def test_a_folder_with_cameras_is_not_a_folder_of_photographs(tiny_scene, tmp_path):
     step = prepare_steps.FindFeatures()
     message = refusal(prepare, plan([step], tiny_scene, tmp_path / "r" / "p"), tiny_scene, tmp_path / "r" / "p")
-    assert "holds cameras already" in message
+    assert "already contains cameras" in message
     assert not list((tmp_path / "r" / "p").iterdir())
 
 
@@ -428,7 +428,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
                 raise DataError("broken")
             (out / "sparse" / "0").mkdir(parents=True)
             (out / "sparse" / "0" / "cameras.bin").write_text(str(len(ran)))
-        return {"registered": 5, "not_registered": [], "error_px": 0.5}
+        return {"photographs": 5, "cameras": 1, "pairs": 10, "registered": 5, "not_registered": [], "error_px": 0.5}
 
     for step in (prepare_steps.FindFeatures, prepare_steps.MatchFeatures, prepare_steps.MapCameras):
         monkeypatch.setattr(step, "make", make)
@@ -448,7 +448,7 @@ def test_photographs_are_placed_from_where_a_run_stopped(photos, tmp_path, done)
 def test_photographs_are_not_placed_from_other_settings(photos, tmp_path, done):
     out = tmp_path / "out"
     place_photographs(photos, out)
-    assert "holds a model already" in refusal(place_photographs, photos, out)
+    assert "already contains a model" in refusal(place_photographs, photos, out)
     shutil.rmtree(out / "sparse")
     done.clear()
     assert place_photographs(photos, out, matching="sequential") == 5
@@ -473,5 +473,5 @@ def test_one_process_places_photographs_in_a_folder_at_a_time(photos, tmp_path, 
 
 def test_images_of_the_user_are_not_overwritten(photos, tmp_path, done):
     (tmp_path / "out" / "images").mkdir(parents=True)
-    assert "holds `images` already" in refusal(place_photographs, photos, tmp_path / "out")
+    assert "already contains `images`" in refusal(place_photographs, photos, tmp_path / "out")
     assert done == []

@@ -46,7 +46,7 @@ def told(folder: Path, cameras: Sequence[tuple[float, float]]) -> str:
 
 
 def test_a_camera_that_turns_on_one_spot_tells_no_depth(tmp_path):
-    assert "only turned on the spot" in told(tmp_path, [(0, angle) for angle in range(-20, 21, 8)])
+    assert "only rotated in place" in told(tmp_path, [(0, angle) for angle in range(-20, 21, 8)])
 
 
 def test_camera_turning_on_each_of_several_spots_gives_depths(tmp_path):

@@ -156,7 +156,7 @@ def test_further_attempts_match_as_the_first_and_can_be_off(photos, tmp_path, mo
     caplog.set_level("INFO")
     with pytest.raises(DataError, match="could not be placed"):
         map_cameras(tmp_path / "matches", tmp_path / "once", attempts=1)
-    assert "another attempt" not in caplog.text
+    assert "trying again" not in caplog.text
     used, more = list[Pairing](), list[int]()
     monkeypatch.setattr(mapping_tool, "match_within", lambda database, pairing: used.append(pairing))
     monkeypatch.setattr(mapping_tool, "match_pairs", lambda database, pairs, threads: more.append(len(pairs)))
@@ -367,7 +367,7 @@ def test_photographs_are_found_below_the_folder(tmp_path):
         (tmp_path / name).touch()
     assert list_photographs(tmp_path, tmp_path / "runs") == ["a/ü 1.png", "b.JPG", "c.tif"]
     (tmp_path / "c.tif").unlink()
-    assert "found 2 photographs; expected at least 3" in refusal(list_photographs, tmp_path, tmp_path / "runs")
+    assert "has 2 photographs; expected at least 3" in refusal(list_photographs, tmp_path, tmp_path / "runs")
 
 
 def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplog):

@@ -103,7 +103,9 @@ def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
 
 
 def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):
-    assert summarize_placement(FOUND) == "32 of 33 photographs placed, 1.27 px; left out: IMG_0034.jpg"
+    assert (
+        summarize_placement(FOUND) == "32 of 33 photographs placed, reprojection error 1.27 px; left out: IMG_0034.jpg"
+    )
     assert summarize_placement({}) == summarize_placement({"map_cameras": {"registered": "x"}}) == ""
     many = {"map_cameras": {**FOUND["map_cameras"], "not_registered": [f"{i}.jpg" for i in range(10)]}}
     assert summarize_placement(many).endswith("7.jpg, and 2 more")

@@ -61,7 +61,7 @@ def test_the_lines_name_the_photographs_that_are_left_out(tmp_path):
     found = put(tmp_path, state="done", progress=None)
     features, cameras = {"damaged": {"b.jpg": "cut"}}, {"registered": 3, "not_registered": [], "error_px": 0.5}
     found["metrics"] = {"preparation": {"find_features": features, "map_cameras": cameras}}
-    assert "3 of 4 photographs placed, 0.50 px; left out: b.jpg (cut)" in reading.status_text(found)
+    assert "3 of 4 photographs placed, reprojection error 0.50 px; left out: b.jpg (cut)" in reading.status_text(found)
 
 
 def test_clock_that_is_ahead_gives_no_negative_time_and_is_noted(tmp_path):
