@@ -84,7 +84,6 @@ def map_cameras(
     """Place cameras and points in at most `attempts` attempts, write the largest model as sparse/0, return figures.
 
     `mapper: global` is faster for many photographs; more than one thread is faster but not bit-identical.
-    An attempt that has nothing to try, such as no further pairs, does not count.
     min_track_length: the number of photographs in which a point must be seen, 2 or 3.
     Raises DataError, with the likely reason, when no attempt places three photographs.
     """
@@ -111,14 +110,13 @@ def map_cameras(
             if attempt.wider:
                 matched = MatchGraph.from_database(pycolmap, attempt.database(source, out), source / IMAGES)
         except FAILURES as error:
-            if attempt.wider:
-                LOG.warning("the attempt failed and is skipped: %s", error)
-                more = []
-                continue
-            if not models:
+            if not (attempt.wider or models):
                 raise
-            LOG.warning("the attempt failed; keeping the earlier model: %s", error)
-            break
+            LOG.warning("the attempt failed and is skipped: %s", error)
+            if not attempt.wider:
+                break
+            more = []
+            continue
         if candidates and candidates[0].num_reg_images() > placed:
             models, used = candidates, attempt
     if not models:
@@ -133,10 +131,14 @@ def map_cameras(
         models[0] = triangulate_pairs(models[0], database, out, threads)
     figures = {**_write_best(models, out, names), "attempt": used.label, "denser_tried": (out / DENSE).exists()}
     figures["reasons"] = explain_unplaced(matched, [_names(model) for model in models])
-    for left in out.glob(".*"):
-        shutil.rmtree(left) if left.is_dir() else left.unlink()
+    _remove_hidden(out)
     log_warnings(figures)
     return figures
+
+
+def _remove_hidden(folder: Path) -> None:
+    for path in folder.glob(".*"):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _run_attempt(
