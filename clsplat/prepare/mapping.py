@@ -115,16 +115,15 @@ def map_cameras(
             LOG.warning("the attempt failed and is skipped: %s", error)
             if not attempt.wider:
                 break
-            more = []
-            continue
+            more, candidates = [], []
         if candidates and candidates[0].num_reg_images() > placed:
             models, used = candidates, attempt
     if not models:
         raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnose(matched)}")
     database = used.database(source, out)
     if why := why_no_depth(pycolmap, database, _names(models[0])):
-        placed = models[0].num_reg_images()
-        raise DataError(f"{source / IMAGES}: the {placed} of {len(names)} photographs that were placed {why}")
+        placed_text = f"{models[0].num_reg_images()} of {len(names)}"
+        raise DataError(f"{source / IMAGES}: the {placed_text} photographs that were placed {why}")
     if used.dense:
         matched = MatchGraph.from_database(pycolmap, database, source / IMAGES)
     if min_track_length == PAIR:
