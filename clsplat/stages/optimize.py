@@ -21,7 +21,7 @@ from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.best_model import Best, Measured
-from clsplat.training.checkpoint import copied_of, finite_values, put_back
+from clsplat.training.checkpoint import copy_model, finite_values, put_back
 from clsplat.training.modules.base import ModuleState, TrainingModule, attach_modules, check_list, implied_modules
 from clsplat.training.records import Forecast, clocks, stage_milliseconds
 from clsplat.training.run import Run
@@ -143,7 +143,7 @@ class Keeping(Training):
             run.best = best.after(now)
             return
         first_overfit = (best and best.first_overfit) or (now if now.is_overfit else None)
-        tables, evaluations = copied_of(run), best.evaluations + 1 if best else 1
+        tables, evaluations = copy_model(run), best.evaluations + 1 if best else 1
         copied = {split: dict(one) for split, one in averages.items()}
         run.best = Best(
             measured=now,

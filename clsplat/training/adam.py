@@ -1,4 +1,4 @@
-"""Adam on the tables of a Gaussians struct, with a learning rate for each."""
+"""Optimize the tables of Gaussians by Adam, with a learning rate for each, and average them over steps."""
 
 from collections.abc import Collection
 from typing import Annotated, Any, ClassVar, Literal
@@ -20,22 +20,22 @@ from clsplat.training.motion import MotionRates, update_motion
 
 
 class FullSizeDecay(Settings):
-    """The initial value as long as photographs have less than their full size, then an exponential decay (DashGaussian,
-    Chen et al. 2025)."""
+    """Keep the initial rate until photographs have their full size, then decay exponentially (DashGaussian, Chen et al.
+    2025)."""
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"until"})
 
     start: Literal["full_size"]
-    """`full_size`: the first step at the full size of the photographs."""
+    """`full_size`: the decay starts at the first step with photographs at full size."""
     until: Annotated[int, Field(gt=0)]
-    """Global step from which the value is the final one."""
+    """Global step at which the rate is final."""
     initial: Annotated[float, Field(gt=0)]
-    """The value before the decay."""
+    """Rate before the decay."""
     final: Annotated[float, Field(gt=0)]
-    """The value after it."""
+    """Rate after the decay."""
 
     def from_step(self, step: int) -> Decay:
-        """Return the decay that begins at a global step."""
+        """Return the decay that starts at a global step."""
         start = min(step, self.until - 1)
         return Decay(initial=self.initial, final=self.final, start=start, over=self.until - start)
 
@@ -47,12 +47,12 @@ def _times(rate: FullSizeDecay | Schedule, factor: float) -> FullSizeDecay | Sch
 
 
 class Rates(Settings):
-    """Learning rates by parameter, each by step.  Those of `means` are multiplied by the scene's extent."""
+    """Learning rates of the parameters, each by step."""
 
     means: Annotated[
         FullSizeDecay | NonNegative, explain_schedule(", or {initial, final, until, start: full_size}")
     ] = Decay(initial=1.6e-4, final=1.6e-6, over=30_000)
-    """Of the means, as shares of the scene's extent."""
+    """Of the means, in units of the scene's extent."""
     quats: NonNegative = 1.0e-3
     """Of the quaternions."""
     log_scales: NonNegative = 5.0e-3
@@ -60,11 +60,11 @@ class Rates(Settings):
     logit_opacity: NonNegative = 5.0e-2
     """Of the logits of the opacities."""
     sh_base: NonNegative = 2.5e-3
-    """Of band 0 of the spherical harmonics."""
+    """Of the spherical harmonics of degree 0."""
     sh_rest: NonNegative = 1.25e-4
-    """Of the other bands, which cost most; where it is 0 they are left alone, with their moments."""
+    """Of the higher degrees, which cost most time; at 0, they and their moments are not updated."""
     motion: MotionRates = MotionRates()
-    """Of the motion, where Gaussians move."""
+    """Of the motion, if Gaussians move."""
 
     def times(self, factor: float) -> "Rates":
         """Return all rates times a factor."""
@@ -73,39 +73,38 @@ class Rates(Settings):
         return self.model_copy(update={**times, "motion": self.motion.times(factor)})
 
     def settled(self, full_size: int) -> "Rates":
-        """Return rates by step alone; full_size: the first step at the full size of the photographs."""
+        """Return rates that depend only on the step.  full_size: first step with photographs at full size."""
         if not isinstance(self.means, FullSizeDecay):
             return self
         return self.model_copy(update={"means": self.means.from_step(full_size)})
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates of a global step, by the names of PARAMETERS and of the fields of the motion.
+        """Return the rates of a global step, by name of parameter and of field of the motion.
 
-        Raises ConfigError before they are settled.
+        Raises ConfigError if `settled` was not called.
         """
         if isinstance(self.means, FullSizeDecay):
             raise ConfigError(
-                "a rate with `start: full_size` needs the step of the photographs' full size: expected what "
-                "`settled(step)` returns"
+                "a rate with `start: full_size` needs the first step at full size; use the rates that `settled(step)` "
+                "returns"
             )
         rates = {name: at_step(getattr(self, name), step) for name in PARAMETERS}
         return {**rates, "means": rates["means"] * extent, **self.motion.at(step, extent)}
 
 
-Rows = Literal["all", "seen", "deferred"]  # Gaussians that an update changes; deferred: all, some later
+Rows = Literal["all", "seen", "deferred"]  # rows that an update changes; deferred: all, some of them later
 _EVERY = {"all": 0xFFFFFFFF, "seen": 0, "deferred": 0xFFFFFFFF}
 _UNDRAWN = {"all": 0xFFFFFFFF, "seen": 0xFFFFFFFF, "deferred": 0}
 
 
 class Adam:
-    """Adam, with its moments in tables beside the parameters, and a number of updates for each parameter.
+    """Adam (Kingma and Ba 2015), with moments in tables next to the parameters and one update count per parameter.
 
-    Of the rows `seen`, one whose splat was culled in the view (it has no pixel within the photograph where it is not
-    fainter than 1/255) keeps its parameters and both moments, whatever penalties give it.  The correction of the
-    moments' bias counts the updates of a parameter, in `seen` too, where a row may have had fewer; published kernels
-    (Taming 3DGS) leave the correction out.
+    With rows `seen`, a Gaussian that is culled in the view (no pixel of the photograph with an alpha of 1/255 or more)
+    keeps its parameters and moments, whatever the gradients of penalties.  Bias correction uses the update count of the
+    parameter, although a row may have had fewer updates; published kernels (Taming 3DGS) omit the correction.
 
-    Of the rows `deferred`, `sh_rest` has its updates when a view sees it: the bits are those of `all`.
+    With rows `deferred`, the updates of `sh_rest` are done when a view sees a Gaussian: bit-identical to `all`.
     """
 
     def __init__(self, gaussians: Gaussians) -> None:
@@ -123,7 +122,7 @@ class Adam:
     def update(
         self, model: DeviceModel, frame: Frame, pixel_sums: Array, rates: dict[str, float], rows: Rows = "all"
     ) -> Array:
-        """Update every parameter from the frame's sums over pixels, [PIXEL_SUMS, S].
+        """Update all parameters from the frame's sums over pixels, [PIXEL_SUMS, S].
 
         Returns the gradient of the projected means, [2, S] px⁻¹, valid until the next update.
         """
@@ -161,9 +160,9 @@ class Adam:
         without: Collection[str] = (),
         rows: Rows = "all",
     ) -> None:
-        """Update every parameter but those named in `without` from gradients in memory; `frame`: of the view.
+        """Update all parameters except `without` from gradients in memory.
 
-        Bands above the active SH degree are left out: their gradients and moments are zero.
+        Harmonics above the active degree are skipped, since their gradients and moments are zero.
         """
         gaussians, rows = self.gaussians, self._possible(rows)
         deferred = None if "sh_rest" in without else self._deferred(rows, model, rates)
@@ -198,7 +197,7 @@ class Adam:
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
 
     def _deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> Waiting | None:
-        """What notes the next update of `sh_rest`; None where all rows have it at once, or none has it."""
+        """Return the record of deferred `sh_rest` updates; None if all rows are updated at once, or none is."""
         gaussians = self.gaussians
         if rows != "deferred":
             if gaussians.deferred:
@@ -211,7 +210,7 @@ class Adam:
         return gaussians.deferred
 
     def _mean2d(self) -> Array:
-        """The array of the gradient of the projected means, of another size after edits."""
+        """Return the array for the gradient of the projected means; edits change its size."""
         shape = (2, self.gaussians.capacity)
         if self._grad_mean2d is None or self._grad_mean2d.shape != shape:
             self._grad_mean2d = None  # released before its successor is allocated
@@ -219,35 +218,35 @@ class Adam:
         return self._grad_mean2d
 
     def _possible(self, rows: Rows) -> Rows:
-        """Harmonics on the host are updated where a view sees them: of `all`, the others later."""
+        """Return the rows to update: harmonics on the host are always updated later, when a view sees them."""
         return "deferred" if rows == "all" and self.gaussians.on_host else rows
 
     def _end(self, deferred: Waiting | None, frame: Frame, rate: float, correction2: float) -> None:
-        """Note the update of `sh_rest` that the rows in the view have had."""
+        """Record that the rows in the view have had this update of `sh_rest`."""
         if deferred:
             deferred.note(frame.depth_key, (rate, correction2))
         if self.gaussians.on_host:
             self.gaussians.on_host.begin_to_fetch()
 
     def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
-        """Rate and second factor of a parameter's next update, with the bias correction of the moments."""
+        """Return the bias-corrected rate and the correction of moment 2 for a parameter's next update."""
         self.updates[name] += name != "sh_rest" or rates[name] != 0  # see Rates.sh_rest
         updates = max(self.updates[name], 1)
         return rates[name] / (1 - self._beta1**updates), 1 / (1 - self._beta2**updates)
 
     def forget(self, name: str) -> None:
-        """Set the moments of one parameter to zero."""
+        """Reset the moments of one parameter."""
         self.gaussians.zero_rows(moment_tables(name), np.arange(self.gaussians.count))
 
 
-# The average of the parameters over steps, in tables beside them (Polyak and Juditsky 1992).
+# The average of the parameters over steps, in tables next to them (Polyak and Juditsky 1992).
 
-FOLDER = "average/"  # before the names of the parameters
-NUMBER = f"{FOLDER}number"  # [1] of steps in the average of a row
+FOLDER = "average/"  # prefix of the names of parameters
+NUMBER = f"{FOLDER}number"  # of steps in the average of a row
 
 
 def attach(gaussians: Gaussians) -> None:
-    """Add the tables, unless they are there: no step so far.  Rows of new Gaussians begin anew."""
+    """Add empty tables for averages, if missing.  Rows of new Gaussians start empty."""
     if NUMBER not in gaussians.tables:
         for name in gaussians.trained:
             gaussians.add(FOLDER + name, gaussians.tables[name].components, zero_fresh=True)
@@ -255,7 +254,7 @@ def attach(gaussians: Gaussians) -> None:
 
 
 def add(gaussians: Gaussians) -> None:
-    """Add the present parameters to their averages."""
+    """Add the current parameters to their averages."""
     program, count = gaussians.device.program("average.cl"), gaussians.count
     for name in gaussians.trained:
         program.add_to_average(
@@ -270,7 +269,7 @@ def add(gaussians: Gaussians) -> None:
 
 
 def take(gaussians: Gaussians) -> None:
-    """Replace the parameters by their averages, those of rows without one stay, and remove the tables."""
+    """Replace the parameters by their averages, where a row has one, and remove the tables."""
     program = gaussians.device.program("average.cl")
     for name in gaussians.trained:
         program.take_average(

@@ -1,10 +1,10 @@
-"""A file of named arrays and notes that notices damage: an .npz in which every object has a SHA-256.
+"""Write and read named arrays and notes in an .npz file that detects damage: every object has a SHA-256.
 
-    NAME.npy          an array of float32; its SHA-256, of all bytes of the member, stands in the notes
+    NAME.npy          a float32 array; the SHA-256 of all bytes of the member is in the notes
     meta.npy          the notes: JSON, with the key `sha256` by name of array
     meta_sha256.npy   the SHA-256 of meta.npy
 
-NumPy reads the arrays.  A changed byte is either noticed or lies where it means nothing, such as in a time of day.
+NumPy can read the arrays.  A changed byte is detected, unless it has no meaning, such as one in a time stamp.
 """
 
 import errno
@@ -37,9 +37,9 @@ def write(file: BinaryIO, notes: Notes, arrays: Iterable[tuple[str, NDArray[np.f
 
 
 def read(path: Path) -> tuple[Notes, Arrays]:
-    """Return notes and arrays, all as they were written.  Raises DataError, with the reason alone, when damaged.
+    """Return notes and arrays.  Raises DataError, with only the reason, if the file is damaged.
 
-    Raises OutputError and MemoryError where the system cannot read it, which says nothing about the file.
+    Raises OutputError or MemoryError if the system cannot read it, which does not mean that it is damaged.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -65,7 +65,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
 
 
 def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:
-    """Divide arrays into those whose names begin with `folder`, by the rest of their names, and the others."""
+    """Split arrays into those below `folder`, named without it, and the others."""
     own = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
     return own, {name: array for name, array in arrays.items() if not name.startswith(folder)}
 
@@ -110,7 +110,7 @@ def _member(archive: zipfile.ZipFile, name: str, digest: str) -> bytes:
 
 
 def _array(data: bytes) -> NDArray[Any]:
-    """Parse a member, without memory of its own: a header may declare any shape."""
+    """Parse a member without a copy, since a damaged header may declare any shape."""
     stream = io.BytesIO(data)
     np.lib.format.read_magic(stream)
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=1000)

@@ -1,7 +1,7 @@
-"""Save and restore a run, bit for bit: parameters, Adam's moments, statistics and counters, without pickle.
+"""Save and restore a run, bit for bit: parameters, Adam moments, statistics and counters, without pickle.
 
-Random numbers and the order of views depend on (seed, step) alone, so the step is their state.  A state that is not
-finite is no checkpoint: it lies beside them as failed_N.npz, and a run goes on from the last good one.
+Random numbers and the order of views depend only on (seed, step), so the step is their state.  A state with values that
+are not finite is saved as failed_N.npz, from which no run resumes.
 """
 
 import logging
@@ -48,13 +48,13 @@ from clsplat.training.run import Run
 from clsplat.training.settings_diff import differences
 from clsplat.training.sh_offload import make_room
 
-# The notes of a checkpoint: all of a run's state but its tables.
+# The notes of a checkpoint: the state of a run without its tables.
 
 Count = Annotated[int, Field(ge=0)]
 
 
 class State(BaseModel):
-    """What a checkpoint holds beside its tables."""
+    """The state of a run in a checkpoint, without its tables."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
@@ -84,13 +84,13 @@ class State(BaseModel):
     pipeline: dict[str, Any]
 
     def is_trained(self, pipeline: dict[str, Any]) -> bool:
-        """Whether all the steps that a resolved pipeline gives the training in progress are done."""
+        """Return whether the training in progress has done all steps of a resolved pipeline."""
         (stage,) = pipeline["stages"][self.stage_index].values()
         return bool(stage.get("steps") == self.stage_step)
 
 
 def check_tables(state: State, tables: Arrays) -> None:
-    """Raise DataError for tables that are not those of a run."""
+    """Raise DataError if tables cannot be those of a run."""
     if missing := [name for name in PARAMETERS if name not in tables]:
         raise DataError(f"lacks {', '.join(missing)}")
     count = len(tables["means"])
@@ -109,9 +109,9 @@ def check_tables(state: State, tables: Arrays) -> None:
         if broken := [key for key in (name, *moments) if not np.isfinite(tables[key]).all()]:
             raise DataError(f"{broken[0]} holds values that are not finite")
         if [tables[moment].shape for moment in moments] != [tables[name].shape] * (2 if state.updates else 0):
-            raise DataError(f"the moments of {name} are not like it")
+            raise DataError(f"the moments of {name} have another shape than it")
     if state.updates and state.updates.keys() != set(trained):
-        raise DataError("it counts updates of other parameters")
+        raise DataError("its update counts are of other parameters")
 
 
 # The tables of a run's modules in a checkpoint, and in the best model.
@@ -120,23 +120,23 @@ MODULES = "modules/"  # before the names of modules, before those of their table
 
 
 def module_tables(run: Run, whole: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the tables by their keys in the file.  whole: with what only training needs."""
+    """Yield the tables with their keys in the file.  whole: include those that only training needs."""
     for module, state in run.modules.items():
         if whole or state.after_training != "dropped":
             yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(whole).items())
 
 
 def check_modules(scalars: Mapping[str, Scalars], tables: Arrays) -> None:
-    """Raise DataError for tables that are not those of modules.  tables: without MODULES."""
+    """Raise DataError if tables cannot be those of modules.  tables: named without MODULES."""
     for name in scalars:
         own, tables = split(tables, f"{name}/")
         class_of(name).check_saved(scalars[name], own)
     if tables:
-        raise DataError(f"it has tables of modules that it says nothing of: {', '.join(tables)}")
+        raise DataError(f"it has tables of modules that its notes do not list: {', '.join(tables)}")
 
 
 def put_back_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -> None:
-    """Give the modules of a run what was copied of them at another step."""
+    """Restore the modules of a run from copies of another step."""
     for name, own in scalars.items():
         if name in run.modules and name in modules_so_far(run):
             run.modules[name].load(own, split(tables, f"{name}/")[0])
@@ -145,25 +145,25 @@ def put_back_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -
 # The tables of the best model of a run: copied to the host, and put back.
 
 
-def copied_of(run: Run) -> Tables:
-    """Copy what the run's model needs to be rendered, and to be trained from anew, to the host."""
+def copy_model(run: Run) -> Tables:
+    """Copy to the host what rendering the run's model, and training it further, needs."""
     return {**model_tables(run.model), **dict(module_tables(run, whole=False))}
 
 
 def put_back(run: Run, tables: Tables, best: Best) -> None:
-    """Make what was copied the run's model."""
+    """Make a copied model the run's model."""
     of_modules, of_gaussians = split(tables, MODULES)
     put_back_modules(run, best.modules, of_modules)
     run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), best.degree)
 
 
-# The tables of a run in its checkpoint: those of a field, or of Gaussians, what is behind them, and the best model.
+# The tables of a run in a checkpoint: of a field; or of Gaussians, modules, and the best model.
 
 UPDATES = "field"  # name of their number
 
 
 def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the tables by their keys in the file, each copied to the host when it is its turn."""
+    """Yield the tables with their keys in the file, copied to the host one at a time."""
     if run.learned_field:
         yield from ((field.FOLDER + name, table) for name, table in run.learned_field.tables().items())
         return
@@ -174,17 +174,17 @@ def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
 
 
 def updates_of(run: Run) -> dict[str, int]:
-    """Return how often Adam has updated each of its tables."""
+    """Return the number of Adam updates of each parameter."""
     if run.learned_field:
         return {UPDATES: run.learned_field.updates}
     return run.adam.updates if run.adam else {}
 
 
 def check_run_tables(state: State, tables: Arrays) -> None:
-    """Raise DataError for tables that are not those of the state."""
+    """Raise DataError if tables do not match the state."""
     if state.field:
         if state.updates.keys() != {UPDATES}:
-            raise DataError("it counts updates of other parameters than those of its field")
+            raise DataError("its update counts are not those of a field")
         kind = field.class_of(state.field)
         kind.check_tables(state.field["shape"], *split(tables, field.FOLDER))
         return
@@ -202,7 +202,7 @@ def _gaussians(modules: Mapping[str, Scalars], tables: Arrays) -> Arrays:
 
 
 def restore_tables(run: Run, state: State, tables: Arrays) -> None:
-    """Put the tables of a state into a run."""
+    """Restore the tables of a run."""
     if state.field:
         own, _ = split(tables, field.FOLDER)
         kind = field.class_of(state.field)
@@ -221,7 +221,7 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
         run.adam.updates = state.updates
         columns = [name for name in tables if name.startswith(STATS_PREFIX) and name != SEEN]
         run.stats = SplatStats(gaussians, [name.removeprefix(STATS_PREFIX) for name in columns])
-    for key, table in tables.items():  # those of rules, penalties and plug-ins too
+    for key, table in tables.items():  # including those of rules, penalties and plug-ins
         name = key.removeprefix("gaussians/")
         if name not in gaussians.tables:
             gaussians.add(name, table.shape[1], zero_fresh=name in state.zero_fresh)
@@ -229,37 +229,37 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
 
 
 def _key(table: str) -> str:
-    """The key of a table in the file: parameters are in the folder `gaussians`."""
+    """Return the key of a table in the file; parameters are below `gaussians/`."""
     return table if "/" in table else f"gaussians/{table}"
 
 
-# What to try after values that are not finite.
+# What to try if values are not finite.
 
-LOWER = 0.1  # times the present rate
-VELOCITY = "motion.velocity"  # whose rate is lowered where a motion is broken
+LOWER = 0.1  # factor of a rate
+VELOCITY = "motion.velocity"  # its rate is lowered if a motion is not finite
 
 
 def lower_rate(run: Run, broken: Collection[str]) -> str:
-    """Return 'place=value' for `--set`: a lower rate of that broken parameter whose rate is the largest by its default.
+    """Return 'key=value' for `--set` that lowers a rate: of the broken parameter whose rate exceeds its default most.
 
-    The value is a tenth of the present one, or the default where that is smaller.  A field has one rate.
+    The value is a tenth of the current rate, or the default if that is smaller.  A field has one rate.
     """
     if run.learned_field:
         (stage,) = run.pipeline["stages"][run.stage_index]
         return f"{stage}.rate={LOWER * run.learned_field.rate:.2g}"
     stages, default = run.pipeline["stages"], Rates()
     trains = [(i, name) for i, stage in enumerate(stages) for name, fields in stage.items() if "rates" in fields]
-    place, stage = next((found for found in reversed(trains) if found[0] <= run.stage_index), (0, "optimize"))
-    present = Rates.model_validate(stages[place].get(stage, {}).get("rates", {}))
+    index, stage = next((one for one in reversed(trains) if one[0] <= run.stage_index), (0, "optimize"))
+    current = Rates.model_validate(stages[index].get(stage, {}).get("rates", {}))
 
     def rate(rates: Rates, name: str) -> float:
         return at_step(rates.motion.velocity if name == VELOCITY else getattr(rates, name), run.step)
 
     names = [VELOCITY if name == MOTION else name for name in broken or PARAMETERS]
-    name = max(names, key=lambda name: rate(present, name) / rate(default, name))
-    alone = [other for _, other in trains].count(stage) <= 1
-    value = min(LOWER * rate(present, name), rate(default, name))
-    return f"{stage if alone else f'stages.{place}'}.rates.{name}={value:.2g}"
+    name = max(names, key=lambda name: rate(current, name) / rate(default, name))
+    is_only = [other for _, other in trains].count(stage) <= 1
+    value = min(LOWER * rate(current, name), rate(default, name))
+    return f"{stage if is_only else f'stages.{index}'}.rates.{name}={value:.2g}"
 
 
 FORMAT = 5
@@ -267,13 +267,13 @@ LOG = logging.getLogger("clsplat")
 
 
 def save(run: Run, keep: int | None = None) -> Path:
-    """Write checkpoints/step_N.npz, whole or not at all; with `keep` remove all but so many of the newest, up to it.
+    """Write checkpoints/step_N.npz atomically.  keep: number of newest checkpoints to keep; others are removed.
 
-    Raises NotFiniteError, after writing failed_N.npz, where the model is not finite; then nothing is removed.  Raises
-    ClsplatError where a step or an edit is half done.
+    Raises NotFiniteError, after writing failed_N.npz, if the model is not finite; then nothing is removed.  Raises
+    ClsplatError in the middle of a step or an edit.
     """
     if not run.is_consistent:
-        raise ClsplatError(f"{run.out}: step {run.step} is half done, so it is not saved; resume the run to go on")
+        raise ClsplatError(f"{run.out}: step {run.step} is half done, so it is not saved; resume the run")
     if broken := run.not_finite():
         raise NotFiniteError(f"step {run.step}: {set_aside(run, broken)}")
     path = _write(run, "refit" if run.is_refit else "step")
@@ -287,7 +287,7 @@ def save(run: Run, keep: int | None = None) -> Path:
 
 
 def set_aside(run: Run, broken: list[str]) -> str:
-    """Write a state that is not finite as failed_N.npz, the only one of its kind; return what to tell and to do."""
+    """Write a state that is not finite as failed_N.npz, replacing any other; return the end of an error message."""
     try:
         path = _write(run, "failed")
         _remove(other for other in path.parent.glob("failed_*.npz") if other != path)
@@ -298,12 +298,12 @@ def set_aside(run: Run, broken: list[str]) -> str:
     return (
         f"parameters not finite: {', '.join(broken) or 'none'}; {state}; "
         f"`clsplat resume {shell_quote(run.out)} --set {lower_rate(run, broken)}` lowers a rate and "
-        f"{f'goes on from {good[-1].name}' if good else 'starts again'}"
+        f"{f'resumes from {good[-1].name}' if good else 'starts again'}"
     )
 
 
 def saved(out: Path) -> list[Path]:
-    """Return the checkpoints of a run folder from old to new; those of a refit come after those before it."""
+    """Return the checkpoints of a run folder from old to new; those of a refit come last."""
     places = {
         (found[1] == "refit", int(found[2])): path
         for path in (out / CHECKPOINTS).glob("*.npz")
@@ -313,7 +313,7 @@ def saved(out: Path) -> list[Path]:
 
 
 def load(path: Path) -> tuple[State, Arrays]:
-    """Read a checkpoint.  Raises DataError, with the reason alone, when damaged; ConfigError for another format."""
+    """Read a checkpoint.  Raises DataError, with only the reason, if damaged; ConfigError for another format."""
     notes, tables = archive.read(path)
     if type(notes.get("format")) is int and notes["format"] != FORMAT:
         raise ConfigError(
@@ -332,12 +332,10 @@ def load(path: Path) -> tuple[State, Arrays]:
 
 
 def restore(run: Run) -> tuple[Path | None, list[str]]:
-    """Take the newest checkpoint that is whole; return its file, or None where the run has saved none so far.
+    """Restore the newest valid checkpoint; return its file, or None if there is none, and remarks to log.
 
-    Also returns what to say where the run goes on: the settings and the device that have changed.
-
-    Raises ConfigError when it was made with settings that a run cannot go on with, or has another format; OutputError
-    when no checkpoint is whole, or all are gone.
+    The remarks report changes of settings and of the device.  Raises ConfigError if settings changed that cannot change
+    on resume, or for another format; OutputError if all checkpoints are damaged or missing.
     """
     paths = saved(run.out)
     again = f"`clsplat run {shell_quote(run.out / PIPELINE)} --out {shell_quote(run.out)} --restart` starts over"
@@ -346,22 +344,22 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
             state, tables = load(path)
         except DataError as error:
             if path == paths[0]:
-                raise OutputError(f"{path} is damaged ({error}), and no checkpoint is whole; {again}") from error
-            LOG.warning("%s is damaged (%s); using the one before it", path, error)
+                raise OutputError(f"{path} is damaged ({error}), and so are all others; {again}") from error
+            LOG.warning("%s is damaged (%s); using an earlier one", path, error)
             continue
         changed = _take_changes(run, path, state)
-        remarks = [f"{text}; from here on the bits are not those of a run without a change" for text in changed]
+        remarks = [f"{text}; from here on, bits differ from a run without this change" for text in changed]
         if state.device != run.device.text:
-            remarks.append(f"the run was started on {state.device}: the bits may differ from here on")
+            remarks.append(f"the run was started on {state.device}; from here on, bits may differ")
         _restore(run, state, tables)
         return path, remarks
     if last := run.status.now.checkpoint:
-        raise OutputError(f"{run.out / CHECKPOINTS}: is empty, but {last} was saved there; put it back, or {again}")
+        raise OutputError(f"{run.out / CHECKPOINTS}: {last} is missing; put it back, or {again}")
     return None, []
 
 
 def drop_later(out: Path, taken: Path | None) -> None:
-    """Rename the damaged checkpoints after the one that was taken: they take no place among those that are kept."""
+    """Rename the damaged checkpoints after the restored one, so that they do not count as kept ones."""
     files = saved(out)
     for damaged in files[files.index(taken) + 1 :] if taken else ():
         try:
@@ -371,16 +369,16 @@ def drop_later(out: Path, taken: Path | None) -> None:
 
 
 def _remove(files: Iterable[Path]) -> None:
-    """Remove older states; one that cannot go, as where Windows lets another program read it, stays until the next."""
+    """Remove older states; on Windows, one that another program reads stays until the next call."""
     for file in files:
         try:
             file.unlink(missing_ok=True)
         except OSError as error:
-            _tell_once(f"{file}: cannot be removed ({error.strerror}); it stays")
+            _warn_once(f"{file}: cannot be removed ({error.strerror}); it stays")
 
 
 @cache
-def _tell_once(text: str) -> None:
+def _warn_once(text: str) -> None:
     LOG.warning("%s", text)
 
 
@@ -425,10 +423,10 @@ def _field_of(run: Run) -> dict[str, Any] | None:
 
 
 def _take_changes(run: Run, path: Path, state: State) -> list[str]:
-    """Note the settings that have changed, and return them.  Raises ConfigError where a run cannot go on."""
-    changed, remedy = [], "give those settings, or begin anew: `clsplat run` with --restart or another --out"
+    """Record and return the changed settings.  Raises ConfigError for one that cannot change on resume."""
+    changed, remedy = [], "restore it, or start again with `clsplat run --restart` or another --out"
     before = state.pipeline
-    if run.inputs and state.inputs == run.inputs:  # the same scene, wherever it lies now
+    if run.inputs and state.inputs == run.inputs:  # the same scene, possibly moved
         before = {**before, "scene": {**before["scene"], "path": run.pipeline["scene"]["path"]}}
     for difference in differences(before, run.pipeline, run.settings):
         if difference.kind == "output" or difference.is_of_place(state.file_hashes, run.file_hashes):
@@ -439,7 +437,7 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
         if state.best and state.best.refit == "begun" and difference.place.endswith((".steps", ".patience")):
             raise ConfigError(f"{path} is of a refit, whose steps validation has found: {difference}; {remedy}")
-        is_end = difference.place.endswith(".steps")  # an end before the one that was planned
+        is_end = difference.place.endswith(".steps")  # an earlier end of the training
         if difference.stage == state.stage_index and state.is_trained(run.pipeline) and not is_end:
             more = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` with that setting trains on"
             raise ConfigError(f"{path}: no step is left to train, at step {state.step}: {difference}; {more}")
@@ -464,7 +462,7 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
 
 @contextmanager
 def saved_on_failure(run: Run) -> Iterator[None]:
-    """Where the block fails, save the state of the last whole step, and tell where it is; the failure is raised."""
+    """If the block fails, save the last complete step and log where it is; the error is raised again."""
     try:
         yield
     except (Interrupted, NotFiniteError):  # saved already, or set aside
@@ -476,24 +474,23 @@ def saved_on_failure(run: Run) -> Iterator[None]:
 
 
 def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float]:
-    """Read the loss and the PSNR, dB, of a step at a view.
+    """Read the loss and the PSNR, dB, of a step.
 
-    Raises NotFiniteError, with the state set aside, where the loss or the model is not finite.
+    Raises NotFiniteError, after saving the state as failed_N.npz, if the loss or the model is not finite.
     """
     broken, loss = run.not_finite(), losses.loss
     if broken or not math.isfinite(loss):
-        told = set_aside(run, broken)
-        raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {told}")
+        raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {set_aside(run, broken)}")
     return loss, psnr(losses.comparison)
 
 
 def _rescue(run: Run) -> str:
-    """Save the state where it is whole; return a sentence about it."""
+    """Save the state if it is consistent; return a sentence about it."""
     try:
         if run.is_consistent and not run.not_finite() and run.gaussians != 0:
-            return f"the state of step {run.step} is saved in {save(run)}; `clsplat resume` goes on from it"
-        why = "the step that failed was not whole" if not run.is_consistent else "the model is not finite"
+            return f"the state of step {run.step} is saved in {save(run)}; `clsplat resume` continues from it"
+        why = "the failed step was half done" if not run.is_consistent else "the model is not finite"
     except Exception as error:  # the failure itself is what the user must see
         why = f"the state could not be saved ({one_line(error)})"
     files = saved(run.out)
-    return f"{why}; {f'the last good state is {files[-1]}' if files else 'no state was saved before'}"
+    return f"{why}; {f'the last good state is {files[-1]}' if files else 'no earlier state was saved'}"

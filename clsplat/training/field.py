@@ -1,4 +1,4 @@
-"""What a run and its checkpoint need of a field: a model that is not made of Gaussians."""
+"""Define the interface of a trained field, a model without Gaussians, for runs and checkpoints."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -16,11 +16,11 @@ Tables = dict[str, NDArray[np.float32]]
 
 
 class TrainedField(ABC):
-    """A field while it is trained.  Checkpoints know a subclass by its `kind` as soon as it is defined."""
+    """A field in training.  Checkpoints can name the `kind` of any subclass that is defined."""
 
     kinds: ClassVar[dict[str, type["TrainedField"]]] = {}
     kind: ClassVar[str]
-    updates: int  # by Adam, which count for the bias of its moments
+    updates: int  # of Adam, for its bias correction
     rate: float  # of the last step
 
     def __init_subclass__(cls) -> None:
@@ -29,20 +29,20 @@ class TrainedField(ABC):
     @property
     @abstractmethod
     def painter(self) -> Painter:
-        """What renders views of it."""
+        """The renderer of its views."""
 
     @property
     @abstractmethod
     def parameters(self) -> int:
-        """The number of parameters that are learned."""
+        """The number of learned parameters."""
 
     @abstractmethod
     def shape_as_data(self) -> dict[str, Any]:
-        """Return what `check_tables` and `of_tables` take as `shape`, as JSON holds it."""
+        """Return the `shape` for `check_tables` and `of_tables`, as JSON."""
 
     @abstractmethod
     def tables(self) -> Tables:
-        """Copy its tables to the host."""
+        """Copy the tables to the host."""
 
     @abstractmethod
     def not_finite(self) -> list[str]:
@@ -51,16 +51,16 @@ class TrainedField(ABC):
     @classmethod
     @abstractmethod
     def check_tables(cls, shape: Mapping[str, Any], tables: Tables, others: Tables) -> None:
-        """Raise DataError for tables that are not those of a field of a shape."""
+        """Raise DataError if tables cannot be those of a field of this shape."""
 
     @classmethod
     @abstractmethod
     def of_tables(cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array) -> Self:
-        """Return the field of a checkpoint, by what `tables` has returned."""
+        """Return the field of a checkpoint from its tables."""
 
 
 def class_of(written: Mapping[str, Any]) -> type[TrainedField]:
-    """Return the class of a field in a checkpoint.  Raises DataError where no module defines it."""
+    """Return the class of a field in a checkpoint.  Raises DataError for an unknown kind."""
     kind = TrainedField.kinds.get(str(written.get("kind")))
     if kind is None or not isinstance(written.get("shape"), dict):
         raise DataError(f"it holds a field of an unknown kind; expected {', '.join(TrainedField.kinds)}")

@@ -1,6 +1,6 @@
-"""The memory that training needs on the device, computed before it is allocated.
+"""Plan the device memory of training before it is allocated.
 
-Bytes are those of the tables for each Gaussian, and those of a frame for each Gaussian, each pair and each pixel.
+Bytes are counted per Gaussian for tables, and per Gaussian, pair and pixel for a frame.
 """
 
 import math
@@ -15,7 +15,7 @@ from clsplat.gaussians.structs import HARMONICS, moment_tables
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 from clsplat.scene.view import View
 
-SEEN_SHARE = 0.5  # of the Gaussians, in one view, an estimate; their harmonics come to the device
+SEEN_SHARE = 0.5  # of the Gaussians in one view, an estimate; only their harmonics are on the device
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
 MOVED = 4 * (3 + 4 + 1)  # means, quaternions and logits of a moment
@@ -25,7 +25,7 @@ FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 4 + 2)
 # entropy of weights and its gradient
 
 Where = Literal["device", "host"]
-Harmonics = Literal["auto", "device", "host"]  # memory of those above band 0; auto: the host where the device is full
+Harmonics = Literal["auto", "device", "host"]  # memory of the bands above 0; auto: the host if the device is full
 
 
 @dataclass(frozen=True)
@@ -41,22 +41,23 @@ class MemoryPlan:
     host: int = 0  # for each Gaussian, in the memory of the host
 
     def needed(self, gaussians: int) -> int:
-        """Return the bytes for a number of Gaussians, with room to grow and one table being moved."""
-        grown = GROWTH * self.gaussian + self.largest_table + PAIRS_PER_GAUSSIAN * self.pair
-        return self.fixed + int(gaussians * grown)
+        """Return the bytes for a number of Gaussians, with room to grow and to move one table."""
+        return self.fixed + int(gaussians * self._per_gaussian)
+
+    @property
+    def _per_gaussian(self) -> float:
+        return GROWTH * self.gaussian + self.largest_table + PAIRS_PER_GAUSSIAN * self.pair
 
     @property
     def limit(self) -> int:
-        """The largest number of Gaussians that fits, in all and in single buffers."""
-        by_total = (self.memory - self.fixed) / (
-            GROWTH * self.gaussian + self.largest_table + PAIRS_PER_GAUSSIAN * self.pair
-        )
+        """The largest number of Gaussians that fits, in total and in single buffers."""
+        by_total = (self.memory - self.fixed) / self._per_gaussian
         by_table = self.allocation // self.largest_table // ALIGNMENT * ALIGNMENT
         by_pairs = self.allocation / (PAIRS_PER_GAUSSIAN * 4 * RECORD)
         return max(0, int(min(by_total, by_table, by_pairs)))
 
     def text(self, gaussians: int) -> str:
-        """Return one line: the memory needed now, and the number of Gaussians that fit."""
+        """Return a line with the memory needed and the number of Gaussians that fit."""
         mib = 2**20
         on_host = f"; harmonics on the host, in {gaussians * self.host / mib:,.0f} MiB of it" if self.host else ""
         return (
@@ -66,7 +67,7 @@ class MemoryPlan:
         )
 
     def check(self, gaussians: int, more: str = "") -> None:
-        """Raise MemoryLimitError when that many Gaussians do not fit.  more: what else helps, behind the others."""
+        """Raise MemoryLimitError if the Gaussians do not fit.  more: another remedy for the message."""
         if gaussians > self.limit:
             raise MemoryLimitError(
                 f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer "
@@ -75,11 +76,11 @@ class MemoryPlan:
 
 
 class DeviceLimits(Protocol):
-    """What a device holds."""
+    """The memory of a device."""
 
     @property
     def memory(self) -> int:
-        """Bytes in all."""
+        """Bytes in total."""
 
     @property
     def allocation(self) -> int:
@@ -87,30 +88,27 @@ class DeviceLimits(Protocol):
 
     @property
     def unified(self) -> bool:
-        """Whether it is the host's memory."""
+        """Whether it is the memory of the host."""
 
 
 def last_place(harmonics: Harmonics, limits: DeviceLimits) -> Where:
-    """Return where harmonics may lie at last.  A device whose memory is the host's has nothing to move them to."""
+    """Return the memory to which harmonics may move.  A device that shares the host's memory cannot offload them."""
     return "host" if harmonics == "host" or (harmonics == "auto" and not limits.unified) else "device"
 
 
 def most_pixels(views: Sequence[View], tile: int) -> int:
-    """Return the pixels of the largest view, whole tiles of so many px."""
+    """Return the pixels of the largest view in whole tiles.  tile: px."""
     return max(-(-view.camera.width // tile) * -(-view.camera.height // tile) * tile**2 for view in views)
 
 
 def bytes_of_modules(stages: Iterable[Any], views: Sequence[View], tile: int) -> int:
-    """Return what the modules of trainings take on the device, of the one that takes most."""
+    """Return the device bytes of modules in the training that needs most."""
     lists = [getattr(stage, "modules", ()) for stage in stages]
     return max((sum(one.device_bytes(views, tile) for one in modules) for modules in lists), default=0)
 
 
 def first_tables(degree: int, motion: int = 0) -> dict[str, int]:
-    """Return the components of the tables that training has at least, by name: parameters and their moments.
-
-    motion: the columns of the motion; 0 where nothing moves.
-    """
+    """Return the components of parameters and moments, by table.  motion: columns of the motion; 0 if static."""
     widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
     parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
     return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}
@@ -127,9 +125,9 @@ def plan(
 ) -> MemoryPlan:
     """Return the plan for Gaussians with tables of these components, by name.
 
-    photographs: their bytes on the device; pixels: of the largest view, whole tiles; pixel_sums: sums over pixels that
-    the backward pass computes for each Gaussian; harmonics: the memory in which those above band 0 lie; seen: share of
-    the Gaussians whose harmonics a view brings to the device.
+    photographs: their bytes on the device; pixels: of the largest view, in whole tiles; pixel_sums: sums over pixels
+    per Gaussian in the backward pass; harmonics: the memory of the bands above 0; seen: share of the Gaussians whose
+    harmonics a view brings to the device.
     """
     shares = dict.fromkeys(HARMONICS, seen) if harmonics == "host" else {}
     held = {name: math.ceil(4 * width * shares.get(name, 1)) for name, width in components.items()}

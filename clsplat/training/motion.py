@@ -1,4 +1,4 @@
-"""Adam on the motion of Gaussians: a rate for each of its fields, and the bound that updates keep."""
+"""Update the motion of Gaussians by Adam, with a rate for each field and a bound on durations."""
 
 import math
 from collections.abc import Mapping
@@ -13,37 +13,37 @@ from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.opencl.device import Array, constants
 
-LONGEST = 15.0  # log of a duration: nothing changes beyond it
-FAR = 3.0e38  # a bound beyond all values
+LONGEST = 15.0  # log of a duration; longer ones look the same
+FAR = 3.0e38  # no bound
 IN_EXTENTS = ("velocity", "acceleration", "jerk")
 Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=100.0))]
 
 
 class MotionRates(Settings):
-    """Learning rates of the motion, each by step, and the bound of durations; read where Gaussians move.
+    """Learning rates of the motion, each by step, and the bound on durations.
 
-    Times are shares of the time from the first to the last moment of the scene.
+    Time is normalized to 0 at the first and 1 at the last timestamp of the scene.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"min_duration"})
 
     velocity: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
-    """Of velocities, as shares of the scene's extent; they fall, as in FreeTimeGS."""
+    """Of velocities, in units of the scene's extent; decaying, as in FreeTimeGS."""
     time_center: Rate = 1.0e-3
-    """Of the times at which Gaussians are most opaque."""
+    """Of the times of largest opacity."""
     log_duration: Rate = 1.0e-2
     """Of the logarithms of durations."""
     acceleration: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
-    """Of accelerations, as shares of the scene's extent."""
+    """Of accelerations, in units of the scene's extent."""
     jerk: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
-    """Of the coefficients of the third power of time, as shares of the scene's extent."""
+    """Of the cubic coefficients, in units of the scene's extent."""
     turn: Rate = 1.0e-3
-    """Of the changes of quaternions by time."""
+    """Of the time derivatives of quaternions."""
     min_duration: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Shortest duration that an update leaves; what is shorter than a moment shows nothing between two of them."""
 
     def times(self, factor: float) -> "MotionRates":
-        """Return all rates times a factor."""
+        """Return the rates scaled by a factor."""
         return self.model_copy(update={name: divide(getattr(self, name), 1 / factor) for name in self._rates})
 
     @property
@@ -64,9 +64,10 @@ def update_motion(
     updates: int,
     every: int,
 ) -> None:
-    """Update the motion, for the time of number `updates`, from gradients in memory.
+    """Update the motion from gradients in memory.
 
-    depth_key: [S] of the view; rates: as MotionRates.at returns them; every: as in motion_step.
+    depth_key: [S], of the view; rates: from MotionRates.at; updates: count, including this one; every: as in
+    motion_step.
     """
     table, (moment1, moment2) = gaussians.tables[MOTION], moment_tables(MOTION)
     beta1, beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]

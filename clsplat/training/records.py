@@ -1,4 +1,4 @@
-"""The records of a run: metrics.jsonl."""
+"""Write and read the records of a run, metrics.jsonl, and estimate the remaining time from them."""
 
 import json
 import logging
@@ -23,22 +23,22 @@ LOG = logging.getLogger("clsplat")
 
 
 class Records:
-    """Writes a run folder's records; every line of metrics.jsonl has its step.
+    """The records in a run folder; each line of metrics.jsonl has its step.
 
-    Lines wait until what they tell of is done, for a stage that fails is repeated when the run goes on.
+    Lines are held back until their stage is done, because a failed stage is repeated on resume.
     """
 
     def __init__(self, out: Path, require_held: Callable[[], None] = lambda: None) -> None:
-        """`require_held` raises OutputError when the folder is no longer held."""
+        """require_held: raises OutputError if the run no longer holds the folder's lock."""
         self.out = out
         self._require_held = require_held
         self.path, self.trial = out / RECORDS, out / TRIAL
-        self.lines = 0  # of metrics.jsonl that belong to the state of the run, with those that wait
-        self.settled = 0  # of them, from before the stages that a resumed run has again
+        self.lines = 0  # of metrics.jsonl in the state of the run, including those held back
+        self.settled = 0  # of them, before the stages that a resumed run repeats
         self._waiting: list[str] = []
 
     def set_aside(self) -> None:
-        """Begin anew, for a refit; the lines so far are in trial.jsonl then.  Raises OutputError."""
+        """Move the lines so far to trial.jsonl, for a refit.  Raises OutputError."""
         self.write()
         self._require_held()
         with raising_output_error(self.trial):
@@ -46,10 +46,10 @@ class Records:
         self.lines = 0
 
     def start(self, is_refit: bool = False) -> None:
-        """Drop the lines after those of the state, which a resumed run writes again.
+        """Drop the lines after the state, which a resumed run writes again.
 
-        Where that is before a refit, lines that were set aside for one come back.
-        Those of the state that cannot be read are lost, with all behind them, and a warning says so.
+        If the state is from before a refit, the lines in trial.jsonl are moved back.  A line that cannot be read is
+        lost with all that follow, and a warning is logged.
         """
         if not is_refit and self.trial.exists():
             with raising_output_error(self.trial):
@@ -62,19 +62,19 @@ class Records:
         except DataError as error:
             fault = str(error)
         if len(kept) < self.lines:
-            LOG.warning("%s: %d of %d lines can be read; %s; the run goes on", self.path, len(kept), self.lines, fault)
+            LOG.warning("%s: only %d of %d lines can be read (%s)", self.path, len(kept), self.lines, fault)
         self.lines = self.settled = len(kept)
         write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
 
     def add(self, step: int, kind: str, **values: Any) -> None:
-        """Add one line; `write` writes it, or the end of the stage."""
+        """Add a line, to be written by `write` or at the end of the stage."""
         self._waiting.append(json.dumps({"step": step, "kind": kind, **values}) + "\n")
         self.lines += 1
 
     def write(self) -> None:
-        """Append the lines that wait, and sync them: a checkpoint counts them.
+        """Append the lines held back, and sync the file, because a checkpoint counts them.
 
-        Raises OutputError; then they wait on, and the file is as it was.
+        Raises OutputError; then the lines are still held back, and the file is unchanged.
         """
         if not self._waiting:
             return
@@ -84,7 +84,7 @@ class Records:
 
     @contextmanager
     def of_a_stage(self) -> Iterator[None]:
-        """Write the lines that the block adds at its end; where it fails they do not count."""
+        """Write the lines of the block at its end; if it fails, drop them."""
         lines, waiting = self.lines, len(self._waiting)
         try:
             yield
@@ -95,11 +95,9 @@ class Records:
             raise
 
     def read(self, kind: str | None = None, trial: bool = False) -> list[dict[str, Any]]:
-        """Return the lines, of one kind or all; a line cut short by a crash is left out.
+        """Return the lines, of one kind or all, without a last line cut short by a crash.
 
-        trial: those before a refit, none where there was none.
-
-        Raises DataError with file and line when the file is damaged in another way.
+        trial: return those before a refit.  Raises DataError, with file and line, for any other damage.
         """
         lines = self._each(self.trial if trial else self.path)
         return [line for line in lines if kind in (None, line["kind"])]
@@ -112,129 +110,79 @@ class Records:
             try:
                 line = json.loads(text)
             except (ValueError, RecursionError):
-                if number == len(texts):  # nothing, or what a crash has left
+                if number == len(texts):  # empty, or cut short by a crash
                     break
                 line = None
             if not isinstance(line, dict) or type(line.get("step")) is not int or not isinstance(line.get("kind"), str):
                 raise DataError(
-                    f"{path}:{number}: damaged; expected keys and values with 'step' and 'kind'; remove this line"
+                    f"{path}:{number}: damaged; expected an object with 'step' and 'kind'; remove this line"
                 )
             yield line
 
 
-# The time of a training step on the device, by stage.
+# The time of a training step on the device, by stage of the step.
 
-STAGES = {
-    "project_forward": "project",
-    "count_large": "pairs",
-    "permute": "pairs",
-    "emit_pairs": "pairs",
-    "emit_large": "pairs",
-    "find_tile_offsets": "pairs",
-    "scan_blocks": "sort",
-    "scan_offsets": "sort",
-    "radix_count": "sort",
-    "radix_scatter": "sort",
-    "count_pairs": "sort",
-    "fill_tiles": "sort",
-    "sort_tiles": "sort",
-    "blend_forward": "blend",
-    "unpack_pixels": "loss",
-    "pixel_loss": "loss",
-    "ssim_maps": "loss",
-    "ssim_gradient": "loss",
-    "weight_entropy": "loss",
-    "lay_over": "blend",
-    "look_behind": "blend backward",
-    "sky_matches": "loss",
-    "sky_cover": "loss",
-    "sky_forward": "blend",
-    "sky_backward": "blend backward",
-    "sky_gather": "sum records",
-    "sky_update": "update",
-    "apply_mask": "loss",
-    "change_background": "loss",
-    "measure_residuals": "loss",
-    "mask_transients": "loss",
-    "covariance_trace": "loss",
-    "anisotropy": "loss",
-    "blend_backward": "blend backward",
-    "sum_records": "sum records",
-    "project_backward": "update",
-    "pose_gradient": "update",
-    "adam_step": "update",
-    "update_gaussians": "update",
-    "replay_updates": "update",
-    "note_update": "update",
-    "count_seen": "statistics",
-    "accumulate_norm": "statistics",
-    "accumulate_error": "statistics",
-    "accumulate_gain": "statistics",
-    "view_error": "statistics",
-    "sum_errors": "statistics",
-    "accumulate_sum": "statistics",
-    "accumulate_pixel_sum": "statistics",
-    "accumulate_radius": "statistics",
-    "accumulate_splitting": "statistics",
-    "sample_magnitude": "statistics",
-    "image_gradient": "statistics",
-    "hide_masked": "statistics",
-    "sampling_interval": "filter",
-    "filter_variance": "filter",
-    "draw_pixels": "cones",
-    "cast_rays": "cones",
-    "spread_edges": "cones",
-    "resample_edges": "cones",
-    "encode_frustums": "encode",
-    "encode_directions": "encode",
-    "grid_places": "encode",
-    "grid_forward": "encode",
-    "dense_forward": "network",
-    "composite_forward": "colors of rays",
-    "composite_backward": "colors of rays, backward",
-    "dense_backward": "network backward",
-    "dense_weights": "network, weights",
-    "dense_biases": "network, weights",
-    "dense_sums": "network, weights",
-    "grid_backward": "grid backward",
-    "dense_update": "update",
-}
-ORDER = tuple(dict.fromkeys(STAGES.values()))
+KERNELS = {
+    "project": "project_forward",
+    "pairs": "count_large permute emit_pairs emit_large find_tile_offsets",
+    "sort": "scan_blocks scan_offsets radix_count radix_scatter count_pairs fill_tiles sort_tiles",
+    "blend": "blend_forward lay_over sky_forward",
+    "loss": (
+        "unpack_pixels pixel_loss ssim_maps ssim_gradient weight_entropy sky_matches sky_cover apply_mask "
+        "change_background measure_residuals mask_transients covariance_trace anisotropy"
+    ),
+    "blend backward": "look_behind sky_backward blend_backward",
+    "sum records": "sky_gather sum_records",
+    "update": (
+        "sky_update project_backward pose_gradient adam_step update_gaussians replay_updates note_update dense_update"
+    ),
+    "statistics": (
+        "count_seen accumulate_norm accumulate_error accumulate_gain view_error sum_errors accumulate_sum "
+        "accumulate_pixel_sum accumulate_radius accumulate_splitting sample_magnitude image_gradient hide_masked"
+    ),
+    "filter": "sampling_interval filter_variance",
+    "cones": "draw_pixels cast_rays spread_edges resample_edges",
+    "encode": "encode_frustums encode_directions grid_places grid_forward",
+    "network": "dense_forward",
+    "colors of rays": "composite_forward",
+    "colors of rays, backward": "composite_backward",
+    "network backward": "dense_backward",
+    "network, weights": "dense_weights dense_biases dense_sums",
+    "grid backward": "grid_backward",
+}  # of each stage, in the order of a step
+STAGES = {kernel: stage for stage, kernels in KERNELS.items() for kernel in kernels.split()}
 
 
 def stage_milliseconds(timings: Timings, steps: int = 1) -> dict[str, float]:
-    """Average milliseconds of each stage over the `steps` sampled since the last call, in the order of a step."""
+    """Return the mean milliseconds of each stage over the `steps` sampled since the last call."""
     totals: dict[str, float] = defaultdict(float)
     for (label, section), seconds in timings.take().items():
         totals[STAGES.get(label.partition(":")[2], section)] += 1e3 * sum(seconds) / steps
-    return {name: totals[name] for name in (*ORDER, "other") if name in totals}
+    return {name: totals[name] for name in (*KERNELS, "other") if name in totals}
 
 
 def clocks() -> tuple[float, float]:
-    """Return the time, and that of all threads of this process, in s."""
+    """Return wall-clock time, and CPU time of all threads, in s."""
     return time.perf_counter(), time.process_time()
 
 
-# What reports of a training say about its course: PSNR over several views, and the time that is left.
+# The course of a training: PSNR averaged over reports, and the remaining time.
 
-VIEWS = 5  # reports whose PSNR is averaged
-LATEST = 3  # reports whose step time is averaged
-TREND = 4  # reports that tell how fast the number of Gaussians grows
-WIDE = 2.0  # of the number of Gaussians, largest by smallest: from there on the times tell what a Gaussian costs
-USUAL = 0.6  # of the mean time by Gaussian is what one more costs, where they do not tell: the rest is per step
-LEAST = 0.4  # of it, whatever they tell: on a busy machine they tell little
+VIEWS = 5  # reports over which PSNR is averaged
+LATEST = 3  # reports over which step time is averaged
+TREND = 4  # reports from which growth is extrapolated
+WIDE = 2.0  # ratio of Gaussian counts from which their cost can be fitted
+USUAL = 0.6  # cost of one more Gaussian, as a share of the mean time per Gaussian, if it cannot be fitted
+MIN_COST = 0.4  # smallest share; on a busy machine fits are unreliable
 
 
 def over_views(psnrs: Sequence[float]) -> list[float]:
-    """Return the mean of each PSNR and those of the reports before it: one is of one view, and views differ by many dB.
-
-    Terminal, live page and reports show it.
-    """
+    """Return moving averages of PSNR, since each report is of one view and views differ by many dB."""
     return [fmean(psnrs[max(0, end - VIEWS) : end]) for end in range(1, len(psnrs) + 1)]
 
 
 class Forecast:
-    """The course of one training, up to `last_step`.  Rules that grow the model act until the step `growth_end`."""
+    """Estimate the remaining time of a training that ends at `last_step`.  Density rules act until `growth_end`."""
 
     def __init__(self, last_step: int, growth_end: int) -> None:
         self.last_step, self.growth_end = last_step, growth_end
@@ -243,23 +191,23 @@ class Forecast:
 
     @classmethod
     def of(cls, step: int, last_step: int, due: Sequence[Callable[[int], bool]]) -> "Forecast":
-        """Return the forecast of a training after `step`; due: whether a rule acts at a step, for each of its rules."""
+        """Return the forecast of a training after `step`.  due: for each rule, whether it acts at a step."""
         later = range(last_step - 1, step, -1)  # none follows the last step
         return cls(last_step, next((one for one in later if any(rule(one) for rule in due)), step))
 
     def add(self, step: int, psnr: float, gaussians: int, seconds: float) -> None:
-        """Take a report; seconds: the mean time of a step since the last one."""
+        """Add a report.  seconds: mean time of a step since the last one."""
         self._psnrs.append(psnr)
         self._reports.append((step, gaussians, seconds))
 
     @property
     def psnr(self) -> float:
-        """dB, the mean over the views of the last reports."""
+        """The mean PSNR of the last reports, dB."""
         return over_views(self._psnrs[-VIEWS:])[-1]
 
     @property
     def growth_known(self) -> bool:
-        """Whether reports have shown how fast rules grow the model, or none will; else the time left is the least."""
+        """Whether the rate of growth is known; if not, the remaining time is a lower bound."""
         step, count, _ = self._reports[-1]
         return step >= self.growth_end or count > self._reports[0][1]
 
@@ -267,8 +215,8 @@ class Forecast:
     def seconds_left(self) -> float:
         """The time until the last step, s.
 
-        The time of a step is taken as linear in the number of Gaussians, and that number as growing on as it did in the
-        last reports until the rules end.
+        It assumes that the time of a step is linear in the number of Gaussians, and that growth continues at the rate
+        of the last reports until `growth_end`.
         """
         steps, counts, seconds = (np.array(column, np.float64) for column in zip(*self._reports, strict=True))
         cost, left = self._cost(counts, seconds), self.last_step - steps[-1]
@@ -282,9 +230,9 @@ class Forecast:
 
     @staticmethod
     def _cost(counts: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
-        """The time that a Gaussian adds to a step, s: its share of the whole, or less."""
+        """Return the time that a Gaussian adds to a step, s."""
         most = float(seconds[-LATEST:].mean() / max(1.0, counts[-LATEST:].mean()))
         if counts.max() < WIDE * counts.min():
             return USUAL * most
         spread = counts - counts.mean()
-        return min(max(float(spread @ seconds / (spread @ spread)), LEAST * most), most)
+        return min(max(float(spread @ seconds / (spread @ spread)), MIN_COST * most), most)

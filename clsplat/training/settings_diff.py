@@ -1,4 +1,4 @@
-"""Settings in which two resolved pipelines differ, and whether a run can go on with them."""
+"""Compare two resolved pipelines, and tell which differences a resumed run allows."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -11,32 +11,32 @@ Kind = Literal["output", "training"] | None
 
 
 class Difference(NamedTuple):
-    """A setting in which two resolved pipelines differ."""
+    """A setting that differs between two resolved pipelines."""
 
     place: str  # such as stages[1].optimize.rates.quats
     was: Any
     now: Any
-    kind: Kind  # as its class says; None: a run cannot go on with the new value
+    kind: Kind  # from its class; None: the setting cannot change on resume
 
     def __str__(self) -> str:
         return f"{self.place} was {shorten(repr(self.was), 80)}, is {shorten(repr(self.now), 80)}"
 
     def is_of_place(self, were: Mapping[str, str], are: Mapping[str, str]) -> bool:
-        """Whether the same file lies at another place now.  were, are: hashes of the files that settings name."""
+        """Return whether a file was only moved.  were, are: hashes of the files that settings name, by path."""
         is_text = isinstance(self.was, str) and isinstance(self.now, str)
         return is_text and self.was in were and were[self.was] == are.get(self.now)
 
     @property
     def stage(self) -> int | None:
-        """The stage of the pipeline that it belongs to, or None."""
+        """The index of its stage in the pipeline; None outside of stages."""
         found = re.match(r"stages\[(\d+)\]", self.place)
         return int(found[1]) if found else None
 
 
 def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind: Kind = None) -> Iterator[Difference]:
-    """Yield the settings in which two resolved pipelines differ, in their order.
+    """Yield the differences of two resolved pipelines, in order.
 
-    settings: what `new` was resolved from; its classes tell the kinds.
+    settings: the settings that `new` was resolved from; their classes define the kinds.
     """
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
@@ -60,19 +60,19 @@ def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind:
 
 
 def _kinds(items: list[Any]) -> dict[str, Any]:
-    """The classes of a list's items by their types, where each is addressed by its type."""
+    """Return the classes of a list's items by type, if the items are addressed by type."""
     known = {tag[1]: kind for kind in Settings.defined if kind.keyed_by_type and (tag := tag_of(kind))}
     named = [str(one.get("type")) if isinstance(one, dict) else "" for one in items]
     return {name: known[name] for name in named} if all(name in known for name in named) else {}
 
 
 def first_difference(old: Any, new: Any) -> Difference | None:
-    """Return the first setting in which two resolved pipelines differ, or None."""
+    """Return the first difference of two resolved pipelines, or None."""
     return next(differences(old, new), None)
 
 
 def _inside(settings: Any, key: str) -> tuple[Any, Kind]:
-    """The settings below a key, and what a change of the key means."""
+    """Return the settings below a key, and what a change of the key means on resume."""
     if not isinstance(settings, Settings):
         return None, None
     if key in type(settings).model_fields:

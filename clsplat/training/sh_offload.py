@@ -1,4 +1,4 @@
-"""Where the harmonics of a training lie: on the device, or on the host."""
+"""Offload the harmonics of a training to the host, if the device cannot hold them."""
 
 import logging
 import math
@@ -9,14 +9,14 @@ from clsplat.training.memory import SEEN_SHARE, MemoryPlan, Where, last_place
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-NEAR = 2  # times as many Gaussians: an edit makes few more of them
-VIEWS = 16  # that are looked at
+NEAR = 2  # factor of the number of Gaussians; an edit seldom adds more
+VIEWS = 16  # rendered to measure how many Gaussians a view sees
 
 
 def place_harmonics(run: Run) -> None:
-    """Move the harmonics to the host before a training, where the settings say so, or where only that holds it.
+    """Move the harmonics to the host before a training, if the settings require it or the device is too small.
 
-    They come before Adam's moments of them, which make the larger part.
+    It must happen before Adam allocates their moments, which are larger.
     """
     gaussians = run.model.gaussians
     if gaussians.on_host is None and gaussians.count <= most_gaussians(run, gaussians.count):
@@ -24,10 +24,7 @@ def place_harmonics(run: Run) -> None:
 
 
 def make_room(run: Run, count: int) -> None:
-    """Move the harmonics to the host where the device does not hold `count` Gaussians with all of theirs.
-
-    Bits do not depend on when they move.
-    """
+    """Move the harmonics to the host if the device cannot hold those of `count` Gaussians.  Bits stay the same."""
     gaussians = run.model.gaussians
     if gaussians.on_host or last_place(run.harmonics, run.device.info) == "device":
         return
@@ -35,17 +32,16 @@ def make_room(run: Run, count: int) -> None:
     if run.harmonics == "auto":
         if count <= (held := _plan(run, "device").limit):
             return
-        why = f", as the device holds {held:,} Gaussians with all of theirs"
+        why = f", since the device can hold only {held:,} Gaussians with harmonics"
     gaussians.move_to_host()
-    told = f"the harmonics lie on the host{why}, and the device has those that a view sees"
-    LOG.info("step %d: %s: the same bits, slower", run.step, told)
+    LOG.info("step %d: harmonics move to the host%s: the same bits, but slower", run.step, why)
 
 
 def most_gaussians(run: Run, asked: float = math.inf) -> int:
-    """Return how many Gaussians the device holds at most, with the harmonics where they may lie at last.
+    """Return how many Gaussians the device can hold, with harmonics offloaded if that is allowed and helps.
 
-    With `auto` it depends on the Gaussians alone, and not on where their harmonics are: what some training views see of
-    them must leave more room on the host.  Those that are there stay.  asked: as many are enough.
+    With `auto`, the result depends only on the Gaussians, not on where their harmonics are now.  asked: the search may
+    stop at this number.
     """
     place = last_place(run.harmonics, run.device.info)
     held = _plan(run, place if run.harmonics == "host" else "device").limit
@@ -56,20 +52,20 @@ def most_gaussians(run: Run, asked: float = math.inf) -> int:
 
 
 def more_room(run: Run) -> str:
-    """Return what makes room, in words that follow others, where the settings keep the harmonics on the device."""
+    """Return a further remedy for an error message, if the settings keep the harmonics on the device."""
     helps = run.pipeline["rasterizer"]["harmonics"] == "device" and not run.device.info.unified
     return ", or rasterizer.harmonics=auto" if helps else ""
 
 
 def _plan(run: Run, harmonics: Where, seen: float = SEEN_SHARE) -> MemoryPlan:
-    """The plan with Adam's moments, whether they are there already or not."""
+    """Return the memory plan including Adam moments, even if they are not allocated yet."""
     widths, trained = run.model.gaussians.components, run.model.gaussians.trained
     moments = {moment: widths[name] for name in trained for moment in moment_tables(name)}
     return run.memory_plan({**widths, **moments}, harmonics, seen)
 
 
 def _seen(run: Run) -> float:
-    """The largest share of the blocks of rows that one of some training views sees, with room for more."""
+    """Return the largest share of row blocks that one of some training views sees, with a margin."""
     survey, gaussians = run.survey(), run.model.gaussians
     lanes, most = int(run.device.tuning["LANES"]), 0.0
     for look in survey.render(survey.sample_views(VIEWS)):

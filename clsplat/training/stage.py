@@ -1,4 +1,4 @@
-"""The base of all stages: settings, needed and made parts of the run, and one method."""
+"""Define the base classes of stages: settings, the parts of a run that they need and make, and `run`."""
 
 from abc import abstractmethod
 from collections.abc import Collection, Iterable, Sequence
@@ -22,13 +22,13 @@ CADENCE = frozenset({"every", "start", "stop"})
 
 @dataclass(frozen=True)
 class PathInRun(AfterValidator):
-    """Marks a field that holds a path inside the run folder: a file where there is a suffix, else a folder."""
+    """Mark a field that holds a path inside the run folder: a file if there are suffixes, else a folder."""
 
     suffixes: tuple[str, ...] = ()
 
 
 def path_in_run(*suffixes: str) -> PathInRun:
-    """Mark a field that holds a file in the run folder whose name ends in one of `suffixes`, or a folder in it."""
+    """Mark a field that holds a file in the run folder, with one of `suffixes`, or a folder."""
 
     def checked(text: str) -> str:
         fault = invalid_output_reason(text)
@@ -42,7 +42,7 @@ def path_in_run(*suffixes: str) -> PathInRun:
 
 
 def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
-    """The marks among metadata, and among those of the types that a type is made of."""
+    """Return the marks in metadata, and in that of the arguments of a type."""
     own = [mark for mark in metadata if isinstance(mark, PathInRun)]
     return own + [mark for one in get_args(kind) for mark in _marks(one, getattr(one, "__metadata__", ()))]
 
@@ -53,8 +53,8 @@ class Stage(Settings):
     needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
     takes: ClassVar[frozenset[str]] = frozenset()  # parts that do not exist afterwards
-    edits: ClassVar[bool] = False  # changes the model; inside `during` it acts between two steps
-    edits_last: ClassVar[bool] = False  # says by run.editing_tables() where its edit begins; else all of it is an edit
+    edits: ClassVar[bool] = False  # changes the model; in `during`, it runs between two steps
+    edits_last: ClassVar[bool] = False  # marks its edit by run.editing_tables(); else all of the stage is an edit
 
     stage: str
     """Name of the stage."""
@@ -63,27 +63,27 @@ class Stage(Settings):
         """Raise errors that do not depend on the run, such as a missing file, before the run starts."""
 
     def check_run(self, run: Run) -> None:
-        """Raise errors of a run that can be known before its first stage, for one that is only described."""
+        """Raise errors that can be detected before the first stage of a run, including a dry run."""
 
     @abstractmethod
     def run(self, run: Run) -> None:
         """Run the stage."""
 
     def outputs(self, out: Path) -> list[Path]:
-        """Return the files and folders of the run folder `out` that the stage writes: those that its fields name."""
+        """Return the files and folders in the run folder `out` that the stage writes."""
         values = (getattr(self, name) for name in self.named_outputs())
         return [out / value for value in values if value is not None]
 
     @classmethod
     def named_outputs(cls) -> dict[str, tuple[str, ...]]:
-        """Return the fields that hold a path inside the run folder, each with the suffixes that a file may have."""
+        """Return the fields that hold a path inside the run folder, each with its suffixes."""
         marks = {name: _marks(field.annotation, field.metadata) for name, field in cls.model_fields.items()}
         return {name: found[0].suffixes for name, found in marks.items() if found}
 
     def act(self, run: Run) -> None:
-        """Run the stage, under its name in status.json; what fails inside of an edit leaves a run that is not whole.
+        """Run the stage under its name in status.json.  A failure inside an edit leaves an inconsistent run.
 
-        A stage that fails is repeated from its beginning when the run goes on, so that its records do not stay.
+        A failed stage is repeated from its start on resume, so its records are dropped.
         """
         changing = run.editing_tables() if self.edits and not self.edits_last else nullcontext()
         with run.status.stage(self.stage), changing, run.records.of_a_stage():
@@ -92,15 +92,14 @@ class Stage(Settings):
 
 ON_HOST = "harmonics on the host"
 ALL_HARMONICS = {
-    ON_HOST: "it changes those of all Gaussians on the device; set rasterizer.harmonics: device, or leave it out"
+    ON_HOST: "it changes the harmonics of all Gaussians on the device; set rasterizer.harmonics: device, or remove it"
 }
 
 
 class Scheduled(Stage):
-    """A stage that may stand inside `optimize.during`, where it runs at a cadence.
+    """A stage that may be listed in `optimize.during`, where it runs at a cadence.
 
-    It runs at every step that is a multiple of `every`, after `start` and before `stop`; of a number that is not whole,
-    at the whole steps at or below its multiples.
+    It runs at every multiple of `every`, rounded down, after step `start` and before step `stop`.
     """
 
     training_keys: ClassVar[frozenset[str]] = CADENCE
@@ -108,39 +107,38 @@ class Scheduled(Stage):
     ends: ClassVar[bool] = False  # whether it runs after the last step of the training too
 
     every: EverySteps | None = None
-    """Steps from one run of the stage to the next, which need not be whole; inside `during` only."""
+    """Steps from one run of the stage to the next, which may be fractional; only in `during`."""
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the stage runs."""
     stop: Annotated[int, Field(gt=0)] | None = None
     """Global step before which the stage runs."""
 
     def attach(self, run: Run) -> None:
-        """Add tables that the stage keeps beside the parameters, before the first step; a resumed run has them."""
+        """Add the tables that the stage needs, before the first step; a resumed run already has them."""
 
     def due(self, step: int, is_last: bool = False) -> bool:
-        """Return whether the stage runs at a global step, counted from 1; `is_last` of the training."""
+        """Return whether the stage runs at a global step.  is_last: whether it is the last of the training."""
         if self.every is None or not (fires_at(self.every, step) or (is_last and self.ends)):
             return False
         return step > self.start and (self.stop is None or step < self.stop)
 
     def is_overdue(self, run: Run) -> bool:
-        """Return whether the stage runs now beside its cadence: for one that changes no bits."""
+        """Return whether the stage runs now although its cadence does not say so; only if it changes no bits."""
         return False
 
     def stale(self, run: Run) -> Collection[str]:
-        """Return the parameters whose gradients the edit makes invalid."""
+        """Return the parameters whose gradients are invalid after the edit."""
         return ()
 
 
 def written_twice(stages: Sequence[Stage]) -> str | None:
-    """Return a path that two stages would write, a file or what one stage takes for a folder; None if there is none.
+    """Return a path that two stages would write as a file, or as file and folder; None if there is none.
 
-    Stages may share a folder, and those of a cadence may share a file with a later stage.  Names that differ in case
-    alone are one file on some systems.
+    Stages may share a folder.  Names are compared without case, since some file systems ignore it.
     """
     written: list[tuple[tuple[str, ...], bool]] = []  # the parts of a path, and whether it is a file
     for stage in stages:
-        if not (named := stage.named_outputs()):  # what other stages write for it
+        if not (named := stage.named_outputs()):  # other stages write its files
             continue
         suffixes = tuple(suffix for of_field in named.values() for suffix in of_field)
         own = [
@@ -155,20 +153,20 @@ def written_twice(stages: Sequence[Stage]) -> str | None:
     return None
 
 
-# A stage that trains for a number of steps, with stages that run between them.
+# A stage that trains for a number of steps, with stages that run between steps.
 
 
 class Training(Stage):
-    """A training with a number of steps, and stages that act between two of them."""
+    """A training with a number of steps, and stages that run between steps."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
-    rehearsed: ClassVar[int] = 200  # steps that tell what one takes; no time is so short that fewer are trained
+    rehearsed: ClassVar[int] = 200  # steps timed for `--minutes`, and the smallest number trained
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""
-    if TYPE_CHECKING:  # fields of each training, behind its own: files have them in that order
+    if TYPE_CHECKING:  # declared by subclasses, after their own fields, for the order of keys in files
         during: list[OneOf[Scheduled]]
         log_every: int
 
@@ -186,25 +184,25 @@ class Training(Stage):
 
     def check_run(self, run: Run) -> None:
         for stage in self.during:
-            if stage.stop is None or stage.stop > run.step + 1:  # else its time has passed
+            if stage.stop is None or stage.stop > run.step + 1:  # else it will not run again
                 stage.check_run(run)
 
     def outputs(self, out: Path) -> list[Path]:
         return [path for stage in self.during for path in stage.outputs(out)]
 
     def acting(self, step: int) -> list[Scheduled]:
-        """Return the stages of `during` that run when the training begins after a global step."""
+        """Return the stages of `during` that will run in a training that starts after a global step."""
         last = step + self.steps
         before = range(step + 1, last)  # no edit follows the last
         return [s for s in self.inner if any(map(s.due, before)) or (not s.edits and s.due(last, True))]
 
     @property
     def inner(self) -> list[Scheduled]:
-        """The stages that act between two steps."""
+        """The stages that run between steps, in order."""
         return self.in_turn(self.during)
 
     def in_turn(self, during: Sequence[Scheduled]) -> list[Scheduled]:
-        """Return all stages of `during` in the order in which they act."""
+        """Return the stages of `during` in the order in which they run."""
         return list(during)
 
     def has_ended(self, run: Run) -> bool:
@@ -212,36 +210,36 @@ class Training(Stage):
         return run.stage_step >= self.steps
 
     def judge(self, run: Run, stage: Scheduled) -> None:
-        """Take notice of a stage of `during` that has acted."""
+        """React to a stage of `during` that has run."""
 
     def leave(self, run: Run) -> None:
-        """Do what the end of the training needs."""
+        """Finish the training."""
 
     def act(self, run: Run) -> None:
-        with run.status.stage(self.stage):  # it goes on in its middle, so that its records stay
+        with run.status.stage(self.stage):  # no records are dropped: it resumes in the middle
             self.run(run)
 
     def act_between(self, run: Run) -> None:
-        """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
-        for place, stage in enumerate(self.inner):
+        """Run the stages that are due and do not edit; a failed one runs again on resume."""
+        for index, stage in enumerate(self.inner):
             due = run.stage_step > 0 and (stage.due(run.step, self.has_ended(run)) or stage.is_overdue(run))
-            if place < run.during_index or stage.edits or not due:
+            if index < run.during_index or stage.edits or not due:
                 continue
-            run.during_index = place + 1  # a checkpoint is of the state after it
+            run.during_index = index + 1  # before it runs, for the checkpoint that it may write
             try:
                 stage.act(run)
                 self.judge(run, stage)
             except BaseException:
-                run.during_index = place
+                run.during_index = index
                 raise
 
     def end_step(self, run: Run) -> None:
-        """Act after a step; save the state, and raise Interrupted, where the run is to stop."""
+        """Run what follows a step; if the run is interrupted, save the state and raise Interrupted."""
         with suppress(Stopped):
             self.act_between(run)
         run.on_step()
         if run.interrupted:
-            told = f"saved in {checkpoint.save(run)}; `clsplat resume {shell_quote(run.out)}` goes on from it"
-            raise Interrupted(f"stopped at step {run.step}, {told}")
+            saved = f"saved in {checkpoint.save(run)}; `clsplat resume {shell_quote(run.out)}` continues from it"
+            raise Interrupted(f"stopped at step {run.step}, {saved}")
         if self.has_ended(run):
             self.leave(run)

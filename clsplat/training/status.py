@@ -1,4 +1,4 @@
-"""status.json: what a run is doing, for whoever watches it from outside."""
+"""Write status.json, which reports what a run is doing."""
 
 import json
 import logging
@@ -20,7 +20,7 @@ from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json
 from clsplat.core.resources import full_version
 
-# The contents of status.json: its schema, which `clsplat check` and `clsplat status` hold a file to.
+# The schema of status.json, against which `clsplat check` and `clsplat status` validate a file.
 
 FORMAT: Literal[1] = 1
 Whole = Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -28,33 +28,33 @@ Seconds = Annotated[float, Field(gt=-1e15, lt=1e15)]
 
 
 class Amount(BaseModel):
-    """How much of a stage is done."""
+    """The progress of a stage."""
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     done: Whole
-    """Number of units that are done."""
+    """Number of units done."""
     total: Whole
-    """Number of units in all."""
+    """Total number of units."""
     unit: str
     """What is counted, in words: steps, views, cells, photographs decoded, …"""
 
 
 class Status(BaseModel):
-    """The contents of status.json.  What does not apply, or is not known yet, is left out; newer versions may have more
+    """The contents of status.json.  Keys that do not apply or are not known yet are missing; newer versions may add
     keys.  Times are in seconds since 1970, UTC.
     """
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     format: Literal[1]
-    """Version of this schema: a key that is new does not change it, one that goes or has another meaning does."""
+    """Version of this schema; it changes if a key is removed or changes its meaning, not if one is added."""
     state: Literal["starting", "preparing", "running", "done", "failed", "interrupted"]
-    """starting: opens the device; preparing: makes and reads the scene; running: the stages; the others are the end."""
+    """starting: opens the device; preparing: makes and reads the scene; running: runs the stages; others are final."""
     stage: str | None = None
-    """Stage or step of `prepare` in progress, or the last that was; of a matrix, the cell."""
+    """Current or last stage, or step of `prepare`; of a matrix, the cell."""
     progress: Amount | None = None
-    """How much of that stage is done, where it can be counted."""
+    """Progress of that stage, if it can be counted."""
     step: Whole | None = None
     """Training steps done, of all stages; not of a matrix."""
     steps: Whole | None = None
@@ -62,20 +62,19 @@ class Status(BaseModel):
     gaussians: Whole | None = None
     """Number of Gaussians at the last report."""
     seconds_left: Seconds | None = None
-    """Time that the training in progress still needs, estimated at the last report; of a preparation, reading the scene
-    alone."""
+    """Estimated remaining time of the training at the last report; in a preparation, only of reading the scene."""
     checkpoint: str | None = None
-    """Newest checkpoint that was saved, a file in the folder `checkpoints`."""
+    """Newest checkpoint, a file in the folder `checkpoints`."""
     cells: Whole | None = None
-    """Number of cells; of a matrix alone."""
+    """Number of cells of a matrix."""
     done: Whole | None = None
-    """Number of cells that have ended; of a matrix alone."""
+    """Number of finished cells of a matrix."""
     failed: dict[str, str] | None = None
-    """Names of the cells that failed, and why; of a matrix alone."""
+    """Failed cells of a matrix, with reasons."""
     exit_code: int | None = None
-    """Exit code of the run, when it has ended."""
+    """Exit code of a run that ended."""
     message: str | None = None
-    """The one line that says why a run failed or was interrupted."""
+    """The reason why a run failed or was interrupted."""
     device: str | None = None
     """OpenCL device and runtime."""
     version: str
@@ -83,13 +82,13 @@ class Status(BaseModel):
     host: str
     """Name of the machine, or of the container."""
     process: Whole
-    """Number of the process on that machine."""
+    """Process ID on that machine."""
     pid_namespace: str | None = None
-    """Linux: where that number counts; containers on one machine have their own."""
+    """Linux: the namespace of that ID; each container has its own."""
     boot: str | None = None
-    """Linux: the start of the machine at which that number was given; the next one begins anew."""
+    """Linux: ID of the boot in which that process ID is valid."""
     started: Seconds
-    """When this process began with the run."""
+    """When this process started the run."""
     changed: Seconds
     """When state, stage, progress or step last changed."""
     time: Seconds
@@ -97,9 +96,9 @@ class Status(BaseModel):
 
 
 def status_of(content: Any) -> Status | None:
-    """Return what a status.json holds; None where a newer version wrote it.
+    """Validate the contents of a status.json; return None if a newer version wrote it.
 
-    Raises DataError with the first field that is wrong.
+    Raises DataError with the first wrong field.
     """
     if isinstance(content, dict) and type(made := content.get("format")) is int and made > FORMAT:
         return None
@@ -117,28 +116,28 @@ def status_schema() -> dict[str, Any]:
 
 
 LOG = logging.getLogger("clsplat")
-BEAT = 5.0  # seconds between two writes of a run that goes on
+BEAT = 5.0  # s between writes
 Item = TypeVar("Item")
 
 
 class StatusFile:
-    """The status.json of one run: held in memory, written at its beginning and end and every few seconds between.
+    """The status.json of one run, written at its start and end, and every few seconds in between.
 
-    A thread does the writing in between, so that training never waits for a disk; where it fails, the run goes on.
-    Where the folder is another's by now, nothing is written, and the run is told when it next says what it does.
+    A thread writes it, so that training never waits for the disk; if writing fails, the run continues.  If another run
+    took over the folder, nothing is written, and the next `note` raises OutputError.
     """
 
     def __init__(self, out: Path, require_held: Callable[[], None] = lambda: None, **values: Any) -> None:
-        """`require_held` raises OutputError when the folder is no longer held."""
+        """require_held: raises OutputError if the run no longer holds the folder's lock."""
         self.out = out
-        self.lost: OutputError | None = None  # what it has raised
+        self.lost: OutputError | None = None  # the error that `require_held` raised
         self._require_held = require_held
         now = time.time()
         before = read_status(out)
         checkpoint = before.get("checkpoint")
-        self.was_done = before.get("state") == "done"  # the run that was in the folder before
-        self.saved_at = time.monotonic()  # s, of the newest checkpoint, or of the beginning
-        self.has_run = False  # so that the folder is no longer as that run has left it
+        self.was_done = before.get("state") == "done"  # whether an earlier run in the folder was done
+        self.saved_at = time.monotonic()  # s, time of the newest checkpoint, or of the start
+        self.has_run = False  # whether a stage has run since
         self.now = Status(
             format=FORMAT,
             state="starting",
@@ -153,18 +152,18 @@ class StatusFile:
         self._changing, self._writing = threading.Lock(), threading.Lock()
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
-        self.seconds: dict[str, float] = {}  # spent in each stage that has ended, without those inside of it
-        self._inside = 0.0  # seconds of the stages that have ended inside of the present one
-        self._depth = 0  # of stages in progress
+        self.seconds: dict[str, float] = {}  # by stage, without nested stages
+        self._inside = 0.0  # seconds of finished stages nested in the current one
+        self._depth = 0  # of nested stages
         self._warned = False
 
     def begin(self) -> None:
-        """Write the first status and go on writing.  Raises OutputError."""
+        """Write the first status and start the thread.  Raises OutputError."""
         self.write()
         self._beat()
 
     def require_held(self) -> None:
-        """Raise OutputError when the run no longer holds its folder: before anything is written there."""
+        """Raise OutputError if the run no longer holds its folder; called before each write there."""
         try:
             self._require_held()
         except OutputError as error:
@@ -173,7 +172,7 @@ class StatusFile:
             raise self.lost
 
     def note(self, **values: Any) -> None:
-        """Change fields; the next heartbeat writes them.  Raises OutputError where one has found the folder lost."""
+        """Set fields, which the next heartbeat writes.  Raises OutputError if the folder is lost."""
         if self.lost:
             raise self.lost
         with self._changing:
@@ -193,17 +192,17 @@ class StatusFile:
         self.write()
 
     def close(self) -> None:
-        """Write no more by itself."""
+        """Stop the thread."""
         self._ended.set()
-        with self._writing:  # what is being written is no longer on its way
+        with self._writing:  # wait for a write in progress
             pass
 
     def count(self, unit: str, done: int, total: int, **values: Any) -> None:
-        """Note how much of the stage is done, and other fields."""
+        """Set the progress of the stage, and other fields."""
         self.note(progress=Amount(done=done, total=total, unit=unit), **values)
 
     def counted(self, items: Iterable[Item], unit: str, total: int) -> Iterator[Item]:
-        """Yield the items and count them; what was yielded is done when the next is asked for."""
+        """Yield the items and count them as progress; an item is done when the next is requested."""
         for number, item in enumerate(items):
             self.count(unit, number, total)
             yield item
@@ -211,9 +210,9 @@ class StatusFile:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Name the stage in progress; one inside of another gives way to it again, unless it fails.
+        """Set the current stage; after a nested stage, the outer one is current again, unless it fails.
 
-        Raises OutputError when the folder is no longer held.
+        Raises OutputError if the folder is lost.
         """
         self.require_held()
         around = {"stage": self.now.stage, "progress": self.now.progress}
@@ -230,19 +229,19 @@ class StatusFile:
             self.note(**around)
 
     def refresh(self) -> None:
-        """Write the status, before the end; where that fails the run goes on, with a warning the first time."""
+        """Write the status of a run in progress; failures are logged once."""
         with self._writing:
             try:
-                if not self._ended.is_set() and os.path.isdir(self.out):  # one that was removed stays so
+                if not self._ended.is_set() and os.path.isdir(self.out):  # do not recreate a removed folder
                     self._write()
             except (OutputError, OSError) as error:
                 if not self._warned and not self.lost:
-                    LOG.warning("%s; the run goes on", error)
+                    LOG.warning("%s; the run continues", error)
                 self._warned = True
 
     def write(self) -> None:
         """Write the status now.  Raises OutputError."""
-        with self._writing:  # whoever writes last writes the newest
+        with self._writing:  # so that the newest status is written last
             self._write()
 
     def _write(self) -> None:
@@ -259,7 +258,7 @@ class StatusFile:
 
 
 def _refresh_until(ended: threading.Event, reference: "weakref.ref[StatusFile]") -> None:
-    """Refresh a status until its run has ended, or nobody holds it any more."""
+    """Refresh a status until its run ends or it is garbage-collected."""
     while not ended.wait(BEAT):
         status = reference()
         if status is None:
@@ -269,7 +268,7 @@ def _refresh_until(ended: threading.Event, reference: "weakref.ref[StatusFile]")
 
 
 def read_status(out: Path) -> dict[str, Any]:
-    """Return the contents of status.json; an empty dict when it is missing or damaged."""
+    """Return the contents of status.json; empty if it is missing or damaged."""
     try:
         status = read_json(out / STATUS)
     except DataError:

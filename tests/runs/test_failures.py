@@ -137,7 +137,7 @@ def test_a_step_that_is_half_done_is_not_saved(place, tiny_scene, tmp_path, monk
     monkeypatch.undo()
     newest = steps_saved(tmp_path)[-1]
     assert newest in ("step_000004.npz", "step_000008.npz")
-    assert f"was not whole; the last good state is {tmp_path / 'checkpoints' / newest}" in caplog.text
+    assert f"was half done; the last good state is {tmp_path / 'checkpoints' / newest}" in caplog.text
     train(tiny_scene, tmp_path, *FEW, resume=True)
     assert digest(tmp_path) == digest(few_steps)
     assert records(tmp_path) == records(few_steps)

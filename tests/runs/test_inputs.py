@@ -372,7 +372,7 @@ def test_a_dry_run_of_a_resumed_run_says_from_where(scene, tmp_path):
     assert "made with other settings: seed was 0, is 7" in done.stderr
     for path in (out / "checkpoints").iterdir():
         path.write_bytes(b"")
-    assert "no checkpoint is whole" in command(*words, "--resume", expect=7).stderr
+    assert "and so are all others" in command(*words, "--resume", expect=7).stderr
 
 
 def test_a_dry_run_finds_damaged_photographs(scene, tmp_path):

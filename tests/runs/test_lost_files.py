@@ -153,7 +153,7 @@ REFUSALS = {
         {},
         r"has no checkpoint to go on from; `clsplat run \S+ --out \S+ --restart` trains",
     ),
-    "a damaged checkpoint": (OutputError, {}, "no checkpoint is whole"),
+    "a damaged checkpoint": (OutputError, {}, "and so are all others"),
     "another setting": (ConfigError, {"init.count": 51}, "was made with other settings"),
     "no such device": (DeviceError, {}, "nowhere"),
 }

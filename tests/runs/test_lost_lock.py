@@ -111,7 +111,7 @@ def test_heartbeat_stops_in_a_lost_folder_and_the_run_learns_it(tmp_path, monkey
         with pytest.raises(OutputError, match=GONE):
             status.note(step=1)  # as a training does at each step
     assert files(tmp_path / "run") == before
-    assert "the run goes on" not in caplog.text
+    assert "the run continues" not in caplog.text
 
 
 def test_run_ending_before_its_first_step_spares_the_next_one(tmp_path):

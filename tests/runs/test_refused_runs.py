@@ -78,7 +78,7 @@ def test_restart_begins_again_and_leaves_the_files_of_others(tiny_scene, tmp_pat
         file.write_bytes(b"")
     (out / "report.html").unlink()
     broken = command("resume", out, expect=7)
-    assert "no checkpoint is whole" in broken.stderr
+    assert "and so are all others" in broken.stderr
     advice = broken.stderr.split("`")[1].split()
     assert advice[0] == "clsplat"
     command(*advice[1:])

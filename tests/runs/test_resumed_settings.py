@@ -28,14 +28,14 @@ def test_what_no_table_depends_on_may_change(killed_run, tiny_scene, few_steps, 
 def test_numbers_of_the_training_may_change(change, killed_run, tiny_scene, caplog):
     run = train(tiny_scene, killed_run, *FEW, change, resume=True)
     assert run.step == (14 if "steps" in change else 12)
-    assert caplog.text.count("from here on the bits are not those of a run without a change") == 1
+    assert caplog.text.count("from here on, bits differ from a run without this change") == 1
     assert len(json.loads((killed_run / "metrics.json").read_text())["changes"]) == 1
     assert f"{change.split('=')[1]}" in (killed_run / "pipeline.yaml").read_text()
 
 
 @pytest.mark.parametrize("change", ["seed=3", "init.count=70", "model.sh_degree=2", "optimize.losses=[l1]"])
 def test_what_tables_depend_on_may_not_change(change, killed_run, tiny_scene):
-    with pytest.raises(ConfigError, match=r"was made with other settings: .*those settings, or begin anew: `clsp"):
+    with pytest.raises(ConfigError, match=r"was made with other settings: .*restore it, or start again with `clsp"):
         train(tiny_scene, killed_run, *FEW, change, resume=True)
 
 
@@ -68,7 +68,9 @@ def test_training_ends_where_it_stopped_if_asked(killed_run):
 
 
 def test_a_stage_that_is_over_keeps_its_settings(killed_run, tiny_scene):
-    crafted(killed_run / "checkpoints" / "step_000008.npz", lambda notes, arrays: notes.update(cursor=2, stage_step=0))
+    crafted(
+        killed_run / "checkpoints" / "step_000008.npz", lambda notes, arrays: notes.update(stage_index=2, stage_step=0)
+    )
     with pytest.raises(ConfigError, match="was saved after that stage, at step 8"):
         train(tiny_scene, killed_run, *FEW, "optimize.steps=20", resume=True)
 
@@ -79,7 +81,7 @@ def test_a_run_that_stopped_after_its_last_stage_ends(killed_run, tiny_scene, fe
     written = {"point_cloud.ply": digest(few_steps)}
     crafted(
         killed_run / "checkpoints" / "step_000012.npz",
-        lambda notes, arrays: notes.update(cursor=last, stage_step=0, written=written),
+        lambda notes, arrays: notes.update(stage_index=last, stage_step=0, model_hashes=written),
     )
     shutil.copy(few_steps / "point_cloud.ply", killed_run)
     before = (killed_run / "checkpoints" / "step_000012.npz").read_bytes()

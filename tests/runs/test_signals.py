@@ -83,7 +83,7 @@ def test_long_stage_ends_early_with_saved_state_and_is_repeated(
         patch.setattr(module, name, signalled(getattr(module, name), call))
         with pytest.raises(Interrupted, match=message) as stopped:
             Job.open(pipeline, tiny_scene, tmp_path).run()
-    assert str(stopped.value).endswith(f"; `clsplat resume {tmp_path}` goes on from it")
+    assert str(stopped.value).endswith(f"; `clsplat resume {tmp_path}` continues from it")
     assert read_status(tmp_path)["state"] == "interrupted"
     assert list((tmp_path / "checkpoints").glob("*.npz"))
     Job.resume(tmp_path).run()

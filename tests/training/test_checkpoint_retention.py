@@ -57,7 +57,7 @@ def test_a_failed_state_that_cannot_be_removed_hides_no_advice(run, stuck):
     stuck.add("failed_000000.npz")
     (run.out / "checkpoints" / "failed_000000.npz").touch()
     run.model.gaussians["means"].fill(np.nan)
-    with pytest.raises(NotFiniteError, match=r"the state is in .*failed_000002.npz; .*goes on from step_000001.npz"):
+    with pytest.raises(NotFiniteError, match=r"the state is in .*failed_000002.npz; .*resumes from step_000001.npz"):
         checkpoint.save(run)
 
 

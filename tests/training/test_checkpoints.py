@@ -39,7 +39,7 @@ CRAFTED = {
     "other numbers": lambda notes, arrays: arrays.update({"stats/seen": arrays["stats/seen"].astype(np.float64)}),
     "not finite": lambda notes, arrays: arrays["gaussians/means"].fill(np.nan),
     "a moment not finite": lambda notes, arrays: arrays["adam/quats/moment2"].fill(np.inf),
-    "no settings": lambda notes, arrays: notes.update(pipeline={}, cursor=1),
+    "no settings": lambda notes, arrays: notes.update(pipeline={}, stage_index=1),
 }
 
 
@@ -98,7 +98,7 @@ def test_checkpoint_before_one_on_a_bad_disk_block_is_used(killed_run, tiny_scen
 
     monkeypatch.setattr(zipfile.ZipFile, "read", fail)
     train(tiny_scene, killed_run, *FEW, resume=True)
-    assert "step_000009.npz is damaged (the disk cannot read it: bad disk); using the one before it" in caplog.text
+    assert "step_000009.npz is damaged (the disk cannot read it: bad disk); using an earlier one" in caplog.text
     assert digest(killed_run) == digest(few_steps)
 
 
@@ -107,7 +107,7 @@ def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(killed_run, tiny_
     shutil.rmtree(killed_run / "checkpoints")
     status = json.loads((killed_run / "status.json").read_text())
     (killed_run / "status.json").write_text(json.dumps({**status, "state": "running"}))
-    with pytest.raises(OutputError, match=r"is empty, but step_000012.npz was saved there; .*--restart` starts"):
+    with pytest.raises(OutputError, match=r"step_000012.npz is missing; .*--restart` starts"):
         train(tiny_scene, killed_run, *FEW, resume=True)
     assert (killed_run / "metrics.jsonl").read_bytes() == before
 

@@ -123,7 +123,7 @@ def test_the_harmonics_move_to_the_host_where_the_device_is_full(spread, at_once
     out, own, device = tmp_path / "run", [f"scene.path='{tiny_scene}'", *spread], small(3150)
     with caplog.at_level("INFO", "clsplat"):
         run_pipeline(load("smoke", own), RunState.read(out), Device(device), "new")
-    (told,) = [one.message for one in caplog.records if "the harmonics lie on the host, as" in one.message]
+    (told,) = [one.message for one in caplog.records if "harmonics move to the host, since" in one.message]
     assert not told.startswith("step 0: ")
     assert digest(out) == digest(at_once)
     for memory in (device.memory, 8 << 30):
@@ -160,9 +160,9 @@ def test_what_the_device_does_not_hold_begins_on_the_host(spread, tiny_scene, tm
         with caplog.at_level("INFO", "clsplat"):
             own = [f"scene.path='{tiny_scene}'", *spread, "densify.start=99", *more]
             run_pipeline(load("smoke", own), RunState.read(tmp_path / name), Device(small(1900)), "new")
-    told = [one.message for one in caplog.records if "the harmonics lie on the host" in one.message]
+    told = [one.message for one in caplog.records if "harmonics move to the host" in one.message]
     assert [one.startswith("step 0: ") for one in told] == [True, True]
-    assert ["as the device holds 1," in one for one in told] == [True, False]
+    assert ["the device can hold only 1," in one for one in told] == [True, False]
     assert digest(tmp_path / "auto") == digest(tmp_path / "host")
 
 
@@ -207,7 +207,9 @@ def test_device_holds_what_a_view_sees_of_host_harmonics(spread, tiny_scene, tmp
 def test_what_needs_all_harmonics_on_the_device_is_refused(tiny_scene):
     own = f"scene.path='{tiny_scene}'", "optimize.during=[{add_to_average: {every: 2}}]"
     assert load("smoke", own)
-    with pytest.raises(ConfigError, match=r"add_to_average: .* harmonics on the host \(rasterizer\): it changes those"):
+    with pytest.raises(
+        ConfigError, match=r"add_to_average: .* harmonics on the host \(rasterizer\): it changes the harmonics"
+    ):
         load("smoke", [*own, HOST])
 
 

@@ -49,7 +49,7 @@ def test_a_state_that_is_not_finite_is_never_a_checkpoint(
     assert len(steps_saved(out)) == 2
     assert steps_saved(out)[0].startswith("failed_")
     assert steps_saved(out)[1] == "step_000004.npz"
-    command = re.search(r"`clsplat resume (\S+) --set (\S+)` .*goes on from step_000004.npz", str(error.value))
+    command = re.search(r"`clsplat resume (\S+) --set (\S+)` .*resumes from step_000004.npz", str(error.value))
     assert command
     with pytest.raises(NumericError):  # and again, however often
         train(tiny_scene, out, *settings, resume=True)
@@ -62,7 +62,7 @@ def test_a_state_that_is_not_finite_is_never_a_checkpoint(
 def test_a_loss_that_is_not_finite_leaves_no_newer_checkpoint(tiny_scene, tmp_path, monkeypatch):
     numbers = SimpleNamespace(isfinite=lambda value: False)
     monkeypatch.setattr("clsplat.training.checkpoint.math", numbers)
-    with pytest.raises(NumericError, match=r"parameters not finite: none; .*goes on from step_000004.npz"):
+    with pytest.raises(NumericError, match=r"parameters not finite: none; .*resumes from step_000004.npz"):
         train(tiny_scene, tmp_path, *FEW)
     assert steps_saved(tmp_path) == ["failed_000005.npz", "step_000004.npz"]
 
@@ -75,7 +75,7 @@ def test_the_advice_after_a_state_that_is_not_finite_works(tiny_scene, tmp_path,
     assert advice, str(error.value)
     train(tiny_scene, tmp_path, *settings, advice[1], resume=True)
     assert "step 4: stages[1].optimize.rates.sh_base was " in caplog.text
-    assert "from here on the bits are not those of a run without a change" in caplog.text
+    assert "from here on, bits differ from a run without this change" in caplog.text
     changes = json.loads((tmp_path / "metrics.json").read_text())["changes"]
     assert len(changes) == 1
     assert changes[0].startswith("step 4: stages[1].optimize.rates.sh_base was ")

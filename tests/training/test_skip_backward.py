@@ -283,6 +283,6 @@ def test_a_run_may_go_on_with_it(tiny_scene, killed_run, caplog):
         SKIP + "={start: 8, warm_up: 1, min_fraction: 0}",
         resume=True,
     )
-    assert caplog.text.count("from here on the bits are not those of a run without a change") == 1
+    assert caplog.text.count("from here on, bits differ from a run without this change") == 1
     assert json.loads((killed_run / "metrics.json").read_text())["steps"] == 12
     assert run.modules["skip_backward"].scalars["skip/steps"] == 4

@@ -177,7 +177,7 @@ def test_a_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, capl
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "done"
     name = tmp_path / "run" / "status.json"
     assert [m for m in caplog.messages if str(name) in m] == [
-        f"{name}: cannot be written (No space left on device); the run goes on"
+        f"{name}: cannot be written (No space left on device); the run continues"
     ]
 
 
