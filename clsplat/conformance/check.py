@@ -92,7 +92,8 @@ class Note:
     data: dict[str, Any]
 
 
-Run = Callable[[Device, np.random.Generator], Iterator[Deviation | Note]]
+Results = Iterator[Deviation | Note]
+Run = Callable[[Device, np.random.Generator], Results]
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class Check:
     kernels: tuple[str, ...]
     run: Run
 
-    def deviations(self, device: Device) -> Iterator[Deviation | Note]:
+    def deviations(self, device: Device) -> Results:
         """Yield the deviations on a device; random numbers depend only on the check's name."""
         return self.run(device, np.random.default_rng(list(self.name.encode())))
 

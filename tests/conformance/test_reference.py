@@ -652,17 +652,9 @@ def test_density_actions_of_absgs():
     gradient = np.array([3e-4, 1e-4, 3e-4, 1e-4])
     absolute = np.array([3e-4, 5e-4, 3e-4, 5e-4])
     scale = np.array([0.009, 0.009, 0.011, 0.011])
-    actions = ref.adc_actions(gradient, scale, np.full(4, 0.5), 10.0, False, ref.ABSGS, absolute)
+    rule = ref.DensityRule(split_gradient=4e-4, dense=0.001)
+    actions = ref.adc_actions(gradient, scale, np.full(4, 0.5), 10.0, False, rule, absolute)
     assert actions.tolist() == [ref.CLONE, ref.KEEP, ref.KEEP, ref.SPLIT]
-
-
-def test_split_children():
-    """A quarter turn about z takes the offset (0.5 · 2, 0, 0) to (0, 1, 0)."""
-    mean, quat = np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0, 0.0, 2.0])
-    noise = np.array([[2.0, 0.0, 0.0], [0.0, -1.0, 1.0]])
-    means, log_scales = ref.split_children(mean, quat, np.log([0.5, 0.25, 4.0]), noise)
-    np.testing.assert_allclose(means, [[1, 3, 3], [1.25, 2, 7]], atol=1e-15)
-    np.testing.assert_allclose(np.exp(log_scales), [[0.5 / 1.6, 0.25 / 1.6, 2.5]] * 2)
 
 
 def test_opacity_reset():

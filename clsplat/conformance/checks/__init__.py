@@ -1,4 +1,4 @@
-"""The checks of all kernels, and those that a run does once on a device that it meets for the first time."""
+"""List the checks of all kernels, and the essential ones that a run does on the first use of a device."""
 
 from clsplat.conformance.check import Check
 from clsplat.conformance.checks import (
@@ -17,21 +17,9 @@ from clsplat.conformance.checks import (
     whole,
 )
 
-KERNELS: list[Check] = [
-    *projection.CHECKS.listed,
-    *tiles.CHECKS.listed,
-    *blending.CHECKS.listed,
-    *pixel_box.CHECKS.listed,
-    *motion.CHECKS.listed,
-    *images.CHECKS.listed,
-    *appearance.CHECKS.listed,
-    *sky.CHECKS.listed,
-    *nerf.CHECKS.listed,
-    *training.CHECKS.listed,
-    *density.CHECKS.listed,
-    *whole.CHECKS.listed,
-]
+_ORDER = projection, tiles, blending, pixel_box, motion, images, appearance, sky, nerf, training, density, whole
+KERNELS: list[Check] = [check for module in _ORDER for check in module.CHECKS.listed]
 SPEED: list[Check] = whole.SPEED.listed
 ESSENTIAL: list[Check] = essential.CHECKS.listed
-BITONIC: list[Check] = essential.BITONIC.listed  # where a run may sort so
+BITONIC: list[Check] = essential.BITONIC.listed  # for runs that may use the bitonic sort
 BY_NAME = {check.name: check for check in (*KERNELS, *SPEED, *ESSENTIAL, *BITONIC)}

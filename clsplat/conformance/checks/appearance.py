@@ -1,6 +1,5 @@
 """The colors of a photograph by place and luminance: a change of an image, its derivatives, and the tables."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import SUM, Checks, Deviation, Note, by_element, equal
+from clsplat.conformance.check import SUM, Checks, Results, by_element, equal
 from clsplat.conformance.checks.images import SIZES, camera_of, outside, planes_of
 from clsplat.conformance.reference import appearance
 from clsplat.conformance.reference.appearance import changed_by_grid
@@ -60,7 +59,7 @@ def picture_of(rng: np.random.Generator, grid: NDArray[Any], width: int, height:
 
 def check_grid(
     device: Device, rng: np.random.Generator, width: int, height: int, nodes: tuple[int, ...], channels: int = 3
-) -> Iterator[Deviation]:
+) -> Results:
     """Compare an image, its gradient, and that by the grid."""
     what = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
     grids = grids_of(device, rng, nodes)
@@ -94,7 +93,7 @@ def check_grid(
         yield equal("color_grid_backward", f"gradient of the fourth plane, {what}", grad_image[3], uploaded.get()[3])
 
 
-def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Iterator[Deviation]:
+def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Results:
     """Compare the smoothness of a grid, three updates of it, and what they leave of the others."""
     what, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
     grids, workspace = grids_of(device, rng, nodes, weight), Workspace(device)
@@ -127,14 +126,14 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
 
 
 @CHECKS.add("color_grid_forward", "color_grid_backward", "color_grid_row_sums", "color_grid_gather")
-def color_grids(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def color_grids(device: Device, rng: np.random.Generator) -> Results:
     for width, height, nodes in CASES:
         yield from check_grid(device, rng, width, height, nodes)
     yield from check_grid(device, rng, 33, 18, (4, 4, 4), channels=4)
 
 
 @CHECKS.add("color_grid_smoothness", "color_grid_update", "color_grid_center")
-def color_grid_tables(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def color_grid_tables(device: Device, rng: np.random.Generator) -> Results:
     for nodes in ((4, 4, 4), (1, 1, 1), (5, 1, 3)):
         yield from check_table(device, rng, nodes)
 
@@ -142,9 +141,7 @@ def color_grid_tables(device: Device, rng: np.random.Generator) -> Iterator[Devi
 # The colors of a photograph: a change of an image and its derivatives.
 
 
-def check_color(
-    device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3
-) -> Iterator[Deviation]:
+def check_color(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
     """Compare an image with a third of its pixels beyond white, its gradient, and that by the matrix."""
     what = f"{width} x {height} px"
     matrix = (IDENTITY + rng.normal(0, 0.2, (3, 4))).astype(np.float32).astype(np.float64)
@@ -175,7 +172,7 @@ def check_color(
 
 
 @CHECKS.add("colors_forward", "colors_backward")
-def colors(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def colors(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         yield from check_color(device, rng, width, height)
     yield from check_color(device, rng, 33, 18, channels=4)
@@ -184,9 +181,7 @@ def colors(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Not
 # What a camera makes of light.
 
 
-def check_response(
-    device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3
-) -> Iterator[Deviation]:
+def check_response(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
     """Compare what a camera makes of an image with values below black and beyond white, its gradient, and that by the
     numbers."""
     what, kernel = f"{width} x {height} px", "camera_response"
@@ -220,7 +215,7 @@ def check_response(
 
 
 @CHECKS.add("camera_response")
-def responses(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def responses(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         yield from check_response(device, rng, width, height)
     yield from check_response(device, rng, 33, 18, channels=4)

@@ -1,6 +1,5 @@
 """The two schedules of blending: images, and the sums over pixels from which gradients come."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -9,18 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import (
-    CONIC,
-    GRADIENT,
-    SUM,
-    Checks,
-    Deviation,
-    Note,
-    by_element,
-    by_norm,
-    check_image,
-    equal,
-)
+from clsplat.conformance.check import CONIC, GRADIENT, SUM, Checks, Results, by_element, by_norm, check_image, equal
 from clsplat.conformance.checks.images import SIZES, camera_of, comparison_of, outside, planes_of
 from clsplat.conformance.scenes import Case, gradients_of_sums, random_case, safe_case
 from clsplat.density.statistics import ABS_X
@@ -44,7 +32,7 @@ def render(device: Device, case: Case, sort: Sort = "radix") -> Frame:
     return Rasterizer(device, sort).forward(case.model(device), case.device_camera(device), device.upload(BACKGROUND))
 
 
-def check_blend(device: Device, case: Case, what: str, sort: Sort = "radix") -> Iterator[Deviation]:
+def check_blend(device: Device, case: Case, what: str, sort: Sort = "radix") -> Results:
     """Compare image and transmittance of a scene with the reference; outside the image they are zero."""
     frame, (width, height) = render(device, case, sort), case.size
     image, transmittance = frame.image.get(), frame.transmittance.get()
@@ -79,7 +67,7 @@ def pixel_sums_of(
     return pixel_sums.get()[:, : model.gaussians.count].T.astype(np.float64)
 
 
-def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], what: str) -> Iterator[Deviation]:
+def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], what: str) -> Results:
     """Compare sums over pixels, [N, PIXEL_SUMS or more], as the gradients of splats."""
     kernel, splats = "blend_backward", case.project()
     truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
@@ -110,7 +98,7 @@ def _of_all_sizes(parameters: dict[str, NDArray[Any]]) -> None:
 
 
 @CHECKS.add("blend_forward")
-def images(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def images(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((0, 20, 20), (1, 16, 16), (17, 15, 17), (60, 33, 31), (120, 40, 30), (40, 5, 3)):
         case = safe_case(rng, count, width, height, MARGIN)
         yield from check_blend(device, case, f"{count} Gaussians, {width} x {height} px")
@@ -120,7 +108,7 @@ def images(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Not
 
 
 @CHECKS.add("blend_backward", "sum_records")
-def gradients_of_blending(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def gradients_of_blending(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24)):
         case = safe_case(rng, count, width, height, MARGIN)
         weights = rng.normal(size=(3, height, width)).astype(np.float32)
@@ -134,7 +122,7 @@ def gradients_of_blending(device: Device, rng: np.random.Generator) -> Iterator[
 
 
 @CHECKS.add("blend_backward", "sum_records")
-def statistics_of_blending(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
     width, height = 48, 32  # whole tiles: the plane of texture is known beyond the image's edge
     case = safe_case(rng, 40, width, height, MARGIN)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
@@ -157,7 +145,7 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Iterator
 
 
 @CHECKS.add("blend_forward", "blend_backward")
-def entropy_of_weights(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def entropy_of_weights(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
         case, what = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
         rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
@@ -173,7 +161,7 @@ def entropy_of_weights(device: Device, rng: np.random.Generator) -> Iterator[Dev
 
 
 @CHECKS.add("blend_backward")
-def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
     """A loss of the transmittance alone is that of an image of black splats before one white channel."""
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
         case, what = safe_case(rng, count, width, height, MARGIN), f"with the transmittance, {count} Gaussians"
@@ -195,7 +183,7 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Iterator[D
 
 
 @CHECKS.add("sum_records")
-def sums_of_records(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def sums_of_records(device: Device, rng: np.random.Generator) -> Results:
     lanes = int(device.tuning["LANES"])
     for count in (1, 15, 17, 65):
         pairs, stride = rng.integers(0, 6, count), -(-count // 64) * 64
@@ -220,7 +208,7 @@ def sums_of_records(device: Device, rng: np.random.Generator) -> Iterator[Deviat
 
 
 @CHECKS.add("blend_forward", "blend_backward")
-def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.Generator) -> Results:
     case = random_case(rng, 150, 50, 70)
     case.parameters["log_scales"][:10] += 1.5  # some over many rows of tiles, and too many tiles for a mask
     weights = rng.normal(size=(3, 70, 50)).astype(np.float32)
@@ -254,7 +242,7 @@ def gradients_of(
     return frame.image.get()[:, :height, :width], sums.get()[:, :count].T.astype(np.float64), depths, means
 
 
-def check_depth(device: Device, case: Case, weights: Floats, what: str) -> Iterator[Deviation]:
+def check_depth(device: Device, case: Case, weights: Floats, what: str) -> Results:
     """Compare image, sums and gradients with the reference."""
     splats, (width, height), background = case.project(), case.size, BACKGROUND.astype(np.float64)
     image, m, depths, means = gradients_of(device, case, weights)
@@ -279,7 +267,7 @@ def check_depth(device: Device, case: Case, weights: Floats, what: str) -> Itera
 
 
 @CHECKS.add("project_forward", "blend_forward", "blend_backward", "sum_inverse_depths", "inverse_depth_backward")
-def inverse_depths(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def inverse_depths(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
         case, what = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
         weights = rng.normal(size=(4, height, width)).astype(np.float32)
@@ -294,7 +282,7 @@ def inverse_depths(device: Device, rng: np.random.Generator) -> Iterator[Deviati
 
 
 @CHECKS.add("inverse_depth_loss")
-def losses_of_depths(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def losses_of_depths(device: Device, rng: np.random.Generator) -> Results:
     for width, height, count in ((1, 1, 1), (17, 33, 64), (40, 20, 65)):
         x = rng.uniform(0, 1, (4, height, width)).astype(np.float32)
         comparison = comparison_of(device, x, x[:3])
@@ -321,9 +309,7 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Iterator[Devia
 # A layer of splats before an image.
 
 
-def check_layer(
-    device: Device, rng: np.random.Generator, width: int, height: int, channels: int
-) -> Iterator[Deviation]:
+def check_layer(device: Device, rng: np.random.Generator, width: int, height: int, channels: int) -> Results:
     """Compare the colors of both, the loss and the derivatives; a sign of T says something else."""
     camera, workspace = camera_of(device, width, height), Workspace(device)
     layer, image = (rng.random((number, height, width)).astype(np.float32) for number in (3, channels))
@@ -349,7 +335,7 @@ def check_layer(
 
 
 @CHECKS.add("lay_over", "look_behind")
-def layer(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def layer(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         for channels in (3, 4):
             yield from check_layer(device, rng, width, height, channels)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import GRADIENT, SUM, Checks, Deviation, Note, by_element, by_norm, equal
+from clsplat.conformance.check import GRADIENT, SUM, Checks, Deviation, Results, by_element, by_norm, equal
 from clsplat.conformance.checks.blending import BACKGROUND, MARGIN
 from clsplat.conformance.checks.images import comparison_of, magnitude_of, planes_of
 from clsplat.conformance.scenes import Case, random_case, safe_case, with_world_filter
@@ -42,7 +42,7 @@ COLUMNS = ("screen_grad", "screen_grad_abs_sum", "rendered_texture", "screen_rad
     *("count_seen", "accumulate_norm", "accumulate_sum", "accumulate_pixel_sum", "accumulate_radius"),
     *("sample_magnitude", "accumulate_error", "accumulate_gain"),
 )
-def statistics(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def statistics(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         case = random_case(rng, count)
         case.parameters["means"][1::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
@@ -81,7 +81,7 @@ def statistics(device: Device, rng: np.random.Generator) -> Iterator[Deviation |
 
 
 @CHECKS.add("accumulate_splitting")
-def splitting_matrices(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         case = safe_case(rng, count, 33, 31, MARGIN)
         case.parameters["means"][1::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
@@ -122,7 +122,7 @@ def _edited(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[
 
 
 @CHECKS.add("start_edit", "mark_rule", "list_rows", "spawn_children", "share_opacity", "gather_rows")
-def edits(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def edits(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         before, gaussians = _edited(device, rng, count)
         size, opacity = np.exp(before["log_scales"]).max(axis=1), 1 / (1 + np.exp(-before["logit_opacity"][:, 0]))
@@ -157,7 +157,7 @@ def edits(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note
 
 
 @CHECKS.add("mark_chosen")
-def choices(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def choices(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         gaussians = random_case(rng, count).model(device).gaussians
         edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), STEP, SEED)
@@ -173,7 +173,7 @@ def choices(device: Device, rng: np.random.Generator) -> Iterator[Deviation | No
 
 
 @CHECKS.add("cap_opacity")
-def opacity_reset(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def opacity_reset(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         for case in (random_case(rng, count), with_world_filter(random_case(rng, count), rng)):
             gaussians, oracle = case.model(device).gaussians, case.gaussians()
@@ -188,7 +188,7 @@ def opacity_reset(device: Device, rng: np.random.Generator) -> Iterator[Deviatio
 
 
 @CHECKS.add("decay_opacity")
-def opacity_decay(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def opacity_decay(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         for factor in (0.995, 0.5):
             case = random_case(rng, count)
@@ -201,7 +201,7 @@ def opacity_decay(device: Device, rng: np.random.Generator) -> Iterator[Deviatio
 
 
 @CHECKS.add("add_noise")
-def noise(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def noise(device: Device, rng: np.random.Generator) -> Results:
     rate, below = 40.0, 0.3
     for count in COUNTS:
         case = random_case(rng, count)
@@ -231,7 +231,7 @@ def photograph_of(device: Device, case: Case, mask: Mask | None = None) -> Photo
 
 
 @CHECKS.add("blend_backward")
-def contribution(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def contribution(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in SIZES:
         case = safe_case(rng, count, width, height, MARGIN)
         masks = (None, rng.random((height, width)) < 0.6)
@@ -265,7 +265,7 @@ def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray
 
 
 @CHECKS.add("most_alike")
-def alike(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def alike(device: Device, rng: np.random.Generator) -> Results:
     """Whole numbers: every product is exact."""
     for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
         points, vectors = (rng.integers(-511, 512, (rows, components)).astype(np.float32) for rows in (count, entries))
@@ -275,7 +275,7 @@ def alike(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note
 
 
 @CHECKS.add("share_mean")
-def shared_means(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def shared_means(device: Device, rng: np.random.Generator) -> Results:
     for count, clusters in ((1, 1), (17, 3), (130, 40)):
         gaussians = random_case(rng, count).model(device).gaussians
         values, labels = gaussians.get("sh_rest"), rng.integers(0, clusters, count)

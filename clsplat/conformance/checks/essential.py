@@ -1,10 +1,8 @@
 """The two-second form: the kernels of every training step, each once, on one small scene."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
-from clsplat.conformance.check import Checks, Deviation, Note
+from clsplat.conformance.check import Checks, Results
 from clsplat.conformance.checks import blending, images, projection, tiles, training
 from clsplat.conformance.checks import tiles as large
 from clsplat.conformance.scenes import random_case, safe_case, with_world_filter
@@ -15,7 +13,7 @@ BITONIC = Checks()  # only where a run may sort so
 
 
 @CHECKS.add("project_forward", "project_backward", "emit_pairs", "blend_forward", "blend_backward", "sum_records")
-def rendering(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def rendering(device: Device, rng: np.random.Generator) -> Results:
     case, what = safe_case(rng, 60, 40, 30, blending.MARGIN), "a scene of 60 Gaussians"
     yield from projection.check_record(device, case, what)
     yield from tiles.check_list(device, case, "radix", what)
@@ -32,7 +30,7 @@ def rendering(device: Device, rng: np.random.Generator) -> Iterator[Deviation | 
 
 
 @CHECKS.add("count_large", "emit_large", "project_forward")
-def large_splats(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def large_splats(device: Device, rng: np.random.Generator) -> Results:
     case = random_case(rng, 12, 150, 130)
     case.parameters["log_scales"][:4] += 2.5
     yield from tiles.check_list(device, case, "radix", "a scene of large Gaussians")
@@ -40,7 +38,7 @@ def large_splats(device: Device, rng: np.random.Generator) -> Iterator[Deviation
 
 
 @CHECKS.add("scan_blocks", "scan_offsets", "radix_count", "radix_scatter")
-def sorting(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def sorting(device: Device, rng: np.random.Generator) -> Results:
     for count in (1025, 40_001):  # one block, and several
         yield tiles.check_scan(device, rng.integers(0, 100, count).astype(np.uint32))
     yield tiles.check_scan(device, np.full(40_001, 2**31, np.uint32))  # sums that would wrap
@@ -48,12 +46,12 @@ def sorting(device: Device, rng: np.random.Generator) -> Iterator[Deviation | No
 
 
 @BITONIC.add("count_pairs", "fill_tiles", "sort_tiles")
-def sorting_in_tiles(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def sorting_in_tiles(device: Device, rng: np.random.Generator) -> Results:
     yield from tiles.check_bitonic(device, rng, (0, 1, 65, 300), 50)
 
 
 @CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient", "update_gaussians")
-def learning(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def learning(device: Device, rng: np.random.Generator) -> Results:
     x, y = images.pictures(rng, 33, 17)
     for loss, oracle, kernel in images.LOSSES:
         yield from images.check_loss(device, loss(weight=0.7), 0.7, oracle, kernel, x, y)

@@ -1,6 +1,5 @@
 """Losses, masks, blur and texture: kernels on planes of pixels."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Deviation, Note, by_element, equal
+from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Deviation, Results, by_element, equal
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, WeightEntropy, view_error
 from clsplat.methods.opti3dgs import apply_filter, filter_gradients
@@ -61,7 +60,7 @@ def pictures(rng: np.random.Generator, width: int, height: int) -> tuple[NDArray
 
 def check_loss(
     device: Device, loss: ImageLoss, weight: float, oracle: Any, kernel: str, x: NDArray[Any], y: NDArray[Any]
-) -> Iterator[Deviation]:
+) -> Results:
     """Compare value and gradient of a loss of weight `weight`."""
     comparison, what = comparison_of(device, x, y), f"{type(loss).__name__}, {x.shape[2]} x {x.shape[1]} px"
     found = loss.add(comparison)
@@ -77,7 +76,7 @@ def check_loss(
 
 
 @CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient")
-def losses(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def losses(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         x, y = pictures(rng, width, height)
         for loss, oracle, kernel in LOSSES:
@@ -85,7 +84,7 @@ def losses(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Not
 
 
 @CHECKS.add("pixel_loss", "ssim_gradient")
-def losses_that_add_up(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def losses_that_add_up(device: Device, rng: np.random.Generator) -> Results:
     x, y = pictures(rng, 50, 20)
     comparison = comparison_of(device, x, y)
     expected = np.zeros(x.shape)
@@ -97,7 +96,7 @@ def losses_that_add_up(device: Device, rng: np.random.Generator) -> Iterator[Dev
 
 
 @CHECKS.add("view_error", "sum_errors")
-def errors_of_views(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def errors_of_views(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         (x, y), what = pictures(rng, width, height), f"{width} x {height} px"
         gradient, comparison = rng.normal(size=x.shape).astype(np.float32), comparison_of(device, x, y)
@@ -112,7 +111,7 @@ def errors_of_views(device: Device, rng: np.random.Generator) -> Iterator[Deviat
 
 
 @CHECKS.add("weight_entropy")
-def entropies(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def entropies(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         x, what = rng.uniform(0, 1, (4, height, width)).astype(np.float32), f"{width} x {height} px"
         comparison = comparison_of(device, x, x[:3])
@@ -126,7 +125,7 @@ def entropies(device: Device, rng: np.random.Generator) -> Iterator[Deviation | 
 
 
 @CHECKS.add("unpack_pixels", "apply_mask", "change_background")
-def photographs(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def photographs(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         pixels = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
         mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
@@ -150,7 +149,7 @@ def photographs(device: Device, rng: np.random.Generator) -> Iterator[Deviation 
 
 
 @CHECKS.add("blur_rows", "blur_columns")
-def blur(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def blur(device: Device, rng: np.random.Generator) -> Results:
     for width, height in ((1, 1), (15, 4), (33, 18), (65, 7)):
         for sigma, share in ((1.0, None), (2.5, 0.7), (0.5, 0.05)):
             image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
@@ -167,7 +166,7 @@ def blur(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]
 
 def check_haar(
     device: Device, rng: np.random.Generator, width: int, height: int, share: float | None, taps: NDArray[Any]
-) -> Iterator[Deviation]:
+) -> Results:
     """Compare a photograph that passed the Haar transform, and the derivatives by its filter."""
     image, gradient = rng.uniform(0, 1, (3, height, width)).astype(np.float32), rng.normal(size=(3, height, width))
     mask = None if share is None else rng.random((height, width)) < share
@@ -189,7 +188,7 @@ def check_haar(
 
 
 @CHECKS.add("haar_forward", "haar_backward")
-def haar(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def haar(device: Device, rng: np.random.Generator) -> Results:
     for width, height in ((1, 1), (2, 2), (16, 5), (17, 33), (129, 66)):
         for share in (None, 0.6):
             yield from check_haar(device, rng, width, height, share, rng.normal(size=2).round(2))
@@ -203,7 +202,7 @@ def magnitude_of(image: NDArray[Any]) -> NDArray[Any]:
 
 
 @CHECKS.add("image_gradient", "hide_masked")
-def texture(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def texture(device: Device, rng: np.random.Generator) -> Results:
     for width, height in ((1, 1), (7, 5), (17, 17), (40, 30), (65, 3)):
         image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
         mask = rng.random((height, width)) < 0.9
@@ -227,7 +226,7 @@ SCALES = (1.0, 1e-2, 8.0)  # of the differences: some lie beyond the bins, on ei
 
 def check_transient(
     device: Device, rng: np.random.Generator, width: int, height: int, scale: float, share: float | None
-) -> Iterator[Deviation]:
+) -> Results:
     """Compare residuals and masks of a picture of which a mask leaves a share; bins and masks are exact."""
     x, y = pictures(rng, width, height)
     x = (y + np.float32(scale) * (x - y)).astype(np.float32)
@@ -255,7 +254,7 @@ def check_transient(
 
 
 @CHECKS.add("measure_residuals", "mask_transients")
-def transients(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def transients(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         for scale in SCALES:
             yield from check_transient(device, rng, width, height, scale, None)

@@ -1,12 +1,11 @@
 """motion.cl: Gaussians at a moment, the gradients by their motion, and its update."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, SUM, Checks, Deviation, Note, by_element, by_norm, equal, wrong
+from clsplat.conformance.check import CONIC, SUM, Checks, Results, by_element, by_norm, equal, wrong
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.formats.splats import MOTION, STILL, WIDTHS, fields_of, width_of
 from clsplat.gaussians.gaussians import Gaussians
@@ -40,7 +39,7 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
     return replace(case, parameters=parameters, view=replace(case.view, time=TIME))
 
 
-def check_moment(device: Device, rng: np.random.Generator, count: int, width: int) -> Iterator[Deviation]:
+def check_moment(device: Device, rng: np.random.Generator, count: int, width: int) -> Results:
     """The tables at a moment, and the gradients by them carried back."""
     case, (degree, turns) = moving_case(rng, count, width), WIDTHS[width]
     model, camera, what = case.model(device), case.device_camera(device), f"{count} of {width} columns"
@@ -73,7 +72,7 @@ def check_moment(device: Device, rng: np.random.Generator, count: int, width: in
     yield by_norm("move_backward", f"by the logit at the center, {what}", center, by_logit, CONIC)
 
 
-def check_still(device: Device, rng: np.random.Generator) -> Iterator[Deviation]:
+def check_still(device: Device, rng: np.random.Generator) -> Results:
     """A motion of none gives the bits of none."""
     case = random_case(rng, 65)
     motion = np.zeros((65, width_of(3, True)), np.float32)
@@ -88,9 +87,7 @@ def check_still(device: Device, rng: np.random.Generator) -> Iterator[Deviation]
     yield equal("move_forward", "an image of Gaussians that stand still", images[1], images[0])
 
 
-def check_step(
-    device: Device, rng: np.random.Generator, count: int, width: int, every: int = 0xFFFFFFFF
-) -> Iterator[Deviation]:
+def check_step(device: Device, rng: np.random.Generator, count: int, width: int, every: int = 0xFFFFFFFF) -> Results:
     """Two updates, in which durations reach their bound.  every: as in motion_step."""
     case = moving_case(rng, count, width)
     model, rates = case.model(device), MotionRates(log_duration=0.5, min_duration=0.3).at(3, EXTENT)
@@ -118,7 +115,7 @@ def check_step(
 
 
 @CHECKS.add("move_forward", "turn_forward", "move_backward", "turn_backward", "motion_step")
-def motion(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def motion(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         yield from check_moment(device, rng, count, width_of(1, False))
         yield from check_step(device, rng, count, width_of(3, True))
@@ -129,7 +126,7 @@ def motion(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Not
 
 
 @CHECKS.add("motion_l2", "short_duration")
-def penalties_of_motion(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def penalties_of_motion(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         table = moving_case(rng, count, 8).parameters[MOTION]
         table[1::7, :3] = 0

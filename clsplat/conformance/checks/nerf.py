@@ -1,15 +1,15 @@
 """Cones of pixels, their samples, and the encodings of these, which a field reads."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.check import GRADIENT, SUM, Checks, Deviation, Note, by_element, by_norm, equal
+from clsplat.conformance.check import GRADIENT, SUM, Checks, Results, by_element, by_norm, equal
 from clsplat.conformance.checks.images import planes_of
 from clsplat.conformance.reference import nerf as ref
+from clsplat.conformance.reference.training import adam_step
 from clsplat.conformance.scenes import random_case
 from clsplat.nerf.field import Draw, Field, Levels, Rays, RayTarget, SampleLevel
 from clsplat.nerf.network import PLACE_ROWS
@@ -124,7 +124,7 @@ def rows_of(table: Array, first: int, count: int) -> NDArray[Any]:
 
 
 @CHECKS.add("draw_pixels", "cast_rays", "spread_edges", "resample_edges")
-def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
     """Pixels, rays and where they are cut, drawn and even."""
     for count in RAYS:
         case = FieldCase.of(device, rng, count, Draw(7, 11, 5))
@@ -135,7 +135,7 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Iterator[Deviat
             yield from _check_edge(replace(case, rays=rays), f"{count} rays, {'drawn' if rays.draw else 'even'}")
 
 
-def _check_edge(case: FieldCase, what: str) -> Iterator[Deviation]:
+def _check_edge(case: FieldCase, what: str) -> Results:
     coarse, fine = ((level.edges.get(), level.weights.get()) for level in case.levels.render(case.on_device, case.rays))
     shape, (edges, weights) = case.shape, coarse
     drawn, again = case.units(shape.coarse_samples, ref.COARSE), case.units(shape.fine_samples, ref.FINE)
@@ -150,7 +150,7 @@ def _check_edge(case: FieldCase, what: str) -> Iterator[Deviation]:
 
 
 @CHECKS.add("encode_frustums", "encode_directions")
-def encodings(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def encodings(device: Device, rng: np.random.Generator) -> Results:
     """What the network reads of a sample."""
     for count in RAYS:
         case = FieldCase.of(device, rng, count, Draw(1, 2, 0))
@@ -188,7 +188,7 @@ CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, place
 
 
 @CHECKS.add("grid_places", "grid_forward", "grid_backward")
-def grids_of_features(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
     """Where samples are in a grid, what a network reads of it there, and derivatives by its numbers."""
     for count in RAYS:
         case = FieldCase.of(device, rng, count, Draw(1, 2, 0), grid=GRID)
@@ -214,9 +214,7 @@ def _by_sample(table: NDArray[np.float32]) -> NDArray[np.float64]:
     return table.transpose(0, 2, 1).reshape(-1, table.shape[1]).astype(np.float64)
 
 
-def _check_grid(
-    device: Device, rng: np.random.Generator, case: FieldCase, places: NDArray[np.float32]
-) -> Iterator[Deviation]:
+def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, places: NDArray[np.float32]) -> Results:
     shape, encoding, tiles = case.shape, case.levels.encoding, len(places)
     assert shape.grid is not None
     what = f"{tiles} tiles, {shape.grid.levels} levels to {shape.grid.finest} with {shape.grid.entries}"
@@ -261,7 +259,7 @@ FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
     *("dense_forward", "dense_backward", "dense_weights", "dense_biases", "dense_sums"),
     *("composite_forward", "composite_backward"),
 )
-def fields(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def fields(device: Device, rng: np.random.Generator) -> Results:
     """Colors of rays and derivatives by all parameters, through both levels."""
     for count, keys in FIELDS_CASES:
         case = FieldCase.of(device, rng, count, Draw(3, 4, 2), **keys)
@@ -287,9 +285,7 @@ def fields(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Not
         yield from _check_gradient(case.shape, gradient.get(), expected, f"{count} rays")
 
 
-def _check_gradient(
-    shape: FieldShape, gradient: NDArray[Any], expected: list[ref.Weights], what: str
-) -> Iterator[Deviation]:
+def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[ref.Weights], what: str) -> Results:
     gradient = gradient[: shape.of_network]
     used = np.zeros(shape.of_network, bool)
     for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
@@ -333,7 +329,7 @@ class _Comparison:
         differences[: case.rays.counted] -= case.wanted()
         return cls(level, scale, network, weights, (colors, densities), inputs, composite, differences)
 
-    def deviations(self, what: str) -> Iterator[Deviation]:
+    def deviations(self, what: str) -> Results:
         colors, densities = (
             rows_of(table, 0, count) for table, count in ((self.level.raw_colors, 3), (self.level.raw_densities, 1))
         )
@@ -352,7 +348,7 @@ class _Comparison:
 
 
 @CHECKS.add("place_colors")
-def pictures_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
     """A whole picture: the pixels in their places, zeros around them."""
     case = FieldCase.of(device, rng, 1, Draw(0, 1, 0))
     field = Field(case.shape, case.on_device, device.upload(BACKGROUND))
@@ -364,7 +360,7 @@ def pictures_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Dev
 
 
 @CHECKS.add("dense_update")
-def updates_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def updates_of_fields(device: Device, rng: np.random.Generator) -> Results:
     """Adam, over some updates of gradients of all sizes."""
     learned = LearnedField.first(SHAPE, 0, device.upload(BACKGROUND))
     count = SHAPE.parameters
@@ -372,8 +368,8 @@ def updates_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Devi
     for number, epsilon in enumerate((1e-8, 1e-8, 1e-15), 1):
         gradient = (rng.normal(size=count) * 10.0 ** rng.uniform(-10, 1, count)).astype(np.float32)
         learned.update(device.upload(gradient), AdamStep(0.01, epsilon), number)
-        own = gradient.astype(np.float64)
-        values, moment1, moment2 = ref.update(values, moment1, moment2, own, 0.01, number, epsilon)
+        exact = gradient.astype(np.float64)
+        values, moment1, moment2 = adam_step(values, exact, moment1, moment2, number, 0.01, epsilon=epsilon)
     found = learned.tables()
     yield by_element("dense_update", "parameters", found["parameters"][:, 0], values, 1e-4, 0.01)
     yield by_element("dense_update", "first moments", found["moment1"][:, 0], moment1, 1e-4, 1e-12)

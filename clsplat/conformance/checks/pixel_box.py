@@ -1,13 +1,12 @@
 """Splats that are integrated over the box of each pixel: records, images, sums over pixels, gradients, updates."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import GRADIENT, Checks, Deviation, Note, by_norm, equal
+from clsplat.conformance.check import GRADIENT, Checks, Results, by_norm, equal
 from clsplat.conformance.checks.blending import (
     ALL_SUMS,
     BACKGROUND,
@@ -39,7 +38,7 @@ def of_size(size: float, rng: np.random.Generator, count: int, width: int, heigh
 
 
 @CHECKS.add("project_forward", "project_backward", "update_gaussians")
-def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> Results:
     for count in (1, 17, 65):
         case, what = random_case(rng, count, **BOX), f"{count} Gaussians for the pixel's box"
         yield from check_record(device, case, what)
@@ -51,7 +50,7 @@ def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> It
 
 
 @CHECKS.add("blend_forward", "blend_backward", "count_large", "emit_large")
-def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((0, 20, 20), (1, 16, 16), (17, 33, 15), (65, 40, 30)):
         case = of_size(0.0, rng, count, width, height)
         yield from check_blend(device, case, f"{count} Gaussians over the pixel's box, {width} x {height} px")
@@ -69,7 +68,7 @@ def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Ite
 
 
 @CHECKS.add("blend_forward", "blend_backward", "emit_large")
-def the_pixel_box_in_bands(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def the_pixel_box_in_bands(device: Device, rng: np.random.Generator) -> Results:
     case = random_case(rng, 60, 150, 130, **BOX)
     case.parameters["log_scales"][:10] += 1.5
     weights = rng.normal(size=(3, 130, 150)).astype(np.float32)

@@ -1,6 +1,5 @@
 """project.cl and what reads splats: records, gradients, depth, the world filter."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +14,7 @@ from clsplat.conformance.check import (
     SUM,
     Checks,
     Deviation,
-    Note,
+    Results,
     by_element,
     by_norm,
     equal,
@@ -42,7 +41,7 @@ def splats_of(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], N
     return frame.splats.get(), keys, frame.radius.get()[: len(keys)]
 
 
-def check_record(device: Device, case: Case, what: str) -> Iterator[Deviation]:
+def check_record(device: Device, case: Case, what: str) -> Results:
     """Compare the records of a scene with the reference."""
     kernel = "project_forward"
     records, keys, radius = splats_of(device, case)
@@ -97,7 +96,7 @@ def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any])
     return ~right
 
 
-def check_gradient(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Deviation]:
+def check_gradient(device: Device, case: Case, rng: np.random.Generator, what: str) -> Results:
     """Give the kernel and the reference the same sums over a Gaussian's pixels; compare the parameters' gradients."""
     model, camera = case.model(device), case.device_camera(device)
     rasterizer = Rasterizer(device, "radix")
@@ -160,7 +159,7 @@ def beyond_the_clamp(rng: np.random.Generator) -> Case:
 
 
 @CHECKS.add("project_forward")
-def projection(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def projection(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         yield from check_record(device, random_case(rng, count), f"{count} Gaussians")
     for degree in range(3):
@@ -171,7 +170,7 @@ def projection(device: Device, rng: np.random.Generator) -> Iterator[Deviation |
 
 
 @CHECKS.add("project_forward")
-def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator) -> Results:
     records, keys, radius = splats_of(device, not_drawable(rng))
     culled = [0, 1, 2, 3, 4, 5, 7, 8]
     yield equal("project_forward", "records of Gaussians behind, faint or not finite", records[culled], 0.0)
@@ -180,7 +179,7 @@ def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator)
     yield wrong("project_forward", "records that are not numbers", np.isnan(records))
 
 
-def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: int) -> Iterator[Deviation]:
+def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: int) -> Results:
     """Hide Gaussians in training views; compare each view's picture with that of the others alone."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     left_out = rng.random((views, count)) < 0.5
@@ -199,13 +198,13 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: in
 
 
 @CHECKS.add("project_forward")
-def gaussians_that_views_leave_out(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def gaussians_that_views_leave_out(device: Device, rng: np.random.Generator) -> Results:
     for count, views in ((17, 2), (65, HIDDEN_VIEWS + 1)):
         yield from check_hidden(device, random_case(rng, count), rng, views)
 
 
 @CHECKS.add("project_backward")
-def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         yield from check_gradient(device, random_case(rng, count), rng, f"{count} Gaussians")
     for degree in range(3):
@@ -218,7 +217,7 @@ def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Ite
 
 
 @CHECKS.add("sampling_interval", "filter_variance")
-def world_filter(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def world_filter(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         case = random_case(rng, count)
         case.parameters["means"][::3] *= 4  # out of sight of some, or of all
@@ -238,7 +237,7 @@ def world_filter(device: Device, rng: np.random.Generator) -> Iterator[Deviation
 
 
 @CHECKS.add("paint_depth")
-def depth(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def depth(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         case = random_case(rng, count)
         frame = Rasterizer(device, "radix").forward(
@@ -254,7 +253,7 @@ def depth(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note
 # poses.cl: derivatives by the place and the focal length of a camera.
 
 
-def check_pose(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Deviation]:
+def check_pose(device: Device, case: Case, rng: np.random.Generator, what: str) -> Results:
     """Give the kernel and the reference the same sums over a Gaussian's pixels; compare the pose's derivatives."""
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device, "radix")
     frame, count = rasterizer.forward(model, camera, device.zeros(3)), model.gaussians.count
@@ -275,7 +274,7 @@ def check_pose(device: Device, case: Case, rng: np.random.Generator, what: str) 
 
 
 @CHECKS.add("pose_gradient")
-def poses(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def poses(device: Device, rng: np.random.Generator) -> Results:
     for count in (1, 15, 17, 65, 600):
         yield from check_pose(device, random_case(rng, count), rng, f"{count} Gaussians")
     for degree in range(3):

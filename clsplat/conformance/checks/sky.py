@@ -1,6 +1,5 @@
 """A background of directions: pictures, derivatives, what covers it, and its Adam."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import SUM, Checks, Deviation, Note, by_element, by_norm, equal
+from clsplat.conformance.check import SUM, Checks, Results, by_element, by_norm, equal
 from clsplat.conformance.checks.images import outside, planes_of
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.gaussians.sky import DeviceSky
@@ -58,7 +57,7 @@ def planes_in_rows(texels: NDArray[Any]) -> NDArray[np.float32]:
     return np.ascontiguousarray(texels.reshape(-1, texels.shape[2]).T, np.float32)
 
 
-def check_sky(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Deviation]:
+def check_sky(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
     """Compare a picture and the derivative by the map; finished pixels have a negative transmittance."""
     view, what = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels a side"
     image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
@@ -78,7 +77,7 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
     yield equal("sky_gather", f"texels that are not shown, {what}", hidden, 0.0)
 
 
-def check_cover(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Deviation]:
+def check_cover(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
     """Compare the loss of what covers the sky; photographs are far from the difference that decides."""
     view, what, difference, weight = SkyView(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
     sky = ref.sky_image(view.texels.astype(np.float64), view.directions)
@@ -100,19 +99,19 @@ def check_cover(device: Device, rng: np.random.Generator, width: int, height: in
 
 
 @CHECKS.add("sky_forward", "sky_backward", "sky_gather")
-def sky(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def sky(device: Device, rng: np.random.Generator) -> Results:
     for width, height, side in SIZES:
         yield from check_sky(device, rng, width, height, side)
 
 
 @CHECKS.add("sky_matches", "sky_cover")
-def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
     for width, height, side in SIZES:
         yield from check_cover(device, rng, width, height, side)
 
 
 @CHECKS.add("sky_update")
-def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
     """Three updates; texels that the view does not show stay."""
     side = 16
     view, texels = SkyView(device, rng, 9, 7, side), side**2
@@ -126,7 +125,7 @@ def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Deviat
         gradient = (rng.normal(size=expected.shape) / pixels).astype(np.float32)
         view.skies.update(view.sky, view.camera, device.upload(gradient), moments, 0.01)
         given = pixels * gradient.astype(np.float64)
-        new, first, second = ref.sky_update(expected, (first, second), given, updates, 0.01)
+        new, first, second = ref.adam_step(expected, given, first, second, updates, 0.01, epsilon=1.0)
         expected = np.where(free, new, expected)
     found = view.sky.texels.get()
     yield by_element("sky_update", "colors of texels", found[:, shown], expected, 1e-6, floor=1.0)

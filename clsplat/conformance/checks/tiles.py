@@ -1,13 +1,12 @@
 """Scans, sorts and tile lists, which are exact."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.check import Checks, Deviation, Note, equal, wrong
+from clsplat.conformance.check import Checks, Deviation, Results, equal, wrong
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Frame, Rasterizer
@@ -31,7 +30,7 @@ def check_scan(device: Device, values: NDArray[Any]) -> Deviation:
     return equal("scan_offsets", f"sums of {len(values)} values", offsets, expected)
 
 
-def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Iterator[Deviation]:
+def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
     """Compare a stable sort of keys below 2^bits."""
     sorted_keys, places = tiler_of(device).sort_pairs(device.upload(keys), bits, len(keys), "test")
     expected = np.argsort(keys, kind="stable")
@@ -39,9 +38,7 @@ def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Iterator[Devia
     yield equal("radix_scatter", f"order of {len(keys)} keys of {bits} bits", sorted_keys.get(), keys[expected])
 
 
-def check_bitonic(
-    device: Device, rng: np.random.Generator, lengths: tuple[int, ...], deepest: int
-) -> Iterator[Deviation]:
+def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, ...], deepest: int) -> Results:
     """Sort tiles of these lengths by depth keys below `deepest`, ties by pair."""
     tiles, pairs = len(lengths), sum(lengths)
     pair_tile = rng.permutation(np.repeat(np.arange(tiles), lengths)).astype(np.uint32)
@@ -58,14 +55,14 @@ def check_bitonic(
 
 
 @CHECKS.add("scan_blocks", "scan_offsets")
-def scans(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def scans(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         yield check_scan(device, rng.integers(0, 100, count).astype(np.uint32))
     yield check_scan(device, rng.integers(0, 2**31, 40_001, dtype=np.uint32))  # sums that would wrap
 
 
 @CHECKS.add("radix_count", "radix_scatter")
-def radix_sort(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def radix_sort(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         for bits in (9, 32):
             keys = rng.integers(0, 2**bits, count, dtype=np.uint64).astype(np.uint32)
@@ -75,13 +72,13 @@ def radix_sort(device: Device, rng: np.random.Generator) -> Iterator[Deviation |
 
 
 @CHECKS.add("count_pairs", "fill_tiles", "sort_tiles")
-def bitonic_sort(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def bitonic_sort(device: Device, rng: np.random.Generator) -> Results:
     for deepest in (50, 2**31):
         yield from check_bitonic(device, rng, LENGTHS, deepest)
 
 
 @CHECKS.add("count_large", "emit_large", "emit_pairs", "find_tile_offsets", "permute")
-def tile_lists(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def tile_lists(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((1, 16, 16), (60, 17, 15), (150, 100, 70), (64, 5, 3), (40, 210, 130)):
         case = random_case(rng, count, width, height)
         case.parameters["log_scales"][: count // 10] += 1.5
@@ -90,7 +87,7 @@ def tile_lists(device: Device, rng: np.random.Generator) -> Iterator[Deviation |
             yield from check_list(device, case, sort, f"{count} Gaussians, {width} x {height} px, {sort}")
 
 
-def check_list(device: Device, case: Case, sort: Sort, what: str) -> Iterator[Deviation]:
+def check_list(device: Device, case: Case, sort: Sort, what: str) -> Results:
     """Every tile lists the splats that reach it, front to back, once, and hardly any other."""
     rasterizer = Rasterizer(device, sort)
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
@@ -162,11 +159,11 @@ def case_of(device: Device, rng: np.random.Generator, columns: int, rows: int, c
 
 
 @CHECKS.add("count_large", "emit_large", "project_forward")
-def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Results:
     yield from check_all(device, rng)
 
 
-def check_all(device: Device, rng: np.random.Generator) -> Iterator[Deviation]:
+def check_all(device: Device, rng: np.random.Generator) -> Results:
     """Compare lists of pictures with many rows, of rectangles around a mask's size, and of wrong counts."""
     for columns, rows in (TALL, *WHOLE):
         case, what = case_of(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
@@ -174,7 +171,7 @@ def check_all(device: Device, rng: np.random.Generator) -> Iterator[Deviation]:
     yield from check_miscounted(device, case_of(device, rng, *TALL))
 
 
-def check_miscounted(device: Device, case: Case) -> Iterator[Deviation]:
+def check_miscounted(device: Device, case: Case) -> Results:
     """Each splat lists as many tiles of the image as were counted, whatever that is, each once."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))

@@ -1,6 +1,5 @@
 """Adam, penalties, and the rows of tables."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, SUM, Checks, Deviation, Note, by_element, by_norm, equal
+from clsplat.conformance.check import CONIC, SUM, Checks, Deviation, Results, by_element, by_norm, equal
 from clsplat.conformance.checks.blending import BACKGROUND
 from clsplat.conformance.checks.projection import COUNTS as DROPOUT_COUNTS
 from clsplat.conformance.checks.projection import check_gradient, check_record, expected_gradients, splats_of
@@ -31,7 +30,7 @@ EXTENT = 2.5
 SPLAT_OPACITY = int(constants("splat.h")["SPLAT_OPACITY"])
 
 
-def check_step(device: Device, rng: np.random.Generator, count: int) -> Iterator[Deviation]:
+def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
     """Three updates from gradients of very different sizes."""
     case = random_case(rng, count)
     model = case.model(device)
@@ -75,7 +74,7 @@ def _sums_of(
     return frame, rasterizer.pixel_sums(model, frame, device.upload(weights))
 
 
-def check_fused(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Deviation]:
+def check_fused(device: Device, rng: np.random.Generator, case: Case, what: str) -> Results:
     """One update on the way: moments against the reference's gradients, values against the device's own moments."""
     kernel, count = "update_gaussians", len(case.parameters["means"])
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
@@ -94,7 +93,7 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, what: str)
         yield by_element(kernel, f"{name}, {what}", gaussians.get(name), before - step, 3e-7, floor)
 
 
-def check_seen(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Deviation]:
+def check_seen(device: Device, rng: np.random.Generator, case: Case, what: str) -> Results:
     """The fifth update, of seen rows alone, with moments from before, by each kernel from the same gradients."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
@@ -135,19 +134,19 @@ def behind_each_fifth(case: Case) -> Case:
 
 
 @CHECKS.add("adam_step")
-def check_adam(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def adam_updates(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         yield from check_step(device, rng, count)
 
 
 @CHECKS.add("adam_step", "update_gaussians")
-def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         yield from check_seen(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians")
 
 
 @CHECKS.add("update_gaussians")
-def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Results:
     for count, degree in ((1, 3), (17, 0), (40, 2), (150, 3)):
         case = with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
         what = f"{count} Gaussians, degree {degree}"
@@ -162,7 +161,7 @@ def check_penalty(
     oracle: Any,
     interval: NDArray[Any] | None = None,
     parameter: str = "log_scales",
-) -> Iterator[Deviation]:
+) -> Results:
     """Compare value and gradient of a penalty of weight 3, for Gaussians of many sizes and forms."""
     case = random_case(rng, count)
     case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
@@ -183,7 +182,7 @@ def check_penalty(
 
 
 @CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity")
-def penalties(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def penalties(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
         trace = CovarianceTrace(weight=3.0, above=0.02)
@@ -205,7 +204,7 @@ def _tables(gaussians: Gaussians) -> dict[str, NDArray[Any]]:
 
 
 @CHECKS.add("set_rows", "zero_rows", "gather_rows", "count_not_finite", "fill_words")
-def rows_of_tables(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
     for count in (0, 1, 15, 17, 1025):
         array = device.upload(np.full(count, 3, np.float32))
         array.fill(-1.5)
@@ -274,7 +273,7 @@ def trained(
     return {name: gaussians.get(name) for name in Deferred.names}
 
 
-def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Iterator[Deviation]:
+def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Results:
     """Compare waiting updates with the reference, and with the bits of updates at once."""
     case = random_case(rng, count)
     before = case.parameters["sh_rest"]
@@ -297,7 +296,7 @@ def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Iter
 
 
 @CHECKS.add("replay_updates", "note_update", "adam_step")
-def updates_that_wait(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def updates_that_wait(device: Device, rng: np.random.Generator) -> Results:
     for count in DEFERRED_COUNTS:
         yield from check_deferred(device, rng, count)
 
@@ -306,12 +305,12 @@ def updates_that_wait(device: Device, rng: np.random.Generator) -> Iterator[Devi
 
 
 @CHECKS.add("add_to_average", "count_step", "take_average")
-def averages(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def averages(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         yield from check_average(device, rng, count)
 
 
-def check_average(device: Device, rng: np.random.Generator, count: int) -> Iterator[Deviation]:
+def check_average(device: Device, rng: np.random.Generator, count: int) -> Results:
     """The average of three steps, where the last row, if it is not the only one, is new after the first step."""
     steps = [random_case(rng, count).parameters for _ in range(3)]
     gaussians = random_case(rng, count).model(device).gaussians
@@ -341,13 +340,13 @@ SEED, STEP = 0x9E3779B9, 700
 DROPOUT = DropoutMask(0.3, SEED, STEP)
 
 
-def check_dropout(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Deviation]:
+def check_dropout(device: Device, case: Case, rng: np.random.Generator, what: str) -> Results:
     """Compare the records, and the gradients of the parameters, of a step that leaves Gaussians out."""
     yield from check_record(device, case, what)
     yield from check_gradient(device, case, rng, what)
 
 
-def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Iterator[Deviation]:
+def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Results:
     """Hide Gaussians in a view of which others are dropped; the records are those without both."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     left_out = rng.random((2, count)) < 0.5
@@ -359,7 +358,7 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Iterat
 
 
 @CHECKS.add("draw_left_out", "project_forward", "project_backward")
-def dropout(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def dropout(device: Device, rng: np.random.Generator) -> Results:
     for count in DROPOUT_COUNTS:
         case = replace(random_case(rng, count), dropout=DROPOUT)
         yield from check_dropout(device, case, rng, f"{count} Gaussians, some dropped")

@@ -1,7 +1,6 @@
 """A training, the memory, and the speed of a device."""
 
 import time
-from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from clsplat.conformance.bench.cases import Peaks, measure_peaks, run_bench
 from clsplat.conformance.bench.cases import case as bench_case
-from clsplat.conformance.check import Checks, Deviation, Note, by_element, equal
+from clsplat.conformance.check import Checks, Deviation, Note, Results, by_element, equal
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.core.errors import MemoryLimitError
 from clsplat.core.machine import available_memory
@@ -69,7 +68,7 @@ def train(
 
 
 @CHECKS.add()
-def training(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def training(device: Device, rng: np.random.Generator) -> Results:
     case = random_case(rng, 120, 48, 40)
     start = {name: table.copy() for name, table in case.parameters.items()}
     start["means"] += rng.normal(0, 0.05, start["means"].shape).astype(np.float32)
@@ -93,7 +92,7 @@ def training(device: Device, rng: np.random.Generator) -> Iterator[Deviation | N
 
 
 @SPEED.add()
-def memory(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def memory(device: Device, rng: np.random.Generator) -> Results:
     """Allocate buffers of growing size, write all of each, and read samples: up to what one buffer may have.
 
     A refusal is no fault of the device: other programs may hold its memory, which OpenCL does not tell.
@@ -119,7 +118,7 @@ def memory(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Not
     yield Note("memory", {"promised": promised, "held": held, "free": free, "stopped": stopped})
 
 
-def _check_buffer(device: Device, size: int) -> Iterator[Deviation]:
+def _check_buffer(device: Device, size: int) -> Results:
     whole = device.empty(size // 4)
     whole.fill(1.5)
     Array(device, whole.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not be seen at the other end
@@ -130,7 +129,7 @@ def _check_buffer(device: Device, size: int) -> Iterator[Deviation]:
 
 
 @SPEED.add("peak_fma", "peak_exp", "peak_copy")
-def yardsticks(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def yardsticks(device: Device, rng: np.random.Generator) -> Results:
     lanes, group = (int(device.tuning[name]) for name in ("LANES", "GROUP"))
     program, whole = device.program("peak.cl"), 2 * group
     result = device.empty(whole * lanes)
@@ -152,7 +151,7 @@ def yardsticks(device: Device, rng: np.random.Generator) -> Iterator[Deviation |
 
 
 @SPEED.add()
-def speed(device: Device, rng: np.random.Generator) -> Iterator[Deviation | Note]:
+def speed(device: Device, rng: np.random.Generator) -> Results:
     peaks = measure_peaks(device, repeats=2)
     one = bench_case(device, *BENCH, load("splat").settings)
     result = run_bench({"": one}, Peaks(**asdict(peaks)), repeats=5)[""]

@@ -95,20 +95,6 @@ class Composite:
         return by_raw, (left * by_weights - behind) * self.lengths * slope
 
 
-def update(
-    values: Floats,
-    moment1: Floats,
-    moment2: Floats,
-    gradient: Floats,
-    rate: float,
-    number: int,
-    epsilon: float = 1e-8,  # of Adam's paper
-) -> tuple[Floats, Floats, Floats]:
-    """Adam (Kingma and Ba 2015) at its update `number`: values and both moments."""
-    m, v = 0.9 * moment1 + 0.1 * gradient, 0.999 * moment2 + 0.001 * gradient**2
-    return values - rate * (m / (1 - 0.9**number)) / (np.sqrt(v / (1 - 0.999**number)) + epsilon), m, v
-
-
 # Cones of pixels, their samples, and the encodings of these, in float64 (Barron et al. 2021, "Mip-NeRF").
 
 BLUR_PADDING, WEIGHT_FLOOR = 0.01, 1e-5  # alpha of equation 18; the released code's least sum

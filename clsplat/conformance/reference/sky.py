@@ -70,12 +70,3 @@ def sky_cover(chosen: NDArray[Any], transmittance: NDArray[Any], weight: float) 
     """The loss of what covers the sky, and its derivative by the transmittance, [H, W]."""
     share = chosen / chosen.size
     return float(weight * (share * (1 - transmittance)).sum()), -weight * share
-
-
-def sky_update(
-    texels: NDArray[Any], moments: tuple[NDArray[Any], NDArray[Any]], grad: NDArray[Any], updates: int, rate: float
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """New values and moments of texels that have had so many updates, this one among them; grad: in pixels of L1."""
-    first, second = 0.9 * moments[0] + 0.1 * grad, 0.999 * moments[1] + 0.001 * grad**2
-    step = first / (1 - 0.9**updates) / (np.sqrt(second / (1 - 0.999**updates)) + 1)
-    return texels - rate * step, first, second

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from clsplat.conformance.reference.blending import alpha_gradients
 from clsplat.conformance.reference.kinds import PinholeCamera, RawGaussians, Splats, Thresholds
-from clsplat.conformance.reference.projection import rotation_matrix
 
 
 def adam_step(
@@ -93,7 +92,6 @@ class DensityRule:
 
 
 VANILLA = DensityRule()
-ABSGS = DensityRule(split_gradient=4e-4, dense=0.001)
 
 
 def screen_gradient(grad_mean2d: NDArray[Any], width: int, height: int) -> NDArray[Any]:
@@ -146,19 +144,6 @@ def adc_actions(
         too_large = prune_large and final_scale > rule.prune_scale * extent
         actions.append(PRUNE if o < rule.min_opacity or too_large else action)
     return np.array(actions, int)
-
-
-def split_children(
-    mean: NDArray[Any],
-    quat: NDArray[Any],
-    log_scale: NDArray[Any],
-    noise: NDArray[Any],
-    factor: float = VANILLA.split_factor,
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Means and log-scales of the children of one Gaussian; `noise` is N(0, 1): [2,3] -> [2,3], [2,3]."""
-    rotation, scale = rotation_matrix(quat), np.exp(log_scale)
-    means = np.array([mean + rotation @ (scale * sample) for sample in noise])
-    return means, np.array([log_scale - np.log(factor) for _ in noise])
 
 
 def shared_logit(logit: NDArray[Any], rows: int) -> NDArray[Any]:
