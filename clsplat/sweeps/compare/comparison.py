@@ -205,9 +205,13 @@ def _is_below(key_path: str, key: str) -> bool:
 
 
 def _name(settings: dict[str, str], distinct: Sequence[dict[str, str]]) -> str:
-    """Return the pipeline's name, and in words the settings in which variants of that pipeline differ."""
+    """Return the pipeline's name, and in words the settings that it does not share with most variants of it."""
     alike = [other for other in distinct if other.get("name") == settings.get("name")]
-    words = list(dict.fromkeys(_in_words(key_path, settings, alike) for key_path in differing(alike)))
+    words: list[str] = []
+    for key_path in differing(alike):
+        text, *others = (_in_words(key_path, one, alike) for one in (settings, *alike))
+        if 2 * others.count(text) <= len(alike) and text not in words:
+            words.append(text)
     more = [f"and {len(words) - MAX_DIFFERENCES} more"] if len(words) > MAX_DIFFERENCES else []
     return ", ".join([settings.get("name", "unnamed"), *words[:MAX_DIFFERENCES], *more])
 
