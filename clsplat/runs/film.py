@@ -17,7 +17,6 @@ from clsplat.conformance.quick import open_correct
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.files import PIPELINE, check_not_run_file
 from clsplat.core.progress import counted
-from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import Model, load
 from clsplat.nerf.files import is_field
 from clsplat.opencl.device import Device
@@ -215,7 +214,7 @@ def view(
     if found is None:
         LOG.info("without a scene up is -y; give --scene where the picture stands on its head")
     packed = counted(loaded.items(), "models packed", len(loaded))
-    shown = {name: pack(with_sky_splats(model), splats) for name, model in packed}
+    shown = {name: pack(model, splats) for name, model in packed}
     Page(title, shown, stand, background, views).write(out)
     return out
 

@@ -1,6 +1,6 @@
 """The stages of pipeline files: init, optimize, densify, evaluate, render, export, report and more."""
 
-import clsplat.methods  # noqa: F401  whose rules and losses stages name
+import clsplat.methods  # noqa: F401  defines rules and losses that stages refer to
 from clsplat.core.settings import import_modules, rebuild_models
 from clsplat.training import modules
 

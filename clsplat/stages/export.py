@@ -1,4 +1,4 @@
-"""Files of a run: the model, its cameras, checkpoints."""
+"""Write files of a run: the model, its cameras, checkpoints."""
 
 import logging
 import time
@@ -20,16 +20,16 @@ from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model
 from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
 
-WRITTEN = tuple(ending for ending in endings() if ending.startswith("."))  # a folder of SOG is no file
+WRITTEN = tuple(ending for ending in endings() if ending.startswith("."))  # files only; SOG may be a folder too
 LOG = logging.getLogger("clsplat")
 
 
 class Export(Scheduled):
-    """Write the model in the format that the name of the file stands for, by default a PLY, and read it back.
+    """Write the model in the format that the file name ends in, by default a PLY, and read it back.
 
-    A world filter is applied to scales and opacities, so that any viewer can show the file.  A second file, a PLY with
-    `_raw` in its name, holds the model as trained, with the filter as a property `filter_3D`.  A sky is beside them,
-    with `_sky.json` in its name, which clsplat alone reads, or among the Gaussians.
+    A world filter is baked into scales and opacities, so that any viewer can show the file.  A second PLY, with `_raw`
+    in its name, holds the model as trained, with the filter as property `filter_3D`.  A learned sky is written next to
+    them, with `_sky.json` in its name, which only clsplat reads, or as Gaussians of the model.
     """
 
     stage: Literal["export"] = "export"
@@ -39,16 +39,16 @@ class Export(Scheduled):
     file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
     """Path inside the run folder; its ending is the format: .ply, .spz, .sog, .glb, .splat, .usda."""
     quality: Quality = "balanced"
-    """Of SPZ and SOG, how finely harmonics, colors, positions and rotations are rounded."""
+    """Precision of harmonics, colors, positions and rotations in SPZ and SOG."""
     sky: Literal["sidecar", "splats"] = "sidecar"
-    """A sky that was learned (`model.background`): a file beside the model, or 10 000 Gaussians on a far sphere, which
-    every viewer shows."""
+    """A learned sky (`model.background`): `sidecar`, a file next to the model, or `splats`, 10 000 Gaussians on a far
+    sphere, which every viewer shows."""
 
     @model_validator(mode="after")
     def _quality_of_its_format(self) -> "Export":
         if self.quality != "balanced" and not for_writing(Path(self.file)).has_quality:
             raise ValueError(
-                f"'quality' is of SPZ and SOG; expected a file that ends in .spz or .sog, got '{self.file}'"
+                f"'quality' applies to SPZ and SOG; expected a file that ends in .spz or .sog, got '{self.file}'"
             )
         return self
 
@@ -60,47 +60,46 @@ class Export(Scheduled):
         model = host_model(run)
         if self.sky == "splats":
             if model.sky is None:
-                LOG.warning("export.sky: splats changes nothing: the model has no sky; model.background gives it one")
+                LOG.warning("export.sky: splats has no effect: the model has no sky; set model.background to learn one")
             model = with_sky_splats(model)
-        path, raw, behind = self.outputs(run.out)
-        if _name(behind, run) not in run.model_hashes:
-            behind.unlink(missing_ok=True)
+        sky = len(model) - run.model.gaussians.count
+        path, raw, sky_path = self.outputs(run.out)
+        if _name(sky_path, run) not in run.model_hashes:
+            sky_path.unlink(missing_ok=True)
         files = {path: model.baked()}
         if model.filter_variance is not None:
             files[raw] = model
         options = Writing(quality=self.quality)
-        for file, one in files.items():
-            run.model_hashes[_name(file, run)] = one.save(file, options)
+        for file, saved in files.items():
+            run.model_hashes[_name(file, run)] = saved.save(file, options)
             try:
                 if for_writing(file).read:
                     load(file, Reading(quiet=True))
             except DataError as error:
-                raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
-            LOG.info("%s Gaussians written to %s", f"{len(one):,}", file)
-        run.model_hashes.pop(_name(behind, run), None)
-        if behind.is_file():
-            run.model_hashes[_name(behind, run)] = sha256(behind)
+                raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
+            of_sky = f" and {sky:,} of the sky" if sky else ""
+            LOG.info("%s Gaussians%s written to %s", f"{len(saved) - sky:,}", of_sky, file)
+        run.model_hashes.pop(_name(sky_path, run), None)
+        if sky_path.is_file():
+            run.model_hashes[_name(sky_path, run)] = sha256(sky_path)
         if model.sky:
-            LOG.info("their sky written to %s; `export: {sky: splats}` makes Gaussians of it", behind)
+            LOG.info("sky written to %s; `export: {sky: splats}` writes it as Gaussians", sky_path)
 
 
 def _name(file: Path, run: Run) -> str:
     return file.relative_to(run.out).as_posix()
 
 
-# The cameras beside the model, for other programs.
-
-
 class Cameras(Stage):
-    """Write the cameras of the scene, at the photographs' full size, so that a model travels with its views.
+    """Write the cameras of the scene at full image size, so that other programs can show the model's views.
 
-    After a training with `camera_optimizer` they are the learned ones, with the learned focal lengths."""
+    After a training with `camera_optimizer`, poses and focal lengths are the optimized ones."""
 
     stage: Literal["cameras"] = "cameras"
     output_keys: ClassVar[frozenset[str]] = frozenset({"formats", "folder"})
 
     formats: Annotated[list[Literal["colmap", "nerfstudio", "inria"]], Field(min_length=1)] = Field(["inria"])
-    """Files that are written: a COLMAP model as text, transforms.json, cameras.json."""
+    """Formats to write: a COLMAP model as text, transforms.json, cameras.json."""
     folder: Annotated[str, path_in_run()] = "cameras"
     """Path inside the run folder."""
 
@@ -114,11 +113,8 @@ class Cameras(Stage):
                 LOG.info("cameras written to %s", path)
 
 
-# Save the run at a cadence.
-
-
 class Checkpoint(Scheduled):
-    """Write everything that a resumed run needs to reach the same bits; also after the last step, to train longer."""
+    """Save everything that a resumed run needs to reach the same bits; also after the last step, to train longer."""
 
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"painter"})
@@ -126,10 +122,11 @@ class Checkpoint(Scheduled):
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"keep", "every_seconds"}
 
     keep: Annotated[int, Field(gt=0)] = 2
-    """Number of checkpoints that are kept, the newest ones."""
+    """Number of checkpoints to keep, the newest ones."""
 
     every_seconds: Annotated[float, Field(gt=0)] | None = None
-    """Seconds without a checkpoint after which one is saved between those of `every`; the bits do not depend on it."""
+    """Seconds without a checkpoint after which another one is saved, in addition to `every`; this does not affect the
+    bits."""
 
     def is_overdue(self, run: Run) -> bool:
         return self.every_seconds is not None and time.monotonic() - run.status.saved_at >= self.every_seconds

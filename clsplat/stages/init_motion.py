@@ -1,4 +1,4 @@
-"""The motion of the first Gaussians: none, for a long time, but where points were seen in some moments only."""
+"""Initialize the motion of Gaussians: static and long-lived, unless points were seen only part of the time."""
 
 import numpy as np
 import scipy
@@ -10,20 +10,20 @@ from clsplat.gaussians.motion import still
 from clsplat.render.filters import Motion
 from clsplat.scene.scene import Scene
 
-STREAM = 4  # of the random numbers, beside those of the points
-NEIGHBORS = 16  # whose times say whether a point stands still (ours)
-STANDS = 0.18  # spread of those times above which it does (ours); below it moves as they do
+STREAM = 4  # of random numbers, apart from that of the points
+NEIGHBORS = 16  # whose timestamps decide whether a point is static (ours)
+STATIC_SPREAD = 0.18  # of these timestamps, above which a point is static (ours); below, it moves as its neighbors do
 
 
 def require_times(scene: Scene, motion: Motion | None) -> None:
-    """Raise DataError for a scene whose views have no times, where Gaussians are to move."""
+    """Raise DataError if Gaussians are to move and the scene's views have no timestamps."""
     if motion is None:
         return
     if missing := [view.name for view in scene.views if view.time is None]:
-        which = "its views have no times" if len(missing) == len(scene.views) else f"{missing[0]} has no time"
+        which = "its views have no timestamps" if len(missing) == len(scene.views) else f"{missing[0]} has no timestamp"
         raise DataError(
-            f"{scene.path}: {which}, and `model.time` lets Gaussians move; expected a time for each photograph "
-            "(docs/moving.md), or a pipeline of a scene that stands still, such as splat_7k"
+            f"{scene.path}: {which}, which `model.time` needs; give a timestamp for each photograph "
+            "(docs/moving.md), or use a pipeline for static scenes, such as splat_7k"
         )
 
 
@@ -34,10 +34,10 @@ def moving(
     durations: tuple[float, float],
     seed: int,
 ) -> Parameters:
-    """Return the tables of Gaussians with a first motion, where settings let them move, else as they are.
+    """Return the tables of Gaussians with an initial motion if `motion` lets them move, or else unchanged.
 
-    seen: [N] times in which their points were seen; without them times are drawn.  durations: of what stands still, and
-    the shortest of what moves; both by the scene's duration.
+    seen: [N] timestamps at which their points were seen; None: random ones.  durations: of static Gaussians, and the
+    shortest of moving ones, as fractions of the scene's duration.
     """
     if motion is None:
         return parameters
@@ -48,8 +48,9 @@ def moving(
     if seen is not None:
         times = seen.astype(np.float64)
         spread, velocities = drift(parameters["means"].astype(np.float64), times)
-        table[:, fields["velocity"]] = np.where(spread > STANDS, 0, velocities.T).T
-        duration = np.log(np.where(spread > STANDS, durations[0], np.maximum(spread, durations[1])))
+        is_static = spread > STATIC_SPREAD
+        table[:, fields["velocity"]] = np.where(is_static, 0, velocities.T).T
+        duration = np.log(np.where(is_static, durations[0], np.maximum(spread, durations[1])))
     table[:, fields["time_center"]] = times[:, None]
     table[:, fields["log_duration"]] = duration[:, None]
     return {**parameters, MOTION: table}
@@ -58,11 +59,11 @@ def moving(
 def drift(
     positions: NDArray[np.float64], times: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how far apart in time the points near each one were seen, the standard deviation, [N], and how their
-    places follow their times, the slope in least squares, [N, 3] scene units by the scene's duration.
+    """Return the spread and the velocity of the neighbors of each point.
 
-    What stands still is seen at the same place at all moments: 0.29, if they are evenly spread.  What moves is there
-    for a while.
+    The spread is the standard deviation of their timestamps, [N]: 0.29 for static points that are seen at all times,
+    less for moving ones.  The velocity is the least-squares slope of their positions over their timestamps, [N, 3],
+    scene units by the scene's duration.
     """
     nearest = scipy.spatial.cKDTree(positions).query(positions, k=min(NEIGHBORS, len(positions)), workers=-1)[1]
     nearest = nearest.reshape(len(positions), -1)
@@ -74,17 +75,17 @@ def drift(
 
 
 def with_motion(parameters: Parameters, motion: Motion | None, file: str) -> Parameters:
-    """Return the tables of a model file for settings of `model.time`: one that stands still gets a motion of none.
+    """Return the tables of a model file for settings of `model.time`; a static model gets zero motion.
 
-    Raises ConfigError for another motion than that of the settings.
+    Raises ConfigError if the motion of the file differs from the settings.
     """
-    own, expected = (parameters[MOTION].shape[1] if MOTION in parameters else 0), motion.width if motion else 0
-    if own == expected:
+    columns, expected = (parameters[MOTION].shape[1] if MOTION in parameters else 0), motion.width if motion else 0
+    if columns == expected:
         return parameters
-    if own:
-        have = "another degree or rotation" if expected else "no `model.time`"
+    if columns:
+        setting = "another degree or rotation" if expected else "no `model.time`"
         raise ConfigError(
-            f"{file}: holds Gaussians that move, and the pipeline has {have}; give those of the file, "
-            f"or start from one moment of it: `clsplat convert {shell_quote(file)} FRAME.ply --time T`"
+            f"{file}: its Gaussians move, and the pipeline has {setting}; set `model.time` as in the file, "
+            f"or start from one frame: `clsplat convert {shell_quote(file)} FRAME.ply --time T`"
         )
     return {**parameters, MOTION: still(len(parameters["means"]), expected)}

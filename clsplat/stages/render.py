@@ -1,4 +1,4 @@
-"""What a model shows: the views of a split as image files, and a page to walk through."""
+"""Render the views of a split to image files, and write a page to walk through the model."""
 
 import logging
 from collections import Counter
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.errors import pluralize
-from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.metrics.views import render_view
 from clsplat.render.camera import upload_camera
 from clsplat.scene.images import is_image, write_image
@@ -27,19 +26,19 @@ LOG = logging.getLogger("clsplat")
 
 
 class Render(Stage):
-    """Write one PNG for each view of a split, with the name of the view."""
+    """Write a PNG for each view of a split, named after the view."""
 
     stage: Literal["render"] = "render"
     needs: ClassVar[frozenset[str]] = frozenset({"painter"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"split", "folder"})
 
     split: Literal["test", "train", "all"] = "test"
-    """Views that are rendered."""
+    """Views to render."""
     folder: Annotated[str, path_in_run()] = "renders"
     """Path inside the run folder."""
 
     def _views(self, run: Run) -> dict[Path, View]:
-        """The views of the split, by the file of their render."""
+        """Return the views of the split by the path of their render."""
         views = learned_scene(run).downscaled(run.downscale).split(self.split)
         return dict(zip(image_paths(run.out / self.folder, [view.name for view in views]), views, strict=True))
 
@@ -54,25 +53,22 @@ class Render(Stage):
 
 
 def image_paths(folder: Path, views: Sequence[str], suffix: str = ".png") -> list[Path]:
-    """Return the files of views' renders; where two views differ in the suffix alone, it stays in their names."""
+    """Return the paths of the renders; the suffix stays in the names of views that differ only in it."""
     paths = [image_path(folder, view, suffix) for view in views]
     uses = Counter(paths)
     return [path if uses[path] == 1 else folder / f"{view}{suffix}" for path, view in zip(paths, views, strict=True)]
 
 
 def image_path(folder: Path, view: str, suffix: str = ".png") -> Path:
-    """Return the file of a view's render: the view's name below `folder`, with another suffix."""
+    """Return the path of a view's render: the view's name below `folder`, with another suffix."""
     name = PurePosixPath(view)
     return folder / name.with_suffix(suffix) if is_image(name) else folder / f"{view}{suffix}"
 
 
-# The model as a page to walk through.
-
-
 class Viewer(Stage):
-    """Write a page that shows the model from every side, and beside its photographs; it opens offline in any browser.
+    """Write a page that shows the model from any viewpoint and next to its photos; it opens offline in any browser.
 
-    Where it would have more than 200 MB, it has the most important Gaussians that fit, and a warning says so.
+    If the page would exceed 200 MB, it shows only the most important Gaussians, with a warning.
     """
 
     stage: Literal["viewer"] = "viewer"
@@ -81,13 +77,12 @@ class Viewer(Stage):
     file: Annotated[str, path_in_run(".html")] = "viewer.html"
     """Path inside the run folder."""
     photographs: Which = "test"
-    """Views whose photographs are in the page; all views have a thumbnail."""
+    """Views whose photos are in the page; all views have a thumbnail."""
     photograph_budget: Annotated[float, Field(gt=0, le=MAX_SIZE)] = BUDGET
-    """MB of photographs; with more, every second, third, … is in the page."""
+    """MB of photos; with more, only every second, third, … is in the page."""
 
     def run(self, run: Run) -> None:
         path, model = run.out / self.file, host_model(run)
-        shown = with_sky_splats(model)
         scene, name = learned_scene(run).downscaled(run.downscale), run.photographs.background_name
 
         def read(view: View) -> NDArray[np.uint8]:
@@ -97,14 +92,15 @@ class Viewer(Stage):
             return run.status.counted(run.until_interrupted(views), "views", len(scene.views))
 
         views = described(scene, read, self.photographs, self.photograph_budget, through)
-        stand = Viewpoint.from_points(model.means, scene.views, (scene.split("test") or scene.views)[0])
-        page = Page(f"{run.name} · {run.scene_name}", {run.name: pack(shown)}, stand, name, views)
-        if page.size > MAX_SIZE and page.fitting:  # else the photographs are the fault, which the page says
+        viewpoint = Viewpoint.from_points(model.means, scene.views, (scene.split("test") or scene.views)[0])
+        packed = pack(model)
+        page = Page(f"{run.name} · {run.scene_name}", {run.name: packed}, viewpoint, name, views)
+        if page.size > MAX_SIZE and (number := page.max_splats):  # without room for any, `write` blames the photos
             LOG.warning(
-                "%s: shows the %s most important of %s Gaussians, so that browsers can open it; "
-                "`clsplat compress` makes models of fewer",
-                *(path, f"{page.fitting:,}", f"{len(shown):,}"),
+                "%s: shows only the %s most important splats of %s, so that browsers can open it; "
+                "`clsplat compress` makes smaller models",
+                *(path, f"{number:,}", packed.count_text),
             )
-            page = Page(page.title, {run.name: pack(shown, page.fitting)}, stand, name, views)
+            page = Page(page.title, {run.name: pack(model, number)}, viewpoint, name, views)
         page.write(path)
         LOG.info("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)

@@ -1,4 +1,4 @@
-"""Small changes of the model at a cadence: harmonics, opacities, the filter, and averages of the parameters."""
+"""Change the model at a cadence: SH degree, opacities, the filter, and averages of the parameters."""
 
 from collections.abc import Collection
 from typing import Annotated, ClassVar, Literal
@@ -12,7 +12,7 @@ from clsplat.training.stage import ALL_HARMONICS, Scheduled, Stage
 
 
 class RaiseSh(Scheduled):
-    """Add one band of spherical harmonics to the colors."""
+    """Raise the active SH degree by one."""
 
     stage: Literal["raise_sh"] = "raise_sh"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
@@ -26,7 +26,7 @@ class RaiseSh(Scheduled):
 class ResetOpacity(Scheduled):
     """Lower all opacities; training raises those of needed Gaussians, and pruning removes floaters (Kerbl et al. 2023).
 
-    `value` holds after the world filter (Yu et al. 2024).
+    `value` applies after the world filter (Yu et al. 2024).
     """
 
     stage: Literal["reset_opacity"] = "reset_opacity"
@@ -37,7 +37,7 @@ class ResetOpacity(Scheduled):
     value: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Largest opacity after the reset."""
     when_background: Literal["black", "white"] | None = None
-    """Background on which the stage acts; without it, on both."""
+    """Background with which the stage acts; default: with any."""
 
     def stale(self, run: Run) -> Collection[str]:
         return ("logit_opacity",) if self._acts(run) else ()
@@ -54,9 +54,9 @@ class ResetOpacity(Scheduled):
 
 
 class RefreshFilter(Scheduled):
-    """Update the world filter and the sampling intervals, which sizes in pixels depend on, to the present means.
+    """Update the world filter, and the sampling intervals that sizes in pixels depend on, to the current means.
 
-    `init` and every density edit update them too.  For a model without both, the stage has no effect.
+    `init` and every density edit update them too.  Without a filter and sizes in pixels, the stage has no effect.
     """
 
     stage: Literal["refresh_filter"] = "refresh_filter"
@@ -67,15 +67,11 @@ class RefreshFilter(Scheduled):
         run.refresh_filter()
 
 
-# The average of the Gaussians over the last steps of a training, instead of those of the last step.
-
-
 class AddToAverage(Scheduled):
     """Add every parameter to its average over the steps at which this stage runs (Polyak and Juditsky 1992).
 
-    Training goes on from the parameters themselves.  A Gaussian that is new has an average since then.  What an edit
-    changes in Gaussians that stay, such as a reset of opacities, is averaged with what was before: `start` belongs
-    after those.
+    Training continues from the parameters, not from the average.  A new Gaussian is averaged since it exists.  Edits of
+    existing Gaussians, such as a reset of opacities, are averaged with the values before: set `start` after them.
     """
 
     stage: Literal["add_to_average"] = "add_to_average"
@@ -93,9 +89,9 @@ class AddToAverage(Scheduled):
 
 
 class TakeAverage(Stage):
-    """Replace the parameters by their averages; it belongs right behind the training.
+    """Replace the parameters by their averages, right after the training.
 
-    Steps that jump about a good model, at learning rates that are still large, lie around one that is better.
+    While learning rates are large, the parameters oscillate around a better model, which their average approaches.
     """
 
     stage: Literal["take_average"] = "take_average"

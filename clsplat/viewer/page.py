@@ -1,4 +1,4 @@
-"""A page that shows models: one file, which needs no network and opens from a disk."""
+"""Write the viewer page: one file that shows models, needs no network and opens from the disk."""
 
 import base64
 import re
@@ -19,30 +19,28 @@ from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import Packed
 
-# Cameras as the scripts of a page read them.
 
-
-def stand_data(stand: Viewpoint) -> dict[str, Any]:
-    """Return where a page begins to look, as main.js reads it."""
+def viewpoint_data(viewpoint: Viewpoint) -> dict[str, Any]:
+    """Return the first viewpoint of a page, as main.js reads it."""
     return {
-        "pivot": rounded(stand.pivot),
-        "up": rounded(stand.up),
-        "radius": stand.radius,
-        "focal": stand.focal,
-        "start": camera_data(stand.start),
+        "pivot": rounded(viewpoint.pivot),
+        "up": rounded(viewpoint.up),
+        "radius": viewpoint.radius,
+        "focal": viewpoint.focal,
+        "start": camera_data(viewpoint.start),
     }
 
 
 def camera_data(view: View) -> dict[str, Any]:
-    """Return a view's pose, by rows, and its lens as camera.js reads them."""
+    """Return a view's pose, row-major, and its intrinsics, as camera.js reads them."""
     c = view.camera
-    moment = {} if view.time is None else {"time": view.time}
+    time = {} if view.time is None else {"time": view.time}
     lens = [c.fx, c.fy, c.cx, c.cy, c.width, c.height]
-    return {"pose": rounded(view.world_to_camera.ravel()), "lens": lens, **moment}
+    return {"pose": rounded(view.world_to_camera.ravel()), "lens": lens, **time}
 
 
 def rounded(values: NDArray[np.floating]) -> list[float]:
-    """Return numbers as short as single precision reads them."""
+    """Return numbers with the digits that float32 needs."""
     return [float(f"{value:.9g}") for value in np.asarray(values, np.float64).tolist()]
 
 
@@ -51,35 +49,35 @@ SCRIPTS = (
     *("data", "sort", "shaders", "draw", "camera", "motion", "controls", "photographs", "frustums"),
     *("panel", "settings", "time", "main"),
 )
-MOMENTS = 31  # from the first to the last, where the page has no views of several
+TIMESTAMPS = 31  # if the views of the page have a single one, or none
 MAX_SIZE = 200.0  # MB: browsers need several times as much memory
-MARGIN = 0.97  # of that size, for splats that pack worse than the average
-MARK = b'<canvas id="frustums"'  # of viewer.html.j2
+MARGIN = 0.97  # of that size, since important splats may compress worse than the average
+MARK = b'<canvas id="frustums"'  # in viewer.html.j2
 COLORS = {"black": [0, 0, 0], "white": [1, 1, 1]}
 
 
 @dataclass(frozen=True)
 class Page:
-    """What a page shows: models by their names, with one camera, and the views of a scene."""
+    """The contents of a page: models by name, which share a camera, and the views of a scene."""
 
     title: str
     models: Mapping[str, Packed]
-    stand: Viewpoint
+    viewpoint: Viewpoint
     background: str = "black"
     views: Sequence[dict[str, Any]] = field(default_factory=list)
 
     def text(self) -> str:
         """Return the page; the same models and views give the same bytes."""
         names = [view["name"] for view in self.views]
-        first = names.index(self.stand.start.name) if self.stand.start.name in names else -1
+        first = names.index(self.viewpoint.start.name) if self.viewpoint.start.name in names else -1
         info = {
-            **stand_data(self.stand),
+            **viewpoint_data(self.viewpoint),
             "models": [{"name": name, **packed.header} for name, packed in self.models.items()],
             "views": self.views,
             "first": first,
             "background": COLORS[self.background],
             "file": re.sub(r"[^\w.-]+", "_", self.title),
-            **({"moments": self._moments} if self.moves else {}),
+            **({"moments": self._timestamps} if self.moves else {}),
         }
         return render(
             "viewer.html.j2",
@@ -98,37 +96,36 @@ class Page:
         return any("motion" in packed.header for packed in self.models.values())
 
     @property
-    def _moments(self) -> list[float]:
-        """Those of the views, in order."""
-        moments = np.unique([view["time"] for view in self.views if "time" in view])
-        return [float(moment) for moment in (moments if len(moments) > 1 else np.linspace(0, 1, MOMENTS))]
+    def _timestamps(self) -> list[float]:
+        """The timestamps of the views, in order."""
+        times = np.unique([view["time"] for view in self.views if "time" in view])
+        return [float(time) for time in (times if len(times) > 1 else np.linspace(0, 1, TIMESTAMPS))]
 
     @property
     def size(self) -> float:
-        """About the size of the page, MB."""
+        """Approximate size of the page, MB."""
         photographs = sum(len(view["thumbnail"]) + len(view["photograph"] or "") for view in self.views)
         return (photographs + sum(len(packed.data) * 4 / 3 for packed in self.models.values())) / 1e6 + 0.1
 
     @property
-    def fitting(self) -> int:
-        """The number of splats of each model with which a page that is too large is not."""
-        splats = sum(len(packed.data) * 4 / 3 for packed in self.models.values()) / 1e6
+    def max_splats(self) -> int:
+        """Largest number of splats per model with which the page stays below MAX_SIZE."""
+        splats = sum(len(packed.data) * 4 / 3e6 for packed in self.models.values())
         room = max(0.0, MAX_SIZE - (self.size - splats))
         low, high = 0, max(packed.count for packed in self.models.values())
         while low < high:  # a model with fewer splats keeps all of them
             middle = (low + high + 1) // 2
-            held = sum(len(one.data) * 4 / 3 * min(1, middle / max(one.count, 1)) for one in self.models.values()) / 1e6
-            low, high = (middle, high) if held <= MARGIN * room else (low, middle - 1)
+            size = sum(len(p.data) * 4 / 3e6 * min(1, middle / max(p.count, 1)) for p in self.models.values())
+            low, high = (middle, high) if size <= MARGIN * room else (low, middle - 1)
         return low
 
     def write(self, path: Path) -> None:
-        """Write the page.  Raises OutputError where it is too large for browsers, or cannot be written."""
+        """Write the page.  Raises OutputError if it is too large for browsers, or cannot be written."""
         if self.size > MAX_SIZE:
-            splats = (
-                f"the {self.fitting:,} most important splats (--splats {self.fitting}), or " if self.fitting else ""
-            )
+            number = self.max_splats
+            splats = f"only the {number:,} most important splats (--splats {number}), or " if number else ""
             raise OutputError(
-                f"{path}: the page would have {self.size:.0f} MB; browsers open {MAX_SIZE:.0f} MB at most: show "
+                f"{path}: the page would have {self.size:.0f} MB, and browsers open at most {MAX_SIZE:.0f} MB; show "
                 f"{splats}fewer photographs (--photographs, --photograph-budget)"
             )
         write_text(path, self.text())
@@ -137,29 +134,25 @@ class Page:
         facts = {}
         for name, packed in self.models.items():
             header, of = packed.header, f" of {name}" if len(self.models) > 1 else ""
-            faint = f" + {header['faint']:,} too faint to draw" if header["faint"] else ""
-            facts[f"splats{of}"] = f"{packed.count:,}{faint}, SH degree {header['degree']}"
-            kept = ", keeps the energy" if header["compensate"] else ""
-            blur = f"{header['variance']:g} px²{kept}"
-            if "box" in header:
-                blur = f"the pixel's box, drawn here as a blur of {blur}"
-            facts[f"screen filter{of}"] = blur
+            facts[f"splats{of}"] = f"{packed.count_text}, SH degree {header['degree']}"
+            blur = f"{header['variance']:g} px²{', normalized' if header['compensate'] else ''}"
+            facts[f"screen filter{of}"] = f"pixel box, drawn here as a blur of {blur}" if "box" in header else blur
             facts[f"size{of}"] = f"{len(packed.data) / 1e6:.2f} MB"
         return facts | ({"views": f"{len(self.views):,}"} if self.views else {})
 
 
 def is_viewer(path: Path) -> bool:
-    """Return whether a file is such a page.  Raises DataError where it cannot be read."""
+    """Return whether a file is a viewer page.  Raises DataError if it cannot be read."""
     return MARK in read_file(path)
 
 
 def script() -> str:
-    """Return the scripts of the page, in one function."""
+    """Return the scripts of the page as one function."""
     return joined(SCRIPTS)
 
 
 def joined(names: Sequence[str], others: Sequence[str] = ()) -> str:
-    """Return scripts of this folder by their names, and the text of others, in one function."""
+    """Join scripts of this folder, given by name, and the texts of others into one function."""
     parts = [*((FOLDER / f"{name}.js").read_text("utf-8") for name in names), *others]
     return '(() => {\n"use strict";\n' + "\n".join(parts) + "})();\n"
 
@@ -169,9 +162,9 @@ def style() -> str:
     return (FOLDER / "viewer.css").read_text("utf-8")
 
 
-# The views of a page: cameras, thumbnails, and photographs as far as a budget of bytes goes.
+# The views of a page: cameras, thumbnails, and photos within a budget of bytes.
 
-Which = Literal["none", "test", "all"]  # views whose photographs are in the page
+Which = Literal["none", "test", "all"]  # views whose photos are in the page
 THUMBNAIL, LARGEST = 128, 1000  # px, the longer side
 BUDGET = 4.0  # MB of photographs
 Image = NDArray[np.uint8]
@@ -186,8 +179,8 @@ def described(
 ) -> list[dict[str, Any]]:
     """Return every view of a scene as photographs.js reads it.
 
-    read: returns a photograph, RGB at the camera's size; budget: MB of photographs, of which every second, third, …
-    is left out until the others fit; through: what the views pass, such as a display of progress.
+    read: returns a photo, RGB at the camera's size.  budget: MB of photos; with more, only every second, third, …
+    stays.  through: wraps the iteration over views, such as with a progress bar.
     """
     test = {view.name for view in scene.split("test")}
     views: list[dict[str, Any]] = []
@@ -199,14 +192,13 @@ def described(
         views.append(
             {"name": view.name, "split": split, "thumbnail": thumbnail, "photograph": photograph, **camera_data(view)}
         )
-    held = [view for view in views if view["photograph"]]
-    for i in left_out([len(view["photograph"]) for view in held], round(1e6 * budget)):
-        held[i]["photograph"] = None
+    with_photo = [view for view in views if view["photograph"]]
+    for i in left_out([len(view["photograph"]) for view in with_photo], round(1e6 * budget)):
+        with_photo[i]["photograph"] = None
     return views
 
 
 def left_out(sizes: list[int], budget: int) -> set[int]:
-    """Return the indices to leave out, so that every n-th stays and their sum is at most `budget`."""
+    """Return the indices to leave out so that every n-th stays and their sum is at most `budget`."""
     every = next((n for n in range(1, len(sizes) + 1) if sum(sizes[::n]) <= budget), len(sizes) + 1)
-    kept = set(range(0, len(sizes), every)) if every <= len(sizes) else set()
-    return set(range(len(sizes))) - kept
+    return {i for i in range(len(sizes)) if every > len(sizes) or i % every}

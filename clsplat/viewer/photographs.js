@@ -1,6 +1,13 @@
-// The filmstrip of views, and the photograph of the chosen one over the picture.
+// The filmstrip of views, and the photo of the chosen view over the render.
 
 const COMPARISONS = ["off", "slider", "blink", "fade"], BLINK = 600; // ms
+
+// The start that all names share, up to a separator, such as "images/IMG_2024_".
+function commonPrefix([first = "", ...others]) {
+  let length = first.length;
+  for (const name of others) while (!name.startsWith(first.slice(0, length))) length--;
+  return first.slice(0, length).match(others.length ? /^.*[/_ -]/ : /^.*[/]/)?.[0] ?? "";
+}
 
 class Photographs {
   constructor(viewer, views) {
@@ -11,7 +18,8 @@ class Photographs {
     this.bar = document.getElementById("comparison");
     this.range = this.bar.querySelector("input");
     this.line = this.frame.querySelector("i");
-    this.items = views.map((view, i) => this.item(view, i));
+    const prefix = commonPrefix(views.map(view => view.name));
+    this.items = views.map((view, i) => this.item(view, i, view.name.slice(prefix.length)));
     choices("comparison", "comparison", name => this.compare(name));
     this.range.addEventListener("input", () => { this.share = this.range.value / 100; this.place(); });
     this.line.addEventListener("pointerdown", event => this.line.setPointerCapture(event.pointerId));
@@ -25,17 +33,16 @@ class Photographs {
     if (!views.length) this.strip.remove();
   }
 
-  item(view, i) {
+  item(view, i, label) {
     const [item, image, name] = ["button", "img", "span"].map(kind => document.createElement(kind));
     item.className = view.split;
-    item.title = `${view.name} (${view.split})${view.photograph ? "" : ", without its photograph"}`;
+    item.title = `${view.name} (${view.split})${view.photograph ? "" : ", photo not included"}`;
     if (!view.thumbnail.startsWith("data:")) image.loading = "lazy"; // a server has to read it first
     image.src = view.thumbnail;
     image.alt = "";
     [image.width, image.height] = [Math.round(64 * view.lens[4] / view.lens[5]), 64];
     image.draggable = false;
-    const stem = view.name.split("/").pop().replace(/\.\w+$/, "");
-    name.textContent = stem.length > 8 && image.width < 80 ? `…${stem.slice(-5)}` : stem;
+    name.textContent = label.length > 9 && image.width < 80 ? `…${label.slice(-8)}` : label;
     item.append(image, name);
     item.addEventListener("click", () => this.choose(i));
     this.strip.append(item);
@@ -62,7 +69,7 @@ class Photographs {
     this.choose((last + by + this.views.length) % this.views.length);
   }
 
-  // The camera has come to the view: its photograph can be shown.
+  // The camera has arrived at the view: its photo can be shown.
   arrived() {
     const view = this.views[this.chosen];
     this.frame.hidden = false;
@@ -73,7 +80,7 @@ class Photographs {
     this.place();
   }
 
-  // The camera moves on its own way.
+  // The camera leaves the view.
   leave() {
     if (this.chosen < 0) return;
     this.items[this.chosen].removeAttribute("aria-current");
@@ -96,7 +103,7 @@ class Photographs {
     if (!this.bar.hidden) this.compare(COMPARISONS[(COMPARISONS.indexOf(this.comparison) + 1) % COMPARISONS.length]);
   }
 
-  // Lay the photograph exactly over the area that its camera sees.
+  // Lay the photo exactly over the area that its camera sees.
   place() {
     if (this.frame.hidden || this.chosen < 0) return;
     const {width, height} = this.viewer.pane(), {lens} = this.views[this.chosen];

@@ -37,11 +37,12 @@ class Settings extends Panel {
     find("angle").textContent = `${Math.round(angle)}°`;
   }
 
-  // ms: of a frame while moving, null when not measured; scale: of the picture's resolution
+  // ms: of a frame during motion, or null; scale: of the resolution
   statistics(ms, scale) {
     const {layers} = this.viewer;
-    const parts = layers.map(({drawn, header: {name, count, faint}}) =>
+    const parts = layers.map(({drawn, header: {name, count, faint, sky}}) =>
       `${layers.length > 1 ? `${name}: ` : ""}${thousands(drawn)} of ${thousands(count)} splats` +
+      (sky ? `, ${thousands(sky)} of the sky` : "") +
       (faint ? ` + ${thousands(faint)} too faint to draw` : ""));
     if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms a frame`);
     if (scale < 1) parts.push(`${Math.round(100 * scale)} % resolution`);

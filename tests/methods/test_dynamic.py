@@ -110,7 +110,7 @@ def test_view_without_a_time_shows_the_first_moment_and_says_so(finished, scene,
 
 
 def test_a_scene_that_stands_still_is_refused(tiny_scene, tmp_path):
-    with pytest.raises(DataError, match=r"its views have no times, and `model\.time`"):
+    with pytest.raises(DataError, match=r"its views have no timestamps, which `model\.time`"):
         train_overridden(tiny_scene, tmp_path / "run", pipeline="dynamic_7k")
 
 

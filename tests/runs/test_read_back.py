@@ -162,5 +162,5 @@ def test_a_writer_that_loses_bytes_is_noticed_at_once(tiny_scene, tmp_path, monk
         return result
 
     monkeypatch.setattr(Model, "save", saved_and_cut)
-    with pytest.raises(OutputError, match=r"early\.ply: .*truncated.*written just now"):
+    with pytest.raises(OutputError, match=r"early\.ply: .*truncated.*just written"):
         Job.open("smoke", tiny_scene, tmp_path / "run", SETTINGS).run()

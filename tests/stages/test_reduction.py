@@ -191,7 +191,7 @@ def test_a_measured_file_lies_in_the_run_folder(tmp_path):
 def test_a_quality_is_of_formats_that_have_one(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("name: x\nstages:\n  - init\n  - export: {file: a.glb, quality: small}\n")
-    with pytest.raises(ConfigError, match=r"'quality' is of SPZ and SOG; .* got 'a.glb'"):
+    with pytest.raises(ConfigError, match=r"'quality' applies to SPZ and SOG; .* got 'a.glb'"):
         load_pipeline(str(path))
 
 

@@ -262,7 +262,7 @@ def test_gaussians_of_a_sky_have_its_colors_in_all_directions(rng, learned):
 def test_what_a_sky_cannot_be_is_said(tiny_scene, yard, tmp_path, caplog):
     """Of transparent photographs, and as splats of a model that has none."""
     transparent = "the photographs have transparency: what is learned and exported as a sky is the color that"
-    nothing = "export.sky: splats changes nothing: the model has no sky"
+    nothing = "export.sky: splats has no effect: the model has no sky"
     few = ("optimize.steps=2", "init.count=60", "optimize.during=[]")
     for scene, key, said in (
         (tiny_scene, "model.background={type: envmap, side: 8}", [True, False]),

@@ -303,8 +303,7 @@ def test_hostile_names_are_text(browser, tmp_path):
     assert browser.run("document.querySelector('h1').textContent") == HOSTILE
     assert browser.run("document.getElementById('caption').textContent") == f"{HOSTILE}/a.png"
     assert (
-        browser.run("document.querySelectorAll('#strip button')[1].title")
-        == f"b/{HOSTILE} (train), without its photograph"
+        browser.run("document.querySelectorAll('#strip button')[1].title") == f"b/{HOSTILE} (train), photo not included"
     )
     assert browser.run("document.querySelectorAll('script').length") == 2, "the scene and the program"
 

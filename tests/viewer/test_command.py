@@ -122,7 +122,7 @@ def test_run_with_too_many_splats_shows_the_most_important(tiny_scene, tmp_path,
     monkeypatch.setattr("clsplat.stages.render.MAX_SIZE", 0.25)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set={**SHORT, "init.count": 8000})
     assert (out / "viewer.html").stat().st_size < 250_000
-    assert any("most important of" in record.message for record in caplog.records)
+    assert any("most important splats of" in record.message for record in caplog.records)
 
 
 def test_the_command_and_the_function_write_the_same_bytes(run, tiny_scene, tmp_path):
@@ -227,6 +227,6 @@ def test_errors_of_the_function(run, tmp_path, monkeypatch):
         clsplat.view(alone, out=tmp_path / "a.html", photographs="all")
     Path(alone).unlink()
     monkeypatch.setattr(module, "MAX_SIZE", 0.15)
-    with pytest.raises(OutputError, match=r"browsers open .* at most: show the [\d,]+ most important splats"):
+    with pytest.raises(OutputError, match=r"browsers open at most .*; show only the [\d,]+ most important splats"):
         clsplat.view(run, out=tmp_path / "a.html")
     assert list(tmp_path.iterdir()) == []

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.viewer.packing import BLOCK, FLATTEST, KNEE, LEAST_RANGE, LEVELS, STEPS, pack
+from clsplat.viewer.packing import BLOCK, KNEE, LEVELS, MAX_LOG_RATIO, MIN_RANGE, STEPS, pack
 from tests.support.viewer_data import unpacked
 from tests.support.viewer_pages import MIP, cloud
 
@@ -46,11 +46,11 @@ def test_what_comes_out_is_what_went_in(count, degree):
         assert (np.abs(after[part] - before[part]) <= 0.51 * np.ptp(before[part], axis=0) / STEPS + 1e-6).all()
     unit = model.quats / np.linalg.norm(model.quats, axis=1, keepdims=True)
     assert (np.abs((found.quats * unit).sum(axis=1)) > 1 - 2e-6).all(), "0.2 degrees"
-    logs = np.maximum(model.log_scales, model.log_scales.max(axis=1, keepdims=True) - FLATTEST)
+    logs = np.maximum(model.log_scales, model.log_scales.max(axis=1, keepdims=True) - MAX_LOG_RATIO)
     assert np.abs(np.log(found.scales) - logs).max() < 0.03
     assert np.abs(found.opacities - model.opacities).max() < 0.003
     assert np.abs(found.sh[:, 0] - model.sh_base).max() < 0.03
-    half_steps = np.hypot(KNEE, model.sh_rest) * np.arcsinh(LEAST_RANGE / KNEE) / 254  # the slope of the table's sinh
+    half_steps = np.hypot(KNEE, model.sh_rest) * np.arcsinh(MIN_RANGE / KNEE) / 254  # the slope of the table's sinh
     assert (np.abs(found.sh[:, 1:].reshape(count, -1) - model.sh_rest) <= 1.02 * half_steps).all()
 
 

@@ -40,9 +40,9 @@ def test_the_same_input_gives_the_same_page(page, tmp_path):
 
 def test_names_are_escaped(page):
     views = [{**view, "name": f"{HOSTILE}{i}"} for i, view in enumerate(page.views)]
-    start = replace(page.stand.start, name=f"{HOSTILE}0")
+    start = replace(page.viewpoint.start, name=f"{HOSTILE}0")
     models = {HOSTILE: page.models["model"], f"{HOSTILE}B": page.models["model"]}
-    text = replace(page, title=HOSTILE, models=models, views=views, stand=replace(page.stand, start=start)).text()
+    text = replace(page, title=HOSTILE, models=models, views=views, stand=replace(page.viewpoint, start=start)).text()
     parsed = Parsed(text)
     assert parsed.elements["script"] == 4, "the scene, two models and the program"
     assert parsed.text.count(HOSTILE) == 2 + 2 + 2 * 3, "title twice, a label and three facts of each model"
@@ -57,7 +57,7 @@ def test_splats_too_faint_to_draw_are_told(page):
     model.logit_opacity[:] = 0
     model.logit_opacity[:7] = -6
     faint = replace(page, models={"model": pack(model)})
-    assert "<dd>53 + 7 too faint to draw, SH degree" in faint.text()
+    assert "<dd>53 Gaussians + 7 too faint to draw, SH degree" in faint.text()
     model.logit_opacity[:] = 0
     assert "too faint to draw, SH" not in replace(page, models={"model": pack(model)}).text()
 
@@ -97,7 +97,7 @@ def test_scripts_are_short_and_part_of_the_page():
 def test_a_page_that_browsers_cannot_open_is_refused(page, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MAX_SIZE", 0.95 * page.size)
     with pytest.raises(
-        OutputError, match=r"page would have 0 MB; .*show the \d+ most important splats \(--splats \d+\)"
+        OutputError, match=r"page would have 0 MB, .*show only the \d+ most important splats \(--splats \d+\)"
     ):
         page.write(tmp_path / "page.html")
     assert not list(tmp_path.iterdir())
@@ -106,7 +106,7 @@ def test_a_page_that_browsers_cannot_open_is_refused(page, tmp_path, monkeypatch
 def test_of_a_page_with_too_many_photographs_these_are_the_fault(page, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MAX_SIZE", 0.2)
     large = replace(page, views=[{"name": "a", "thumbnail": "", "photograph": "x" * 300_000}])
-    with pytest.raises(OutputError, match="at most: show fewer photographs") as raised:
+    with pytest.raises(OutputError, match="at most 0 MB; show fewer photographs") as raised:
         large.write(tmp_path / "page.html")
     assert "splats" not in str(raised.value)
 
@@ -115,15 +115,15 @@ def test_as_many_splats_fit_as_the_advice_says(page, monkeypatch):
     model = cloud(4000)
     large = replace(page, models={"model": pack(model)})
     monkeypatch.setattr(module, "MAX_SIZE", 0.7 * large.size)
-    assert 500 < large.fitting < 3000
-    fitting = replace(large, models={"model": pack(model, large.fitting)})
+    assert 500 < large.max_splats < 3000
+    fitting = replace(large, models={"model": pack(model, large.max_splats)})
     assert 0.5 * module.MAX_SIZE < fitting.size <= module.MAX_SIZE
 
 
 def test_a_small_model_beside_a_large_one_keeps_its_splats(page, monkeypatch):
     large = replace(page, models={"a": pack(cloud(4000)), "b": pack(cloud(40))})
     monkeypatch.setattr(module, "MAX_SIZE", 0.7 * large.size)
-    assert 500 < large.fitting < 3000
+    assert 500 < large.max_splats < 3000
 
 
 def test_the_size_is_that_of_the_file(page, tmp_path):

@@ -25,7 +25,7 @@ from clsplat.runs.live.preview import Credit, Desk, Kind, Pace, PageCamera, Show
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
-from clsplat.viewer.page import camera_data, joined, stand_data, style
+from clsplat.viewer.page import camera_data, joined, style, viewpoint_data
 
 # What a browser asks, and who may ask: GET alone, by a name of this machine, below a secret path.
 
@@ -213,7 +213,7 @@ def scene_data(number: int, title: str, views: Sequence[View], test: set[str], s
 
     first = next((i for i, view in enumerate(views) if view is stand.start), -1)
     described_views = [described(i, view) for i, view in enumerate(views)]
-    return {"number": number, "title": title, **stand_data(stand), "views": described_views, "first": first}
+    return {"number": number, "title": title, **viewpoint_data(stand), "views": described_views, "first": first}
 
 
 # The answers of the server: the page, the scene, the state, pictures, and the two buttons.
