@@ -394,7 +394,7 @@ def convert(
     file of its own: `out` is a folder, for PLY, or the name whose number is still to come.
     """
     from clsplat.gaussians import conversion
-    from clsplat.gaussians.conversion import checked_time, convert_frames
+    from clsplat.gaussians.conversion import check_time, convert_frames
     from clsplat.runs.model_file import refuse_field
 
     files = [Path(source) for source in ([sources] if isinstance(sources, str | Path) else sources)]
@@ -404,10 +404,10 @@ def convert(
     options = conversion.ConversionOptions(sh_bits, axes, quality, keep_nan)
     changes = conversion.Changes(
         drop_below,
-        None if transform is None else conversion.transform_of(transform),
-        None if box is None else conversion.crop_of(box),
-        conversion.checked_degree(sh_degree),
-        checked_time(time),
+        None if transform is None else conversion.parse_transform(transform),
+        None if box is None else conversion.parse_crop(box),
+        conversion.check_degree(sh_degree),
+        check_time(time),
     )
     if frames is not None:
         return convert_frames(files, Path(out), frames, changes, options)

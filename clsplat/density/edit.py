@@ -22,7 +22,7 @@ from clsplat.density.statistics import SEEN, SplatStats, Statistic
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale, Threshold
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.gaussians.structs import checked_rows, moment_tables
+from clsplat.gaussians.structs import check_rows, moment_tables
 
 MAX_ROWS = 2**32 - 2  # cl_kernels/scan.cl saturates at 2**32 - 1, which marks an overflow
 
@@ -193,12 +193,12 @@ class Edit:
         """Write values, [n, copies, components], of a table into the rows that distinct Gaussians, [n], become.
 
         Gaussians that end with another number of rows, because growth was undone, stay as they are.  Raises
-        ValueError for invalid rows (`checked_rows`) and for values of a wrong shape.
+        ValueError for invalid rows (`check_rows`) and for values of a wrong shape.
         """
         components = self.gaussians.tables[name].components
         if values.ndim != 3 or len(values) != len(rows) or values.shape[2] != components:
             raise ValueError(f"{name}: expected [{len(rows)}, copies, {components}], got {list(values.shape)}")
-        self.children.append((name, checked_rows(rows, self.gaussians.count), values))
+        self.children.append((name, check_rows(rows, self.gaussians.count), values))
 
     def zero_moments(self, rows: NDArray[np.integer], parameters: Collection[str] | None = None) -> None:
         """Set Adam's moments of distinct rows, [n], to zero, for some parameters or for all that are trained."""

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError
 from clsplat.core.reading import open_file
 from clsplat.formats.packing import from_smallest_three
-from clsplat.formats.ply import MAX_HEADER, PlyHeader, comment_of, mode_of, parse_ply_header
-from clsplat.formats.splats import MAX_DEGREE, SH_C0, SplatFile, logits, require_held, sh_coefficients, swapped
+from clsplat.formats.ply import MAX_HEADER, PlyHeader, parse_ply_header, render_mode, rendering_of
+from clsplat.formats.splats import MAX_DEGREE, SH_C0, SplatFile, logits, reorder_columns, require_size, sh_coefficients
 
 CHUNK = 256  # splats
 BITS = (11, 10, 11)  # of x, y, and z
@@ -43,7 +43,7 @@ def read_compressed_ply(path: Path) -> SplatFile:
             if (section := header.sections.get(name)) is None:
                 continue
             length = section.count * section.dtype.itemsize
-            require_held(path, size, section.start + length, f"{section.count} rows of '{name}'")
+            require_size(path, size, section.start + length, f"{section.count} rows of '{name}'")
             file.seek(section.start)
             tables[name] = np.ndarray(section.count, section.dtype, file.read(length))
     chunks, vertices = _checked(path, header, tables)
@@ -58,7 +58,7 @@ def read_compressed_ply(path: Path) -> SplatFile:
         "sh_base": ((color - 0.5) / SH_C0).astype(np.float32),
         "sh_rest": rest,
     }
-    return SplatFile(parameters, comment_of(path, header), mode_of(header))
+    return SplatFile(parameters, rendering_of(path, header), render_mode(header))
 
 
 def _checked(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -90,7 +90,7 @@ def _harmonics(path: Path, table: NDArray[Any] | None, count: int) -> NDArray[np
     share = (np.arange(256) + 0.5) / 256
     share[0], share[255] = 0, 1
     levels = ((share - 0.5) * SH_RANGE).astype(np.float32)
-    return swapped(levels[table.view("u1").reshape(count, columns)], 3, columns // 3)
+    return reorder_columns(levels[table.view("u1").reshape(count, columns)], 3, columns // 3)
 
 
 def _fields(packed: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]:

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, one_line, quote
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file
-from clsplat.formats.packing import Output, written
-from clsplat.formats.ply import checked_numbers
+from clsplat.formats.packing import Output, open_hashed
+from clsplat.formats.ply import check_rendering
 from clsplat.formats.splats import (
     MAX_DEGREE,
     MAX_FILE,
@@ -28,11 +28,11 @@ from clsplat.formats.splats import (
     Parameters,
     SplatFile,
     Writing,
-    flipped,
+    flip_axes,
     logits,
     logs,
     opacities,
-    require_some,
+    require_gaussians,
     unit,
 )
 
@@ -196,16 +196,16 @@ def read_glb(path: Path) -> SplatFile:
         ) from error
     if len(degrees) > 1:
         raise DataError(f"{path}: its parts have different SH degrees; expected one: export them apart")
-    parameters = flipped({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    parameters = flip_axes({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
     ours = extras.get("clsplat") if isinstance(extras, dict) else None
-    rendering = checked_numbers(path, ours) if isinstance(ours, dict) else {}
+    rendering = check_rendering(path, ours) if isinstance(ours, dict) else {}
     return SplatFile(parameters, rendering, "mip" if rendering.get("compensate") else "default", found.placement)
 
 
 def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write Gaussians as one primitive.  Raises OutputError."""
-    require_some(path, splats)
-    p = flipped(splats.parameters)
+    require_gaussians(path, splats)
+    p = flip_axes(splats.parameters)
     attributes = _attributes(p)
     views: list[Any] = []
     accessors: list[Any] = []
@@ -242,7 +242,7 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
     }
     text = json.dumps(tree, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    with written(path) as file:
+    with open_hashed(path) as file:
         file.write(struct.pack("<4s2I", MAGIC, 2, 12 + 8 + len(text) + 8 + start))
         file.write(struct.pack("<2I", len(text), JSON) + text + struct.pack("<2I", start, BINARY))
         for block in blocks:
@@ -343,8 +343,8 @@ def ParticleField3DGaussianSplat "Gaussians"
 
 def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write a `.usda` file.  Raises OutputError."""
-    require_some(path, splats)
-    p = flipped(splats.parameters)
+    require_gaussians(path, splats)
+    p = flip_axes(splats.parameters)
     scales = np.exp(np.clip(p["log_scales"].astype(np.float64), -80, 80))
     around = EXTENT * scales.max(axis=1, keepdims=True)
     extent = np.stack([(p["means"] - around).min(axis=0), (p["means"] + around).max(axis=0)])
@@ -357,7 +357,7 @@ def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
         "float[] opacities": opacities(p["logit_opacity"]),
         "float3[] radiance:sphericalHarmonicsCoefficients": harmonics,
     }
-    with written(path) as file:
+    with open_hashed(path) as file:
         file.write(START.encode())
         file.write(f"    uniform int radiance:sphericalHarmonicsDegree = {splats.sh_degree}\n".encode())
         for name, table in tables.items():

@@ -61,12 +61,12 @@ def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return values
 
 
-def beyond_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
+def outside_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which levels no byte holds, by more than rounding, as the shape of `levels`."""
     return (levels < -0.5) | (levels > 255.5)
 
 
-def tell_cut(path: Path, name: str, what: str, beyond: NDArray[np.bool_]) -> None:
+def warn_clipped(path: Path, name: str, what: str, beyond: NDArray[np.bool_]) -> None:
     """Log how many Gaussians, rows of `beyond`, have values outside of what a format holds."""
     if count := int(beyond.any(axis=1).sum()):
         LOG.warning("%s: %s holds %s; those of %s Gaussians were cut", path, name, what, f"{count:,}")
@@ -159,13 +159,13 @@ class Output:
 
 def write_bytes(path: Path, data: bytes) -> str:
     """Write a file and return its SHA-256.  Raises OutputError."""
-    with written(path) as file:
+    with open_hashed(path) as file:
         file.write(data)
     return file.sha256
 
 
 @contextmanager
-def written(path: Path) -> Iterator[Output]:
+def open_hashed(path: Path) -> Iterator[Output]:
     """Open a file as `open_atomic` does.  Raises OutputError."""
     with open_atomic(path) as file:
         yield Output(file)

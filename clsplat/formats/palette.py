@@ -89,7 +89,7 @@ def _first_cuts(ordered: NDArray[np.float64]) -> NDArray[np.int64]:
     return cuts.astype(np.int64)
 
 
-def nearest(values: NDArray[np.floating], entries: NDArray[np.float64]) -> NDArray[np.uint8]:
+def nearest_entries(values: NDArray[np.floating], entries: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Return the index of the nearest entry for each value."""
     return np.searchsorted((entries[1:] + entries[:-1]) / 2, values).astype(np.uint8)
 
@@ -103,7 +103,7 @@ def palette(
     from its own.  At most 45 components.  `weights`, [N], say how much errors count: a point is in that share as often
     as its weight says.  Points that are at most `entries` different ones stay.
     """
-    if (kept := different(points, entries)) is not None:
+    if (kept := unique_points(points, entries)) is not None:
         return kept
     whole = _whole_numbers(points)
     chosen = _drawn(len(points), SAMPLE * entries, weights)
@@ -155,11 +155,11 @@ def _drawn(count: int, most: int, weights: NDArray[np.float64]) -> NDArray[np.in
 
 def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Values as whole numbers from -LEVELS to LEVELS."""
-    largest = usual_largest(values) or np.float32(1)
+    largest = robust_max(values) or np.float32(1)
     return np.asarray(np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS)))
 
 
-def different(points: NDArray[np.float32], most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+def unique_points(points: NDArray[np.float32], most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Return the points that differ, in their order, and the label of each; None where more than `most` do."""
     if len(np.unique(points[:, 0])) > most:  # at once for most models
         return None
@@ -172,7 +172,7 @@ def different(points: NDArray[np.float32], most: int) -> tuple[NDArray[np.float6
     return found[order].astype(np.float64), place[labels.reshape(-1)]
 
 
-def usual_largest(values: NDArray[np.float32]) -> np.float32:
+def robust_max(values: NDArray[np.float32]) -> np.float32:
     """Return the size that all values but a share TAIL do not exceed; 0 of none."""
     size = np.abs(values).ravel()
     place = min(int((1 - TAIL) * size.size), size.size - 1)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quote, shorten
 from clsplat.core.reading import open_file
-from clsplat.formats.packing import written
+from clsplat.formats.packing import open_hashed
 from clsplat.formats.splats import (
     FLAT_LOG_SCALE,
     MAX_DEGREE,
@@ -30,11 +30,11 @@ from clsplat.formats.splats import (
     PARAMETERS,
     Parameters,
     SplatFile,
-    columns_among,
-    columns_of,
-    require_held,
+    find_motion_columns,
+    motion_columns,
+    reorder_columns,
+    require_size,
     sh_coefficients,
-    swapped,
 )
 
 # The header of a PLY file: comments, and place and properties of its vertices.
@@ -197,11 +197,11 @@ def read_ply(path: Path) -> SplatFile:
         header = parse_ply_header(path, file.read(MAX_HEADER))
         if header.format == "ascii":
             raise DataError(f"{path}: is an ascii PLY; expected binary_little_endian or big_endian: export it again")
-        rendering, size = comment_of(path, header), header.count * header.dtype.itemsize
-        require_held(path, file.seek(0, os.SEEK_END), header.start + size, f"{header.count} splats")
+        rendering, size = rendering_of(path, header), header.count * header.dtype.itemsize
+        require_size(path, file.seek(0, os.SEEK_END), header.start + size, f"{header.count} splats")
         file.seek(header.start)
         parameters = _read(path, file, header)
-    return SplatFile(parameters, rendering, "mip" if "filter_variance" in parameters else mode_of(header))
+    return SplatFile(parameters, rendering, "mip" if "filter_variance" in parameters else render_mode(header))
 
 
 def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> str:
@@ -214,9 +214,11 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     names += [f"f_rest_{i}" for i in range(parameters["sh_rest"].shape[1])]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     names += [FILTER] if "filter_variance" in parameters else []
-    names += columns_of(parameters[MOTION].shape[1]) if MOTION in parameters else ()
-    with written(path) as file:
-        file.write(format_ply_header(comments(rendering), vertex=(count, (f"float {name}" for name in names))))
+    names += motion_columns(parameters[MOTION].shape[1]) if MOTION in parameters else ()
+    with open_hashed(path) as file:
+        file.write(
+            format_ply_header(rendering_comments(rendering), vertex=(count, (f"float {name}" for name in names)))
+        )
         for first in range(0, count, ROWS):
             file.write(_body({name: table[first : first + ROWS] for name, table in parameters.items()}))
     return file.sha256
@@ -229,7 +231,7 @@ def _body(parameters: Parameters) -> bytes:
         parameters["means"],
         np.zeros((count, 3), np.float32),
         parameters["sh_base"],
-        swapped(parameters["sh_rest"], rest // 3, 3),
+        reorder_columns(parameters["sh_rest"], rest // 3, 3),
         parameters["logit_opacity"],
         parameters["log_scales"],
         parameters["quats"],
@@ -239,28 +241,28 @@ def _body(parameters: Parameters) -> bytes:
     return np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4").tobytes()
 
 
-def comments(rendering: dict[str, Any]) -> list[str]:
+def rendering_comments(rendering: dict[str, Any]) -> list[str]:
     """Return the comments of a header that say how a model is rendered."""
     mode = "mip" if rendering.get("compensate") else "default"
     return [f"{RENDERING}{json.dumps(rendering, sort_keys=True, allow_nan=False)}", f"{MODE}{mode}"]
 
 
-def mode_of(header: PlyHeader) -> str:
+def render_mode(header: PlyHeader) -> str:
     """Return `mip` where a comment of any program says so, else `default`."""
     return "mip" if any(MIP.match(text) for text in header.comments) else "default"
 
 
-def comment_of(path: Path, header: PlyHeader) -> dict[str, Any]:
+def rendering_of(path: Path, header: PlyHeader) -> dict[str, Any]:
     """Return the numbers of our comment; none where there is another.  Raises DataError for an invalid one."""
     text = next((text.removeprefix(RENDERING) for text in header.comments if text.startswith(RENDERING)), "")
     try:
         values = json.loads(text or "{}")
     except (ValueError, RecursionError):
         return {}
-    return checked_numbers(path, values) if isinstance(values, dict) else {}
+    return check_rendering(path, values) if isinstance(values, dict) else {}
 
 
-def checked_numbers(path: Path, values: dict[str, Any]) -> dict[str, Any]:
+def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
     """Return what a file says about rendering.  Raises DataError for an invalid number."""
     for name in NUMBERS:
         value = values.get(name)
@@ -312,14 +314,14 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     parameters = {name: _columns(vertices, columns) for name, columns in columns_of.items()}
     by_channel = _columns(vertices, columns)
     per_channel = sh_coefficients(degree) - 1
-    parameters["sh_rest"] = swapped(by_channel, 3, per_channel)
+    parameters["sh_rest"] = reorder_columns(by_channel, 3, per_channel)
     if parameters["log_scales"].shape[1] == 2:
         parameters["log_scales"] = np.pad(parameters["log_scales"], ((0, 0), (0, 1)), constant_values=FLAT_LOG_SCALE)
     parameters = {name: parameters[name] for name in PARAMETERS}
     if FILTER in names:
         with np.errstate(over="ignore"):  # infinity is refused
             parameters["filter_variance"] = np.square(_columns(vertices, (FILTER,)))
-    moving = columns_among(names)
+    moving = find_motion_columns(names)
     if moving is None:
         raise DataError(
             f"{path}: has some properties of a motion and lacks others; expected velocity_0..2, time_center and "
@@ -353,7 +355,7 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
         if (header.dtype, header.comments) != (first.dtype, first.comments):
             raise DataError(f"{part}: has other properties, or another comment, than {parts[0]}; train both alike")
     properties = [f"float {name}" for name in first.dtype.names or ()]
-    with written(path) as output:
+    with open_hashed(path) as output:
         output.write(format_ply_header(first.comments, vertex=(count, properties)))
         for number, (part, header) in enumerate(zip(parts, headers, strict=True)):
             with open_file(part, "a PLY file") as file:

@@ -29,16 +29,16 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_file, read_json
 from clsplat.formats import packing
 from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, write_bytes
-from clsplat.formats.palette import codebook, different, nearest, palette
-from clsplat.formats.ply import checked_numbers
+from clsplat.formats.palette import codebook, nearest_entries, palette, unique_points
+from clsplat.formats.ply import check_rendering
 from clsplat.formats.sog_quantize import (
-    base_for,
+    compensate_base,
     log_weights,
-    rounded,
-    rounded_quats,
+    round_means,
+    round_quats,
+    round_to,
     tree_palette,
     visible_form,
-    weighed_means,
 )
 from clsplat.formats.splats import (
     MAX_DEGREE,
@@ -49,8 +49,8 @@ from clsplat.formats.splats import (
     Writing,
     logits,
     opacities,
-    require_moderate,
-    require_some,
+    require_gaussians,
+    require_in_range,
     sh_coefficients,
     unit,
 )
@@ -66,7 +66,7 @@ RATIO = 2  # most bytes of images that one byte of a ZIP may stand for: they are
 SLACK = 1 << 16  # bytes, or px, beyond what the numbers need
 
 
-def with_images(path: Path) -> list[Path]:
+def sog_folder_files(path: Path) -> list[Path]:
     """Return a meta.json and the images beside it that it names and that are there; of a damaged one it alone."""
     try:
         meta = read_json(path, limit=MAX_META)
@@ -75,11 +75,11 @@ def with_images(path: Path) -> list[Path]:
     parts = [meta.get(name) for name in (*PARTS, "shN")] if isinstance(meta, dict) else []
     lists = [part.get("files") for part in parts if isinstance(part, dict)]
     names = {name: None for one in lists if isinstance(one, list) for name in one if isinstance(name, str)}
-    images = [path.with_name(name) for name in names if is_beside(name) and name != META]
+    images = [path.with_name(name) for name in names if is_sibling(name) and name != META]
     return [path, *filter(os.path.isfile, images)]
 
 
-def is_beside(name: str) -> bool:
+def is_sibling(name: str) -> bool:
     """Whether a name does not leave its folder."""
     return name == Path(name).name and "\\" not in name and bool(name.strip("."))
 
@@ -193,7 +193,7 @@ class _Sog:
         mip = self.meta.get("model") == "antialiased" or self.meta.get("antialias") is True
         extras = self.meta.get("extras")
         ours = extras.get("clsplat") if isinstance(extras, dict) else None
-        rendering = checked_numbers(self.path, ours) if isinstance(ours, dict) else {}
+        rendering = check_rendering(self.path, ours) if isinstance(ours, dict) else {}
         return SplatFile(parameters, rendering, "mip" if mip else "default")
 
     def _means(self) -> NDArray[np.float32]:
@@ -288,7 +288,7 @@ class _Sog:
             raise DataError(
                 f"{self.path}: {name}.files is {quote(names)}; expected the names of one or two files: export it again"
             )
-        if wrong := [one for one in names if not is_beside(one)]:
+        if wrong := [one for one in names if not is_sibling(one)]:
             raise DataError(
                 f"{self.path}: {name}.files has {quote(wrong[0])}; "
                 "expected the name of a file beside it: export it again"
@@ -340,8 +340,8 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
 
     The images of a folder have their content in their names, so that none of another model is replaced.
     """
-    require_some(path, splats)
-    require_moderate(path, splats, "SOG")
+    require_gaussians(path, splats)
+    require_in_range(path, splats, "SOG")
     ordered = splats.rows(morton_order(splats.parameters["means"]))
     return write_as_ordered(path, ordered, log_weights(ordered.parameters, ordered.has_sky), options)
 
@@ -375,7 +375,7 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
     meta["quats"] = {"files": [image("quats", *levels.T, ROTATED + largest)]}
     for name, table, more in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
         entries = codebook(p[table])
-        planes = nearest(p[table], entries).T
+        planes = nearest_entries(p[table], entries).T
         meta[name] = {"codebook": [_short(number) for number in entries], "files": [image(name, *planes, *more)]}
     if harmonics is not None:
         meta["shN"] = _write_harmonics(harmonics, splats.sh_degree, image)
@@ -385,13 +385,13 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
 
 def _write_beside(path: Path, images: dict[str, bytes]) -> str:
     """Write images and then their meta.json: until it is renamed, the model before is whole.  Images of no use go."""
-    before, new = set(with_images(path)), {path.with_name(name) for name in images}
+    before, new = set(sog_folder_files(path)), {path.with_name(name) for name in images}
     kept = before
     try:
         sums = [write_bytes(path.with_name(name), data) for name, data in images.items()]
         kept = new
     finally:
-        for one in (before | new) - kept - set(with_images(path)):
+        for one in (before | new) - kept - set(sog_folder_files(path)):
             if one.suffix == ".webp":
                 with suppress(OSError):
                     one.unlink()
@@ -423,7 +423,7 @@ class Harmonics:
     labels: NDArray[np.int64]
 
     @classmethod
-    def few(
+    def fit(
         cls,
         rest: NDArray[np.float32],
         quality: Quality,
@@ -439,13 +439,15 @@ class Harmonics:
         vectors, labels = palette(rest, _few(len(rest), quality), weights)
         if weights.any() and not np.array_equal(vectors[labels].astype(np.float32), rest):
             vectors, labels = better(vectors)
-        return cls.by(vectors, labels, step)
+        return cls.from_vectors(vectors, labels, step)
 
     @classmethod
-    def by(cls, vectors: NDArray[np.float64], labels: NDArray[np.int64], step: float | None = None) -> "Harmonics":
+    def from_vectors(
+        cls, vectors: NDArray[np.float64], labels: NDArray[np.int64], step: float | None = None
+    ) -> "Harmonics":
         """Those that vectors [E, c] and labels [N] stand for."""
         numbers = np.array([_short(number) for number in codebook(vectors, step)])
-        return cls(numbers, nearest(vectors, numbers), labels)
+        return cls(numbers, nearest_entries(vectors, numbers), labels)
 
     @property
     def values(self) -> NDArray[np.float32]:
@@ -466,21 +468,21 @@ def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) ->
     """
     rest, base = p["sh_rest"], p["sh_base"]
     most = min(MAX_PALETTE, max(_few(len(rest), options.quality), int(SHARES[options.quality] * len(rest))))
-    kept = different(rest, most) if rest.shape[1] else None
-    harmonics = None if kept is None else Harmonics.by(*kept)
+    kept = unique_points(rest, most) if rest.shape[1] else None
+    harmonics = None if kept is None else Harmonics.from_vectors(*kept)
     if harmonics and rest.any():
         return p, harmonics
     if rest.any():
-        harmonics = Harmonics.by(*tree_palette(rest, weights, most, MEDIAN_STEPS[options.quality]))
-        base = base_for(base, rest - harmonics.values, visible_form(rest))
+        harmonics = Harmonics.from_vectors(*tree_palette(rest, weights, most, MEDIAN_STEPS[options.quality]))
+        base = compensate_base(base, rest - harmonics.values, visible_form(rest))
     if options.quality == "high":
         return {**p, "sh_base": base}, harmonics
-    quats, log_scales = rounded_quats(p["quats"], p["log_scales"], TURN_STEP)
+    quats, log_scales = round_quats(p["quats"], p["log_scales"], TURN_STEP)
     changed = {
-        "means": weighed_means(p["means"], p["log_scales"], weights, SIZE_SHARE),
+        "means": round_means(p["means"], p["log_scales"], weights, SIZE_SHARE),
         "quats": quats,
-        "log_scales": rounded(log_scales, SCALE_STEP),
-        "sh_base": rounded(base, COLOR_STEP),
+        "log_scales": round_to(log_scales, SCALE_STEP),
+        "sh_base": round_to(base, COLOR_STEP),
     }
     return {**p, **changed}, harmonics
 

@@ -13,7 +13,7 @@ from clsplat.core.harmonics import mean_basis
 from clsplat.core.quaternions import multiply
 from clsplat.formats.packing import from_smallest_three, smallest_three
 from clsplat.formats.palette import LEVELS as PALETTE_LEVELS
-from clsplat.formats.palette import usual_largest
+from clsplat.formats.palette import robust_max
 from clsplat.formats.splats import MAX_LOG, SH_C0, Parameters, unit
 
 Floats = NDArray[np.floating]
@@ -25,17 +25,17 @@ _SIGNED = [turn for turn in product((0, 1, -1), repeat=4) if np.count_nonzero(tu
 _TURNS = np.array([np.divide(turn, np.linalg.norm(turn)) for turn in _SIGNED if next(filter(None, turn)) > 0])
 
 
-def rounded(values: Floats, step: float) -> NDArray[np.float32]:
+def round_to(values: Floats, step: float) -> NDArray[np.float32]:
     """Return values as multiples of a step."""
     return np.asarray(np.rint(values.astype(np.float64) / step) * step, np.float32)
 
 
-def weighed_means(
+def round_means(
     means: Floats, log_scales: Floats, log_weights: NDArray[np.float64], share: float
 ) -> NDArray[np.float32]:
     """Return positions [N, 3] in steps of about `share` of the size of each Gaussian, those of median weight.
 
-    The step is as 1 / sqrt(weight) (see `steps`): a power of two of the levels of a SOG.
+    The step is as 1 / sqrt(weight) (see `quantization_steps`): a power of two of the levels of a SOG.
     """
     levels, low, level = _levels(means)
     sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
@@ -63,7 +63,7 @@ def _positions(logarithms: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.asarray(np.sign(logarithms) * np.expm1(np.abs(logarithms)), np.float32)
 
 
-def rounded_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return quaternions [N, 4] on every `step`-th level of a SOG, and the scales [N, 3] that go with them.
 
     A Gaussian has 24 pairs of a rotation and scales, which differ in the names and signs of its axes.  That of the
@@ -94,7 +94,7 @@ USUAL = 0.028  # root of the mean square of harmonics: fox after 7 000 steps; Le
 ROWS = 1 << 15  # that are rounded at once
 
 
-def steps(log_weights: NDArray[np.float64], median: float, most: float) -> NDArray[np.float32]:
+def quantization_steps(log_weights: NDArray[np.float64], median: float, most: float) -> NDArray[np.float32]:
     """Return a step for each Gaussian, [N]: a power of two, about `median` for the median weight, from 1 to `most`."""
     exponents = np.rint(np.log2(median) - log_weights / 2)
     return np.asarray(np.exp2(np.clip(exponents, 0, np.log2(most))), np.float32)
@@ -108,7 +108,7 @@ def usual_step(rest: Floats, step: float, most: float) -> float:
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:
     """Return G for harmonics [N, 3 K], as [K, K] with a trace of K, the same bits with any number of threads."""
-    largest = usual_largest(rest)
+    largest = robust_max(rest)
     count = rest.shape[1] // 3
     form = np.zeros((count, count))
     for start in range(0, len(rest) if largest else 0, ROWS):
@@ -120,7 +120,7 @@ def visible_form(rest: Floats) -> NDArray[np.float64]:
     return (form * (count / trace) if trace else form) + ISOTROPIC * np.eye(count)
 
 
-def base_for(base: Floats, errors: Floats, form: NDArray[np.float64]) -> NDArray[np.float32]:
+def compensate_base(base: Floats, errors: Floats, form: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return coefficients of band 0, [N, 3], that take up what is the same everywhere of errors of the others.
 
     errors: what the others lack, [N, 3 K].
@@ -133,7 +133,7 @@ def base_for(base: Floats, errors: Floats, form: NDArray[np.float64]) -> NDArray
     return np.asarray(base + change / SH_C0, np.float32)
 
 
-def rounded_rows(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
+def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return harmonics [N, 3 K] as multiples of each Gaussian's step, whose errors show little by `form`, [K, K]."""
     count = len(form)
     # (G^-1) reversed = U^T U: row k of U tells how the coefficients after k take up an error of k
@@ -177,13 +177,13 @@ def tree_palette(
     held = np.bincount(labels, weights)
     vectors = _sums(labels, weights, rest, len(held)) / held[:, None]
     log_held = np.log2(held)
-    step = steps(log_held - np.median(log_held), usual_step(rest, median_step, median_step), LARGEST_STEP)
+    step = quantization_steps(log_held - np.median(log_held), usual_step(rest, median_step, median_step), LARGEST_STEP)
     first = np.zeros(len(held), np.int64)
     first[labels[::-1]] = np.arange(len(labels))[::-1]
     order = np.lexsort((first, step))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-    rounded = rounded_rows(SH_LEVELS * vectors, step, form).astype(np.float64) / SH_LEVELS
+    rounded = round_sh(SH_LEVELS * vectors, step, form).astype(np.float64) / SH_LEVELS
     return rounded[order], place[labels]
 
 
@@ -269,14 +269,14 @@ def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
         return np.zeros(0)
     means, scales = p["means"].astype(np.float64), np.sort(p["log_scales"].astype(np.float64), axis=1)
     squares = np.square(means - np.median(means, axis=0)).sum(axis=1)
-    counted = before_a_gap(np.sqrt(squares)) if has_sky else np.ones(len(squares), np.bool_)
+    counted = before_gap(np.sqrt(squares)) if has_sky else np.ones(len(squares), np.bool_)
     squares += np.maximum(np.median(squares[counted]), 1e-30)
     opacity = -np.logaddexp(0, -p["logit_opacity"][:, 0].astype(np.float64))
     found = (opacity + (scales[:, 1] + scales[:, 2] - np.log(squares)) / 2) / np.log(2)
     return np.asarray(np.clip(found - np.median(found[counted]), -LARGEST, LARGEST))
 
 
-def before_a_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
+def before_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of these distances, [N], are not behind a gap, as those of a sky are; all where there is none.
 
     A sky lies around the scene, so that the median of all positions is in the scene's middle.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.core.reading import read_file
-from clsplat.formats.packing import beyond_bytes, tell_cut, write_bytes
+from clsplat.formats.packing import outside_bytes, warn_clipped, write_bytes
 from clsplat.formats.splats import (
     MAX_FILE,
     SH_C0,
@@ -27,8 +27,8 @@ from clsplat.formats.splats import (
     logits,
     logs,
     opacities,
-    require_held,
-    require_some,
+    require_gaussians,
+    require_size,
     sh_coefficients,
     unit,
 )
@@ -73,7 +73,7 @@ def read_splat(path: Path) -> SplatFile:
 
 def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write a `.splat` file.  Raises DataError for a model without Gaussians, OutputError."""
-    require_some(path, splats)
+    require_gaussians(path, splats)
     p = splats.parameters
     alpha = opacities(p["logit_opacity"])
     volume = p["log_scales"].astype(np.float64).sum(axis=1)
@@ -84,7 +84,7 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     with np.errstate(over="ignore"):
         rows["scale"] = np.minimum(np.exp(p["log_scales"].astype(np.float64)), LARGEST_SCALE / 2)
     color = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
-    tell_cut(path, "splat", "colors from 0 to 1", beyond_bytes(255 * color))
+    warn_clipped(path, "splat", "colors from 0 to 1", outside_bytes(255 * color))
     if p["sh_rest"].shape[1]:
         LOG.warning(
             "%s: splat holds no harmonics: the colors are the same from everywhere; other formats hold them", path
@@ -123,7 +123,7 @@ class SplatSection:
     partial: int
 
     @classmethod
-    def of(cls, data: bytes, start: int) -> "SplatSection":
+    def parse(cls, data: bytes, start: int) -> "SplatSection":
         """Take the numbers of a header."""
         count, rows, bucket_size, buckets = struct.unpack_from("<4I", data, start)
         (block,) = struct.unpack_from("<f", data, start + 16)
@@ -164,13 +164,13 @@ def read_ksplat(path: Path) -> SplatFile:
     (level,) = struct.unpack_from("<H", data, 20)
     ends = struct.unpack_from("<2f", data, 36)
     start = HEADER + SECTION * most
-    require_held(path, len(data), start, f"{most} sections")
+    require_size(path, len(data), start, f"{most} sections")
     parts = []
     for number in range(sections):
-        section = SplatSection.of(data, HEADER + SECTION * number)
+        section = SplatSection.parse(data, HEADER + SECTION * number)
         _check(path, section, number)
         sizes = section.sizes(level)
-        require_held(path, len(data), start + sum(sizes), f"{section.rows} splats in section {number}")
+        require_size(path, len(data), start + sum(sizes), f"{section.rows} splats in section {number}")
         parts.append(_tables(path, data, start, section, level, ends if any(ends) else SH_ENDS))
         start += sum(sizes)
     width = max(part["sh_rest"].shape[1] for part in parts)

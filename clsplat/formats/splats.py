@@ -26,29 +26,31 @@ MOTION = "motion"
 FIELDS = {"velocity": 3, "time_center": 1, "log_duration": 1, "acceleration": 3, "jerk": 3, "turn": 4}
 TURN = 4  # columns of the turn
 MAX_DEGREE = 3
-EXPECTED = "expected a number from 0, the first moment of the scene, to 1, its last"
-STILL = 12.0  # log of a duration: what is there always, exp(-1/2 exp(-24)) being 1 in float32
+EXPECTED_TIME = "expected a number from 0, the first moment of the scene, to 1, its last"
+STATIC_LOG_DURATION = 12.0  # log of a duration: what is there always, exp(-1/2 exp(-24)) being 1 in float32
 
 
-def is_moment(time: float) -> bool:
+def is_timestamp(time: float) -> bool:
     """Return whether a number is a moment of a scene."""
     return math.isfinite(time) and 0 <= time <= 1
 
 
-def width_of(degree: int, turns: bool) -> int:
+def motion_width(degree: int, turns: bool) -> int:
     """Return the number of columns for polynomials of a degree from 1 to 3."""
     return 2 + 3 * degree + TURN * turns
 
 
-WIDTHS = {width_of(degree, turns): (degree, turns) for degree in range(1, MAX_DEGREE + 1) for turns in (False, True)}
+WIDTHS = {
+    motion_width(degree, turns): (degree, turns) for degree in range(1, MAX_DEGREE + 1) for turns in (False, True)
+}
 
 
-def motion_degree_of(width: int) -> int:
+def motion_degree(width: int) -> int:
     """Return the degree of the polynomials of a table with so many columns."""
     return WIDTHS[width][0]
 
 
-def fields_of(width: int) -> dict[str, slice]:
+def motion_fields(width: int) -> dict[str, slice]:
     """Return the columns of each field in a table with so many columns, by name, in their order."""
     degree, turns = WIDTHS[width]
     present = ["velocity", "time_center", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * turns]
@@ -60,18 +62,18 @@ def fields_of(width: int) -> dict[str, slice]:
     return ends
 
 
-def columns_of(width: int) -> tuple[str, ...]:
+def motion_columns(width: int) -> tuple[str, ...]:
     """Return the names of the columns in a PLY."""
     names = []
-    for name in fields_of(width):
+    for name in motion_fields(width):
         names += [name] if FIELDS[name] == 1 else [f"{name}_{i}" for i in range(FIELDS[name])]
     return tuple(names)
 
 
-def columns_among(names: Collection[str]) -> tuple[str, ...] | None:
+def find_motion_columns(names: Collection[str]) -> tuple[str, ...] | None:
     """Return the columns of the motion among the properties of a file; () of none, None of some but no whole table."""
-    own = {column for width in WIDTHS for column in columns_of(width)} & set(names)
-    return next((columns_of(width) for width in WIDTHS if set(columns_of(width)) == own), None) if own else ()
+    own = {column for width in WIDTHS for column in motion_columns(width)} & set(names)
+    return next((motion_columns(width) for width in WIDTHS if set(motion_columns(width)) == own), None) if own else ()
 
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
@@ -79,7 +81,7 @@ SH_C0 = 0.28209479177387814  # basis function of band 0
 NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: nearest distance and screen filter of 3DGS
 MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
-LARGEST = 1e15  # of LIMITED: beyond it neither viewers nor codebooks hold anything
+MAX_VALUE = 1e15  # of LIMITED: beyond it neither viewers nor codebooks hold anything
 LIMITED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
 MAX_EXPONENT = 700.0  # of e in float64
@@ -107,7 +109,7 @@ class SplatFile:
     @property
     def sh_degree(self) -> int:
         """Highest degree of the spherical harmonics."""
-        return degree_of(self.parameters["sh_rest"].shape[1])
+        return sh_degree_of(self.parameters["sh_rest"].shape[1])
 
     @property
     def has_sky(self) -> bool:
@@ -143,7 +145,7 @@ def sh_coefficients(degree: int) -> int:
     return (degree + 1) ** 2
 
 
-def degree_of(columns: int) -> int:
+def sh_degree_of(columns: int) -> int:
     """Return the SH degree of a table sh_rest with so many columns."""
     degree: int = round((1 + columns / 3) ** 0.5) - 1
     return degree
@@ -188,14 +190,14 @@ def unit(quats: Floats) -> NDArray[np.float64]:
         return np.where(length > 0, wide / length, [1.0, 0, 0, 0])
 
 
-def flipped(parameters: Parameters) -> Parameters:
+def flip_axes(parameters: Parameters) -> Parameters:
     """Return the Gaussians in axes whose y and z point the other way: up and back for down and ahead, or back again."""
     signs = _signs(parameters)
     return {name: table * signs[name] if name in signs else table for name, table in parameters.items()}
 
 
-def flip(parameters: Parameters) -> None:
-    """Turn the Gaussians as `flipped` does, in place."""
+def flip_axes_in_place(parameters: Parameters) -> None:
+    """Turn the Gaussians as `flip_axes` does, in place."""
     for name, signs in _signs(parameters).items():
         parameters[name] *= signs
 
@@ -206,7 +208,7 @@ def _signs(parameters: Parameters) -> Parameters:
     return {name: np.array(values, np.float32) for name, values in signs.items()}
 
 
-def swapped(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:
+def reorder_columns(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:
     """Return columns in outer-major order as inner-major ones, [N, outer * inner]."""
     count = len(table)
     moved = table.reshape(count, outer, inner).transpose(0, 2, 1)
@@ -226,25 +228,25 @@ def too_large(parameters: Parameters) -> NDArray[np.bool_]:
     return np.asarray(np.any([_beyond(parameters[name]) for name in LIMITED if name in parameters], axis=0))
 
 
-def told_too_large(parameters: Parameters) -> str:
+def too_large_message(parameters: Parameters) -> str:
     """Say how many Gaussians hold values that are too large, and of which tables; '' of none."""
     if not (count := int(too_large(parameters).sum())):
         return ""
     names = ", ".join(name for name in LIMITED if name in parameters and _beyond(parameters[name]).any())
-    return f"{count:,} of {len(parameters['means']):,} Gaussians hold {names} beyond {LARGEST:g}"
+    return f"{count:,} of {len(parameters['means']):,} Gaussians hold {names} beyond {MAX_VALUE:g}"
 
 
 def _beyond(table: Floats) -> NDArray[np.bool_]:
     """Which rows hold finite values beyond LARGEST, [N]."""
     size = np.abs(table)
-    return np.asarray(((size > LARGEST) & (size < np.inf)).any(axis=1))
+    return np.asarray(((size > MAX_VALUE) & (size < np.inf)).any(axis=1))
 
 
-def settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
+def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
     """Refuse, drop or keep Gaussians that are not finite; drop those that are too large, too.  Raises DataError."""
     bad = not_finite(splats.parameters)
     if options.not_finite == "drop":
-        if told := told_too_large(splats.parameters):
+        if told := too_large_message(splats.parameters):
             LOG.warning("%s: %s; they are dropped", path, told)
         if bad.any():
             LOG.warning("%s: dropped %s Gaussians with values that are not finite", path, f"{int(bad.sum()):,}")
@@ -259,13 +261,13 @@ def settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
     )
 
 
-def require_moderate(path: Path, splats: SplatFile, name: str) -> None:
+def require_in_range(path: Path, splats: SplatFile, name: str) -> None:
     """Raise DataError for values that the format `name` cannot hold."""
-    if told := told_too_large(splats.parameters):
+    if told := too_large_message(splats.parameters):
         raise DataError(f"{path}: {told}, which {name} cannot hold; `clsplat convert MODEL OTHER.ply` drops them")
 
 
-def require_still(path: Path, splats: SplatFile, name: str) -> None:
+def require_static(path: Path, splats: SplatFile, name: str) -> None:
     """Raise DataError for Gaussians that move, which the format `name` cannot hold."""
     if MOTION in splats.parameters:
         raise DataError(
@@ -274,7 +276,7 @@ def require_still(path: Path, splats: SplatFile, name: str) -> None:
         )
 
 
-def require_held(path: Path, held: int, expected: int, what: str) -> None:
+def require_size(path: Path, held: int, expected: int, what: str) -> None:
     """Raise DataError where a file holds fewer bytes than its header declares."""
     if held < expected:
         raise DataError(
@@ -283,7 +285,7 @@ def require_held(path: Path, held: int, expected: int, what: str) -> None:
         )
 
 
-def require_some(path: Path, splats: SplatFile) -> None:
+def require_gaussians(path: Path, splats: SplatFile) -> None:
     """Raise DataError for a model without Gaussians, which most formats do not know."""
     if not len(splats):
         raise DataError(f"{path}: the model holds no Gaussians; a PLY can hold none")

@@ -27,14 +27,21 @@ from numpy.typing import NDArray
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.reading import read_file
 from clsplat.formats.packing import (
-    beyond_bytes,
     from_smallest_three,
     morton_order,
+    outside_bytes,
     smallest_three,
-    tell_cut,
+    warn_clipped,
     write_bytes,
 )
-from clsplat.formats.sog_quantize import base_for, log_weights, rounded_rows, steps, usual_step, visible_form
+from clsplat.formats.sog_quantize import (
+    compensate_base,
+    log_weights,
+    quantization_steps,
+    round_sh,
+    usual_step,
+    visible_form,
+)
 from clsplat.formats.splats import (
     MAX_DEGREE,
     MAX_FILE,
@@ -43,12 +50,12 @@ from clsplat.formats.splats import (
     Reading,
     SplatFile,
     Writing,
-    flip,
-    flipped,
+    flip_axes,
+    flip_axes_in_place,
     logits,
     opacities,
-    require_moderate,
-    require_some,
+    require_gaussians,
+    require_in_range,
     sh_coefficients,
     unit,
 )
@@ -87,7 +94,7 @@ class SpzHeader:
     flags: int
 
     @classmethod
-    def of(cls, path: Path, data: bytes) -> "SpzHeader":
+    def parse(cls, path: Path, data: bytes) -> "SpzHeader":
         """Take them from the first bytes.  Raises DataError where they cannot be."""
         if len(data) < HEADER or data[:4] != MAGIC:
             raise DataError(f"{path}: not an SPZ file; expected its header of {HEADER} bytes: copy or export it again")
@@ -190,10 +197,10 @@ def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: in
         "colors": 255 * (COLOR * base.astype(np.float64) + 0.5),
         "scales": 16 * (p["log_scales"].astype(np.float64) + 10),
     }
-    tell_cut(path, "SPZ", "harmonics from -1 to 1", np.abs(p["sh_rest"]) > 1)
-    tell_cut(path, "SPZ", "colors from -0.44 to 1.44", beyond_bytes(cut["colors"]))
-    tell_cut(path, "SPZ", "scales from 4.5e-05 to 379", beyond_bytes(cut["scales"]))
-    step = steps(weights, *BASE_STEP[options.quality])[:, None]
+    warn_clipped(path, "SPZ", "harmonics from -1 to 1", np.abs(p["sh_rest"]) > 1)
+    warn_clipped(path, "SPZ", "colors from -0.44 to 1.44", outside_bytes(cut["colors"]))
+    warn_clipped(path, "SPZ", "scales from 4.5e-05 to 379", outside_bytes(cut["scales"]))
+    step = quantization_steps(weights, *BASE_STEP[options.quality])[:, None]
     cut["colors"] = np.rint(cut["colors"] / step) * step
     alphas, colors, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in cut.values())
     positions = _fixed(p, weights, fraction, SMALLEST_SHARE[options.quality])
@@ -228,7 +235,7 @@ def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: 
     most = LARGEST_STEP[options.quality]
     if options.sh_bits or most == 1 or not rest.shape[1]:
         return np.ones(len(rest), np.float32)
-    return steps(weights, usual_step(rest, *MEDIAN_STEP[options.quality]), most)
+    return quantization_steps(weights, usual_step(rest, *MEDIAN_STEP[options.quality]), most)
 
 
 def _rounded_sh(
@@ -240,8 +247,8 @@ def _rounded_sh(
     levels = np.clip(rest, -1, 1) * np.float32(128)
     if bits is None and sh_steps.max(initial=1) > 1:
         form = visible_form(rest)
-        found = np.clip(rounded_rows(levels, sh_steps, form), -128, 128 - sh_steps[:, None])
-        base = base_for(p["sh_base"], rest - found / 128, form)
+        found = np.clip(round_sh(levels, sh_steps, form), -128, 128 - sh_steps[:, None])
+        base = compensate_base(p["sh_base"], rest - found / 128, form)
     else:
         columns = np.full(rest.shape[1], 2.0 ** (8 - (bits or WHOLE)[1]), np.float32)
         columns[:9] = 2.0 ** (8 - (bits or WHOLE)[0])
@@ -321,7 +328,7 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
     if header.degree > MAX_DEGREE:
         LOG.warning("%s: dropped the bands of SH degree 4", path)
     if options.axes == "spz":
-        flip(parameters)
+        flip_axes_in_place(parameters)
     if options.axes == "spz" and not options.quiet:
         LOG.info("%s: axes as the format says (up, back); if it stands on its head, `clsplat convert --axes ply`", path)
     return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default")
@@ -332,12 +339,12 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
 
     Raises OutputError; DataError where positions are too large.
     """
-    require_some(path, splats)
-    require_moderate(path, splats, "SPZ")  # one value that is not finite would spoil the harmonics of all
+    require_gaussians(path, splats)
+    require_in_range(path, splats, "SPZ")  # one value that is not finite would spoil the harmonics of all
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     weights = log_weights(p, splats.has_sky)
     fraction = fraction_of(path, p["means"], options.quality == "high")
-    planes = packed(path, flipped(p) if options.axes == "spz" else p, weights, fraction, options)
+    planes = packed(path, flip_axes(p) if options.axes == "spz" else p, weights, fraction, options)
     numbers = (WRITTEN_VERSION, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
     return write_bytes(path, _gzip(MAGIC + struct.pack("<2I4B", *numbers, 0) + b"".join(planes)))
 
@@ -353,7 +360,7 @@ def _gzip(data: bytes) -> bytes:
 def _unpacked(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
     """Header and parameters of versions 1 to 3."""
     stream = _Gzip(path, data)
-    header = SpzHeader.of(path, stream.read(HEADER))
+    header = SpzHeader.parse(path, stream.read(HEADER))
     if header.version > 3:
         raise DataError(f"{path}: SPZ of version 4 in gzip; expected Zstandard: export it again")
     _check_size(path, header, sum(header.sizes), len(data) * GZIP_RATIO)
@@ -405,7 +412,7 @@ class _Gzip:
 
 def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
     """Header and parameters of version 4."""
-    header = SpzHeader.of(path, data)
+    header = SpzHeader.parse(path, data)
     if header.version != 4 or len(data) < HEADER4:
         raise DataError(f"{path}: SPZ of version {header.version} without gzip; expected version 4: export it again")
     streams, table = struct.unpack_from("<BI", data, HEADER - 1)

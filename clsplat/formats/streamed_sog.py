@@ -20,15 +20,15 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.files import invalid_name_reason, is_inside
 from clsplat.core.reading import read_json
 from clsplat.formats.packing import morton_order, write_bytes
-from clsplat.formats.sog import MAX_META, META, read_sog, with_images, write_as_ordered
+from clsplat.formats.sog import MAX_META, META, read_sog, sog_folder_files, write_as_ordered
 from clsplat.formats.sog_quantize import log_weights
 from clsplat.formats.splats import (
     MAX_DEGREE,
     Parameters,
     SplatFile,
     Writing,
-    require_moderate,
-    require_some,
+    require_gaussians,
+    require_in_range,
     unit,
     with_degree,
 )
@@ -60,7 +60,7 @@ def read_lod(path: Path) -> SplatFile:
     return SplatFile(joined, parts[0].rendering, parts[0].mode)
 
 
-def faults_of_levels(path: Path) -> list[str]:
+def find_level_faults(path: Path) -> list[str]:
     """Return a sentence for each file of the coarser levels that is missing or damaged; `read_lod` reads the others."""
     meta, faults = _meta(path), []
     levels = _runs(path, meta)
@@ -85,12 +85,12 @@ def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
     return faults
 
 
-def files_of_lod(path: Path) -> list[Path]:
+def lod_files(path: Path) -> list[Path]:
     """Return a lod-meta.json and all files of its levels."""
     meta = _meta(path)
     names = [*meta["filenames"], *([meta["environment"]] if "environment" in meta else [])]
     places = [path.parent / _inside(path, name) for name in names]
-    return [path, *(file for place in places for file in with_images(place))]
+    return [path, *(file for place in places for file in sog_folder_files(place))]
 
 
 def _meta(path: Path) -> dict[str, Any]:
@@ -266,8 +266,8 @@ def write_lod(
     Raises DataError for a level without Gaussians, or one that SOG cannot hold, OutputError.
     """
     for level in levels:
-        require_some(folder / LOD_META, level)
-        require_moderate(folder / LOD_META, level, "SOG")
+        require_gaussians(folder / LOD_META, level)
+        require_in_range(folder / LOD_META, level, "SOG")
     root = tree([level.parameters for level in levels], limits)
     files = _Files(limits.splats)
     shape = files.shape(root)

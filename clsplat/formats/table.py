@@ -12,8 +12,8 @@ from clsplat.core.errors import ConfigError, DataError, OutputError, quote, shor
 from clsplat.core.reading import open_file
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply
 from clsplat.formats.gltf_usd import read_glb, write_glb, write_usda
-from clsplat.formats.ply import MAX_HEADER, PlyHeader, checked_numbers, parse_ply_header, read_ply, write_ply
-from clsplat.formats.sog import META, looks_like_sog, read_sog, with_images, write_sog
+from clsplat.formats.ply import MAX_HEADER, PlyHeader, check_rendering, parse_ply_header, read_ply, write_ply
+from clsplat.formats.sog import META, looks_like_sog, read_sog, sog_folder_files, write_sog
 from clsplat.formats.splat import looks_like_ksplat, looks_like_splat, read_ksplat, read_splat, write_splat
 from clsplat.formats.splats import (
     MIP_VARIANCE,
@@ -22,12 +22,12 @@ from clsplat.formats.splats import (
     Reading,
     SplatFile,
     Writing,
+    apply_not_finite,
     not_finite,
-    require_still,
-    settled,
+    require_static,
 )
 from clsplat.formats.spz import read_spz, write_spz
-from clsplat.formats.streamed_sog import LOD_META, files_of_lod, looks_like_lod, read_lod
+from clsplat.formats.streamed_sog import LOD_META, lod_files, looks_like_lod, read_lod
 
 # Each format with its functions that recognize, read, and write files.
 
@@ -73,24 +73,24 @@ class Codec:
 # The files of a model.
 
 
-def located(path: Path) -> Path:
+def model_file(path: Path) -> Path:
     """Return the main file of a model: in a folder, its meta.json or lod-meta.json."""
     files = (path / name for name in (META, LOD_META)) if path.is_dir() else ()
     return next(filter(Path.is_file, files), path)
 
 
-def files_of(path: Path) -> list[Path]:
+def model_files(path: Path) -> list[Path]:
     """Return a model's main file and the files that it names."""
     if path.name == META:
-        return with_images(path)
-    return files_of_lod(path) if path.name == LOD_META else [path]
+        return sog_folder_files(path)
+    return lod_files(path) if path.name == LOD_META else [path]
 
 
-def bytes_of(path: Path) -> int:
+def model_bytes(path: Path) -> int:
     """Return the size of a model in bytes, with all files that its JSON names.  Raises DataError if one is missing."""
-    main = located(path)
+    main = model_file(path)
     try:
-        return sum(file.stat().st_size for file in files_of(main))
+        return sum(file.stat().st_size for file in model_files(main))
     except OSError as error:
         missing = "" if error.filename == str(main) else f"names {quote(error.filename)}, which "
         raise DataError(f"{main}: {missing}cannot be read ({error.strerror}); copy or export it again") from error
@@ -189,7 +189,7 @@ def detect(path: Path) -> Codec | None:
     return next((codec for codec in CODECS if codec.matches(start)), None)
 
 
-def named(path: Path) -> Codec | None:
+def format_of_name(path: Path) -> Codec | None:
     """Return the format of a file name, or None; the longest matching ending wins."""
     name = path.name.lower()
     pairs = [(end, codec) for codec in CODECS for end in codec.endings]
@@ -200,25 +200,25 @@ def named(path: Path) -> Codec | None:
 def read(path: Path, options: Reading | None = None) -> SplatFile:
     """Read a model file of any format.  Raises DataError if it is missing, damaged, or of an unknown format."""
     options = options or Reading()
-    path = located(path)
-    codec = detect(path) or named(path)  # the reader of the named format reports what is wrong
+    path = model_file(path)
+    codec = detect(path) or format_of_name(path)  # the reader of the named format reports what is wrong
     if codec is None:
         known = ", ".join(endings(reads=True))
         raise DataError(f"{path}: unknown model format; expected one of {known}")
     if codec.read is None:
         raise DataError(f"{path}: {codec.name} can be written but not read; convert the model that it was made from")
     with np.errstate(all="ignore"):  # values that are not finite are handled below
-        return settled(path, codec.read(path, options), options)
+        return apply_not_finite(path, codec.read(path, options), options)
 
 
-def for_writing(path: Path) -> Codec:
+def writing_format(path: Path) -> Codec:
     """Return the format in which a file of this name is written.
 
     Raises ConfigError if there is none, and OutputError for an empty name.
     """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no file name); give the path of a file")
-    codec = named(path)
+    codec = format_of_name(path)
     if codec is None or codec.write is None:
         how = f"is only written by `{codec.command}`" if codec and codec.command else "can be read but not written"
         fault = f"{codec.name} {how}" if codec else f"no format has the name {quote(path.name)}"
@@ -233,12 +233,12 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
     Raises ConfigError for an unknown name, DataError for a model that the format cannot store, OutputError if the file
     cannot be written, and ValueError for a world filter that is not baked: only a PLY stores one.
     """
-    codec = for_writing(path)
+    codec = writing_format(path)
     assert codec.write is not None
     if not codec.keeps_filter and "filter_variance" in splats.parameters:
         raise ValueError(f"{path}: {codec.name} cannot store a world filter; call baked() first")
     if not codec.keeps_motion:
-        require_still(path, splats, codec.name)
+        require_static(path, splats, codec.name)
     if not codec.keeps_nan and (bad := int(not_finite(splats.parameters).sum())):
         raise DataError(
             f"{path}: {bad:,} Gaussians have values that are not finite, which {codec.name} cannot store; drop them, "
@@ -246,15 +246,15 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
         )
     options = options or Writing()
     if not options.quiet:
-        tell_losses(path, splats)
+        warn_about_losses(path, splats)
     if codec.keeps_numbers:
-        checked_numbers(path, splats.rendering)  # the reader would refuse invalid numbers
+        check_rendering(path, splats.rendering)  # the reader would refuse invalid numbers
     return codec.write(path, splats, options)
 
 
-def tell_losses(path: Path, splats: SplatFile) -> None:
+def warn_about_losses(path: Path, splats: SplatFile) -> None:
     """Warn if the format of a file name does not store the mip mark or the numbers for rendering."""
-    codec = for_writing(path)
+    codec = writing_format(path)
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning(
             "%s: %s cannot mark a mip model, so viewers show it as plain 3DGS; PLY, SPZ, SOG, and GLB can",

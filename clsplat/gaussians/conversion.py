@@ -19,21 +19,21 @@ from clsplat.core.errors import ConfigError, DataError, quote
 from clsplat.core.files import check_not_run_file, path_exists, raising_output_error, scratch_folder
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import (
-    EXPECTED,
+    EXPECTED_TIME,
     MAX_DEGREE,
     SH_C0,
     Parameters,
     Quality,
     Reading,
     Writing,
-    is_moment,
+    is_timestamp,
     sh_coefficients,
     with_degree,
 )
-from clsplat.formats.table import bytes_of, detect, for_writing, named
-from clsplat.gaussians.model import Model, load, model_at
-from clsplat.gaussians.motion import alike, still
-from clsplat.gaussians.sky import sampled, sky_file
+from clsplat.formats.table import detect, format_of_name, model_bytes, writing_format
+from clsplat.gaussians.model import Model, load, model_path
+from clsplat.gaussians.motion import static_motion, with_motion
+from clsplat.gaussians.sky import sample_texels, sky_path
 from clsplat.scene.scene import PointCloud
 
 # Several models as one.
@@ -42,7 +42,7 @@ LOG = logging.getLogger("clsplat")
 KEPT = ("near", "screen_variance", "background", "alpha")  # of the first model
 
 
-def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
+def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     """Return one model of all Gaussians, with the numbers of the first for rendering and the largest SH degree.
 
     Where one has a world filter and another has none, it is baked; where some move, the others stand still.  Raises
@@ -62,7 +62,7 @@ def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
     if any(model.filter_variance is None for model in models):
         models = [model.baked() for model in models]
     degree = max(model.sh_degree for model in models)
-    tables = alike([with_degree(model.tables(), degree) for model in models], names)
+    tables = with_motion([with_degree(model.tables(), degree) for model in models], names)
     merged: dict[str, Any] = {n: np.concatenate([t[n] for t in tables]) for n in tables[0]}
     return Model(**merged, rendering=first.rendering, sky=first.sky)
 
@@ -88,7 +88,7 @@ class Changes:
     sh_degree: int | None = None  # at most
     time: float | None = None  # of a moving model: that moment of it
 
-    def of(self, model: Model) -> Model:
+    def apply(self, model: Model) -> Model:
         """Return the changed model.  Raises DataError where nothing is left, ConfigError for a transform too far."""
         model = model if self.time is None else _at(model, self.time)
         kept = model[model.opacities >= self.drop_below] if self.drop_below else model
@@ -117,9 +117,9 @@ class ConversionOptions:
     quality: Quality = "balanced"
     keep_nan: bool = False
 
-    def of(self, sources: Sequence[Path], out: Path) -> tuple[Reading, Writing]:
+    def resolve(self, sources: Sequence[Path], out: Path) -> tuple[Reading, Writing]:
         """Return them for these files.  Raises ConfigError where one has no meaning there."""
-        codec, reads_axes = for_writing(out), _reads_axes(sources)
+        codec, reads_axes = writing_format(out), _reads_axes(sources)
         for name, value, known in (("axes", self.axes, AXES), ("quality", self.quality, QUALITIES)):
             if value not in known:
                 raise ConfigError(f"--{name} {quote(value)}: expected one of {', '.join(known)}")
@@ -131,7 +131,7 @@ class ConversionOptions:
             raise ConfigError(f"{out}: --quality is of SPZ and SOG; expected a name that ends in .spz or .sog")
         if self.keep_nan and not codec.keeps_nan:
             raise ConfigError(f"{out}: --keep-nan is of PLY; expected a name that ends in .ply")
-        bits = None if self.sh_bits is None else sh_bits_of(self.sh_bits)
+        bits = None if self.sh_bits is None else parse_sh_bits(self.sh_bits)
         written = Writing(bits, "spz" if reads_axes else self.axes, self.quality)
         return Reading(self.axes, "keep" if self.keep_nan else "drop"), written
 
@@ -145,32 +145,32 @@ def convert(
     """
     if not sources:
         raise ConfigError("convert: expected a model file to read, and one to write")
-    check_place(sources, out)
-    reading, writing = (options or ConversionOptions()).of(sources, out)
-    return written(sources, (changes or Changes()).of(read(sources, reading)), out, writing)
+    check_output(sources, out)
+    reading, writing = (options or ConversionOptions()).resolve(sources, out)
+    return write_model(sources, (changes or Changes()).apply(read(sources, reading)), out, writing)
 
 
 def read(sources: Sequence[Path], reading: Reading) -> Model:
     """Return one model of all Gaussians of model files or run folders.  Raises DataError."""
-    return merged([load(source, reading) for source in sources], [str(source) for source in sources])
+    return merge_models([load(source, reading) for source in sources], [str(source) for source in sources])
 
 
-def written(sources: Sequence[Path], model: Model, out: Path, writing: Writing) -> dict[str, Any]:
+def write_model(sources: Sequence[Path], model: Model, out: Path, writing: Writing) -> dict[str, Any]:
     """Write a model that was read from sources, and return what `convert` does.  Raises OutputError."""
-    size = sum(bytes_of(model_at(source)) for source in sources)
+    size = sum(model_bytes(model_path(source)) for source in sources)
     model.save(out, writing)
-    kind = for_writing(out).name
-    return {"file": str(out), "format": kind, "gaussians": len(model), "bytes": bytes_of(out), "bytes_read": size}
+    kind = writing_format(out).name
+    return {"file": str(out), "format": kind, "gaussians": len(model), "bytes": model_bytes(out), "bytes_read": size}
 
 
-def check_place(sources: Sequence[Path], out: Path) -> None:
+def check_output(sources: Sequence[Path], out: Path) -> None:
     """Raise ConfigError where the file to write is one of those that are read, or belongs to a run."""
-    if any(_is_same(out, model_at(source)) for source in sources):
+    if any(_is_same(out, model_path(source)) for source in sources):
         raise ConfigError(f"{out}: is one of the files that are read; give another name")
     check_not_run_file(out)
 
 
-def transform_of(text: str) -> NDArray[np.float64]:
+def parse_transform(text: str) -> NDArray[np.float64]:
     """Return the matrix [4, 4] of words such as `scale=2 rotate=90,0,0 translate=0,1,0`, done from left to right.
 
     Rotations are in degrees about x, then y, then z.  12 or 16 numbers, with commas, are a matrix row by row.
@@ -225,7 +225,7 @@ def _step(word: str, values: list[float]) -> NDArray[np.float64]:
     return matrix
 
 
-def crop_of(text: str) -> tuple[float, ...]:
+def parse_crop(text: str) -> tuple[float, ...]:
     """Return the box of `x0,y0,z0,x1,y1,z1`.  Raises ConfigError."""
     try:
         box = tuple(float(part) for part in text.split(","))
@@ -236,14 +236,14 @@ def crop_of(text: str) -> tuple[float, ...]:
     return box
 
 
-def sh_bits_of(text: str) -> tuple[int, int]:
+def parse_sh_bits(text: str) -> tuple[int, int]:
     """Return the bits of `A/B`: of band 1 and of the others.  Raises ConfigError."""
     if not (found := re.fullmatch("([1-8])/([1-8])", text)):
         raise ConfigError(f"--sh-bits {quote(text)}: expected two numbers from 1 to 8, such as 8/6")
     return int(found[1]), int(found[2])
 
 
-def checked_degree(degree: int | None) -> int | None:
+def check_degree(degree: int | None) -> int | None:
     """Return an SH degree.  Raises ConfigError for one that there is not."""
     if degree is not None and not 0 <= degree <= MAX_DEGREE:
         raise ConfigError(f"--sh-degree {degree}: expected 0 to {MAX_DEGREE}")
@@ -262,7 +262,7 @@ def _at(model: Model, time: float) -> Model:
 
 def _reads_axes(sources: Sequence[Path]) -> bool:
     """Whether one of the files is of a format that does not tell its axes."""
-    found = [detect(place) for place in map(model_at, sources) if place.is_file()]
+    found = [detect(place) for place in map(model_path, sources) if place.is_file()]
     return any(codec is not None and codec.has_axes for codec in found)
 
 
@@ -276,13 +276,13 @@ def _is_same(one: Path, other: Path) -> bool:
 
 # A moving model as files that stand still: one of a moment, or one of each of many moments.
 
-MOST = 10_000  # files
+MAX_FRAMES = 10_000  # files
 
 
-def checked_time(time: float | None) -> float | None:
+def check_time(time: float | None) -> float | None:
     """Return a time.  Raises ConfigError for one that is not of a scene."""
-    if time is not None and not is_moment(time):
-        raise ConfigError(f"--time {time:g}: {EXPECTED}")
+    if time is not None and not is_timestamp(time):
+        raise ConfigError(f"--time {time:g}: {EXPECTED_TIME}")
     return time
 
 
@@ -295,28 +295,28 @@ def convert_frames(
     Returns what `convert` does, with the sums over files, the largest number of `gaussians`, and `files`.
     Raises ConfigError, DataError, OutputError.
     """
-    if not 2 <= frames <= MOST:
-        raise ConfigError(f"--frames {frames}: expected 2 to {MOST:,} moments; `--time T` writes one")
+    if not 2 <= frames <= MAX_FRAMES:
+        raise ConfigError(f"--frames {frames}: expected 2 to {MAX_FRAMES:,} moments; `--time T` writes one")
     if changes.time is not None:
         raise ConfigError("--frames and --time: expected one of them")
     folder, begin, end = _name_of(out)
     digits = max(4, len(str(frames - 1)))
     places = [folder / f"{begin}{number:0{digits}}{end}" for number in range(frames)]
     for place in places:
-        check_place(sources, place)
+        check_output(sources, place)
     _require_no_others(folder, re.compile(re.escape(begin) + r"\d{4,}" + re.escape(end)), places)
-    reading, writing = options.of(sources, places[0])
+    reading, writing = options.resolve(sources, places[0])
     model = read(sources, reading)
     moments = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
     for moment in moments:  # before anything is written
         try:
-            moment.of(model)
+            moment.apply(model)
         except DataError as error:
             raise DataError(f"--frames {frames}: the moment {moment.time:g}: {error}; nothing was written") from error
     done: list[dict[str, Any]] = []
-    with _all_or_as_before([*places, *map(sky_file, places)]):
+    with _all_or_as_before([*places, *map(sky_path, places)]):
         for place, moment in zip(places, moments, strict=True):
-            done.append(written(sources, moment.of(model), place, replace(writing, quiet=bool(done))))
+            done.append(write_model(sources, moment.apply(model), place, replace(writing, quiet=bool(done))))
     return {
         **done[0],
         "file": str(out),
@@ -375,9 +375,9 @@ def _require_no_others(folder: Path, names: re.Pattern[str], places: Sequence[Pa
 
 def _name_of(out: Path) -> tuple[Path, str, str]:
     """The folder of frames, and what stands before and after the number in their names."""
-    if named(out) is None and out.suffix == "":
+    if format_of_name(out) is None and out.suffix == "":
         return out, "", ".ply"
-    codec = for_writing(out)
+    codec = writing_format(out)
     ending = next((end for end in sorted(codec.endings, key=len, reverse=True) if out.name.lower().endswith(end)), "")
     if not ending.startswith("."):
         raise ConfigError(f"{out}: --frames adds a number to a name; expected a folder, or a name such as frame.spz")
@@ -409,12 +409,12 @@ def with_sky_splats(model: Model, count: int = COUNT) -> Model:
         "quats": _turns(directions),
         "log_scales": np.tile([across, across, across + np.log(FLAT)], (count, 1)),
         "logit_opacity": np.full((count, 1), LOGIT),
-        "sh_base": (np.clip(sampled(sky.texels, directions), 0, 1) - 0.5) / SH_C0,
+        "sh_base": (np.clip(sample_texels(sky.texels, directions), 0, 1) - 0.5) / SH_C0,
         "sh_rest": np.zeros((count, model.sh_rest.shape[1])),
     }
     tables: dict[str, Any] = {name: np.concatenate([getattr(model, name), rows]) for name, rows in added.items()}
     if model.motion is not None:
-        tables["motion"] = np.concatenate([model.motion, still(count, model.motion.shape[1])])
+        tables["motion"] = np.concatenate([model.motion, static_motion(count, model.motion.shape[1])])
     notes = {**model.rendering.notes, "sky": "splats"}
     return replace(model, **tables, rendering=replace(model.rendering, notes=notes), sky=None)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from clsplat.formats.splats import sh_coefficients
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.gaussians.sh_offload import defines_of, slots_of
+from clsplat.gaussians.sh_offload import slot_arguments, slot_defines
 from clsplat.gaussians.structs import HARMONICS
 from clsplat.opencl.device import Array
 
@@ -60,7 +60,7 @@ class Deferred:
             self._done.fill(0)
             self.updates = 0
 
-    def before(self, degree: int) -> None:
+    def prepare(self, degree: int) -> None:
         """Make room in the list for an update of the bands up to a degree.
 
         All rows have had what waits where the degree changes, where the list is full, and where rows were moved.
@@ -71,7 +71,7 @@ class Deferred:
         if self._done.shape != (self._blocks,):  # whatever moves rows has flushed
             self._done = self.gaussians.device.zeros(self._blocks, np.uint32)
 
-    def note(self, depth_key: Array, factors: tuple[float, float]) -> None:
+    def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
         """Note an update that the blocks of rows that the view sees have had; factors: rate and correction2 of adam.h.
 
         They must have been brought up to date by `catch_up`, with the same keys.
@@ -92,10 +92,10 @@ class Deferred:
         values, moment1, moment2 = (self.array(name) for name in self.names)
         arguments: dict[str, Any] = {"values": values, "moment1": moment1, "moment2": moment2}
         on_host = self.gaussians.on_host
-        self.gaussians.device.program("deferred.cl", **defines_of(self.gaussians)).replay_updates(
+        self.gaussians.device.program("deferred.cl", **slot_defines(self.gaussians)).replay_updates(
             items=-(-self.gaussians.count // self._lanes),
             **arguments,
-            **slots_of(self.gaussians),
+            **slot_arguments(self.gaussians),
             depth_key=depth_key,
             factors=self._factors,
             done=self._done,

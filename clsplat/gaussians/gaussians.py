@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError
-from clsplat.formats.splats import MOTION, PARAMETERS, degree_of, sh_coefficients
-from clsplat.gaussians.sh_offload import OnHost, defines_of
+from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients, sh_degree_of
+from clsplat.gaussians.sh_offload import HostTables, slot_defines
 from clsplat.gaussians.sky import DeviceSky
-from clsplat.gaussians.structs import HARMONICS, Struct, Waiting, checked_rows, moment_tables
+from clsplat.gaussians.structs import HARMONICS, DeferredUpdates, Struct, check_rows, moment_tables
 from clsplat.opencl.device import Array, Device
 
 # Which parameters of Gaussians are numbers.
@@ -85,10 +85,10 @@ class Gaussians:
         self.device = device
         self.count = len(parameters["means"])
         self.capacity = _aligned(self.count)
-        self.sh_degree = degree_of(parameters["sh_rest"].shape[1])
+        self.sh_degree = sh_degree_of(parameters["sh_rest"].shape[1])
         self.tables: dict[str, Table] = {}
-        self.deferred: Waiting | None = None  # updates that rows wait for
-        self.on_host: OnHost | None = None  # tables that lie on the host
+        self.deferred: DeferredUpdates | None = None  # updates that rows wait for
+        self.on_host: HostTables | None = None  # tables that lie on the host
         self.no_slot = device.zeros(1, np.uint32)
         for name in PARAMETERS:
             self.add(name, parameters[name].shape[1])
@@ -129,7 +129,7 @@ class Gaussians:
         if self.on_host:
             return
         present = {name: self.get(name) for name in HARMONICS if name in self.tables}
-        self.on_host = OnHost(self)
+        self.on_host = HostTables(self)
         for name, values in present.items():
             self.add(name, values.shape[1], self.tables[name].zero_fresh)
             self.set(name, values)
@@ -157,9 +157,9 @@ class Gaussians:
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[Any]) -> None:
         """Write [n, components] from the host into some rows of a table.
 
-        rows: [n] integers, as in `checked_rows`.  Raises ValueError for other rows and for values of another shape.
+        rows: [n] integers, as in `check_rows`.  Raises ValueError for other rows and for values of another shape.
         """
-        table, rows = self._settled(name), checked_rows(rows, self.count)
+        table, rows = self._settled(name), check_rows(rows, self.count)
         if values.shape != (len(rows), table.components):
             raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
         if self.on_host and name in self.on_host:
@@ -178,9 +178,9 @@ class Gaussians:
     def zero_rows(self, names: Collection[str], rows: NDArray[np.integer]) -> None:
         """Set some rows of tables to zero.
 
-        rows: [n] integers, as in `checked_rows`.  Raises ValueError for other rows.
+        rows: [n] integers, as in `check_rows`.  Raises ValueError for other rows.
         """
-        uploaded = self.device.upload(checked_rows(rows, self.count))
+        uploaded = self.device.upload(check_rows(rows, self.count))
         for name in names:
             table = self._settled(name)
             if self.on_host and name in self.on_host:
@@ -207,10 +207,10 @@ class Gaussians:
     @property
     def trained(self) -> tuple[str, ...]:
         """The names of the tables that training changes: the parameters, and the motion where there is one."""
-        return (*PARAMETERS, *([MOTION] if self.moves else []))
+        return (*PARAMETERS, *([MOTION] if self.is_moving else []))
 
     @property
-    def moves(self) -> bool:
+    def is_moving(self) -> bool:
         """Whether the Gaussians have a motion."""
         return MOTION in self.tables
 
@@ -270,7 +270,7 @@ class DeviceModel:
     @property
     def defines(self) -> dict[str, int]:
         """What chooses the programs that project, list and blend these splats."""
-        return ({"PIXEL_BOX": 1} if self.pixel_box else {}) | defines_of(self.gaussians)
+        return ({"PIXEL_BOX": 1} if self.pixel_box else {}) | slot_defines(self.gaussians)
 
 
 def _aligned(count: int) -> int:
@@ -297,7 +297,7 @@ def hide(gaussians: Gaussians, left_out: NDArray[np.bool_]) -> None:
     gaussians.set(HIDDEN, bits)
 
 
-def left_out_arguments(model: DeviceModel, view: int | None, drawn: Array) -> dict[str, Any]:
+def visibility_arguments(model: DeviceModel, view: int | None, drawn: Array) -> dict[str, Any]:
     """Return the arguments of project_forward that leave Gaussians out.
 
     view: the number of a training view, whose hidden ones are among them; drawn: [S], written where the model has a

@@ -16,10 +16,10 @@ from clsplat.core.reading import read_json
 from clsplat.formats import splats as columns
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import (
-    LARGEST,
     MAX_DEGREE,
     MAX_EXPONENT,
     MAX_LOG,
+    MAX_VALUE,
     MIP_VARIANCE,
     NEAR,
     PARAMETERS,
@@ -28,16 +28,16 @@ from clsplat.formats.splats import (
     Reading,
     SplatFile,
     Writing,
-    degree_of,
     inverse_opacities,
     not_finite,
     opacities,
     sh_coefficients,
+    sh_degree_of,
 )
-from clsplat.formats.table import for_writing, located, read, write
+from clsplat.formats.table import model_file, read, write, writing_format
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.motion import at_time, transformed_motion
-from clsplat.gaussians.sky import Sky, keep_sky, sky_beside
+from clsplat.gaussians.sky import Sky, read_sky_file, write_sky_file
 from clsplat.opencl.device import Device
 
 # The numbers with which a model is rendered, as its file says them.
@@ -56,7 +56,7 @@ class Rendering:
     pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead; screen_variance is for viewers
 
     @classmethod
-    def of(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
+    def from_comment(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
         """Take the numbers from a file's comment; files of other programs get those of 3DGS or Mip-Splatting."""
         mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
         names = ("near", "screen_variance", "compensate", "pixel_box")
@@ -82,18 +82,18 @@ class Rendering:
 MODEL = "point_cloud.ply"  # of a run that does not name its own
 
 
-def model_at(path: Path) -> Path:
+def model_path(path: Path) -> Path:
     """Return the model file that a path names: of a folder of SOG its meta.json, of a run folder its model."""
-    place = located(path)
-    return model_of_run(place) if place.is_dir() else place
+    place = model_file(path)
+    return run_model(place) if place.is_dir() else place
 
 
-def model_of_run(folder: Path) -> Path:
+def run_model(folder: Path) -> Path:
     """Return the model file of a run folder: the last export, as its metrics.json names it."""
-    return file_of_run(folder, "export", MODEL)
+    return run_output(folder, "export", MODEL)
 
 
-def file_of_run(folder: Path, stage: str, default: str) -> Path:
+def run_output(folder: Path, stage: str, default: str) -> Path:
     """Return the file of the last stage of a name, as metrics.json of a run folder has it, else the default one."""
     try:
         name = read_json(folder / METRICS)["files"][stage]
@@ -102,7 +102,7 @@ def file_of_run(folder: Path, stage: str, default: str) -> Path:
     return folder / (name if isinstance(name, str) and is_inside(name) else default)
 
 
-def as_trained(file: Path) -> Path:
+def raw_model(file: Path) -> Path:
     """Return the PLY beside a model of a run that holds its world filter apart, where there is one, else the model."""
     raw = file.with_name(f"{file.stem}_raw.ply")
     return raw if raw.is_file() else file
@@ -177,7 +177,7 @@ class Model:
         tables: dict[str, Any] = dict(at_time(self.tables(), time))
         if lost := int(not_finite(tables).sum()):
             raise DataError(
-                f"at the time {time:g}, {lost:,} Gaussians are at no finite place; expected speeds below {LARGEST:g}: "
+                f"time {time:g}, {lost:,} Gaussians have no finite position; keep speeds below {MAX_VALUE:g}: "
                 "`clsplat convert MODEL OTHER.ply` drops the others"
             )
         return replace(self, **tables, motion=None)
@@ -185,7 +185,7 @@ class Model:
     @property
     def sh_degree(self) -> int:
         """Highest degree of the spherical harmonics."""
-        return degree_of(self.sh_rest.shape[1])
+        return sh_degree_of(self.sh_rest.shape[1])
 
     @property
     def scales(self) -> Floats:
@@ -237,7 +237,7 @@ class Model:
         near = self.rendering.near * scale
         if near >= MAX_NUMBER or (not_finite({**self.tables(), **tables}) & ~not_finite(self.tables())).any():
             raise ValueError("expected a smaller scale and translation: no model file holds so large numbers")
-        sky = self.sky.turned(turn) if self.sky and rotation is not None else self.sky
+        sky = self.sky.rotated(turn) if self.sky and rotation is not None else self.sky
         return replace(self, **tables, rendering=replace(self.rendering, near=near), sky=sky)
 
     def baked(self) -> "Model":
@@ -265,12 +265,12 @@ class Model:
         Returns the SHA-256 of what was written; of a folder of SOG that of its meta.json.
         Raises ConfigError for another name, and OutputError when the file cannot be written.
         """
-        model = self if for_writing(Path(path)).keeps_filter else self.baked()
-        digest = write(Path(path), model.as_file(), options)
-        keep_sky(self.sky, Path(path), digest)
+        model = self if writing_format(Path(path)).keeps_filter else self.baked()
+        digest = write(Path(path), model.to_splat_file(), options)
+        write_sky_file(self.sky, Path(path), digest)
         return digest
 
-    def as_file(self) -> SplatFile:
+    def to_splat_file(self) -> SplatFile:
         """Return what a model file holds, with the arrays of the model."""
         return SplatFile(self.tables(), self.rendering.comment(), "mip" if self.rendering.compensate else "default")
 
@@ -299,9 +299,9 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
     Raises DataError when it is missing, damaged or not a splat.
     """
     path = Path(path)
-    file = read(model_at(path), options)
-    sky = sky_beside(model_at(path), file.rendering.get("sky") == "directions" and not (options and options.quiet))
-    model = Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode), sky=sky)
+    file = read(model_path(path), options)
+    sky = read_sky_file(model_path(path), file.rendering.get("sky") == "directions" and not (options and options.quiet))
+    model = Model(**file.parameters, rendering=Rendering.from_comment(file.rendering, file.mode), sky=sky)
     if file.placement is None:
         return model
     scale = float(np.cbrt(np.linalg.det(file.placement[:3, :3])))

@@ -10,23 +10,23 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.core.quaternions import multiply, unit_quaternions
-from clsplat.formats.splats import MOTION, STILL, Parameters, fields_of
+from clsplat.formats.splats import MOTION, STATIC_LOG_DURATION, Parameters, motion_fields
 
 FAINTEST = 1 / 255  # of a presence: what is fainter is nowhere to be seen
 LOGIT = 80.0  # of an opacity, at most where it fades
 
 
-def still(count: int, width: int) -> NDArray[np.float32]:
+def static_motion(count: int, width: int) -> NDArray[np.float32]:
     """Return the motion of Gaussians that are there always and never move, [count, width]."""
     table = np.zeros((count, width), np.float32)
-    fields = fields_of(width)
-    table[:, fields["time_center"]], table[:, fields["log_duration"]] = 0.5, STILL
+    fields = motion_fields(width)
+    table[:, fields["time_center"]], table[:, fields["log_duration"]] = 0.5, STATIC_LOG_DURATION
     return table
 
 
 def presence(motion: NDArray[np.floating], time: float | NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the factor of each opacity at a time, or at a time of its own, [N]; it is [N] in (0, 1]."""
-    fields, table = fields_of(motion.shape[1]), motion.astype(np.float64)
+    fields, table = motion_fields(motion.shape[1]), motion.astype(np.float64)
     dt = np.reshape(time, (-1, 1)) - table[:, fields["time_center"]]
     with np.errstate(over="ignore"):
         return np.exp(-0.5 * np.square(dt * np.exp(np.minimum(-table[:, fields["log_duration"]], LOGIT))))[:, 0]
@@ -35,7 +35,7 @@ def presence(motion: NDArray[np.floating], time: float | NDArray[np.float64]) ->
 def at_time(parameters: Parameters, time: float) -> Parameters:
     """Return the tables of static Gaussians as moving ones are at a time: those that are there, without motion."""
     motion = parameters[MOTION].astype(np.float64)
-    fields, factor = fields_of(motion.shape[1]), presence(motion, time)
+    fields, factor = motion_fields(motion.shape[1]), presence(motion, time)
     there = factor >= FAINTEST
     tables = {name: table[there] for name, table in parameters.items() if name != MOTION}
     motion, factor = motion[there], factor[there, None]
@@ -57,7 +57,7 @@ def at_time(parameters: Parameters, time: float) -> Parameters:
 
 def transformed_motion(motion: NDArray[np.floating], scale: float, turn: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the motion after x -> scale · turn x; turn: [3, 3], a rotation."""
-    fields, moved = fields_of(motion.shape[1]), motion.astype(np.float64)
+    fields, moved = motion_fields(motion.shape[1]), motion.astype(np.float64)
     for name in fields.keys() & {"velocity", "acceleration", "jerk"}:
         moved[:, fields[name]] = scale * moved[:, fields[name]] @ turn.T
     if "turn" in fields:
@@ -65,7 +65,7 @@ def transformed_motion(motion: NDArray[np.floating], scale: float, turn: NDArray
     return moved
 
 
-def alike(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters]:
+def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters]:
     """Return the tables of models with a motion in all of them where some move: the others stand still.
 
     Raises DataError where they move in different ways.
@@ -77,13 +77,17 @@ def alike(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters
             f"{second}: moves by a polynomial of another degree than {first}, or one of them turns; expected the same: "
             "take one moment of them (`clsplat convert MODEL OUT --time T`)"
         )
-    return [{**one, MOTION: one.get(MOTION, still(len(one["means"]), *widths))} if widths else one for one in tables]
+    return [
+        {**one, MOTION: one.get(MOTION, static_motion(len(one["means"]), *widths))} if widths else one for one in tables
+    ]
 
 
-def moved_to(tables: Mapping[str, NDArray[np.float64]], by: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+def shift_time_center(
+    tables: Mapping[str, NDArray[np.float64]], by: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
     """Return means, quaternions and motion of the same paths, told from centers that are `by`, [N], later in time."""
     motion, way = tables[MOTION].copy(), by[:, None]
-    fields, still_there = fields_of(motion.shape[1]), np.zeros((len(by), 3))
+    fields, still_there = motion_fields(motion.shape[1]), np.zeros((len(by), 3))
     first, second, third = (
         motion[:, fields[name]].copy() if name in fields else still_there
         for name in ("velocity", "acceleration", "jerk")

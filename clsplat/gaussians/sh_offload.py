@@ -19,7 +19,7 @@ GROWTH = 1.25  # of the slots, where a view sees more
 FEWEST = 4096  # rows in the slots, as many as are sent at a time where all rows are needed
 
 
-class OnHost:
+class HostTables:
     """Tables of a Gaussians struct that lie on the host, [blocks, components, LANES] each; blocks: of LANES rows."""
 
     def __init__(self, gaussians: Struct) -> None:
@@ -135,13 +135,13 @@ class OnHost:
         self.held, self.slot = np.zeros(0, np.int64), self._no_slots()
 
 
-def slots_of(gaussians: Struct) -> dict[str, Any]:
+def slot_arguments(gaussians: Struct) -> dict[str, Any]:
     """Return the arguments of kernels that say where the harmonics lie (cl_kernels/slots.h)."""
     if gaussians.on_host:
         return {"sh_slot": gaussians.on_host.slot, "sh_block": gaussians.on_host.block}
     return {"sh_slot": gaussians.no_slot, "sh_block": 0}
 
 
-def defines_of(gaussians: Struct) -> dict[str, int]:
+def slot_defines(gaussians: Struct) -> dict[str, int]:
     """Return what chooses the programs that find the harmonics there."""
     return {"SH_SLOTS": 1} if gaussians.on_host else {}

@@ -25,7 +25,7 @@ def signs(directions: NDArray[np.floating]) -> Floats:
     return np.where(directions < 0, -1.0, 1.0)
 
 
-def places(directions: NDArray[np.floating], side: int) -> Floats:
+def texel_positions(directions: NDArray[np.floating], side: int) -> Floats:
     """Return where directions, [..., 3] of any length, lie between the centers of texels, [..., 2] from -0.5 on."""
     directions = np.asarray(directions, np.float64)
     sign = signs(directions)
@@ -55,30 +55,30 @@ def texel_at(i: Integers, j: Integers, side: int) -> Integers:
     return j * side + i
 
 
-def neighbors(side: int) -> Integers:
+def neighbor_texels(side: int) -> Integers:
     """Return the texels about each texel and itself, [side * side, 9]."""
     j, i = (axis.ravel() for axis in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
     return np.stack([texel_at(i + right, j + down, side) for down in (-1, 0, 1) for right in (-1, 0, 1)], axis=1)
 
 
-def corners(i: Integers, j: Integers, side: int) -> Integers:
+def bilinear_texels(i: Integers, j: Integers, side: int) -> Integers:
     """Return the four texels about places whose integer parts are i and j, from -1 to side - 1, [..., 4]."""
     return np.stack([texel_at(i + right, j + down, side) for down in (0, 1) for right in (0, 1)], axis=-1)
 
 
-def weights(fractions: Floats) -> Floats:
+def bilinear_weights(fractions: Floats) -> Floats:
     """Return the bilinear weights of the four texels, [..., 4], of the fractional parts of places, [..., 2]."""
     a, b = fractions[..., 0], fractions[..., 1]
     return np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=-1)
 
 
-def sampled(texels: NDArray[np.floating], directions: NDArray[np.floating]) -> Floats:
+def sample_texels(texels: NDArray[np.floating], directions: NDArray[np.floating]) -> Floats:
     """Return the values of a map, [side * side, C], in directions [..., 3]: [..., C]."""
     side = int(np.sqrt(len(texels)))
-    place = places(directions, side)
+    place = texel_positions(directions, side)
     first = np.floor(place).astype(np.int64)
-    found = texels[corners(first[..., 0], first[..., 1], side)]
-    return np.asarray(np.einsum("...kc,...k->...c", found, weights(place - first)))
+    found = texels[bilinear_texels(first[..., 0], first[..., 1], side)]
+    return np.asarray(np.einsum("...kc,...k->...c", found, bilinear_weights(place - first)))
 
 
 LOG = logging.getLogger("clsplat")
@@ -118,9 +118,9 @@ class Sky:
         """Copy it to a device."""
         return DeviceSky(device.upload(np.ascontiguousarray(self.texels.T)), self.side)
 
-    def turned(self, rotation: NDArray[np.floating]) -> "Sky":
+    def rotated(self, rotation: NDArray[np.floating]) -> "Sky":
         """Return the map of a scene that is turned by x -> rotation x, [3, 3]; colors between texels are bilinear."""
-        return Sky(sampled(self.texels, texel_directions(self.side) @ rotation).astype(np.float32))
+        return Sky(sample_texels(self.texels, texel_directions(self.side) @ rotation).astype(np.float32))
 
     def write(self, path: Path, models: Mapping[str, str]) -> None:
         """Write it as JSON, with the SHA-256 of the model files that it belongs to, by name; numbers keep their bits.
@@ -133,17 +133,17 @@ class Sky:
         write_text(path, json.dumps(data) + "\n")
 
 
-def sky_file(model: Path) -> Path:
+def sky_path(model: Path) -> Path:
     """Return the file that holds the sky of a model file, where it has one; of one as it was trained, `_raw`, too."""
     return model.with_name(f"{model.stem.removesuffix('_raw')}_sky.json")
 
 
-def keep_sky(sky: Sky | None, model: Path, digest: str) -> None:
+def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
     """Write the sky of a model file, of that SHA-256, beside it; without a sky, let none that is there belong to it.
 
     Other model files of the same stem stay with a sky that is the same.  Raises OutputError.
     """
-    path = sky_file(model)
+    path = sky_path(model)
     try:
         before, models = _read(path) if path.is_file() else (None, {})
     except DataError:  # which belongs to no model
@@ -161,12 +161,12 @@ def keep_sky(sky: Sky | None, model: Path, digest: str) -> None:
             raise write_error(path, error) from error
 
 
-def sky_beside(model: Path, expected: bool = False) -> Sky | None:
+def read_sky_file(model: Path, expected: bool = False) -> Sky | None:
     """Return the sky of a model file; None without one, with a warning where one is expected or is of another model.
 
     Raises DataError where its file is damaged.
     """
-    path = sky_file(model)
+    path = sky_path(model)
     if not path.is_file():
         if expected:
             LOG.warning("%s: was trained with a sky, which is drawn where %s lies beside it", model, path.name)

@@ -11,7 +11,7 @@ from clsplat.formats.splats import PARAMETERS
 from clsplat.opencl.device import Array, Device
 
 
-class Waiting(Protocol):
+class DeferredUpdates(Protocol):
     """Updates that rows wait for, as `Deferred` does them."""
 
     names: ClassVar[tuple[str, ...]]
@@ -23,10 +23,10 @@ class Waiting(Protocol):
     def flush(self) -> None:
         """Do what waits for all rows."""
 
-    def before(self, degree: int) -> None:
+    def prepare(self, degree: int) -> None:
         """Make room for an update of the bands up to a degree."""
 
-    def note(self, depth_key: Array, factors: tuple[float, float]) -> None:
+    def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
         """Note an update that the rows that a view sees have had."""
 
 
@@ -95,7 +95,7 @@ def _shapes(gaussians: Struct) -> dict[str, tuple[int, ...]]:
 # Rows of tables, as a caller gives them and as a kernel takes them.
 
 
-def checked_rows(rows: NDArray[np.integer], count: int) -> NDArray[np.uint32]:
+def check_rows(rows: NDArray[np.integer], count: int) -> NDArray[np.uint32]:
     """Return rows, [n], as a kernel takes them; raise ValueError unless they are different integers in [0, count)."""
     if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
         raise ValueError(

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.formats.splats import Reading, fields_of, not_finite, told_too_large
-from clsplat.formats.streamed_sog import LOD_META, faults_of_levels
-from clsplat.formats.table import detect, located, named
+from clsplat.formats.splats import Reading, motion_fields, not_finite, too_large_message
+from clsplat.formats.streamed_sog import LOD_META, find_level_faults
+from clsplat.formats.table import detect, format_of_name, model_file
 from clsplat.gaussians.model import Model, load
 
 ENOUGH = 16  # Gaussians, from which their numbers tell something
@@ -21,10 +21,10 @@ DEGENERATE = {"not_finite": "not finite", "no_rotation": "without rotation", "fl
 
 def is_model(path: Path) -> bool:
     """Return whether a path is a model, by its content or its name; pipeline files are none."""
-    place = located(path)
+    place = model_file(path)
     if place.suffix in (".yaml", ".yml"):
         return False
-    return bool(named(place) or (place.is_file() and detect(place)))
+    return bool(format_of_name(place) or (place.is_file() and detect(place)))
 
 
 def examine(path: Path) -> dict[str, Any]:
@@ -33,20 +33,20 @@ def examine(path: Path) -> dict[str, Any]:
 
     Raises DataError where it cannot be read.
     """
-    codec = detect(located(path))
+    codec = detect(model_file(path))
     model = load(path, Reading(not_finite="keep"))
     bad = not_finite(model.tables())
     whole = model[~bad] if bad.any() else model
     findings = [f"{int(bad.sum()):,} of {len(model):,} Gaussians hold values that are not finite"] if bad.any() else []
-    findings += [told] if (told := told_too_large(whole.tables())) else []
+    findings += [told] if (told := too_large_message(whole.tables())) else []
     findings += _activated(whole)
     length = np.linalg.norm(whole.quats.astype(np.float64), axis=1)
     if zero := int((length == 0).sum()):
         findings.append(f"{zero} quaternions have no length")
     if not len(model):
         findings.append("it holds no Gaussians")
-    if located(path).name == LOD_META:
-        findings += faults_of_levels(located(path))
+    if model_file(path).name == LOD_META:
+        findings += find_level_faults(model_file(path))
     return {
         "model": str(path),
         "format": codec.name if codec else "",
@@ -126,7 +126,7 @@ def _ranges(model: Model) -> dict[str, list[float]]:
         "quaternions": np.linalg.norm(model.quats.astype(np.float64), axis=1),
     }
     if model.motion is not None:
-        fields, motion = fields_of(model.motion.shape[1]), model.motion.astype(np.float64)
+        fields, motion = motion_fields(model.motion.shape[1]), model.motion.astype(np.float64)
         quantities["speeds"] = np.linalg.norm(motion[:, fields["velocity"]], axis=1)
         quantities["durations"] = np.exp(np.minimum(motion[:, fields["log_duration"]], 700))
     return {

@@ -10,9 +10,9 @@ from pydantic import Field
 from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import Positive, at_step
 from clsplat.density.edit import Edit, Rule
-from clsplat.formats.splats import MOTION, fields_of, opacities
+from clsplat.formats.splats import MOTION, motion_fields, opacities
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.gaussians.motion import moved_to, presence
+from clsplat.gaussians.motion import presence, shift_time_center
 from clsplat.losses.base import LossValue, Penalty, PenaltyInputs
 from clsplat.methods.adc import Grow
 
@@ -44,7 +44,7 @@ class SplitInTime(Grow):
         rows = np.flatnonzero(steep & (edit.rows() == 1))
         names = ("means", "quats", "log_scales", "logit_opacity", MOTION)
         tables = {name: gaussians.get(name)[rows].astype(np.float64) for name in names}
-        fields = fields_of(tables[MOTION].shape[1])
+        fields = motion_fields(tables[MOTION].shape[1])
         duration = np.minimum(np.exp(np.minimum(tables[MOTION][:, fields["log_duration"]][:, 0], 0)), MAX_DURATION)
         travel = np.linalg.norm(tables[MOTION][:, fields["velocity"]], axis=1) * duration
         size = np.exp(tables["log_scales"]).max(axis=1)
@@ -53,7 +53,7 @@ class SplitInTime(Grow):
         if not len(rows):
             return
         tables = {name: table[far] for name, table in tables.items()}
-        children = [moved_to(tables, sign * OFFSET * duration) for sign in (-1, 1)]
+        children = [shift_time_center(tables, sign * OFFSET * duration) for sign in (-1, 1)]
         for child in children:
             child[MOTION][:, fields["log_duration"]] = np.log(SHORTENING * duration)[:, None]
             child["logit_opacity"] = shared_in_time(tables["logit_opacity"])
@@ -79,7 +79,7 @@ class PruneInvisible(Rule):
         require_motion(self.type, gaussians)
         timestamps = np.unique([view.time or 0.0 for view in edit.survey.views])
         motion = gaussians.get(MOTION)
-        centers = motion[:, fields_of(motion.shape[1])["time_center"]][:, 0]
+        centers = motion[:, motion_fields(motion.shape[1])["time_center"]][:, 0]
         after = np.searchsorted(timestamps, centers).clip(1, max(len(timestamps) - 1, 1))
         near = [presence(motion, timestamps[np.minimum(i, len(timestamps) - 1)]) for i in (after - 1, after)]
         opacity = opacities(gaussians.get("logit_opacity")[:, 0]) * np.maximum(*near)
@@ -95,7 +95,7 @@ def shared_in_time(logit: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def require_motion(name: str, gaussians: Gaussians) -> None:
     """Raise ConfigError if the Gaussians do not move; name: of the rule or loss."""
-    if not gaussians.moves:
+    if not gaussians.is_moving:
         raise ConfigError(f"'{name}' needs Gaussians that move; set `model.time`, or remove '{name}'")
 
 

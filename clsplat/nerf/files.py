@@ -18,7 +18,7 @@ from clsplat.core.errors import DataError, one_line, quote, shorten
 from clsplat.core.files import open_atomic, path_exists
 from clsplat.core.reading import sha256
 from clsplat.core.resources import __version__
-from clsplat.gaussians.model import Rendering, file_of_run
+from clsplat.gaussians.model import Rendering, run_output
 from clsplat.nerf.field import Field
 from clsplat.nerf.shape import FieldShape, WrittenShape
 from clsplat.opencl.device import Device
@@ -86,7 +86,7 @@ def is_field(path: Path) -> bool:
 
 def field_of_run(folder: Path) -> Path:
     """Return the file of the field of a run folder: the last that `export_field` has written."""
-    return file_of_run(folder, "export_field", FILE)
+    return run_output(folder, "export_field", FILE)
 
 
 def load_field(path: str | Path) -> FieldModel:

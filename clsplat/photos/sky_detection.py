@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.sky import corners, neighbors, places, weights
+from clsplat.gaussians.sky import bilinear_texels, bilinear_weights, neighbor_texels, texel_positions
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import up_direction
@@ -80,9 +80,9 @@ def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32
     """
     colors, of_sky, of_all = np.zeros((side**2, 3)), np.zeros(side**2), np.zeros(side**2)
     for one in seen:
-        place = places(one.directions, side)
+        place = texel_positions(one.directions, side)
         first = np.floor(place).astype(np.int64)
-        texels, weight = corners(first[..., 0], first[..., 1], side), weights(place - first)
+        texels, weight = bilinear_texels(first[..., 0], first[..., 1], side), bilinear_weights(place - first)
         of_all += np.bincount(texels[one.counted].ravel(), weight[one.counted].ravel(), side**2)
         texels, weight = texels[one.mask], weight[one.mask]
         of_sky += np.bincount(texels.ravel(), weight.ravel(), side**2)
@@ -94,7 +94,7 @@ def panorama(seen: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32
         return None
     free = of_sky > 0
     for _ in range(BEYOND):
-        free = np.asarray(free[neighbors(side)].any(axis=1))
+        free = np.asarray(free[neighbor_texels(side)].any(axis=1))
     mean = colors.sum(axis=0) / of_sky.sum()
     found = np.where(of_sky[:, None] > 0, colors / np.maximum(of_sky, 1e-9)[:, None], mean)
     return found.astype(np.float32), free | (of_all == 0)

@@ -12,9 +12,9 @@ from typing import Any
 from clsplat.core.errors import DataError
 from clsplat.core.reading import sha256
 from clsplat.core.settings import Settings
-from clsplat.formats.table import files_of
-from clsplat.gaussians.model import model_at
-from clsplat.gaussians.sky import sky_file
+from clsplat.formats.table import model_files
+from clsplat.gaussians.model import model_path
+from clsplat.gaussians.sky import sky_path
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import fingerprint
 from clsplat.scene.images import is_image
@@ -64,12 +64,12 @@ def content_of(path: Path) -> str:
 
 
 def _content_of(path: Path) -> str:
-    model = model_at(path)
+    model = model_path(path)
     if not model.is_file() and any(is_image(file) for file in path.rglob("*")):
         return f"sha256:{fingerprint(path, path / 'nothing')}"
     if not model.is_file():
         raise DataError(f"{path}: has no model; expected a file, or the folder of a finished run")
-    others = [file for file in (*files_of(model), sky_file(model)) if file != model and file.is_file()]
+    others = [file for file in (*model_files(model), sky_path(model)) if file != model and file.is_file()]
     digests = " ".join(map(_digest, (model, *others)))
     return f"sha256:{hashlib.sha256(digests.encode()).hexdigest() if others else digests}"
 

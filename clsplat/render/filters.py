@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 
 from clsplat.core.settings import OneOf, Settings
 from clsplat.formats.ply import MAX_NUMBER
-from clsplat.formats.splats import MAX_DEGREE, width_of
+from clsplat.formats.splats import MAX_DEGREE, motion_width
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.opencl.device import Array, Device
 from clsplat.render.backdrops import Backdrop, EnvironmentMap
@@ -170,7 +170,7 @@ class Motion(Settings):
     @property
     def width(self) -> int:
         """Columns of the table of the motion."""
-        return width_of(self.degree, self.rotation)
+        return motion_width(self.degree, self.rotation)
 
 
 class ModelSettings(Settings):

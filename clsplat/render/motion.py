@@ -23,7 +23,7 @@ def at_moment(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) ->
     A camera without a time shows the first moment, which is told once.
     """
     gaussians = model.gaussians
-    if not gaussians.moves:
+    if not gaussians.is_moving:
         return model
     if camera.time is None:
         _tell_of_the_first()
@@ -50,7 +50,7 @@ def to_centers(model: DeviceModel, camera: DeviceCamera, gradients: GaussianGrad
     """Make gradients by a moving model at the time of a camera those by the model and its motion; a static one has
     them already."""
     gaussians = model.gaussians
-    if not gaussians.moves:
+    if not gaussians.is_moving:
         return
     program = gaussians.device.program("motion.cl")
     program.move_backward(

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 
 from clsplat.core.errors import MemoryLimitError
-from clsplat.gaussians.gaussians import DeviceModel, Gaussians, left_out_arguments
-from clsplat.gaussians.sh_offload import slots_of
+from clsplat.gaussians.gaussians import DeviceModel, Gaussians, visibility_arguments
+from clsplat.gaussians.sh_offload import slot_arguments
 from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Array, Device, Program, constants
 from clsplat.render.camera import DeviceCamera
@@ -96,7 +96,7 @@ def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
         "screen_variance": 0.0 if model.pixel_box else model.screen_variance,
         "compensate": 0.0 if model.pixel_box else model.compensate,
         "degree": model.degree,
-        **slots_of(gaussians),
+        **slot_arguments(gaussians),
         "stride": gaussians.capacity,
         "count": gaussians.count,
     }
@@ -121,7 +121,7 @@ def project(
         items=-(-count // int(device.tuning["LANES"])),
         **shape_arguments(model, camera),
         sh_base=gaussians["sh_base"],
-        **left_out_arguments(model, camera.view, workspace.array("left_out", stride)),
+        **visibility_arguments(model, camera.view, workspace.array("left_out", stride)),
         splats=splats,
         **vars(footprints),
         radius=radius,

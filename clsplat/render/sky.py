@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.sky import DeviceSky, corners, places, signs
+from clsplat.gaussians.sky import DeviceSky, bilinear_texels, signs, texel_positions
 from clsplat.opencl.device import Array, Device, Program, constants
 from clsplat.render.camera import CAMERA, DeviceCamera
 from clsplat.render.workspace import Workspace
@@ -51,7 +51,7 @@ def run_words(values: NDArray[np.void], width: int, height: int, side: int) -> I
     """Return the runs of all rows, [R, RUN_WORDS]: pixels side by side that lie between the same four texels, in one
     octant.  values: camera_t."""
     rays = directions_of(values, width, height)
-    first = np.floor(places(rays, side)).astype(np.int64)
+    first = np.floor(texel_positions(rays, side)).astype(np.int64)
     bits = (signs(rays) < 0) @ np.array([1, 2, 4])
     place = first[..., 0] + 1 | (first[..., 1] + 1) << PLACE_BITS | bits << 2 * PLACE_BITS
     begins = np.ones(place.shape, bool)
@@ -61,7 +61,7 @@ def run_words(values: NDArray[np.void], width: int, height: int, side: int) -> I
     end[np.append(row[1:] != row[:-1], True)] = width
     found = first[row, column]
     words = np.column_stack([row, column, end, place[row, column]])
-    return np.column_stack([words, corners(found[:, 0], found[:, 1], side)])
+    return np.column_stack([words, bilinear_texels(found[:, 0], found[:, 1], side)])
 
 
 class Skies:

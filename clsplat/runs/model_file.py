@@ -21,8 +21,8 @@ from clsplat.core.errors import ConfigError, DataError, shell_quote
 from clsplat.core.files import METRICS, PIPELINE, open_atomic, path_exists, raising_output_error, write_text
 from clsplat.core.progress import counted
 from clsplat.core.reading import read_json
-from clsplat.formats.table import located
-from clsplat.gaussians.model import MODEL, Model, load, model_at, model_of_run
+from clsplat.formats.table import model_file
+from clsplat.gaussians.model import MODEL, Model, load, model_path, run_model
 from clsplat.metrics.perceptual import InputRange, Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure
 from clsplat.nerf.files import FieldModel, field_of_run, is_field, load_field
@@ -108,7 +108,7 @@ class ModelSource:
         run = run_of(model)
         trained = scene if scene is not None and has_pipeline(scene) else run
         if trained is None and scene is None:
-            if model.is_dir() and not located(model).is_file():
+            if model.is_dir() and not model_file(model).is_file():
                 raise _no_model(model)
             if not model.exists():
                 raise DataError(f"{model}: not found; expected a model file or a run folder")
@@ -133,7 +133,7 @@ class ModelSource:
 def require_model(path: Path) -> None:
     """Raise DataError for a folder that holds no Gaussians, and for the file of a field."""
     refuse_field(path)
-    if path.is_dir() and not (file := model_at(path)).is_file():
+    if path.is_dir() and not (file := model_path(path)).is_file():
         raise _no_model(path, file.name)
 
 
@@ -153,7 +153,7 @@ def _no_model(folder: Path, name: str = MODEL) -> DataError:
 
 def refuse_field(path: Path) -> None:
     """Raise DataError for the file of a field, and for a run that has trained one."""
-    if is_field(path) or (has_pipeline(path) and _has_field(path) and not model_of_run(path).is_file()):
+    if is_field(path) or (has_pipeline(path) and _has_field(path) and not run_model(path).is_file()):
         raise of_a_field(path)
 
 
@@ -165,7 +165,7 @@ def of_a_field(path: Path) -> DataError:
 
 def shown_of_run(run: Path) -> Path:
     """The file of what a run has trained: Gaussians, or a field."""
-    file = model_of_run(run)
+    file = run_model(run)
     return file if file.is_file() or not _has_field(run) else field_of_run(run)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.core.errors import DataError, PoseError, quote
-from clsplat.formats.splats import EXPECTED, is_moment
+from clsplat.formats.splats import EXPECTED_TIME, is_timestamp
 from clsplat.scene.camera import MODELS, Camera, Lens
 from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_image
 
@@ -46,8 +46,8 @@ def validate_time(name: str, time: float | None) -> float | None:
         return None
     if isinstance(time, bool) or not isinstance(time, int | float | np.floating | np.integer):
         raise PoseError(f"the time of {quote(name)} is {quote(time)}; expected a number from 0 to 1, or None")
-    if not is_moment(time):
-        raise PoseError(f"the time of {quote(name)} is {float(time):g}; {EXPECTED}")
+    if not is_timestamp(time):
+        raise PoseError(f"the time of {quote(name)} is {float(time):g}; {EXPECTED_TIME}")
     return float(time)
 
 

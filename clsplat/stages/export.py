@@ -10,10 +10,10 @@ from pydantic import Field, model_validator
 from clsplat.core.errors import DataError, OutputError
 from clsplat.core.reading import sha256
 from clsplat.formats.splats import Quality, Reading, Writing
-from clsplat.formats.table import endings, for_writing
+from clsplat.formats.table import endings, writing_format
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import load
-from clsplat.gaussians.sky import sky_file
+from clsplat.gaussians.sky import sky_path
 from clsplat.scene.camera_files import check_cameras, write_cameras
 from clsplat.training import checkpoint
 from clsplat.training.modules.base import learned_scene
@@ -46,7 +46,7 @@ class Export(Scheduled):
 
     @model_validator(mode="after")
     def _quality_of_its_format(self) -> "Export":
-        if self.quality != "balanced" and not for_writing(Path(self.file)).has_quality:
+        if self.quality != "balanced" and not writing_format(Path(self.file)).has_quality:
             raise ValueError(
                 f"'quality' applies to SPZ and SOG; expected a file that ends in .spz or .sog, got '{self.file}'"
             )
@@ -54,7 +54,7 @@ class Export(Scheduled):
 
     def outputs(self, out: Path) -> list[Path]:
         path = out / self.file
-        return [path, path.with_name(f"{path.stem}_raw.ply"), sky_file(path)]
+        return [path, path.with_name(f"{path.stem}_raw.ply"), sky_path(path)]
 
     def run(self, run: Run) -> None:
         model = host_model(run)
@@ -73,7 +73,7 @@ class Export(Scheduled):
         for file, saved in files.items():
             run.model_hashes[_name(file, run)] = saved.save(file, options)
             try:
-                if for_writing(file).read:
+                if writing_format(file).read:
                     load(file, Reading(quiet=True))
             except DataError as error:
                 raise OutputError(f"{error}; it was just written: check the disk and its free space") from error

@@ -5,8 +5,8 @@ import scipy
 from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, DataError, shell_quote
-from clsplat.formats.splats import MOTION, Parameters, fields_of
-from clsplat.gaussians.motion import still
+from clsplat.formats.splats import MOTION, Parameters, motion_fields
+from clsplat.gaussians.motion import static_motion
 from clsplat.render.filters import Motion
 from clsplat.scene.scene import Scene
 
@@ -42,7 +42,7 @@ def moving(
     if motion is None:
         return parameters
     count = len(parameters["means"])
-    table, fields = still(count, motion.width), fields_of(motion.width)
+    table, fields = static_motion(count, motion.width), motion_fields(motion.width)
     times = np.random.default_rng([seed, count, STREAM]).uniform(0, 1, count)
     duration = np.full(count, np.log(durations[0]))
     if seen is not None:
@@ -88,4 +88,4 @@ def with_motion(parameters: Parameters, motion: Motion | None, file: str) -> Par
             f"{file}: its Gaussians move, and the pipeline has {setting}; set `model.time` as in the file, "
             f"or start from one frame: `clsplat convert {shell_quote(file)} FRAME.ply --time T`"
         )
-    return {**parameters, MOTION: still(len(parameters["means"]), expected)}
+    return {**parameters, MOTION: static_motion(len(parameters["means"]), expected)}

@@ -16,9 +16,9 @@ from clsplat.density.survey import WEIGHT, RenderedView
 from clsplat.formats.sog import Harmonics
 from clsplat.formats.sog_quantize import (
     log_weights,
-    rounded,
-    rounded_quats,
-    weighed_means,
+    round_means,
+    round_quats,
+    round_to,
 )
 from clsplat.formats.splats import SH_C0, Quality
 from clsplat.gaussians.gaussians import ALIGNMENT, Gaussians
@@ -68,7 +68,7 @@ class PaletteSh(Scheduled):
             return
         rest, error = gaussians.get("sh_rest"), visible_error(run)
         better = partial(error.palette, rest, nearest=partial(most_alike, run.device))
-        found = Harmonics.few(rest, self.quality, error.weights, better, self.step)
+        found = Harmonics.fit(rest, self.quality, error.weights, better, self.step)
         gaussians.set("sh_rest", found.values)
         gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - found.values))
         set_clusters(gaussians, found.labels, error.weights)
@@ -300,13 +300,13 @@ class RoundTables(Stage):
         tables = {name: gaussians.get(name) for name in self._changed()}
         if self.means:
             p = {name: gaussians.get(name) for name in ("means", "log_scales", "logit_opacity")}
-            tables["means"] = weighed_means(p["means"], p["log_scales"], log_weights(p), self.means)
+            tables["means"] = round_means(p["means"], p["log_scales"], log_weights(p), self.means)
         if self.quats:
-            tables["quats"], tables["log_scales"] = rounded_quats(tables["quats"], tables["log_scales"], self.quats)
+            tables["quats"], tables["log_scales"] = round_quats(tables["quats"], tables["log_scales"], self.quats)
         if self.log_scales:
-            tables["log_scales"] = rounded(tables["log_scales"], self.log_scales)
+            tables["log_scales"] = round_to(tables["log_scales"], self.log_scales)
         if self.sh_base:
-            tables["sh_base"] = rounded(tables["sh_base"], self.sh_base)
+            tables["sh_base"] = round_to(tables["sh_base"], self.sh_base)
         for name, table in tables.items():
             gaussians.set(name, table)
         run.refresh_filter()

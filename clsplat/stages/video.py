@@ -141,7 +141,7 @@ class Video(Stage):
         return Wish.of(self.path, self.frames, self.fps, self.size, self.times)
 
     def _plan(self, run: Run) -> Film:
-        moves = run.gaussians is not None and run.model.gaussians.moves
+        moves = run.gaussians is not None and run.model.gaussians.is_moving
         return plan(self._wish(), run.scene.downscaled(run.downscale), _points(run), moves)
 
     def check(self) -> None:

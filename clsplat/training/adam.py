@@ -12,8 +12,8 @@ from clsplat.core.settings import Settings
 from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients
 from clsplat.gaussians.deferred import Deferred
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
-from clsplat.gaussians.sh_offload import defines_of, slots_of
-from clsplat.gaussians.structs import GaussianGradients, Waiting, moment_tables
+from clsplat.gaussians.sh_offload import slot_arguments, slot_defines
+from clsplat.gaussians.structs import DeferredUpdates, GaussianGradients, moment_tables
 from clsplat.opencl.device import Array, constants
 from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.training.motion import MotionRates, update_motion
@@ -174,7 +174,7 @@ class Adam:
                 components = 3 * (sh_coefficients(model.degree) - 1)
             values, moment1, moment2 = (gaussians.tables[table].array for table in (name, *moment_tables(name)))
             rate, correction2 = self._factors(name, rates)
-            in_slots = defines_of(gaussians) if name == "sh_rest" else {}
+            in_slots = slot_defines(gaussians) if name == "sh_rest" else {}
             gaussians.device.program("adam.cl", **in_slots).adam_step(
                 items=(-(-gaussians.count // self._lanes), components),
                 values=values,
@@ -186,17 +186,17 @@ class Adam:
                 correction2=correction2,
                 every=_EVERY[rows],
                 undrawn=_UNDRAWN[rows] if name == "sh_rest" else _UNDRAWN["all"],
-                **slots_of(gaussians),
+                **slot_arguments(gaussians),
                 stride=gaussians.capacity,
                 count=gaussians.count,
             )
             if name == "sh_rest":
                 self._end(deferred, frame, rate, correction2)
-        if gaussians.moves and MOTION not in without:
+        if gaussians.is_moving and MOTION not in without:
             self.updates[MOTION] += 1
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
 
-    def _deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> Waiting | None:
+    def _deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> DeferredUpdates | None:
         """Return the record of deferred `sh_rest` updates; None if all rows are updated at once, or none is."""
         gaussians = self.gaussians
         if rows != "deferred":
@@ -206,7 +206,7 @@ class Adam:
         if model.degree == 0 or not rates["sh_rest"]:
             return None
         gaussians.deferred = gaussians.deferred or Deferred(gaussians)
-        gaussians.deferred.before(model.degree)
+        gaussians.deferred.prepare(model.degree)
         return gaussians.deferred
 
     def _mean2d(self) -> Array:
@@ -221,10 +221,10 @@ class Adam:
         """Return the rows to update: harmonics on the host are always updated later, when a view sees them."""
         return "deferred" if rows == "all" and self.gaussians.on_host else rows
 
-    def _end(self, deferred: Waiting | None, frame: Frame, rate: float, correction2: float) -> None:
+    def _end(self, deferred: DeferredUpdates | None, frame: Frame, rate: float, correction2: float) -> None:
         """Record that the rows in the view have had this update of `sh_rest`."""
         if deferred:
-            deferred.note(frame.depth_key, (rate, correction2))
+            deferred.record(frame.depth_key, (rate, correction2))
         if self.gaussians.on_host:
             self.gaussians.on_host.begin_to_fetch()
 

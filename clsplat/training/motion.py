@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field
 
 from clsplat.core.schedule import Bounded, Decay, Schedule, at_step, divide
 from clsplat.core.settings import Settings
-from clsplat.formats.splats import MOTION, fields_of
+from clsplat.formats.splats import MOTION, motion_fields
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.opencl.device import Array, constants
@@ -84,7 +84,7 @@ def update_motion(
         "stride": gaussians.capacity,
         "count": gaussians.count,
     }
-    for name, columns in fields_of(table.components).items():
+    for name, columns in motion_fields(table.components).items():
         lowest, highest = bounds.get(name, (-FAR, FAR))
         gaussians.device.program("motion.cl").motion_step(
             items=(-(-gaussians.count // int(gaussians.device.tuning["LANES"])), columns.stop - columns.start),

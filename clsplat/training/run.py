@@ -257,7 +257,7 @@ def host_model(run: Run) -> Model:
     tables = {name: gaussians.get(name) for name in (*gaussians.trained, "filter_variance")}
     if not tables["filter_variance"].any():
         del tables["filter_variance"]
-    rendering = Rendering.of({"version": __version__, **_rendering(run)}, "default")
+    rendering = Rendering.from_comment({"version": __version__, **_rendering(run)}, "default")
     return Model(**tables, rendering=rendering, sky=model.sky.host() if model.sky else None)
 
 

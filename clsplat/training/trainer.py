@@ -162,7 +162,7 @@ class StepTrainer:
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step
         rates = self.rates.at(step, self.extent)
-        if not (penalties or stale or self.model.gaussians.moves or view.frame.content == "inverse_depth"):
+        if not (penalties or stale or self.model.gaussians.is_moving or view.frame.content == "inverse_depth"):
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
         waits = self.rows == "deferred" or self.model.gaussians.on_host

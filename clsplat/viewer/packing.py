@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.formats.packing import morton_order, smallest_three
-from clsplat.formats.splats import MAX_LOG, fields_of, motion_degree_of
+from clsplat.formats.splats import MAX_LOG, motion_degree, motion_fields
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import Model
 
@@ -163,7 +163,7 @@ def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
 def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArray[np.float16]:
     """Return the columns of the motion, [columns, N], with the rotation relative to the stored quaternion."""
     columns = motion.astype(np.float64)
-    if (turn := fields_of(motion.shape[1]).get("turn")) is not None:
+    if (turn := motion_fields(motion.shape[1]).get("turn")) is not None:
         unit = np.roll(quats.astype(np.float64), -1, axis=1)
         largest = np.take_along_axis(unit, np.abs(unit).argmax(axis=1)[:, None], axis=1)
         norm = np.linalg.norm(unit, axis=1, keepdims=True) * np.where(largest < 0, -1.0, 1.0)
@@ -173,8 +173,8 @@ def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArra
 
 def _motion_header(columns: int) -> dict[str, int]:
     """Return the number of columns, the number of powers above the first, and the first column of the rotation."""
-    turn = fields_of(columns).get("turn")
-    return {"columns": columns, "bends": motion_degree_of(columns) - 1, "turns": turn.start if turn else 0}
+    turn = motion_fields(columns).get("turn")
+    return {"columns": columns, "bends": motion_degree(columns) - 1, "turns": turn.start if turn else 0}
 
 
 def _table(values: NDArray[np.floating]) -> Floats:

@@ -54,7 +54,9 @@ def require_divisible(pipeline: Pipeline) -> None:
         raise ConfigError(f"{pipeline.path}: expected `init: {{source: model}}` first, and a stage 'optimize'")
 
 
-def of_block(pipeline: Pipeline, block: Block, start: Path, extent: float, share: Fraction = Fraction(1)) -> Pipeline:
+def block_pipeline(
+    pipeline: Pipeline, block: Block, start: Path, extent: float, share: Fraction = Fraction(1)
+) -> Pipeline:
     """Return the training of a block from its first Gaussians, up to its model, cropped to its cell.
 
     extent: of the whole scene; share: of the pipeline's steps that are trained, with the rates of `_shared`.
@@ -69,14 +71,14 @@ def of_block(pipeline: Pipeline, block: Block, start: Path, extent: float, share
     return found if share == 1 else replace(found, settings=_shared(found.settings, share))
 
 
-def of_merged(pipeline: Pipeline, file: Path) -> Pipeline:
+def merged_pipeline(pipeline: Pipeline, file: Path) -> Pipeline:
     """Return what comes after the training, for the merged model: it is measured, exported, shown."""
     data, last = pipeline.resolved(), _last(pipeline)
     stages = [*_starting(data["stages"][:1], file), *(data["stages"][last:] or [{"export": {"file": MODEL}}])]
     return checked(pipeline.path, Document({**data, "stages": stages}))
 
 
-def of_coarse(coarse: Pipeline, pipeline: Pipeline) -> Pipeline:
+def coarse_pipeline(coarse: Pipeline, pipeline: Pipeline) -> Pipeline:
     """Return the pipeline of the coarse model with the photographs, filters and seed of that of the blocks."""
     data = pipeline.resolved()
     same = {key: data[key] for key in ("scene", "model", "rasterizer", "seed") if key in data}

@@ -31,7 +31,7 @@ from clsplat.core.text_table import text_table
 from clsplat.formats.ply import join_plys
 from clsplat.formats.table import detect
 from clsplat.gaussians.conversion import from_points
-from clsplat.gaussians.model import NUMBERS, Model, as_trained, model_at
+from clsplat.gaussians.model import NUMBERS, Model, model_path, raw_model
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
@@ -48,8 +48,14 @@ from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.sweeps.batch import Batch
 from clsplat.sweeps.store import Store
-from clsplat.workflows.block_pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
-from clsplat.workflows.finetune import claimed, is_trained, trained
+from clsplat.workflows.block_pipelines import (
+    block_pipeline,
+    coarse_pipeline,
+    merged_pipeline,
+    require_divisible,
+    without_start,
+)
+from clsplat.workflows.finetune import claim_folder, is_trained, train_in_folder
 from clsplat.workflows.folder import COARSE, MERGED, RECORD
 from clsplat.workflows.partition import SIGHT, Block, Partition, Partitioner
 
@@ -83,7 +89,7 @@ def _trainings(pipeline: Pipeline) -> list[Optimize]:
 
 
 LOG = logging.getLogger("clsplat")
-MOST = 99  # blocks
+MAX_BLOCKS = 99  # blocks
 Steps = Literal["each", "shared"]
 
 
@@ -100,8 +106,8 @@ class BlocksPlan:
     coarse_overrides: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.blocks <= MOST:
-            raise ConfigError(f"--blocks {self.blocks}: expected 1 to {MOST}")
+        if not 1 <= self.blocks <= MAX_BLOCKS:
+            raise ConfigError(f"--blocks {self.blocks}: expected 1 to {MAX_BLOCKS}")
         if not 0 <= self.sight < 1:
             raise ConfigError(f"--sight {self.sight:g}: expected a share of a view's pixels from 0 to below 1")
         if self.steps not in get_args(Steps):
@@ -123,7 +129,7 @@ class Blocks:
         self.pipeline = load(plan.pipeline, [*where, "init.file=coarse", *plan.overrides])
         require_divisible(self.pipeline)
         self.given = _given(plan.coarse)
-        self.coarse = None if self.given else of_coarse(load(plan.coarse, plan.coarse_overrides), self.pipeline)
+        self.coarse = None if self.given else coarse_pipeline(load(plan.coarse, plan.coarse_overrides), self.pipeline)
         if self.given and plan.coarse_overrides:
             raise ConfigError("--set-coarse is for a coarse model that is trained; leave it out, or give a pipeline")
         rasterizer = self.pipeline.settings.rasterizer
@@ -148,7 +154,7 @@ class Blocks:
         file = self.given
         if file is None and self.coarse is not None:
             LOG.info("the coarse model")
-            file = as_trained(trained(self.coarse, self.out / COARSE, self.device))
+            file = raw_model(train_in_folder(self.coarse, self.out / COARSE, self.device))
         assert file is not None
         photographs = Photographs(self.device, self.scene.background, budget=0)  # each is used once in a pass
         work = Partitioner(load_model(file), self.scene.scene, self.device, photographs)
@@ -156,18 +162,18 @@ class Blocks:
         found.write(self.out)
         return found
 
-    def plan_of(self, partition: Partition) -> dict[str, Any]:
+    def plan_data(self, partition: Partition) -> dict[str, Any]:
         """Return the manifest with the time that the training of each block takes, roughly."""
-        pipelines = {block.name: self.of_block(block, partition) for block in partition.blocks}
+        pipelines = {block.name: self.block_pipeline(block, partition) for block in partition.blocks}
         sizes = sorted((view.camera.width, view.camera.height) for view in self.scene.scene.split("train"))
         units, size = self.device.info.units, sizes[len(sizes) // 2]
         found, times = partition.data(), block_seconds(partition.blocks, pipelines, size, units)
         return {**found, "blocks": [{**block, "seconds": times[block["name"]]} for block in found["blocks"]]}
 
-    def of_block(self, block: Block, partition: Partition) -> Pipeline:
+    def block_pipeline(self, block: Block, partition: Partition) -> Pipeline:
         """Return the pipeline of a block."""
         share = Fraction(len(block.views), partition.views) if self.plan.steps == "shared" else Fraction(1)
-        return of_block(self.pipeline, block, self.out / f"{block.name}.ply", partition.extent, share)
+        return block_pipeline(self.pipeline, block, self.out / f"{block.name}.ply", partition.extent, share)
 
     def train(self, partition: Partition) -> list[tuple[Block, Path]]:
         """Train the blocks that are not done; return them with their models, in order.
@@ -176,7 +182,7 @@ class Blocks:
         error names the first, and has its exit code.
         """
         files, failures = [], Failures("blocks")
-        pipelines = {block.name: self.of_block(block, partition) for block in partition.blocks}
+        pipelines = {block.name: self.block_pipeline(block, partition) for block in partition.blocks}
         if self.execution:
             self._train_as_cells(self.execution, pipelines, failures)
         for block in partition.blocks:
@@ -185,8 +191,8 @@ class Blocks:
             LOG.info("%s of %d: %s", block.name, len(pipelines), pluralize(len(block.views), "view"))
             with failures.kept(block.name):
                 try:
-                    model = trained(pipelines[block.name], self.out / block.name, self.device)
-                    files.append((block, as_trained(model)))
+                    model = train_in_folder(pipelines[block.name], self.out / block.name, self.device)
+                    files.append((block, raw_model(model)))
                 except EmptyRegionError:
                     LOG.warning("%s: no Gaussian is left in its cell; the model goes on without it", block.name)
         if failures:
@@ -228,7 +234,7 @@ class Blocks:
     def finish(self, file: Path) -> Path:
         """Run what follows a training on the merged model; return its folder."""
         run = self.out / MERGED
-        trained(of_merged(self.pipeline, file), run, self.device)
+        train_in_folder(merged_pipeline(self.pipeline, file), run, self.device)
         return run
 
 
@@ -247,10 +253,10 @@ def train_in_blocks(
     partition; execution: where blocks are trained as cells of a store.  Raises ClsplatError; one of a block names it.
     """
     work = Blocks(scene, out, plan or BlocksPlan(), device, execution)
-    with claimed(out, work.question(), RECORD, "a scene in blocks", "another --out"):
+    with claim_folder(out, work.question(), RECORD, "a scene in blocks", "another --out"):
         partition = work.partition()
         if only_plan:
-            return {**work.plan_of(partition), "run": None}
+            return {**work.plan_data(partition), "run": None}
         run = work.finish(work.merge(work.train(partition)))
     return {**partition.data(), "run": str(run), "metrics": read_json(run / METRICS)}
 
@@ -260,7 +266,7 @@ def _given(coarse: str) -> Path | None:
     path = Path(coarse)
     if path.is_dir() or (path.is_file() and detect(path)):
         require_model(path)
-        return as_trained(model_at(path))
+        return raw_model(model_path(path))
     return None
 
 
@@ -327,6 +333,6 @@ def plan_blocks(
         Model(**tables, rendering=NUMBERS, sky=None).save(model)
         work = Blocks(scene, Path(made), BlocksPlan(pipeline, str(model), blocks), device)
         try:
-            return work.plan_of(work.partition())
+            return work.plan_data(work.partition())
         except DataError as error:
             raise DataError(f"{scene}, by its {pluralize(len(points), 'point')}: {error}") from error

@@ -14,15 +14,15 @@ from clsplat.core.files import write_text
 from clsplat.core.page import render, safe_charts
 from clsplat.core.reading import read_file, sha256
 from clsplat.core.text_table import text_table
-from clsplat.formats.packing import written
-from clsplat.formats.splats import Quality, Reading, Writing, require_still, with_degree
-from clsplat.formats.table import bytes_of, located, tell_losses
+from clsplat.formats.packing import open_hashed
+from clsplat.formats.splats import Quality, Reading, Writing, require_static, with_degree
+from clsplat.formats.table import model_bytes, model_file, warn_about_losses
 from clsplat.gaussians.model import MODEL, load
-from clsplat.gaussians.sky import keep_sky, sky_beside
+from clsplat.gaussians.sky import read_sky_file, write_sky_file
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.model_file import ModelFile
 from clsplat.viewer.charts import Line, curve
-from clsplat.workflows.finetune import Measurer, Tuning, claimed, require_steps
+from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_steps
 
 # The rungs of the ladder: a model with fewer and fewer Gaussians, each trained from the one before.
 
@@ -49,7 +49,7 @@ class Ladder:
         if keep == 1:
             return self.tuning.source.file
         file = self.tuning.source.file if before == 1 else self.folder(before) / MODEL
-        return self.tuning.trained(self.pipeline(file, keep / before), self.folder(keep))
+        return self.tuning.train(self.pipeline(file, keep / before), self.folder(keep))
 
     def folder(self, keep: float) -> Path:
         """Return the run folder of a rung."""
@@ -60,7 +60,7 @@ class Ladder:
         values = {"init.file": str(file.resolve()), "reduce_sh.degree": degree}
         values |= {f"stages.{place}.quality": quality for place, name in enumerate(FITTING) if name == PALETTE}
         pipeline = self.tuning.pipeline(FITTING, values, file=SOG, quality=quality)
-        return self.tuning.trained(pipeline, self.out / FITTED / name, SOG)
+        return self.tuning.train(pipeline, self.out / FITTED / name, SOG)
 
     def pipeline(self, file: Path, keep: float) -> Pipeline:
         """Return the recipe as it is run: to prune a model file to a share of it."""
@@ -106,7 +106,7 @@ class CompressionTarget:
     change: float | None = None  # dB, of the PSNR of the model
 
     @classmethod
-    def of(cls, text: str) -> "CompressionTarget":
+    def parse(cls, text: str) -> "CompressionTarget":
         """Read '5MB' (1 MB = 10^6 bytes; MiB = 2^20) or '-0.1dB'.  Raises ConfigError."""
         found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*([a-z]+)\s*", text, re.IGNORECASE | re.ASCII)
         unit = found[2].lower() if found else ""
@@ -293,19 +293,19 @@ def compress(
     Raises ConfigError for a target that no file meets, after the page is written; OutputError where another process
     searches in `out`.
     """
-    wanted, shares = CompressionTarget.of(target), checked_keeps(keeps)
+    wanted, shares = CompressionTarget.parse(target), checked_keeps(keeps)
     if steps is not None:
         require_steps(steps)
     if form not in get_args(Format):
         raise ConfigError(f"--format {quote(form)}: expected one of {', '.join(get_args(Format))}")
     opened = ModelFile(model, scene, device)
     source, first, measurer = opened.source, opened.gaussians, Measurer(opened)
-    require_still(source.file, first.as_file(), form)
-    question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
+    require_static(source.file, first.to_splat_file(), form)
+    question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(model_file(source.file))}
     question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": shares, "steps": steps}
-    size = bytes_of(source.file)  # which a damaged model has not: before the folder is made
-    with claimed(out, question, RECORD, "a search", "another --out"):
-        tell_losses(_result(out, form), first.as_file())
+    size = model_bytes(source.file)  # which a damaged model has not: before the folder is made
+    with claim_folder(out, question, RECORD, "a search", "another --out"):
+        warn_about_losses(_result(out, form), first.to_splat_file())
         whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
         search = Search(out, wanted, question, whole, measurer.split, source.scene_name)
         ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))
@@ -366,6 +366,6 @@ def _result(out: Path, form: Format) -> Path:
 
 def _copy(source: Path, file: Path) -> None:
     """Copy a model file, and the sky beside it."""
-    with written(file) as output:
+    with open_hashed(file) as output:
         output.write(read_file(source))
-    keep_sky(sky_beside(source), file, output.sha256)
+    write_sky_file(read_sky_file(source), file, output.sha256)

@@ -66,9 +66,9 @@ class Tuning:
         first = next(stage for stage in data["stages"] if _is(stage, TRAINING))[TRAINING]["steps"]
         return replace(pipeline, settings=stretched(pipeline.settings, Fraction(self.steps, first)))
 
-    def trained(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
-        """Run a pipeline in a folder, as the function `trained`; return the file that it writes there."""
-        return trained(pipeline, folder, self.device, file)
+    def train(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
+        """Run a pipeline in a folder as `train_in_folder` does; return the file that it writes."""
+        return train_in_folder(pipeline, folder, self.device, file)
 
     def _scene(self) -> dict[str, Any]:
         settings, numbers = self.source.settings, self.model.rendering
@@ -94,7 +94,7 @@ class Tuning:
         }
 
 
-def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL) -> Path:
+def train_in_folder(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL) -> Path:
     """Run a pipeline in a folder; return the file that it writes there.
 
     What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.  Where
@@ -157,7 +157,7 @@ WORDS = {"sha256": "the model's bytes"}  # for keys of a question, where they ar
 
 
 @contextmanager
-def claimed(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> Iterator[None]:
+def claim_folder(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> Iterator[None]:
     """Make the folder, with the question in its record, sweep it of what killed processes left, and hold it.
 
     what: the question in a word, such as "a search"; remedy: what to give in the place of this folder.

@@ -15,18 +15,18 @@ from clsplat.core.files import new_folder, require_free
 from clsplat.core.reading import sha256
 from clsplat.core.text_table import text_table
 from clsplat.density.mixture import Floats, Mixtures, Rows, log_scales_of, mass_of, merge, surface
-from clsplat.formats.splats import not_finite, require_moderate, require_still, unit
+from clsplat.formats.splats import not_finite, require_in_range, require_static, unit
 from clsplat.formats.streamed_sog import LOD_META, write_lod
-from clsplat.formats.table import bytes_of, located
+from clsplat.formats.table import model_bytes, model_file
 from clsplat.gaussians.model import Model, load
-from clsplat.gaussians.sky import keep_sky, sky_file
+from clsplat.gaussians.sky import sky_path, write_sky_file
 from clsplat.runs.model_file import ModelFile, photographs_of, run_of
 from clsplat.scene.detect import read_scene
-from clsplat.workflows.finetune import Measurer, Tuning, claimed, require_steps
+from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_steps
 
 # The training of levels: what is asked for, and run folders beside the folder of the levels.
 
-MOST = 12  # levels; halves of a million Gaussians are 500 then
+MAX_LEVELS = 12  # levels; halves of a million Gaussians are 500 then
 STEPS = 500
 STAGES = ("init", "optimize", "take_average")  # of the recipe
 RECORD = "lod.json"
@@ -42,8 +42,8 @@ class LodPlan:
     downscale: float | None = None  # divisor of their size in this training; None: as the model was trained
 
     def __post_init__(self) -> None:
-        if not 1 <= self.levels <= MOST:
-            raise ConfigError(f"--levels {self.levels}: expected 1 to {MOST}")
+        if not 1 <= self.levels <= MAX_LEVELS:
+            raise ConfigError(f"--levels {self.levels}: expected 1 to {MAX_LEVELS}")
         if not 0.01 <= self.keep < 1:
             raise ConfigError(
                 f"--keep {self.keep:g}: expected a share of the Gaussians from 0.01 to below 1, such as 0.5"
@@ -74,21 +74,21 @@ class LevelTrainer:
         self.measurer = Measurer(opened)
         self.tuning = Tuning("lod", opened.source, opened.gaussians, self.steps, opened.device)
 
-    def held(self) -> AbstractContextManager[None]:
+    def locked(self) -> AbstractContextManager[None]:
         """Hold the folder of the training in a block, where anything is trained."""
         if not self.steps or self.plan.levels == 1:
             return nullcontext()
-        question: dict[str, Any] = {"sha256": sha256(located(self.source.file)), "scene": str(self.source.folder)}
+        question: dict[str, Any] = {"sha256": sha256(model_file(self.source.file)), "scene": str(self.source.folder)}
         question |= {"keep": self.plan.keep, "steps": self.steps, "downscale": self.plan.downscale}
         question["photographs"] = self.measurer.identity()
-        return claimed(self.place, question, RECORD, "the training of levels", "the name of another folder")
+        return claim_folder(self.place, question, RECORD, "the training of levels", "the name of another folder")
 
     def measured(self, model: Model) -> DetailLevel:
         """Return a level that is not trained."""
         psnr = self.measurer.figures(model)[0]
         return DetailLevel(model, psnr, psnr)
 
-    def trained(self, number: int, model: Model) -> DetailLevel:
+    def train(self, number: int, model: Model) -> DetailLevel:
         """Return a level after its training."""
         merged = self.measured(model)
         if not self.steps:
@@ -97,7 +97,7 @@ class LevelTrainer:
         model.save(file)
         size = {"scene.downscale": self.plan.downscale} if self.plan.downscale else {}
         pipeline = self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), **size})
-        found = load(self.tuning.trained(pipeline, self.place / f"level_{number}"))
+        found = load(self.tuning.train(pipeline, self.place / f"level_{number}"))
         return DetailLevel(found, merged.psnr, self.measured(found).psnr)
 
 
@@ -107,7 +107,7 @@ LOG_SCALES, LOGIT = (-17.0, 60.0), 80.0  # beyond which numbers that follow from
 Tables = dict[str, Floats]
 
 
-def decimated(model: Model, keep: float = 0.5) -> Model:
+def decimate(model: Model, keep: float = 0.5) -> Model:
     """Return a model with a share of the Gaussians, one at least, of which neighbors are merged.
 
     A world filter is baked.  Raises ConfigError for what is no share, DataError for values that are not finite.
@@ -122,13 +122,13 @@ def decimated(model: Model, keep: float = 0.5) -> Model:
         return plain
     tables = _settled(plain)
     while (count := len(tables["means"])) > target:
-        first, second = matched(tables)
+        first, second = match_pairs(tables)
         tables = _joined(tables, first[: count - target], second[: count - target])
     fewer: dict[str, Any] = {name: table.astype(np.float32) for name, table in tables.items()}
     return replace(plain, **fewer)
 
 
-def matched(tables: Tables) -> tuple[Rows, Rows]:
+def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
     """Return pairs of rows, the cheapest first, of which none shares a row: one at least, where there are two rows."""
     one, two = _neighbors(tables["means"])
     cost = pair_cost(tables, one, two)
@@ -214,23 +214,23 @@ def levels_of_detail(
     opened, first = _opened(model, scene, plan, device)
     if not len(first):
         raise DataError(f"{model}: the model holds no Gaussians; expected some to merge")
-    require_still(model, first.as_file(), "SOG")
-    require_moderate(model, first.as_file(), "SOG")
+    require_static(model, first.to_splat_file(), "SOG")
+    require_in_range(model, first.to_splat_file(), "SOG")
     if len(first) < FEW:
         told = pluralize(len(first), "Gaussian")
         LOG.warning("%s: has %s; below a million one SOG is better: `clsplat convert`", model, told)
     training = LevelTrainer(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
     with new_folder(folder) as place:
-        with training.held() if training else nullcontext():
+        with training.locked() if training else nullcontext():
             levels = _levels(first, plan, training)
-        digest = write_lod(place, [level.model.as_file() for level in levels])
-        keep_sky(first.sky, place / LOD_META, digest)
+        digest = write_lod(place, [level.model.to_splat_file() for level in levels])
+        write_sky_file(first.sky, place / LOD_META, digest)
     if first.sky:
-        told = sky_file(folder / LOD_META).name
+        told = sky_path(folder / LOD_META).name
         LOG.info("%s: the sky of the finest level is in %s, which clsplat alone draws", folder, told)
     return {
         "folder": str(folder),
-        "bytes": bytes_of(folder),
+        "bytes": model_bytes(folder),
         "split": training.measurer.split if training else None,
         "levels": [_figures(folder, number, level) for number, level in enumerate(levels)],
     }
@@ -277,9 +277,9 @@ def _fault_of_photographs(run: Path) -> DataError | None:
 def _levels(first: Model, plan: LodPlan, training: LevelTrainer | None) -> list[DetailLevel]:
     levels = [training.measured(first) if training else DetailLevel(first)]
     for number in range(1, plan.levels):
-        fewer = decimated(levels[-1].model, plan.keep)
+        fewer = decimate(levels[-1].model, plan.keep)
         LOG.info("level %d: %s", number, pluralize(len(fewer), "Gaussian"))
-        levels.append(training.trained(number, fewer) if training else DetailLevel(fewer))
+        levels.append(training.train(number, fewer) if training else DetailLevel(fewer))
     return levels
 
 

@@ -56,7 +56,7 @@ def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[Part
     return _cut(means.astype(np.float64), weights, Box(), count)
 
 
-def owners(means: NDArray[np.floating], found: list[PartitionCell]) -> NDArray[np.int64]:
+def assign_cells(means: NDArray[np.floating], found: list[PartitionCell]) -> NDArray[np.int64]:
     """Return the number of the cell in which each of the points, [N, 3], lies, [N].
 
     Raises DataError for points that are not numbers, which lie in none.
@@ -123,7 +123,7 @@ class Membership:
     sight: float  # share above which a view belongs to a block
 
     @property
-    def of_views(self) -> NDArray[np.bool_]:
+    def view_blocks(self) -> NDArray[np.bool_]:
         """The blocks of each view, [V, B]: one at least, that of which it shows most."""
         best = np.arange(self.share.shape[1]) == self.share.argmax(axis=1)[:, None]
         return np.asarray(best | self.inside | (self.share > self.sight))
@@ -131,7 +131,7 @@ class Membership:
     @property
     def chosen(self) -> NDArray[np.bool_]:
         """The same, with the view that shows most of it for a block that has none."""
-        found = self.of_views
+        found = self.view_blocks
         for block in np.flatnonzero(~found.any(axis=0)):
             found[self.share[:, block].argmax(), block] = True
         return found
@@ -143,7 +143,7 @@ class Membership:
         return "sight" if self.share[view, block] > self.sight else "best"
 
 
-def pairs_of(looks: Iterable[RenderedView], count: int, tile: int) -> Floats:
+def count_pairs(looks: Iterable[RenderedView], count: int, tile: int) -> Floats:
     """Return the (tile, Gaussian) pairs of N = `count` Gaussians over views, [N]: what their training costs.
 
     It is an estimate by the radius of a splat, which an image's sides bound.
@@ -156,7 +156,7 @@ def pairs_of(looks: Iterable[RenderedView], count: int, tile: int) -> Floats:
     return total
 
 
-def share_of(look: RenderedView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
+def pixel_share(look: RenderedView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the share of a view's pixels that the Gaussians of each block make, [B], and which are seen, [N].
 
     owner: the block of each Gaussian, [N].  Pixels that a mask leaves out do not count.
@@ -241,9 +241,9 @@ class Partitioner:
         Each view is rendered twice.  Raises DataError where so many blocks are not to be had.
         """
         means, total = self.model.means, len(self.model)
-        pairs = pairs_of(self._looks(self.views), total, int(self.device.tuning["TILE"]))
+        pairs = count_pairs(self._looks(self.views), total, int(self.device.tuning["TILE"]))
         found = cells(means, pairs, count)
-        owner = owners(means, found)
+        owner = assign_cells(means, found)
         members, seen = self._members(owner, found, sight)
         blocks = [
             Block(
@@ -266,12 +266,12 @@ class Partitioner:
         inside = np.stack([cell.grown(NEAR_CELL).holds(places) for cell in found], axis=1)
         shares, seen = np.zeros(inside.shape), np.zeros((len(found), len(owner)), bool)
         for view, look in enumerate(self._looks(self.views)):
-            shares[view], visible = share_of(look, owner, len(found))
-            seen[Membership(shares[[view]], inside[[view]], sight).of_views[0]] |= visible
+            shares[view], visible = pixel_share(look, owner, len(found))
+            seen[Membership(shares[[view]], inside[[view]], sight).view_blocks[0]] |= visible
         members = Membership(shares, inside, sight)
-        for view, block in np.argwhere(members.chosen & ~members.of_views):
+        for view, block in np.argwhere(members.chosen & ~members.view_blocks):
             (look,) = self._looks([self.views[view]])
-            seen[block] |= share_of(look, owner, len(found))[1]
+            seen[block] |= pixel_share(look, owner, len(found))[1]
         return members, seen | ~seen.any(axis=0)  # what is hidden from all views may come to light in any
 
     def _looks(self, views: Sequence[View]) -> Iterator[RenderedView]:

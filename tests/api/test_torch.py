@@ -8,7 +8,7 @@ import pytest
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.formats.splats import PARAMETERS
-from clsplat.gaussians.motion import still
+from clsplat.gaussians.motion import static_motion
 from tests.support.models import model_of
 
 torch = pytest.importorskip("torch")
@@ -111,7 +111,7 @@ def test_count_that_differs_from_the_world_filter_is_refused(device, rng):
 
 def test_a_model_that_moves_is_refused_and_its_moment_is_not(device, rng):
     case = random_case(rng, 5, *SIZE)
-    model = replace(model_of(case), motion=still(5, 5))
+    model = replace(model_of(case), motion=static_motion(5, 5))
     with pytest.raises(
         ValueError, match=r"the renderer's model moves, .* give the renderer one moment, `model\.at\(time"
     ):

@@ -19,8 +19,8 @@ from clsplat.core.harmonics import basis
 from clsplat.density.mixture import mass_of
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import inverse_opacities, opacities
-from clsplat.formats.table import CODECS, bytes_of, detect, read, write
-from clsplat.gaussians.conversion import transform_of
+from clsplat.formats.table import CODECS, detect, model_bytes, read, write
+from clsplat.gaussians.conversion import parse_transform
 from clsplat.gaussians.model import Rendering, load
 from clsplat.gaussians.validate import examine, lines, verdict
 from clsplat.viewer.packing import pack
@@ -175,11 +175,11 @@ def test_a_transform_turns_harmonics_as_directions_say(source, tmp_path, rng):
 
 
 def test_a_transform_is_words_from_left_to_right_or_a_matrix():
-    words = transform_of("translate=1,0,0 rotate=0,0,90 scale=2")
+    words = parse_transform("translate=1,0,0 rotate=0,0,90 scale=2")
     np.testing.assert_allclose(words @ [0, 0, 0, 1], [0, 2, 0, 1], atol=1e-12)
     rows = ",".join(str(value) for value in words.ravel())
-    np.testing.assert_allclose(transform_of(rows), words)
-    np.testing.assert_allclose(transform_of("1,0,0,5,0,1,0,6,0,0,1,7")[:3, 3], [5, 6, 7])
+    np.testing.assert_allclose(parse_transform(rows), words)
+    np.testing.assert_allclose(parse_transform("1,0,0,5,0,1,0,6,0,0,1,7")[:3, 3], [5, 6, 7])
 
 
 WRONG = {
@@ -361,7 +361,7 @@ def test_the_size_of_a_model_is_that_of_its_own_files(few_steps, source, tmp_pat
     written = clsplat.convert(source, folder)["bytes"]
     assert written == sum(file.stat().st_size for file in (tmp_path / "f").iterdir()) - 10**6
     for place in (folder, tmp_path / "f"):
-        assert clsplat.convert(place, tmp_path / "b.ply")["bytes_read"] == written == bytes_of(place)
+        assert clsplat.convert(place, tmp_path / "b.ply")["bytes_read"] == written == model_bytes(place)
 
 
 def test_a_name_stands_as_it_is(source, tmp_path):

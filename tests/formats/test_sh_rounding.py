@@ -13,11 +13,11 @@ from clsplat.formats.packing import morton_order
 from clsplat.formats.sog_quantize import (
     LARGEST,
     SH_LEVELS,
-    base_for,
-    before_a_gap,
+    before_gap,
+    compensate_base,
     log_weights,
-    rounded_rows,
-    steps,
+    quantization_steps,
+    round_sh,
     tree_palette,
     usual_step,
     visible_form,
@@ -80,7 +80,7 @@ def test_sky_of_gaussians_does_not_decide_the_rounding(count, rng, tmp_path):
     source, texels = splats(rng, count), rng.uniform(0, 1, (64, 3)).astype(np.float32)
     source.parameters["log_scales"] = rng.uniform(-3.5, -3, (count, 3)).astype(np.float32)
     baked = with_sky_splats(Model(**source.parameters, sky=Sky(texels)), 5000)
-    behind = baked.as_file()
+    behind = baked.to_splat_file()
     assert behind.has_sky
     alone, beside = log_weights(source.parameters), log_weights(behind.parameters, has_sky=True)[:count]
     np.testing.assert_allclose(beside, alone, atol=0.15)
@@ -98,7 +98,7 @@ def test_a_model_without_a_sky_counts_all_whatever_its_shape(rng, tmp_path):
     directions, radii = rng.normal(size=(2300, 3)), np.append(rng.uniform(0, 0.1, 2000), rng.uniform(2, 3, 300))
     source.parameters["means"] = unit(np.pad(directions, ((0, 0), (1, 0))))[:, 1:] * radii[:, None].astype(np.float32)
     source.parameters["means"] = source.parameters["means"].astype(np.float32)
-    assert not before_a_gap(radii).all()
+    assert not before_gap(radii).all()
     assert abs(np.median(log_weights(source.parameters))) < 1e-9
     noted = replace(source, rendering={"sky": "splats"})
     for name in ("a.spz", "a.sog"):
@@ -116,13 +116,13 @@ def test_a_sky_is_known_again_in_a_ply_that_is_converted(rng, tmp_path):
 
 def test_without_a_gap_all_gaussians_count(rng):
     for power in (1, 2, 4):
-        assert before_a_gap(rng.uniform(0, 1, 2000) ** power).all()
+        assert before_gap(rng.uniform(0, 1, 2000) ** power).all()
     few = np.append(rng.uniform(0, 1, 980), rng.uniform(40, 50, 20))
-    assert before_a_gap(few).all(), "too few to decide a median"
-    assert before_a_gap(np.zeros(50)).all()
-    assert before_a_gap(np.array([0.0, 1.0])).all()
+    assert before_gap(few).all(), "too few to decide a median"
+    assert before_gap(np.zeros(50)).all()
+    assert before_gap(np.array([0.0, 1.0])).all()
     sky = np.append(rng.uniform(0, 1, 300), np.full(700, 10.0))
-    np.testing.assert_array_equal(before_a_gap(sky), sky < 5)
+    np.testing.assert_array_equal(before_gap(sky), sky < 5)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 50])
@@ -137,7 +137,7 @@ def test_weights_are_finite_of_any_model(count, rng):
 
 
 def test_steps_are_as_the_roots_of_the_weights(rng):
-    found = steps(np.array([-20.0, -4, -2, 0, 2, 4, 6]), 4, 64)
+    found = quantization_steps(np.array([-20.0, -4, -2, 0, 2, 4, 6]), 4, 64)
     np.testing.assert_array_equal(found, [64, 16, 8, 4, 2, 1, 1])
 
 
@@ -156,7 +156,7 @@ def test_rounding_is_that_of_the_reference(count, rng):
                 wanted[:k] += change
                 wanted[k] = value
             expected[row, channel::3] = wanted
-    found = rounded_rows(rest, step, form)
+    found = round_sh(rest, step, form)
     assert (np.abs(found - expected) > 1e-6).any(axis=1).mean() < 0.05  # a tie of float32 is none of float64
 
 
@@ -164,10 +164,10 @@ def test_less_shows_of_rounding_than_of_rounding_each_alone(rng):
     rest = seen_from_one_side(rng, 400).parameters["sh_rest"]
     step = np.full(400, 1 / 32, np.float32)
     form = visible_form(rest)
-    found, alone = rounded_rows(rest, step, form), np.rint(rest / step[:, None]) * step[:, None]
+    found, alone = round_sh(rest, step, form), np.rint(rest / step[:, None]) * step[:, None]
     np.testing.assert_array_equal(found, np.rint(found * 32) / 32)
     assert shown(found - rest, form).sum() < 0.4 * shown(alone - rest, form).sum()
-    np.testing.assert_array_equal(rounded_rows(rest, step, np.eye(15)), alone)
+    np.testing.assert_array_equal(round_sh(rest, step, np.eye(15)), alone)
 
 
 @pytest.mark.parametrize("rows", [7, 64])
@@ -179,11 +179,11 @@ def test_rounding_is_the_same_in_any_blocks(rows, rng, monkeypatch):
     moments = np.einsum("nkc,nlc->kl", table, table)
     expected = 8 * moments / np.trace(moments) + sog_quantize.ISOTROPIC * np.eye(8)
     np.testing.assert_allclose(form, expected, atol=0.02)
-    found = rounded_rows(rest, step, form)
+    found = round_sh(rest, step, form)
     monkeypatch.setattr(sog_quantize, "ROWS", rows)
     np.testing.assert_array_equal(visible_form(rest), form)
-    np.testing.assert_array_equal(rounded_rows(rest, step, form), found)
-    assert np.isfinite(rounded_rows(0 * rest, step, visible_form(0 * rest))).all()
+    np.testing.assert_array_equal(round_sh(rest, step, form), found)
+    assert np.isfinite(round_sh(0 * rest, step, visible_form(0 * rest))).all()
 
 
 @pytest.mark.parametrize("count", [3, 8, 15])
@@ -206,7 +206,7 @@ def test_band_0_takes_up_what_is_the_same_from_all_cameras(rng):
     directions = rng.normal((0, 0, 2), size=(40, 3))
     values = basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     base, lacking = rng.normal(size=(20, 3)), rng.normal(0, 0.1, (20, 15, 3))
-    found = base_for(base, lacking.reshape(20, 45), values.T @ values)
+    found = compensate_base(base, lacking.reshape(20, 45), values.T @ values)
     colors = np.einsum("dk,nkc->ndc", values, lacking)
     np.testing.assert_allclose((found - base) * SH_C0, colors.mean(axis=1), atol=1e-5)
 
@@ -216,7 +216,9 @@ def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
     found = there_and_back(tmp_path / "a.spz", source).parameters
     levels = 128 * found["sh_rest"]
     np.testing.assert_array_equal(levels, np.rint(levels))
-    expected = np.sort(steps(log_weights(source.parameters), usual_step(source.parameters["sh_rest"], 3, 5), 64))
+    expected = np.sort(
+        quantization_steps(log_weights(source.parameters), usual_step(source.parameters["sh_rest"], 3, 5), 64)
+    )
     np.testing.assert_array_equal(levels, np.rint(levels / expected[:, None]) * expected[:, None])
     assert len(np.unique(expected)) > 4
     write(tmp_path / "high.spz", source, Writing(quality="high"))
@@ -232,11 +234,11 @@ def test_each_gaussian_of_an_spz_has_the_steps_of_its_own_weight(tmp_path, rng):
     source.parameters["log_scales"] += rng.uniform(-3, 3, (500, 1)).astype(np.float32)
     found = there_and_back(tmp_path / "a.spz", source).parameters
     p = source.rows(morton_order(source.parameters["means"])).parameters
-    own = np.argsort(steps(log_weights(p), usual_step(p["sh_rest"], 3, 5), 64), kind="stable")
+    own = np.argsort(quantization_steps(log_weights(p), usual_step(p["sh_rest"], 3, 5), 64), kind="stable")
     p = {name: table[own] for name, table in p.items()}
     weights = log_weights(p)[:, None]
-    base = base_for(p["sh_base"], p["sh_rest"] - found["sh_rest"], visible_form(p["sh_rest"]))
-    step = steps(weights, 2**0.5, 16)
+    base = compensate_base(p["sh_base"], p["sh_rest"] - found["sh_rest"], visible_form(p["sh_rest"]))
+    step = quantization_steps(weights, 2**0.5, 16)
     levels = 255 * (0.15 * found["sh_base"].astype(np.float64) + 0.5)
     np.testing.assert_allclose(levels, np.rint(levels / step) * step, atol=1e-3)
     assert (np.abs(found["sh_base"] - base) <= step / 2 / 255 / 0.15 + 1e-5).all()
@@ -314,7 +316,7 @@ def test_sog_has_the_models_shape_and_converts_again_losslessly(tmp_path, rng):
     size = np.linalg.norm(expected, axis=(1, 2))
     assert (np.linalg.norm(shapes - expected, axis=(1, 2)) < 0.2 * size).all()
     rest = source.parameters["sh_rest"][order]
-    base = base_for(source.parameters["sh_base"][order], rest - found.parameters["sh_rest"], visible_form(rest))
+    base = compensate_base(source.parameters["sh_base"][order], rest - found.parameters["sh_rest"], visible_form(rest))
     assert np.abs(found.parameters["sh_base"] - base).max() < 0.03
     for name, bound in (("means", 0.01), ("logit_opacity", 1.0)):
         away = np.abs(found.parameters[name] - source.parameters[name][order])

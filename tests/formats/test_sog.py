@@ -18,7 +18,7 @@ import pytest
 
 from clsplat.core.errors import DataError, OutputError
 from clsplat.formats.packing import morton_order
-from clsplat.formats.palette import ENTRIES, codebook, nearest, palette
+from clsplat.formats.palette import ENTRIES, codebook, nearest_entries, palette
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import detect, read, write
 from tests.support.data_sets import data_set
@@ -139,11 +139,11 @@ def test_a_codebook_is_better_than_equal_steps(rng):
     entries = codebook(values)
     assert len(entries) == ENTRIES
     assert (np.diff(entries) >= 0).all()
-    error = np.square(entries[nearest(values, entries)] - values).mean()
+    error = np.square(entries[nearest_entries(values, entries)] - values).mean()
     equal = np.linspace(values.min(), values.max(), ENTRIES)
-    assert error < 0.2 * np.square(equal[nearest(values, equal)] - values).mean()
+    assert error < 0.2 * np.square(equal[nearest_entries(values, equal)] - values).mean()
     few = np.float32([3, 1, 2, 2])
-    np.testing.assert_array_equal(codebook(few)[nearest(few, codebook(few))], few)
+    np.testing.assert_array_equal(codebook(few)[nearest_entries(few, codebook(few))], few)
 
 
 @pytest.mark.parametrize("far", [[-1e5] * 50, [1e8], [1e15, -1e15, 3e8]])
@@ -151,7 +151,7 @@ def test_a_few_far_values_cost_the_others_little(far, rng):
     values = rng.normal(-5, 1.2, 60_000)
 
     def error(entries):
-        return np.square(entries[nearest(values, entries)] - values).mean()
+        return np.square(entries[nearest_entries(values, entries)] - values).mean()
 
     assert error(codebook(np.append(values, far))) < 2 * error(codebook(values))
 

@@ -7,7 +7,7 @@ import numpy as np
 from clsplat.conformance import reference as ref
 from clsplat.formats.packing import morton_order
 from clsplat.formats.palette import ENTRIES, codebook
-from clsplat.formats.sog_quantize import LEVELS, rounded, rounded_quats, weighed_means
+from clsplat.formats.sog_quantize import LEVELS, round_means, round_quats, round_to
 from clsplat.formats.splats import Writing, unit
 from clsplat.formats.table import write
 from tests.support.models import splats, there_and_back
@@ -20,7 +20,7 @@ def covariances(quats, log_scales):
 
 def test_renamed_axes_give_the_same_gaussian_turned_less(rng):
     quats, sizes = rng.normal(size=(2000, 4)), rng.normal(size=(2000, 3))
-    found, renamed = rounded_quats(quats, sizes, 1)
+    found, renamed = round_quats(quats, sizes, 1)
     assert (np.argmax(np.abs(found), axis=1) == 0).all()
     assert found[:, 0].min() > 0.84, "the farthest rotation from all that bring axes onto axes has 62.8 degrees"
     np.testing.assert_array_equal(np.sort(renamed, axis=1), np.sort(sizes.astype(np.float32), axis=1))
@@ -32,7 +32,7 @@ def test_renamed_axes_give_the_same_gaussian_turned_less(rng):
 def test_light_gaussians_have_larger_position_steps(rng):
     means, sizes = rng.normal(size=(3000, 3)).astype(np.float32), rng.normal(-3, 0.5, (3000, 3)).astype(np.float32)
     weights = rng.uniform(-4, 4, 3000)
-    found = weighed_means(means, sizes, weights, 0.25)
+    found = round_means(means, sizes, weights, 0.25)
     largest = 0.25 * np.exp(sizes.mean(axis=1)) * np.exp2(-weights / 2) / 2  # half a step
     level = np.log1p(np.abs(means)).max() * 2 / LEVELS * 5
     moved = np.abs(found - means).max(axis=1)
@@ -42,7 +42,7 @@ def test_light_gaussians_have_larger_position_steps(rng):
 
 def test_positions_of_a_scene_without_extent_stay(rng):
     means = np.full((5, 3), 2.5, np.float32)
-    np.testing.assert_allclose(weighed_means(means, np.zeros((5, 3)), np.zeros(5), 0.25), means, rtol=1e-6)
+    np.testing.assert_allclose(round_means(means, np.zeros((5, 3)), np.zeros(5), 0.25), means, rtol=1e-6)
 
 
 def test_a_codebook_of_steps_where_they_suffice(rng):
@@ -60,9 +60,9 @@ def test_rounded_tables_are_written_as_they_are_in_fewer_bytes(tmp_path: Path, r
     p = source.parameters
     p["log_scales"] -= 2
     there_and_back(tmp_path / "before.sog", source, Writing(quality="high"))
-    p["means"] = weighed_means(p["means"], p["log_scales"], np.zeros(1500), 0.5)
-    p["quats"], p["log_scales"] = rounded_quats(p["quats"], p["log_scales"], 4)
-    p["log_scales"], p["sh_base"] = rounded(p["log_scales"], 0.1), rounded(p["sh_base"], 0.06)
+    p["means"] = round_means(p["means"], p["log_scales"], np.zeros(1500), 0.5)
+    p["quats"], p["log_scales"] = round_quats(p["quats"], p["log_scales"], 4)
+    p["log_scales"], p["sh_base"] = round_to(p["log_scales"], 0.1), round_to(p["sh_base"], 0.06)
     found = there_and_back(tmp_path / "after.sog", source, Writing(quality="high"))
     expected = source.rows(morton_order(p["means"]))
     for name in ("means", "quats", "log_scales", "sh_base"):

@@ -15,7 +15,7 @@ from clsplat.formats import streamed_sog
 from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import SplatFile, Writing
 from clsplat.formats.streamed_sog import LeafLimits, half_boxes, tree, write_lod
-from clsplat.formats.table import bytes_of, detect, read, write
+from clsplat.formats.table import detect, model_bytes, read, write
 from clsplat.gaussians.conversion import convert
 from clsplat.gaussians.model import load
 from clsplat.gaussians.validate import examine, verdict
@@ -132,7 +132,7 @@ def test_the_same_levels_give_the_same_bytes(written, tmp_path, rng):
     files = {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
     again = {p.relative_to(tmp_path / "again"): p.read_bytes() for p in (tmp_path / "again").rglob("*") if p.is_file()}
     assert files == again
-    assert bytes_of(folder) == sum(map(len, files.values()))
+    assert model_bytes(folder) == sum(map(len, files.values()))
 
 
 def test_one_gaussian_and_many_in_one_place_are_levels(tmp_path, rng):
@@ -292,7 +292,7 @@ def test_the_tree_is_walked_once_whatever_the_number_of_levels(written, monkeypa
     folder, _ = written
     walks, real = [], streamed_sog._leaves
     monkeypatch.setattr(streamed_sog, "_leaves", lambda path, tree: walks.append(path) or real(path, tree))
-    assert streamed_sog.faults_of_levels(folder / "lod-meta.json") == []
+    assert streamed_sog.find_level_faults(folder / "lod-meta.json") == []
     assert len(walks) == 1
 
 

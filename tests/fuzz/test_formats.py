@@ -13,7 +13,7 @@ import pytest
 
 from clsplat.formats.splats import Reading
 from clsplat.formats.streamed_sog import LeafLimits, write_lod
-from clsplat.formats.table import CODECS, bytes_of, detect, read, write
+from clsplat.formats.table import CODECS, detect, model_bytes, read, write
 from clsplat.gaussians.validate import examine
 from tests.fuzz.mutation import damaged, fuzzed, misbuilt, one_of
 from tests.fuzz.outcome import outcome
@@ -129,7 +129,7 @@ def test_a_damaged_tree_of_levels_is_read_or_refused(folder: Path):
         reads_or_refuses(path)
         path.write_bytes(other)
         reads_or_refuses(path)
-        outcome(bytes_of, path)
+        outcome(model_bytes, path)
 
     reads()
 

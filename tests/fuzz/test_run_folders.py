@@ -12,7 +12,7 @@ import clsplat
 from clsplat.core.files import INPUTS
 from clsplat.core.reading import sha256
 from clsplat.gaussians.model import Rendering
-from clsplat.gaussians.sky import Sky, sky_beside
+from clsplat.gaussians.sky import Sky, read_sky_file
 from clsplat.nerf.files import FieldModel, load_field
 from clsplat.nerf.shape import FieldShape
 from clsplat.runs.state import RunState
@@ -118,7 +118,7 @@ def test_a_damaged_sky_is_a_map_or_refused(folder: Path):
     @fuzzed(data=damaged([path.read_bytes()], ["side", "texels", "models", "NaN", "1e999", "null", "[[0, 0, 0]]"]))
     def reads(data):
         path.write_bytes(data)
-        found = outcome(sky_beside, model)
+        found = outcome(read_sky_file, model)
         if found is not None:
             assert found.texels.shape == (found.side**2, 3)
             assert np.isfinite(found.texels).all()

@@ -170,5 +170,5 @@ def test_a_scene_shows_four_photographs_and_escapes_their_names(tiny_scene):
 
 @pytest.mark.parametrize("path", ["", ".", "/"])
 def test_a_path_without_a_name_is_refused(rng, path):
-    with pytest.raises(OutputError, match=r"cannot be written \(it has no name\); expected the path of a file$"):
+    with pytest.raises(OutputError, match=r"cannot be written \(it has no file name\); give the path of a file$"):
         model_of(random_case(rng, 3)).save(path)

@@ -11,10 +11,10 @@ import pytest
 
 import clsplat
 from clsplat.core.errors import ConfigError, DataError, OutputError
-from clsplat.formats.splats import MOTION, STILL, WIDTHS, columns_of, width_of
-from clsplat.gaussians.conversion import merged
+from clsplat.formats.splats import MOTION, STATIC_LOG_DURATION, WIDTHS, motion_columns, motion_width
+from clsplat.gaussians.conversion import merge_models
 from clsplat.gaussians.model import Model, load
-from clsplat.gaussians.motion import presence, still
+from clsplat.gaussians.motion import presence, static_motion
 from clsplat.gaussians.sky import Sky
 
 
@@ -23,7 +23,7 @@ def moving_model(width: int = 5, count: int = 40) -> Model:
     rng = np.random.default_rng(width)
     motion = rng.normal(0, 0.2, (count, width)).astype(np.float32)
     motion[:, 3], motion[:, 4] = rng.uniform(0, 1, count), rng.normal(-1, 0.3, count)
-    motion[0, :3], motion[0, 4] = 0, STILL
+    motion[0, :3], motion[0, 4] = 0, STATIC_LOG_DURATION
     motion[0, 5:] = 0
     motion[-1, 3], motion[-1, 4] = 1, -2
     tables = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 9}
@@ -37,7 +37,7 @@ def test_a_ply_keeps_the_motion(tmp_path, width):
     found = load(tmp_path / "model.ply")
     for name, table in model.tables().items():
         np.testing.assert_array_equal(getattr(found, name), table)
-    for column in columns_of(width):
+    for column in motion_columns(width):
         assert f"property float {column}\n".encode() in (tmp_path / "model.ply").read_bytes()
 
 
@@ -58,7 +58,7 @@ def test_other_formats_refuse_what_they_would_lose(tmp_path, name):
 
 
 def test_a_moment_has_the_formulas_of_the_kernel():
-    model = moving_model(width_of(3, True))
+    model = moving_model(motion_width(3, True))
     moment, motion = model.at(0.25), model.motion.astype(np.float64)
     there = presence(motion, 0.25) >= 1 / 255
     dt = 0.25 - motion[there, 3:4]
@@ -76,7 +76,7 @@ def test_a_moment_has_the_formulas_of_the_kernel():
 
 
 def test_a_moment_of_a_model_that_was_moved_is_the_moment_moved():
-    model, turn = moving_model(width_of(2, True)), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    model, turn = moving_model(motion_width(2, True)), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     one, other = model.transformed(2.0, turn, (1, 2, 3)).at(0.6), model.at(0.6).transformed(2.0, turn, (1, 2, 3))
     for name, table in one.tables().items():
         np.testing.assert_allclose(table, getattr(other, name), atol=2e-5, err_msg=name)
@@ -84,12 +84,12 @@ def test_a_moment_of_a_model_that_was_moved_is_the_moment_moved():
 
 def test_merged_models_move_as_before():
     moving, standing = moving_model(), replace(moving_model(), motion=None)
-    both = merged([standing, moving], ["a", "b"])
+    both = merge_models([standing, moving], ["a", "b"])
     np.testing.assert_array_equal(both.motion[40:], moving.motion)
-    np.testing.assert_array_equal(both.motion[:40], still(40, 5))
+    np.testing.assert_array_equal(both.motion[:40], static_motion(40, 5))
     assert len(both.at(0)) == 40 + len(moving.at(0))
     with pytest.raises(DataError, match="another degree"):
-        merged([moving, moving_model(8)], ["a", "b"])
+        merge_models([moving, moving_model(8)], ["a", "b"])
 
 
 def test_convert_writes_moments(tmp_path: Path):
@@ -167,7 +167,7 @@ def test_speeds_beyond_what_a_file_holds_are_refused_and_dropped(tmp_path):
     motion = model.motion.copy()
     motion[3, 0], motion[3, 3:5] = 1e38, (1e38, 90)
     fast = replace(model, motion=motion)
-    with pytest.raises(DataError, match="1 Gaussians are at no finite place"):
+    with pytest.raises(DataError, match="1 Gaussians have no finite position"):
         fast.at(0.5)
     fast.save(tmp_path / "fast.ply")
     clsplat.convert(tmp_path / "fast.ply", tmp_path / "rest.ply", time=0.5)

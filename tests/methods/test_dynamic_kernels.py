@@ -13,7 +13,7 @@ from clsplat.density.edit import Edit
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
-from clsplat.formats.splats import MOTION, PARAMETERS, width_of
+from clsplat.formats.splats import MOTION, PARAMETERS, motion_width
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.motion import presence
@@ -23,7 +23,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
 from tests.support.devices import on_one_setting
 
-WIDTH = width_of(3, True)
+WIDTH = motion_width(3, True)
 
 
 def statistics_of(gaussians: Gaussians, gradients: np.ndarray) -> SplatStats:

@@ -9,7 +9,7 @@ from clsplat.conformance.check import CONIC, relative_error
 from clsplat.conformance.checks.motion import TIME, check_moment, motion, moving_case
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
-from clsplat.formats.splats import MOTION, PARAMETERS, STILL, WIDTHS, width_of
+from clsplat.formats.splats import MOTION, PARAMETERS, STATIC_LOG_DURATION, WIDTHS, motion_width
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import Comparison, ViewGradients
@@ -25,12 +25,12 @@ def test_motion_and_its_gradients(device, rng):
 
 @on_devices("count", [16, 63, 64, 129])
 def test_sizes_around_the_groups(device, rng, count):
-    assert_within_bounds(check_moment(device, rng, count, width_of(2, True)))
+    assert_within_bounds(check_moment(device, rng, count, motion_width(2, True)))
 
 
 @on_one_setting
 def test_a_moment_on_the_host_looks_like_that_on_the_device(device, rng):
-    case = moving_case(rng, 65, width_of(3, True))
+    case = moving_case(rng, 65, motion_width(3, True))
     model = Model(**case.parameters)
     camera, rasterizer = case.device_camera(device), Rasterizer(device, "radix")
     moving = rasterizer.forward(case.model(device), camera, device.zeros(3)).image.get()
@@ -44,7 +44,7 @@ def test_a_moment_on_the_host_looks_like_that_on_the_device(device, rng):
 
 def test_gradients_of_an_image_are_carried_back_to_the_motion(device, rng):
     """Those of a static model of the moment, carried back in float64, are what the rasterizer returns."""
-    case, width = moving_case(rng, 65, width_of(2, True)), width_of(2, True)
+    case, width = moving_case(rng, 65, motion_width(2, True)), motion_width(2, True)
     camera, rasterizer, p = case.device_camera(device), Rasterizer(device, "radix"), case.parameters
     weights = np.zeros((3, camera.rows, camera.stride), np.float32)
     weights[:, : camera.height, : camera.width] = rng.normal(size=(3, camera.height, camera.width))
@@ -72,7 +72,7 @@ def test_gradients_of_an_image_are_carried_back_to_the_motion(device, rng):
 def test_what_stands_still_for_ever_has_the_bits_of_none(device, rng):
     case = random_case(rng, 65)
     still = np.zeros((65, 5), np.float32)
-    still[:, 3], still[:, 4] = rng.uniform(0, 1, 65), STILL
+    still[:, 3], still[:, 4] = rng.uniform(0, 1, 65), STATIC_LOG_DURATION
     moving = replace(case, parameters={**case.parameters, MOTION: still}, view=replace(case.view, time=0.625))
     found = []
     for one in (case, moving):
@@ -97,7 +97,7 @@ def test_what_is_not_there_counts_as_not_seen(device, rng):
 
 
 def test_splitting_matrices_are_those_of_the_moment(device, rng):
-    case = moving_case(rng, 65, width_of(3, True))
+    case = moving_case(rng, 65, motion_width(3, True))
     camera, background = case.device_camera(device), device.zeros(3)
     weights = device.upload(rng.normal(size=(3, camera.rows, camera.stride)).astype(np.float32))
     rasterizer, found = Rasterizer(device, "radix"), []

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from clsplat.formats.splats import fields_of
+from clsplat.formats.splats import motion_fields
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.scene.camera import Camera
 from clsplat.scene.scene import Scene, make_scene
@@ -33,7 +33,7 @@ def cloud(count: int, rendering: Rendering = PLAIN, degree: int = 3, seed: int =
 
 def moving(model: Model, width: int = 15, seed: int = 1) -> Model:
     """The same splats, which come, go, bend their way and turn, as far as `width` columns of motion hold that."""
-    rng, fields = np.random.default_rng(seed), fields_of(width)
+    rng, fields = np.random.default_rng(seed), motion_fields(width)
     motion = np.zeros((len(model), width))
     spread = {"velocity": 0.8, "acceleration": 0.5, "jerk": 0.5, "turn": 1.0}
     for name, columns in fields.items():

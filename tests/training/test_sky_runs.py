@@ -13,7 +13,7 @@ import clsplat
 from clsplat.core.errors import DataError
 from clsplat.core.reading import sha256
 from clsplat.gaussians.conversion import with_sky_splats
-from clsplat.gaussians.sky import Sky, keep_sky, sampled, sky_beside, texel_directions
+from clsplat.gaussians.sky import Sky, read_sky_file, sample_texels, texel_directions, write_sky_file
 from clsplat.metrics.images import psnr
 from clsplat.photos.sky_detection import SkyEvidence, detect_sky, panorama
 from clsplat.pipeline.loading import load, without_auto
@@ -200,7 +200,9 @@ def test_the_best_model_is_left_with_the_sky_of_its_step(tiny_scene, tmp_path):
     run = train(tiny_scene, tmp_path / "run", *FEW, *kept, wild)
     assert run.best.measured.step == 8, "the last steps ruin it"
     _, then = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    np.testing.assert_array_equal(sky_beside(tmp_path / "run" / "point_cloud.ply").texels, then["modules/sky/texels"])
+    np.testing.assert_array_equal(
+        read_sky_file(tmp_path / "run" / "point_cloud.ply").texels, then["modules/sky/texels"]
+    )
 
 
 # ---- where it goes
@@ -254,7 +256,7 @@ def test_gaussians_of_a_sky_have_its_colors_in_all_directions(rng, learned):
     baked = with_sky_splats(model, 500)
     added = baked[len(model) :]
     directions = added.means - np.median(model.means, axis=0)
-    expected = np.clip(sampled(model.sky.texels, directions), 0, 1)
+    expected = np.clip(sample_texels(model.sky.texels, directions), 0, 1)
     np.testing.assert_allclose(added.colors, expected, atol=2e-3)
     assert with_sky_splats(baked) is baked
 
@@ -278,8 +280,8 @@ def test_a_turned_model_has_a_turned_sky(rng, learned):
     model = clsplat.load(learned)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     direction = np.array([0.3, -0.8, 0.2])
-    found = sampled(model.transformed(rotation=turn).sky.texels, turn @ direction)
-    np.testing.assert_allclose(found, sampled(model.sky.texels, direction), atol=0.02)
+    found = sample_texels(model.transformed(rotation=turn).sky.texels, turn @ direction)
+    np.testing.assert_allclose(found, sample_texels(model.sky.texels, direction), atol=0.02)
     assert model.transformed(scale=2.0).sky is model.sky
 
 
@@ -296,7 +298,7 @@ def test_a_turned_model_has_a_turned_sky(rng, learned):
 def test_a_damaged_sky_is_refused(tmp_path, damage):
     (tmp_path / "point_cloud_sky.json").write_text(damage)
     with pytest.raises(DataError, match=r"point_cloud_sky\.json: expected"):
-        sky_beside(tmp_path / "point_cloud.ply")
+        read_sky_file(tmp_path / "point_cloud.ply")
 
 
 def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
@@ -315,6 +317,6 @@ def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
 def test_a_sky_file_keeps_every_bit(rng, tmp_path):
     sky = Sky(rng.normal(size=(64, 3)).astype(np.float32))
     (tmp_path / "model.ply").write_bytes(b"a model")
-    keep_sky(sky, tmp_path / "model.ply", sha256(tmp_path / "model.ply"))
-    np.testing.assert_array_equal(sky_beside(tmp_path / "model.ply").texels, sky.texels)
+    write_sky_file(sky, tmp_path / "model.ply", sha256(tmp_path / "model.ply"))
+    np.testing.assert_array_equal(read_sky_file(tmp_path / "model.ply").texels, sky.texels)
     assert replace(sky).side == 8

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.formats.splats import MOTION, fields_of, width_of
+from clsplat.formats.splats import MOTION, motion_fields, motion_width
 from clsplat.gaussians.motion import at_time
 from clsplat.metrics.images import psnr, to_8_bits
 from clsplat.scene.viewpoint import Viewpoint
@@ -17,7 +17,7 @@ from tests.support.browser import CHROMIUM, Browser
 from tests.support.viewer_data import unpacked
 from tests.support.viewer_pages import cloud, moving, scene
 
-WIDTHS = [width_of(1, False), width_of(3, False), width_of(2, True)]
+WIDTHS = [motion_width(1, False), motion_width(3, False), motion_width(2, True)]
 MOMENTS = (0.0, 0.35, 0.6, 1.0)
 PIXELS = """(picture => {
   let letters = "";
@@ -46,7 +46,7 @@ def page_of(folder, model) -> Page:
 def test_motion_is_packed_beside_the_other_planes(width):
     model = moving(cloud(300), width)
     packed = pack(model)
-    found, fields = unpacked(packed), fields_of(width)
+    found, fields = unpacked(packed), motion_fields(width)
     order = [int(np.linalg.norm(model.means - mean, axis=1).argmin()) for mean in found.means]
     known = model.motion[order].astype(np.float64)
     straight = slice(0, fields["turn"].start if "turn" in fields else width)

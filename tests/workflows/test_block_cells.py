@@ -9,7 +9,7 @@ from clsplat.core.errors import DataError
 from clsplat.density.control import Box
 from clsplat.formats import ply
 from clsplat.formats.ply import join_plys, read_ply, write_ply
-from clsplat.workflows.partition import Membership, cells, owners, quantile
+from clsplat.workflows.partition import Membership, assign_cells, cells, quantile
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
@@ -19,7 +19,7 @@ def test_every_gaussian_has_one_cell_and_each_cell_its_share(rng, count):
     found = cells(means, weights, count)
     held = np.stack([cell.box.holds(means) for cell in found])
     assert (held.sum(axis=0) == 1).all()
-    np.testing.assert_array_equal(owners(means, found), held.argmax(axis=0))
+    np.testing.assert_array_equal(assign_cells(means, found), held.argmax(axis=0))
     np.testing.assert_allclose([weights[one].sum() for one in held], weights.sum() / count, rtol=0.03)
     far = np.array([[-1e9, 0, 0], [1e9, 1e9, 1e9], [0, -1e9, 1e9]])
     assert (np.stack([cell.box.holds(far) for cell in found]).sum(axis=0) == 1).all()
@@ -52,7 +52,7 @@ def test_equal_places_are_not_cut():
 def test_a_gaussian_without_a_place_is_told():
     means = np.array([[0.0, 0, 0], [np.nan, 0, 0]])
     with pytest.raises(DataError, match="1 of 2 Gaussians of the coarse model have places that are not finite"):
-        owners(means, cells(means[:1], np.ones(1), 1))
+        assign_cells(means, cells(means[:1], np.ones(1), 1))
 
 
 def test_a_quantile_follows_the_weights():

@@ -178,11 +178,11 @@ def test_a_block_without_gaussians_at_its_end_is_left_out(
     def empty(pipeline, folder, *options):
         if folder.name == "block_01":
             raise EmptyRegionError("crop: none lies inside")
-        return finetune.trained(pipeline, folder, *options)
+        return finetune.train_in_folder(pipeline, folder, *options)
 
     out = tmp_path / "out"
     shutil.copytree(trained[0], out)
-    monkeypatch.setattr("clsplat.workflows.blocks.trained", empty)
+    monkeypatch.setattr("clsplat.workflows.blocks.train_in_folder", empty)
     train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
     assert "block_01: no Gaussian is left in its cell; the model goes on without it" in caplog.text
     parts = [clsplat.load(trained[0] / f"block_{i:02d}").means for i in (0, 2)]

@@ -57,14 +57,14 @@ def searched(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_targets(text, most, change):
-    found = CompressionTarget.of(text)
+    found = CompressionTarget.parse(text)
     assert (found.most, found.change) == (most, change)
 
 
 @pytest.mark.parametrize("text", ["", "5", "MB", "-5MB", "0MB", "0.5B", "0.1dB", "1e3MB", "-0.1 dB\n5MB", "٥MB"])
 def test_what_is_no_target_is_refused(text):
     with pytest.raises(ConfigError, match="expected a size such as 5MB"):
-        CompressionTarget.of(text)
+        CompressionTarget.parse(text)
 
 
 def test_a_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
@@ -76,21 +76,21 @@ def test_a_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
 
 def test_the_best_of_a_size_and_the_smallest_of_a_loss():
     points = [point(900, 30.0), point(700, 29.95), point(500, 29.5)]
-    assert CompressionTarget.of("800B").best(points, 30) is points[1]
-    assert CompressionTarget.of("-0.1dB").best(points, 30) is points[1]
-    assert CompressionTarget.of("-0.6dB").best(points, 30) is points[2]
-    assert CompressionTarget.of("0dB").best(points, 31) is None
-    assert CompressionTarget.of("400B").best(points, 30) is None
-    assert CompressionTarget.of("400B").nearest(points) is points[2]
-    assert CompressionTarget.of("0dB").nearest(points) is points[0]
+    assert CompressionTarget.parse("800B").best(points, 30) is points[1]
+    assert CompressionTarget.parse("-0.1dB").best(points, 30) is points[1]
+    assert CompressionTarget.parse("-0.6dB").best(points, 30) is points[2]
+    assert CompressionTarget.parse("0dB").best(points, 31) is None
+    assert CompressionTarget.parse("400B").best(points, 30) is None
+    assert CompressionTarget.parse("400B").nearest(points) is points[2]
+    assert CompressionTarget.parse("0dB").nearest(points) is points[0]
 
 
 def test_the_search_goes_down_until_it_cannot_be_better():
     rung = [point(900, 30.0), point(500, 29.5)]
-    assert not CompressionTarget.of("600B").ends(rung, 30), "fewer Gaussians let more settings fit"
-    assert CompressionTarget.of("1kB").ends(rung, 30), "all fit"
-    assert not CompressionTarget.of("-0.1dB").ends(rung, 30)
-    assert CompressionTarget.of("0dB").ends(rung, 31), "none is good enough"
+    assert not CompressionTarget.parse("600B").ends(rung, 30), "fewer Gaussians let more settings fit"
+    assert CompressionTarget.parse("1kB").ends(rung, 30), "all fit"
+    assert not CompressionTarget.parse("-0.1dB").ends(rung, 30)
+    assert CompressionTarget.parse("0dB").ends(rung, 31), "none is good enough"
 
 
 def test_unsearched_format_is_refused_before_anything_is_opened():
@@ -137,13 +137,13 @@ def test_the_page_names_the_scene_and_leads_to_the_file(searched, few_steps, tin
     assert f"<title>{tiny_scene.name} · point_cloud.ply, compressed to " in text
     assert str(few_steps / "point_cloud.ply") in text
     assert '<a href="compressed.sog">compressed.sog</a>' in text
-    before = page(CompressionTarget.of("-1dB"), point(2000, 31), [point(900, 30.5)], None, "test", "fox", "a.ply")
+    before = page(CompressionTarget.parse("-1dB"), point(2000, 31), [point(900, 30.5)], None, "test", "fox", "a.ply")
     assert "<a" not in before, "as long as none is written"
 
 
 def test_names_of_files_are_escaped():
     source = point(2000, 31)
-    text = page(CompressionTarget.of("-1dB"), source, [point(900, 30.5)], None, "test", "a<b>", "a<b>.ply")
+    text = page(CompressionTarget.parse("-1dB"), source, [point(900, 30.5)], None, "test", "a<b>", "a<b>.ply")
     assert "a<b>" not in text
     assert "a&lt;b&gt;" in text
     assert "No file meets the target" in text
@@ -268,7 +268,7 @@ def test_what_spz_loses_is_said_once_for_a_search(few_steps, tiny_scene, tmp_pat
     clsplat.compress_model(tmp_path / "a.ply", tiny_scene, target="-90dB", **ask)
     assert len(list((tmp_path / "out" / "trials").iterdir())) > 1
     (told,) = [text for text in caplog.messages if "does not store" in text]
-    assert told.startswith(f"{tmp_path / 'out' / 'compressed.spz'}: SPZ does not keep near = 0.05")
+    assert told.startswith(f"{tmp_path / 'out' / 'compressed.spz'}: SPZ does not store near = 0.05")
     assert "axes as the format says" not in caplog.text
 
 
@@ -324,7 +324,7 @@ def test_a_model_whose_size_cannot_be_told_leaves_no_folder(few_steps, tmp_path,
     def damaged(path):
         raise DataError("a level is missing")
 
-    monkeypatch.setattr(compress, "bytes_of", damaged)
+    monkeypatch.setattr(compress, "model_bytes", damaged)
     with pytest.raises(DataError, match="a level is missing"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -9,7 +9,7 @@ from clsplat.density.mixture import covariance_of, mass_of, merge, surface, volu
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.workflows import lod
-from clsplat.workflows.lod import decimated, matched, pair_cost
+from clsplat.workflows.lod import decimate, match_pairs, pair_cost
 from tests.support.models import splats
 
 
@@ -80,7 +80,7 @@ def test_a_mixture_is_symmetric_in_its_pair(rng, size):
 @pytest.mark.parametrize("count", [2, 3, 64, 257])
 def test_mass_and_mean_are_kept(rng, count):
     source = model(rng, count)
-    found = decimated(source)
+    found = decimate(source)
     assert len(found) == (count + 1) // 2
     before, after = wide(source), wide(found)
     mass = [mass_of(tables, surface) for tables in (before, after)]
@@ -92,23 +92,23 @@ def test_mass_and_mean_are_kept(rng, count):
 
 
 def test_a_share_is_met_in_several_rounds(rng):
-    assert [len(decimated(model(rng, 100), keep)) for keep in (1, 0.7, 0.25, 0.001)] == [100, 70, 25, 1]
+    assert [len(decimate(model(rng, 100), keep)) for keep in (1, 0.7, 0.25, 0.001)] == [100, 70, 25, 1]
 
 
 def test_none_and_one_stay(rng):
     for count in (0, 1):
         source = model(rng, count)
-        found = decimated(source)
+        found = decimate(source)
         for name, table in source.tables().items():
             np.testing.assert_array_equal(getattr(found, name), table)
 
 
 def test_same_model_gives_same_bytes_in_any_row_order(rng):
     source = model(rng, 300)
-    found, again = decimated(source), decimated(source[:])
+    found, again = decimate(source), decimate(source[:])
     for name, table in found.tables().items():
         assert table.tobytes() == getattr(again, name).tobytes()
-    mixed = decimated(source[rng.permutation(300)])
+    mixed = decimate(source[rng.permutation(300)])
     for name in ("means", "sh_base"):
         tables = (np.sort(getattr(one, name), axis=0) for one in (found, mixed))
         np.testing.assert_allclose(*tables, rtol=1e-4, atol=1e-5)
@@ -117,7 +117,7 @@ def test_same_model_gives_same_bytes_in_any_row_order(rng):
 def test_duplicates_in_one_place_become_one(rng):
     """More of them than there are neighbors."""
     one = model(rng, 1)
-    found = decimated(one[np.zeros(51, int)])
+    found = decimate(one[np.zeros(51, int)])
     assert len(found) == 26
     np.testing.assert_allclose(found.means, np.repeat(one.means, 26, axis=0), rtol=1e-6)
     np.testing.assert_allclose(np.sort(found.log_scales), np.repeat(np.sort(one.log_scales), 26, axis=0), rtol=1e-5)
@@ -128,7 +128,7 @@ def test_duplicates_in_one_place_become_one(rng):
 def test_thousands_in_one_place_are_no_more_work_than_others(rng):
     """A round pairs them all: a tree of places alone, or of rows, takes quadratic time here."""
     one = model(rng, 1, degree=0)
-    rows = [len(pairs) for pairs in matched(wide(one[np.zeros(30_000, int)]))]
+    rows = [len(pairs) for pairs in match_pairs(wide(one[np.zeros(30_000, int)]))]
     assert rows == [15_000, 15_000]
 
 
@@ -140,9 +140,9 @@ def test_work_grows_with_rows_and_pairs_not_with_their_product(rng, monkeypatch)
     )
     monkeypatch.setattr(lod, "mass_of", mixture.mass_of, raising=False)
     source = wide(model(rng, 300))
-    whole = matched(source)
+    whole = match_pairs(source)
     monkeypatch.setattr(lod, "BLOCK", 50)
-    for one, two in zip(matched(source), whole, strict=True):
+    for one, two in zip(match_pairs(source), whole, strict=True):
         np.testing.assert_array_equal(one, two)
     assert rows == [300, 300]
 
@@ -158,7 +158,7 @@ def test_the_cheapest_pair_goes_first_and_none_is_in_two():
         "sh_base": np.zeros((5, 3)),
         "sh_rest": np.zeros((5, 0)),
     }
-    first, second = matched({name: table.astype(np.float64) for name, table in tables.items()})
+    first, second = match_pairs({name: table.astype(np.float64) for name, table in tables.items()})
     assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(3, 4), (0, 1)]
 
 
@@ -171,7 +171,7 @@ def test_color_keeps_neighbors_apart():
         "sh_base": np.array([[1.0] * 3, [-1.0] * 3, [-1.0] * 3]),
         "sh_rest": np.zeros((3, 0)),
     }
-    assert [rows.tolist() for rows in matched(tables)] == [[1], [2]]
+    assert [rows.tolist() for rows in match_pairs(tables)] == [[1], [2]]
 
 
 def test_extreme_values_and_zero_quaternions_merge_to_finite(rng):
@@ -181,7 +181,7 @@ def test_extreme_values_and_zero_quaternions_merge_to_finite(rng):
     source.quats[3:9] = 0
     source.logit_opacity[8:16] = (np.arange(8)[:, None] - 4) * 30
     source.means[20] = 1e30
-    found = decimated(source, 0.25)
+    found = decimate(source, 0.25)
     assert len(found) == 6
     assert all(np.isfinite(table).all() for table in found.tables().values())
 
@@ -189,17 +189,17 @@ def test_extreme_values_and_zero_quaternions_merge_to_finite(rng):
 def test_mip_model_keeps_its_numbers_and_bakes_a_world_filter(rng):
     source = model(rng, 10, mode="mip")
     filtered = Model(**source.tables(), filter_variance=np.full((10, 1), 0.1), rendering=source.rendering)
-    found = decimated(filtered)
+    found = decimate(filtered)
     assert found.filter_variance is None
     assert found.rendering == source.rendering
-    np.testing.assert_array_equal(found.means, decimated(filtered.baked()).means)
+    np.testing.assert_array_equal(found.means, decimate(filtered.baked()).means)
 
 
 def test_what_cannot_be_merged_is_refused(rng):
     source = model(rng, 5)
     for keep in (0, -1, 1.5, float("nan")):
         with pytest.raises(ConfigError, match="expected a share"):
-            decimated(source, keep)
+            decimate(source, keep)
     source.means[2, 1] = np.nan
     with pytest.raises(DataError, match="1 Gaussians hold values that are not finite"):
-        decimated(source)
+        decimate(source)

@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 import clsplat
 from clsplat.cli import app
 from clsplat.core.errors import ConfigError, DataError, Interrupted, OutputError
-from clsplat.formats.table import bytes_of, read
+from clsplat.formats.table import model_bytes, read
 from clsplat.gaussians.sky import Sky
 from clsplat.runs import runner
 from clsplat.runs.model_file import evaluate
 from clsplat.workflows import lod
-from clsplat.workflows.lod import LodPlan, decimated, table
+from clsplat.workflows.lod import LodPlan, decimate, table
 from tests.support.runs import NO_PROCESS
 
 pytestmark = pytest.mark.slow
@@ -55,20 +55,20 @@ def test_levels_are_trained_and_measured(trained, few_steps, tiny_scene):
 
 def test_numbers_are_told_as_elsewhere(monkeypatch, caplog):
     caplog.set_level("INFO")
-    monkeypatch.setattr(lod, "decimated", lambda model, keep: range(1200))
+    monkeypatch.setattr(lod, "decimate", lambda model, keep: range(1200))
     lod._levels(range(2400), LodPlan(levels=2), None)
     assert "level 1: 1,200 Gaussians" in caplog.text
 
 
 def test_each_level_is_merged_from_the_trained_one_before(trained):
     training = trained[0].with_name("site.training")
-    expected = decimated(clsplat.load(training / "level_1" / "point_cloud.ply"))
+    expected = decimate(clsplat.load(training / "level_1" / "point_cloud.ply"))
     np.testing.assert_array_equal(clsplat.load(training / "level_2.ply").means, expected.means)
 
 
 def test_sizes_are_those_of_the_files(trained):
     folder, found = trained
-    assert found["bytes"] == bytes_of(folder) == sum(map(len, tree(folder).values()))
+    assert found["bytes"] == model_bytes(folder) == sum(map(len, tree(folder).values()))
     meta = (folder / "lod-meta.json").stat().st_size
     assert sum(level["bytes"] for level in found["levels"]) == found["bytes"] - meta
 
@@ -174,7 +174,7 @@ def test_unwritable_path_is_refused_before_the_work(name, steps, few_steps, tmp_
     def works(*_):
         raise AssertionError("the work begins")
 
-    monkeypatch.setattr("clsplat.workflows.lod.decimated", works)
+    monkeypatch.setattr("clsplat.workflows.lod.decimate", works)
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match="cannot be written"):
         clsplat.write_levels(few_steps, tmp_path / name, steps=steps)

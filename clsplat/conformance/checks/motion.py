@@ -7,7 +7,7 @@ import numpy as np
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import CONIC, SUM, Checks, Results, by_element, by_norm, equal, wrong
 from clsplat.conformance.scenes import Case, random_case
-from clsplat.formats.splats import MOTION, STILL, WIDTHS, fields_of, width_of
+from clsplat.formats.splats import MOTION, STATIC_LOG_DURATION, WIDTHS, motion_fields, motion_width
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import PenaltyInputs
@@ -27,13 +27,13 @@ EXTENT = 2.0
 
 def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
     """Gaussians that move about their places; some come and go, a tenth is not there at TIME, a tenth always."""
-    case, fields = random_case(rng, count), fields_of(width)
+    case, fields = random_case(rng, count), motion_fields(width)
     motion = rng.normal(0, 0.3, (count, width))
     center, duration = rng.uniform(0, 1, count), rng.normal(-1, 0.5, count)
     apart = np.abs(TIME - center) / np.exp(duration)
     duration[(apart > 3) & (apart < 3.7)] += 0.5  # 3.33 is the end of what can be seen
     center[::10], duration[::10] = 0.875, -2.5
-    duration[5::10] = STILL
+    duration[5::10] = STATIC_LOG_DURATION
     motion[:, fields["time_center"]], motion[:, fields["log_duration"]] = center[:, None], duration[:, None]
     parameters = {**case.parameters, MOTION: motion.astype(np.float32)}
     return replace(case, parameters=parameters, view=replace(case.view, time=TIME))
@@ -67,7 +67,7 @@ def check_moment(device: Device, rng: np.random.Generator, count: int, width: in
     by_motion, by_logit = ref.moved_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
     found, center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
     kernel = "turn_backward" if turns else "move_backward"
-    for name, columns in fields_of(width).items():
+    for name, columns in motion_fields(width).items():
         yield by_norm(kernel, f"by {name}, {what}", found[:, columns], by_motion[:, columns], CONIC)
     yield by_norm("move_backward", f"by the logit at the center, {what}", center, by_logit, CONIC)
 
@@ -75,8 +75,8 @@ def check_moment(device: Device, rng: np.random.Generator, count: int, width: in
 def check_still(device: Device, rng: np.random.Generator) -> Results:
     """A motion of none gives the bits of none."""
     case = random_case(rng, 65)
-    motion = np.zeros((65, width_of(3, True)), np.float32)
-    motion[:, 3], motion[:, 4] = rng.uniform(0, 1, 65), STILL
+    motion = np.zeros((65, motion_width(3, True)), np.float32)
+    motion[:, 3], motion[:, 4] = rng.uniform(0, 1, 65), STATIC_LOG_DURATION
     still = replace(
         case, parameters={**case.parameters, MOTION: motion}, view=replace(case.view, time=float(np.float32(0.7)))
     )
@@ -96,7 +96,7 @@ def check_step(device: Device, rng: np.random.Generator, count: int, width: int,
     frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
     values, m, v = case.parameters[MOTION].astype(np.float64), np.zeros((count, width)), np.zeros((count, width))
     seen = np.full(count, every != 0) | (frame.depth_key.get()[:count] != 0xFFFFFFFF)
-    each = np.concatenate([np.full(c.stop - c.start, rates[name]) for name, c in fields_of(width).items()])
+    each = np.concatenate([np.full(c.stop - c.start, rates[name]) for name, c in motion_fields(width).items()])
     for step in (1, 2):
         gradient = rng.normal(size=(count, width)).astype(np.float32)
         gradients = GaussianGradients(gaussians)
@@ -117,9 +117,9 @@ def check_step(device: Device, rng: np.random.Generator, count: int, width: int,
 @CHECKS.add("move_forward", "turn_forward", "move_backward", "turn_backward", "motion_step")
 def motion(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
-        yield from check_moment(device, rng, count, width_of(1, False))
-        yield from check_step(device, rng, count, width_of(3, True))
-        yield from check_step(device, rng, count, width_of(3, True), every=0)
+        yield from check_moment(device, rng, count, motion_width(1, False))
+        yield from check_step(device, rng, count, motion_width(3, True))
+        yield from check_step(device, rng, count, motion_width(3, True), every=0)
     for width in WIDTHS:
         yield from check_moment(device, rng, 65, width)
     yield from check_still(device, rng)

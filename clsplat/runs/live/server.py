@@ -20,7 +20,7 @@ import numpy as np
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.page import inline, render
 from clsplat.core.quaternions import rotation_matrix
-from clsplat.formats.splats import EXPECTED, is_moment
+from clsplat.formats.splats import EXPECTED_TIME, is_timestamp
 from clsplat.runs.live.preview import Credit, Desk, Kind, Pace, PageCamera, ShownRun
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
@@ -314,8 +314,8 @@ def moment(text: str) -> float:
         found = float(text)
     except ValueError:
         found = math.nan
-    if not is_moment(found):
-        raise Refused(400, f"time: {EXPECTED}")
+    if not is_timestamp(found):
+        raise Refused(400, f"time: {EXPECTED_TIME}")
     return found
 
 

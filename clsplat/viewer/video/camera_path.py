@@ -19,7 +19,7 @@ import scipy
 from clsplat.core.errors import ConfigError, DataError, quote
 from clsplat.core.files import write_text
 from clsplat.core.reading import read_json
-from clsplat.formats.splats import is_moment
+from clsplat.formats.splats import is_timestamp
 from clsplat.scene import camera_files
 from clsplat.scene.camera import Camera
 from clsplat.scene.camera_files import warn_center_lost, warn_width_lost
@@ -76,7 +76,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         matrix = {"transform_matrix": _rows(own.get("camera_to_world"))}
         pose = np.linalg.inv(camera_to_world_of(JsonFrame(path.parent, frame.where, matrix)))[:3]
         time = frame.number("render_time")
-        if time is not None and not is_moment(time):
+        if time is not None and not is_timestamp(time):
             raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1: export the path again")
         views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose), time=time))
     return CameraPath(views, rate, size)

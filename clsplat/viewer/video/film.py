@@ -9,7 +9,7 @@ import numpy as np
 
 from clsplat.core.errors import ConfigError, quote
 from clsplat.core.files import check_result_path
-from clsplat.formats.splats import is_moment
+from clsplat.formats.splats import is_timestamp
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.scene.view_selection import ViewSelection, choose
@@ -47,7 +47,7 @@ def times_of(given: "str | float | Sequence[float] | None") -> Times | None:
         found = [float(part) for part in parts]
     except (ValueError, TypeError):
         found = []
-    if len(found) not in (1, 2) or not all(map(is_moment, found)):
+    if len(found) not in (1, 2) or not all(map(is_timestamp, found)):
         raise ConfigError(f"the time {quote(given)}: {EXPECTED}")
     return found[0], found[-1]
 
