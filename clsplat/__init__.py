@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from clsplat.api.commands import resume as resume
     from clsplat.api.commands import run as run
     from clsplat.api.commands import run_cell as run_cell
+    from clsplat.api.commands import run_worker as run_worker
     from clsplat.api.commands import status as status
     from clsplat.api.commands import status_schema as status_schema
     from clsplat.api.commands import train_in_blocks as train_in_blocks
     from clsplat.api.commands import view as view
-    from clsplat.api.commands import work_for as work_for
     from clsplat.api.commands import write_levels as write_levels
     from clsplat.api.pictures import camera_path as camera_path
     from clsplat.api.pictures import render_path as render_path
@@ -91,7 +91,7 @@ sys.meta_path.append(_CheckoutFinder)
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.commands": "cancel check compare_runs compress_model convert copy_pipeline describe_run evaluate"
     " pipeline_schema pipelines plan_in_blocks resume run run_cell status status_schema"
-    " train_in_blocks view work_for write_levels",
+    " run_worker train_in_blocks view write_levels",
     "clsplat.api.pictures": "camera_path render_path render_views write_cameras write_video",
     "clsplat.api.renderer": "FieldRenderer Gradients Picture Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_speed read_measurement",

@@ -1,4 +1,4 @@
-"""What the functions of the API take, in the forms that the rooms below take."""
+"""Convert arguments of the API to the forms that the rest of the package takes."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -8,11 +8,11 @@ from typing import Any
 from clsplat.core.errors import ConfigError
 
 PathLike = str | Path
-Overrides = Mapping[str, Any] | Sequence[str]  # values by place, or 'place=value' as --set takes it
+Overrides = Mapping[str, Any] | Sequence[str]  # values by key, or 'key=value' as for --set
 
 
 def overrides(values: Overrides) -> list[str]:
-    """Return settings as `--set` takes them; paths and numbers of NumPy count as text and numbers.
+    """Return settings as for `--set`; paths become text, and NumPy numbers become numbers.
 
     Raises ConfigError for a value that YAML cannot hold.
     """
@@ -21,14 +21,14 @@ def overrides(values: Overrides) -> list[str]:
     if not isinstance(values, Mapping):
         return list(values)
     try:
-        return [f"{place}={json.dumps(value, default=_plain)}" for place, value in values.items()]
+        return [f"{key}={json.dumps(value, default=_plain)}" for key, value in values.items()]
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"set: {error}; expected numbers, text, and lists and mappings of them") from None
+        raise ConfigError(f"set: {error}; expected numbers, text, and lists or mappings of these") from None
 
 
 def _plain(value: Any) -> Any:
-    """A value that JSON does not know as one that it does.  Raises TypeError."""
-    import numpy as np  # only where it is needed: the command line starts without it
+    """Convert a value for JSON.  Raises TypeError."""
+    import numpy as np  # slow to import, and the command line does not need it
 
     if isinstance(value, Path):
         return str(value)
@@ -41,17 +41,17 @@ def load_plugins() -> None:
     """Import the plug-ins of installed packages, once."""
     from importlib.metadata import entry_points
 
-    if entry_points(group="clsplat.plugins"):  # without any, the command line starts without OpenCL and pydantic
+    if entry_points(group="clsplat.plugins"):  # without plug-ins, the command line starts without OpenCL and pydantic
         from clsplat.pipeline import plugins
 
         plugins.load_installed()
 
 
 def path_of(value: PathLike | None) -> Path | None:
-    """Return a path as one."""
+    """Return a path as a Path; None stays None."""
     return None if value is None else Path(value)
 
 
 def layer_names(depth: bool, alpha: bool) -> tuple[str, ...]:
-    """Return the layers that are rendered."""
+    """Return the names of the layers to render."""
     return ("color", *(name for name, wanted in (("depth", depth), ("alpha", alpha)) if wanted))

@@ -1,9 +1,9 @@
-"""What the commands do, as functions: paths and plain values in, files and plain values out.
+"""Provide the commands as functions, from paths and plain values to files and plain values.
 
-The command line prints what these return.  They raise the errors of `clsplat.core.errors`, with the messages of the
-commands: ConfigError for a pipeline or an argument, DataError for a dataset or a model, DeviceError for a device,
-OutputError for a file that cannot be written.  `device` is a part of a device's name, as `devices` lists them, or a
-`Device`; without it CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU.
+The command line prints what they return.  They raise the errors of `clsplat.core.errors`: ConfigError for a pipeline or
+an argument, DataError for a dataset or a model, DeviceError for a device, OutputError for a file that cannot be
+written.  `device` is part of a device's name, as in `devices`, or a `Device`; the default is CLSPLAT_DEVICE, or else
+the strongest GPU that works, or else the first CPU.
 """
 
 from collections.abc import Sequence
@@ -33,14 +33,16 @@ def run(
 ) -> Path:
     """Run a pipeline or a matrix, as `clsplat run` does; return the run folder.
 
-    pipeline: a file, or the name of a shipped one; scene: default that of the pipeline; out: default runs/NAME; set:
-    settings by place, such as {"optimize.steps": 3000}; start: "resume" goes on from the newest checkpoint in `out`, if
-    there is one, "restart" begins again where `out` holds a run, and removes its checkpoints and metrics; live: the
-    port of a page on this machine that shows the model while it trains, 0 for the usual one; minutes: the time that the
-    run takes once its photographs are read, in as many steps as fit: they are chosen before it starts; on: a file that
-    says where the cells of a matrix run, in the place of its `execution`.
+    pipeline: a file, or the name of a shipped one
+    scene: folder of the dataset; default: the scene of the pipeline
+    out: the run folder; default: runs/NAME
+    set: settings by key, such as {"optimize.steps": 3000}
+    start: "resume" continues from the newest checkpoint in `out`, if there is one; "restart" starts over where `out`
+        has a run, and removes its checkpoints and metrics
+    live: port of a web page on this machine that shows the model while it trains; 0: the default port
+    minutes: train in as many steps as fit into this time, counted from when the photos are read
+    on: a file that says where the cells of a matrix run, instead of its `execution`
     """
-
     return run_job(_job(pipeline, scene, out, set, start, on), device, live, minutes)
 
 
@@ -54,7 +56,7 @@ def describe_run(
     start: Literal["new", "resume", "restart"] = "new",
     on: PathLike | None = None,
 ) -> str:
-    """Check all that `run` would need and return what it would do, as lines of text; nothing is written."""
+    """Check everything that `run` needs, and return what it would do as text; nothing is written."""
     return _job(pipeline, scene, out, set, start, on).describe(device)
 
 
@@ -70,7 +72,7 @@ def resume(
 ) -> Path:
     """Continue a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder.
 
-    scene: where its photographs are, if they have moved; steps: train to this step; set, live, on: as for `run`.
+    scene: where its photos are, if they have moved; steps: train up to this step; set, live, on: as for `run`.
     """
     return run_job(resume_job(folder, scene, set, steps, on), device, live)
 
@@ -87,12 +89,12 @@ def resume_job(
 
 
 def status(folder: PathLike) -> dict[str, Any]:
-    """Return how far a run or a matrix is, from its files: what status.json holds, `last` report, `metrics` at the end.
+    """Return the state of a run or a matrix from its files: the content of status.json, `last` report, and `metrics`.
 
-    A matrix has `cells`, `done` and `failed` in the place of the step.  `silent` is the time in s since the last
-    heartbeat of a run that has not ended, `ahead` that by which it lies in the future, from a minute on; the state is
-    `killed` where its process is gone.  Of the store of a sweep return its `cells`, `counts` of their states, `events`,
-    of a scene in blocks its `state` and its `parts`.
+    A matrix has `cells`, `done` and `failed` instead of a step.  `silent` is the time in seconds since the last
+    heartbeat of a run that has not ended, and `ahead` how far that is in the future, if more than a minute; the state
+    is `killed` if the process is gone.  `advice` says how to continue.  The store of a sweep has `cells`, `counts` of
+    their states and `events`; a scene in blocks has `state` and `parts`.
     """
     from clsplat.workflows.folder import status_of
 
@@ -107,12 +109,12 @@ def status_schema() -> dict[str, Any]:
 
 
 def check(pipeline: PathLike) -> dict[str, Any]:
-    """Validate a pipeline or a matrix; return its `path`, its `name`, its `stages` or `cells`, and as
-    `adapts` the keys that its photographs will decide.
+    """Validate a pipeline or a matrix, verify a run folder, or inspect a model file.
 
-    Of a run folder, or that of a scene in blocks, return `whole`, its `state`, and `objects`: every file, whether it is
-    `whole`, and a `detail`.  Of a model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`,
-    and whether it is `valid`.
+    A pipeline or a matrix returns `path`, `name`, `stages` or `cells`, and in `adapts` the keys that the photos will
+    decide.  The folder of a run, or of a scene in blocks, returns `whole`, `state`, and `objects`: each file, whether
+    it is `whole`, and a `detail`.  A model file returns `format`, `ranges`, `bounds`, `degenerate` counts, `findings`,
+    and `valid`.
     """
     from clsplat.workflows.folder import check
 
@@ -129,7 +131,7 @@ def pipeline_schema() -> dict[str, Any]:
 
 
 def pipelines(name: PathLike | None = None) -> Any:
-    """Return `name`, `summary` and `path` of every shipped pipeline; of one of them its `stages` and `keys` too."""
+    """Return `name`, `summary` and `path` of each shipped pipeline, or of one of them, with its `stages` and `keys`."""
     from clsplat.pipeline import recipes
 
     load_plugins()
@@ -137,7 +139,7 @@ def pipelines(name: PathLike | None = None) -> Any:
 
 
 def copy_pipeline(name: PathLike, file: PathLike) -> Path:
-    """Copy a pipeline to a file, or into a folder, to change it; return the copy.  A file is never replaced."""
+    """Copy a pipeline to a file, or into a folder; return the copy.  Existing files are never replaced."""
     from clsplat.pipeline import recipes
 
     return recipes.copy(str(name), Path(file))
@@ -153,10 +155,10 @@ def evaluate(
     lpips_input: Literal["-1..1", "0..1"] = "-1..1",
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Measure a model at the views of a scene; return metrics by split and divisor, with the keys of metrics.json.
+    """Measure a model at the views of a scene; return metrics by split and downscale factor, as in metrics.json.
 
-    model, scene: as for `render_views`; downscales: divisors of the photographs' size; metrics: of psnr (dB), ssim,
-    ms_ssim and flip; lpips: an ONNX file, which reads values from -1 or from 0 on, as `lpips_input` says.
+    model, scene: as for `render_views`; downscales: divisors of the image size; metrics: some of psnr (dB), ssim,
+    ms_ssim and flip; lpips: an ONNX file; lpips_input: the range of pixel values that it expects.
     """
     from clsplat.runs import model_file
 
@@ -188,7 +190,7 @@ def _job(
 
 
 def run_job(job: "Job", device: "str | Device | None", live: int | None = None, minutes: float | None = None) -> Path:
-    """Run a job, and return its folder; arguments as for `Job.run`.  Raises ClsplatError."""
+    """Run a job and return its folder; arguments as for `Job.run`.  Raises ClsplatError."""
     from clsplat.opencl.device import Device
     from clsplat.pipeline.matrix import Experiment
 
@@ -197,20 +199,18 @@ def run_job(job: "Job", device: "str | Device | None", live: int | None = None, 
         job.run(device, live, minutes)
         return job.out
     if live is not None or minutes is not None:
-        raise ConfigError("--live and --minutes are for one run; the cells of a store run in other processes")
+        raise ConfigError("--live and --minutes are for single runs; the cells of a store run in other processes")
     if isinstance(device, Device):
-        raise ConfigError("expected the name of a device: the cells of a store run in other processes")
+        raise ConfigError("device: expected a name, as the cells of a store run in other processes")
     if device is not None and work.execution.has_workers:
-        raise ConfigError(
-            "--device: a scheduler has the devices that its workers offer, by `clsplat worker --device NAME`"
-        )
-    from clsplat.sweeps.batch import run_sweep  # and what tells devices apart, which a single run does not need
+        raise ConfigError("--device: with a scheduler, workers choose the devices: use `clsplat worker --device NAME`")
+    from clsplat.sweeps.batch import run_sweep  # slow to import, and not needed for a single run
 
     run_sweep(work, job.state, work.execution, device, job.start)
     return job.out
 
 
-# A model made small, or in levels of detail, as functions; errors and `device` as in `clsplat.api.commands`.
+# Compression and levels of detail.
 
 
 def compress_model(
@@ -224,12 +224,12 @@ def compress_model(
     steps: int | None = None,
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Look for the smallest file of a model that loses no more than `target`, or the best one of that size.
+    """Find the smallest file of a model within a loss of quality, or the best file of a size.
 
-    model, scene: as for `render_views`; target: "-0.1dB" or "5MB"; out: a folder, which holds the file, a page and all
-    that was tried; keep: shares of the Gaussians to try; steps: of training after each pruning,
-    default 1000; with each palette it is a fifth of them.  Returns
-    what compress.json holds, `file` and `page`.  Raises ConfigError for a target that no file meets.
+    model, scene: as for `render_views`; target: "-0.1dB" or "5MB"; out: folder for the file, a page and all trials;
+    keep: fractions of the Gaussians to try; steps: training steps after each pruning, default 1000, and a fifth of that
+    for each palette.  Returns the content of compress.json, with `file` and `page`.  Raises ConfigError for a target
+    that no file meets.
     """
     from clsplat.workflows import compress
 
@@ -252,13 +252,13 @@ def write_levels(
     downscale: float | None = None,
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Write a model in levels of detail, as streamed SOG (lod-meta.json): each level has a share of the one before.
+    """Write a model in levels of detail, as streamed SOG (lod-meta.json).
 
     model, scene: as for `render_views`, but without a scene nothing is trained, and ConfigError is raised for `steps`,
-    `downscale` or `device`; levels: with the model itself; keep: the share; steps: of training each coarser level,
-    default 500, 0 for none; downscale: divisor of the photographs' size there, by default that of the model's run.
-    Returns `folder`, `bytes`, the `split` that is measured, and `levels` with
-    `gaussians`, `bytes`, and in dB `merged_psnr`, before the training, and `psnr`.
+    `downscale` or `device`; levels: their number, including the model itself; keep: fraction of the Gaussians of the
+    previous level; steps: training steps of each coarser level, default 500, 0 for none; downscale: divisor of the
+    image size in training, by default that of the run.  Returns `folder`, `bytes`, the `split` that is measured, and
+    `levels` with `gaussians`, `bytes`, and in dB `merged_psnr`, before training, and `psnr`.
     """
     from clsplat.workflows.lod import LodPlan, levels_of_detail
 
@@ -267,14 +267,14 @@ def write_levels(
     return levels_of_detail(Path(model), Path(folder), path_of(scene), plan, device)
 
 
-# A scene trained in blocks, as a function; errors and `device` as in `clsplat.api.commands`.
+# Training a large scene in blocks.
 
 
 def plan_in_blocks(
     scene: PathLike, pipeline: str = "blocks", *, blocks: int = 4, device: "str | Device | None" = None
 ) -> dict[str, Any]:
-    """Return how a scene would be cut by its points, before anything is trained: what partition.json holds, and the
-    time of each block, `seconds`, from some steps on the device.  Nothing is kept.
+    """Return how a scene would be cut by its points, without training it: the content of partition.json, and the
+    time of each block in `seconds`, extrapolated from some steps on the device.  Nothing is written.
     """
     from clsplat.workflows.blocks import plan_blocks
 
@@ -289,7 +289,7 @@ def train_in_blocks(
     *,
     blocks: int = 4,
     coarse: PathLike = "blocks_coarse",
-    sight: float = 0.05,
+    min_coverage: float = 0.05,
     steps: Literal["each", "shared"] = "each",
     overrides: "Sequence[str]" = (),
     coarse_overrides: "Sequence[str]" = (),
@@ -297,25 +297,25 @@ def train_in_blocks(
     on: PathLike | None = None,
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Train a scene in blocks: a coarse model is cut, each block is trained from what its views see, all are merged.
+    """Train a scene in blocks: cut a coarse model, train each block with the views that see it, and merge them.
 
-    out: a folder, in which an interrupted call goes on; coarse: a pipeline that trains the coarse model, or a model
-    file or run; sight: the share of a view's pixels above which it belongs to a block; steps: of each block those of
-    the pipeline, or its share of them by its views; overrides: 'stage.key=value'; only_plan: stop after the partition;
-    on: a file that says where blocks are trained, as cells of a store, in the place of one after the other here.
-    Returns what partition.json holds, `run`, the folder of the merged model, and `metrics`.
+    out: a folder; an interrupted call continues there; coarse: a pipeline that trains the coarse model, or a model file
+    or run; min_coverage: a view trains a block that covers more than this fraction of its pixels; steps: "each": all
+    steps of the pipeline for each block, "shared": a share of them by its number of views; overrides:
+    'stage.key=value'; only_plan: stop after the partition; on: a file that says where to train the blocks.
+    Returns the content of partition.json, `run`, the folder of the merged model, and `metrics`.
     """
     from clsplat.pipeline.execution import Execution, read_execution
     from clsplat.workflows.blocks import BlocksPlan, train_in_blocks
 
     load_plugins()
-    plan = BlocksPlan(pipeline, str(coarse), blocks, sight, steps, list(overrides), list(coarse_overrides))
+    plan = BlocksPlan(pipeline, str(coarse), blocks, min_coverage, steps, list(overrides), list(coarse_overrides))
     values = read_execution(path_of(on))
     execution = None if values is None else Execution.model_validate(values)
     return train_in_blocks(Path(scene), Path(out), plan, device, only_plan=only_plan, execution=execution)
 
 
-# Functions about the cells of a sweep; errors and `device` as in `clsplat.api.commands`.
+# The cells of a sweep.
 
 
 def run_cell(
@@ -327,9 +327,9 @@ def run_cell(
     set: Overrides = (),
     device: str | None = None,
 ) -> Path:
-    """Run one cell of a matrix, or a pipeline as a cell, and keep it in a store; return the folder of its result.
+    """Run one cell of a matrix, or a pipeline as a cell, and store it; return the folder of its result.
 
-    index: of the cell in the matrix, from 0.  What is in the store already is not run again.
+    index: of the cell in the matrix, from 0.  A cell whose result is in the store is not run again.
     """
     from clsplat.runs.model_file import overrides_of
     from clsplat.sweeps.batch import run_one
@@ -339,7 +339,7 @@ def run_cell(
 
 
 def cancel(store: PathLike, cell: str | None = None) -> str:
-    """Let the cells of a store that have begun save their state and stop, or one of them, by its name or key.
+    """Ask running cells of a store, or one of them by name or key, to save their state and stop.
 
     Return the key, or "all".
     """
@@ -348,16 +348,16 @@ def cancel(store: PathLike, cell: str | None = None) -> str:
     return Store.opened(Path(store)).cancel(cell)
 
 
-def work_for(
+def run_worker(
     scheduler: str,
     devices: Sequence[str] | None = None,
     *,
     tls: tuple[str | None, str | None, str | None] = (None, None, None),
     insecure: bool = False,
 ) -> None:
-    """Offer the devices of this machine to a scheduler, dask://HOST:PORT or tls://HOST:PORT, until that ends.
+    """Offer the devices of this machine to a scheduler, dask://HOST:PORT or tls://HOST:PORT, until it ends.
 
-    devices: names, default every device that works; tls: files of the authority, the certificate and its key.
+    devices: names, by default all devices that work; tls: files of the CA certificate, the certificate, and its key.
     """
     from clsplat.pipeline.execution import from_options
     from clsplat.sweeps.dask import offer  # where Dask is installed
@@ -367,7 +367,7 @@ def work_for(
     offer(from_options({"engine": scheduler, "insecure": insecure, "tls": certificates}), devices)
 
 
-# Model files in another format, as a function.
+# Conversion of model files.
 
 
 def convert(
@@ -385,13 +385,13 @@ def convert(
     time: float | None = None,
     frames: int | None = None,
 ) -> dict[str, Any]:
-    """Write models, merged, as one file of the format that its name stands for; return `format`, `gaussians`, `bytes`.
+    """Merge models and write them as one file, in the format of its name; return `format`, `gaussians`, `bytes`.
 
-    sh_bits: of SPZ, such as "8/6"; axes: of SPZ files that are read, or where none is of the one that is written; crop:
-    x0, y0, z0, x1, y1, z1 in scene units, after `transform`, such as "scale=2 rotate=90,0,0" (degrees); drop_below: an
-    opacity.  Gaussians that are not finite are dropped, unless `keep_nan`.
-    time: the moment of a moving model, from 0 to 1, that a static one is written of; frames: so many moments, each in a
-    file of its own: `out` is a folder, for PLY, or the name whose number is still to come.
+    sh_bits: SPZ, such as "8/6"; axes: of SPZ files that are read or, if none is, written; crop: x0, y0, z0, x1, y1, z1
+    in scene units, after `transform`, such as "scale=2 rotate=90,0,0" (degrees); drop_below: an opacity.  Gaussians
+    that are not finite are dropped unless `keep_nan`.
+    time: write a moving model as a static one, at this time from 0 to 1; frames: write this number of files, one per
+    timestamp: `out` is a folder, for PLY, or a file name to which the numbers are added.
     """
     from clsplat.gaussians import conversion
     from clsplat.gaussians.conversion import check_time, convert_frames
@@ -414,13 +414,13 @@ def convert(
     return conversion.convert(files, Path(out), changes, options)
 
 
-# Pages of runs and models as functions; errors as in `clsplat.api.commands`.
+# Pages about runs and models.
 
 
 def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html", published: PathLike | None = None) -> int:
-    """Write the page that shows runs side by side; return their number.  The folder of a matrix stands for its runs.
+    """Write a page that compares runs; return their number.  The folder of a matrix means all its runs.
 
-    published: a YAML file of figures that others have published, which are shown below, apart.
+    published: a YAML file with published metrics, which are shown in a separate table.
     """
     from clsplat.core.files import check_result_path
     from clsplat.sweeps.compare.comparison import read_published
@@ -439,10 +439,11 @@ def view(
     photograph_budget: float = 4.0,
     splats: int | None = None,
 ) -> Path:
-    """Write a page that shows one model, or two with one camera, in any browser and offline; return the page.
+    """Write a page that shows one model, or two side by side, in any browser, offline; return the page.
 
-    models: files or run folders; scene: whose views and photographs are in the page, by default that of a run folder;
-    photographs: of which views, up to `photograph_budget` MB; splats: only so many, the most important ones.
+    models: files or run folders; scene: its views and photos are in the page, by default that of a run folder;
+    photographs: which photos to include, up to `photograph_budget` MB; splats: include only this number of Gaussians,
+    the most important ones.
     """
     from clsplat.runs import film
 

@@ -1,4 +1,4 @@
-"""The commands.  Each prints one line for an error, and exits with that error's code."""
+"""Run the command line.  An error prints one line and sets the exit code."""
 
 import difflib
 import os
@@ -15,23 +15,23 @@ from clsplat.core.errors import Interrupted, as_clsplat_error, one_line
 from clsplat.core.signals import stop_at_once, stopping_on_signals
 
 COMPLETION = "_CLSPLAT_COMPLETE"  # set where a shell asks for completions
-DEBUG, PLUGIN = "--debug", "--plugin"  # options that stand before the command or after it
-LIVE = "--live"  # its port may be left out
+DEBUG, PLUGIN = "--debug", "--plugin"  # options that may come before or after the command
+LIVE = "--live"  # its port is optional
 
 
 def main(*before: str) -> None:
-    """Run the command line; an error ends as one line, a traceback is shown with --debug only.
+    """Run the command line.  An error prints one line, with --debug also its traceback.
 
-    before: arguments that stand before those of the process.
+    before: arguments in front of those of the process.
     """
     signals.install()
     arguments = _options_first(_with_port(_one_set_each([*before, *sys.argv[1:]])))
     try:
         with stopping_on_signals(stop_at_once):
             shown = app(arguments, prog_name="clsplat", standalone_mode=False)
-            if shown:  # typer makes the code 130 of a KeyboardInterrupt before the command begins
+            if shown:  # 130, which typer makes of a KeyboardInterrupt before the command starts
                 raise KeyboardInterrupt
-            if shown is not None:  # the code of --help and --version; commands return nothing
+            if shown is not None:  # the exit code of --help and --version; commands return None
                 signals.check_output()
             code = 0
     except BaseException as error:
@@ -42,14 +42,14 @@ def main(*before: str) -> None:
 
 
 def _report(error: BaseException, debugging: bool) -> int:
-    """Print the line for an error, or for what the user has stopped; return the exit code."""
+    """Print the line for an error, or for an interruption by the user; return the exit code."""
     if isinstance(error, Passed | typer.Abort):
         error = error.__cause__ or error
-    if isinstance(error, KeyboardInterrupt):  # not of a run, whose message tells how to go on
+    if isinstance(error, KeyboardInterrupt):  # not in a run, which says how to continue
         error = Interrupted("stopped")
     if debugging:
         traceback.print_exception(error)
-    if hasattr(error, "format_message"):  # of typer
+    if hasattr(error, "format_message"):  # from typer
         message, code = _usage(error), 2
     else:
         failure = as_clsplat_error(error)
@@ -59,7 +59,7 @@ def _report(error: BaseException, debugging: bool) -> int:
 
 
 def _usage(error: Any) -> str:
-    """What is wrong with the command line, and where help is."""
+    """Return what is wrong with the command line, and where to find help."""
     context = getattr(error, "ctx", None)
     command = context.command_path if context else "clsplat"
     if type(error).__name__ == "NoArgsIsHelpError":
@@ -75,7 +75,7 @@ def _usage(error: Any) -> str:
 
 
 def _one_set_each(arguments: list[str]) -> list[str]:
-    """Let `--set a=1 b=2` stand for `--set a=1 --set b=2`."""
+    """Expand `--set a=1 b=2` to `--set a=1 --set b=2`."""
     spread: list[str] = []
     for argument in arguments:
         follows = len(spread) >= 2 and spread[-2] == "--set"
@@ -84,7 +84,7 @@ def _one_set_each(arguments: list[str]) -> list[str]:
 
 
 def _with_port(arguments: list[str]) -> list[str]:
-    """Let `--live` without a number stand for `--live=0`."""
+    """Expand `--live` without a number to `--live=0`."""
     following = [*arguments, ""][1:]
     return [
         f"{LIVE}=0" if argument == LIVE and not after.isdecimal() else argument
@@ -93,7 +93,7 @@ def _with_port(arguments: list[str]) -> list[str]:
 
 
 def _options_first(arguments: list[str]) -> list[str]:
-    """Let `--debug` and `--plugin FILE` after the command stand for those before it."""
+    """Move `--debug` and `--plugin FILE` in front of the command."""
     others = [argument for argument in arguments if argument != DEBUG]
     first = [DEBUG] if len(others) < len(arguments) else []
     rest: list[str] = []

@@ -1,4 +1,4 @@
-"""The command line itself: options before the command, near misses, and what commands share."""
+"""Define the command-line application: global options, suggestions for misspelled commands, shared options."""
 
 import difflib
 from collections.abc import Callable
@@ -28,7 +28,7 @@ SYNONYMS = {
     **dict.fromkeys(("benchmark", "time", "profile"), "bench"),
     **dict.fromkeys(("prove", "diagnose", "selftest"), "doctor"),
     **dict.fromkeys(("export", "transform", "merge"), "convert"),
-    **dict.fromkeys(("shrink", "prune", "quantize", "quantize"), "compress"),
+    **dict.fromkeys(("shrink", "prune", "quantize"), "compress"),
     **dict.fromkeys(("decimate", "simplify", "levels", "stream"), "lod"),
     **dict.fromkeys(("split", "tiles", "city"), "blocks"),
     "diff": "compare",
@@ -45,11 +45,11 @@ ORDER = [
 
 
 class Passed(Exception):
-    """Carries, as its cause, an exception that typer would take for something of its own."""
+    """Wraps an exception, as its cause, that typer would handle itself."""
 
 
 class Commands(TyperGroup):
-    """The commands; those of `data` are imported when they are asked for."""
+    """The commands.  Those of `data` are imported only when used."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return sorted([*super().list_commands(ctx), "data"], key=ORDER.index)
@@ -81,7 +81,7 @@ class Commands(TyperGroup):
 
 
 def examples(*lines: str) -> str:
-    """The end of a command's help: command lines that work."""
+    """Return the end of a help text, with examples."""
     return "Examples:\n" + "\n".join(f"  {line}" for line in lines)
 
 
@@ -99,13 +99,13 @@ app = typer.Typer(
 
 
 def command(name: str, *lines: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Register a command with examples of its use."""
+    """Register a command, with examples for its help."""
     return app.command(name, epilog=examples(*lines))
 
 
 @dataclass(frozen=True)
 class Common:
-    """The options before the command."""
+    """The global options."""
 
     device: str | None
 
@@ -120,7 +120,7 @@ def _show_version(wanted: bool) -> None:
 def common(
     context: typer.Context,
     device: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The OpenCL device, where the command itself names none.")
+        str | None, typer.Option(metavar="NAME", help="OpenCL device for commands that take --device.")
     ] = None,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show tracebacks and every log line; also after the command.")
@@ -128,11 +128,11 @@ def common(
     plugin: Annotated[
         list[Path] | None,
         typer.Option(
-            "--plugin", metavar="FILE", help="A plug-in: a Python file with methods of your own; may be repeated."
+            "--plugin", metavar="FILE", help="A plug-in: a Python file with your own methods; may be repeated."
         ),
     ] = None,
     attended: Annotated[
-        bool, typer.Option("--attended", hidden=True, help="End when standard input ends, as by SIGTERM.")
+        bool, typer.Option("--attended", hidden=True, help="Stop when standard input ends, as by SIGTERM.")
     ] = False,
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
@@ -151,10 +151,10 @@ def common(
         raise ConfigError("expected a command")
 
 
-def _or_common(context: typer.Context, device: str | None) -> str | None:
-    """The device given after the command, or before it."""
-    given = context.find_root().obj
-    return device if device is not None or given is None else given.device
+def _device_or_global(context: typer.Context, device: str | None) -> str | None:
+    """Return the --device after the command, else the one before it."""
+    common = context.find_root().obj
+    return device if device is not None or common is None else common.device
 
 
 def recipe_names(incomplete: str) -> list[str]:
@@ -165,8 +165,8 @@ DeviceOption = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        callback=_or_common,
-        help="Part of a device's name as `clsplat devices` prints it; NAME:1 is the second that matches.",
+        callback=_device_or_global,
+        help="Part of a device's name in `clsplat devices`; NAME:1 is the second match.",
     ),
 ]
 PipelineArgument = Annotated[
@@ -181,7 +181,10 @@ PipelineArgument = Annotated[
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A model file with --scene, or a run folder.")]
 SceneOption = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="A COLMAP, Blender or nerfstudio folder, or a run's; default: that of the run."),
+    typer.Option(
+        metavar="DIR",
+        help="Dataset folder (COLMAP, Blender, nerfstudio, …) or run folder; default: the scene of the run.",
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -194,7 +197,7 @@ LiveOption = Annotated[
         metavar="[PORT]",
         min=0,
         max=65535,
-        help="Show the model in a browser while it trains; without PORT: 8710, or the next that is free.",
+        help="Show the model in a browser while it trains; default port: 8710, or the next free one.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -1,4 +1,4 @@
-"""Commands about trained models."""
+"""Define the commands for trained models."""
 
 import json
 import math
@@ -8,14 +8,15 @@ from typing import Annotated, Any, Literal
 import typer
 
 from clsplat.api import commands, pictures
-from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
+from clsplat.cli.app import DeviceOption, JsonOption, ModelArgument, SceneOption, command
 from clsplat.core import terminal
 from clsplat.core.errors import ConfigError, pluralize, quote
 from clsplat.core.files import path_exists
+from clsplat.core.text_table import text_table
 
 
 def _numbers(option: str, text: str | None, expected: str) -> list[float] | None:
-    """The numbers of an option, separated by commas.  Raises ConfigError."""
+    """Parse the comma-separated numbers of an option.  Raises ConfigError."""
     try:
         return None if text is None else [float(part) for part in text.split(",")]
     except ValueError:
@@ -32,29 +33,32 @@ def evaluate(
     scene: SceneOption = None,
     downscales: Annotated[
         str | None,
-        typer.Option(metavar="N,…", help="Divide image sizes by these; default: as the run did, 1 for a file."),
+        typer.Option(
+            metavar="N,…", help="Divisors of the image size; default: that of the run, or 1 for a model file."
+        ),
     ] = None,
     metrics: Annotated[
-        str, typer.Option(metavar="NAME,…", help="Of psnr, ssim, ms_ssim and flip, separated by commas.")
+        str, typer.Option(metavar="NAME,…", help="One or more of psnr, ssim, ms_ssim and flip.")
     ] = "psnr,ssim",
     lpips: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="An ONNX file of LPIPS; without it lpips is null.")
+        Path | None, typer.Option(metavar="FILE", help="ONNX file of an LPIPS network, to compute LPIPS too.")
     ] = None,
-    lpips_input: Annotated[Literal["-1..1", "0..1"], typer.Option(help="Values that LPIPS reads.")] = "-1..1",
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the metrics here as JSON; default: print them.")
-    ] = None,
+    lpips_input: Annotated[
+        Literal["-1..1", "0..1"], typer.Option(help="Range of pixel values that the network expects.")
+    ] = "-1..1",
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the metrics to a JSON file.")] = None,
+    as_json: JsonOption = False,
     device: DeviceOption = None,
 ) -> None:
-    """Measure a model on a scene's test and training views."""
+    """Measure a model on a scene's test and training views, and print a table."""
     from clsplat.core.files import check_result_path, write_text
 
-    if out is None:
+    if as_json:
         terminal.keep_stdout_for_json()
-    else:
+    if out is not None:
         check_result_path(out, ".json")
     divisors = _numbers("--downscales", downscales, "numbers, separated by commas, such as 1,2,4")
-    found = commands.evaluate(
+    results = commands.evaluate(
         model,
         scene,
         downscales=divisors,
@@ -63,10 +67,26 @@ def evaluate(
         lpips_input=lpips_input,
         device=device,
     )
-    if out is None:
-        terminal.show_json(found)
-    else:
-        write_text(out, json.dumps(found, indent=1) + "\n")
+    if out is not None:
+        write_text(out, json.dumps(results, indent=1) + "\n")
+    if as_json:
+        terminal.show_json(results)
+    elif out is None:
+        terminal.show(_metrics_table(results))
+
+
+def _metrics_table(results: dict[str, Any]) -> str:
+    """Return metrics as a table, a row for each split and downscale factor."""
+    rows = [
+        {"split": split, "size": f"1/{downscale}", **averages}
+        for split in ("test", "train")
+        for downscale, averages in results[split].items()
+    ]
+    columns = ["split", "size", *(name for name, value in (rows or [{}])[0].items() if isinstance(value, int | float))]
+    cells = [
+        [f"{row[name]:.4f}" if isinstance(row[name], float) else str(row[name]) for name in columns] for row in rows
+    ]
+    return text_table([columns, *cells], left=2)
 
 
 @command(
@@ -77,21 +97,20 @@ def evaluate(
 )
 def view(
     models: Annotated[
-        list[Path], typer.Argument(metavar="MODEL|RUN [MODEL2]", help="Model files or run folders; two share a camera.")
+        list[Path],
+        typer.Argument(metavar="MODEL|RUN [MODEL2]", help="Model files or run folders; two are shown side by side."),
     ],
     scene: SceneOption = None,
     out: Annotated[Path, typer.Option(metavar="FILE.html", help="The page to write.")] = Path("viewer.html"),
-    photographs: Annotated[
-        Literal["none", "test", "all"], typer.Option(help="Views whose photographs are in the page.")
-    ] = "test",
+    photographs: Annotated[Literal["none", "test", "all"], typer.Option(help="Which photos to include.")] = "test",
     photograph_budget: Annotated[
-        float, typer.Option(min=0, metavar="MB", help="Photographs up to this size: every second, third, … then.")
+        float, typer.Option(min=0, metavar="MB", help="Limit of the total size of photos; some are left out if needed.")
     ] = 4.0,
     splats: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Only so many, the most important ones; default: all.")
+        int | None, typer.Option(min=1, metavar="N", help="Include only the N most important Gaussians; default: all.")
     ] = None,
 ) -> None:
-    """Write a page to walk through a model, beside its photographs; it opens offline."""
+    """Write an HTML page to walk through a model next to its photos; it opens offline."""
     before = "replaced; " if path_exists(out) else ""
     with terminal.counts_on_terminal():
         page = commands.view(
@@ -109,41 +128,40 @@ def view(
 def convert(
     files: Annotated[
         list[Path],
-        typer.Argument(metavar="IN… OUT", help="Models to read, all merged, and the file to write; its name says how."),
+        typer.Argument(metavar="IN… OUT", help="Models to merge, and the file to write; its name sets the format."),
     ],
-    sh_degree: Annotated[int | None, typer.Option(metavar="N", help="Keep harmonics to this degree.")] = None,
+    sh_degree: Annotated[int | None, typer.Option(metavar="N", help="Highest SH degree to keep.")] = None,
     sh_bits: Annotated[
-        str | None,
-        typer.Option(metavar="A/B", help="SPZ: bits of harmonics, of band 1 and of the others; default: by --quality."),
+        str | None, typer.Option(metavar="A/B", help="SPZ: bits of SH band 1 and of the others; default: by --quality.")
     ] = None,
     axes: Annotated[
-        Literal["spz", "ply"],
-        typer.Option(help="Of SPZ files that are read, else of the one that is written: up and back, or as in a PLY."),
+        Literal["spz", "ply"], typer.Option(help="Axes of the SPZ files: right, up, back (spz), or as in a PLY.")
     ] = "spz",
     quality: Annotated[
-        Literal["small", "balanced", "high"], typer.Option(help="Of SPZ and SOG: how finely all is rounded.")
+        Literal["small", "balanced", "high"], typer.Option(help="SPZ, SOG: precision of the values.")
     ] = "balanced",
     keep_nan: Annotated[
-        bool, typer.Option("--keep-nan", help="Keep Gaussians that are not finite or too large, in a PLY.")
+        bool, typer.Option("--keep-nan", help="PLY: keep Gaussians that are not finite or too large.")
     ] = False,
     crop: Annotated[
-        str | None, typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep what lies in this box after --transform.")
+        str | None, typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep the Gaussians in this box, after --transform.")
     ] = None,
     transform: Annotated[
         str | None,
-        typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; colors turn too."),
+        typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; rotates SH too."),
     ] = None,
     drop_below: Annotated[
-        float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians that are fainter.")
+        float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians with a lower opacity.")
     ] = 0.0,
     time: Annotated[
-        float | None, typer.Option(metavar="T", help="Of a model that moves: the moment, 0 to 1, that is written.")
+        float | None, typer.Option(metavar="T", help="Moving model: write it at this time, 0 to 1.")
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(metavar="N", help="So many moments, each in a file; OUT is a folder, or frame.spz.")
+        int | None,
+        typer.Option(metavar="N", help="Moving model: write N files, one per timestamp; OUT: a folder, or frame.spz."),
     ] = None,
 ) -> None:
-    """Write models in another format: PLY, SPZ, SOG, glTF and others."""
+    """Convert models to another format: PLY, SPZ, SOG, glTF and others."""
     done = commands.convert(
         files[:-1],
         files[-1],
@@ -172,24 +190,25 @@ def compress(
     model: ModelArgument,
     scene: SceneOption = None,
     target: Annotated[
-        str, typer.Option(metavar="SIZE|LOSS", help="The best file of this size, or the smallest of this loss.")
+        str, typer.Option(metavar="SIZE|LOSS", help="Size of the file, or loss of PSNR: 5MB, or -0.1dB.")
     ] = "-0.1dB",
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for the file, the page and all that is tried.")
-    ] = Path("runs/compress"),
-    format_: Annotated[Literal["sog", "spz"], typer.Option("--format", help="Of the files.")] = "sog",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the file, the page and all trials.")] = Path(
+        "runs/compress"
+    ),
+    format_: Annotated[Literal["sog", "spz"], typer.Option("--format", help="Format of the files.")] = "sog",
     keep: Annotated[
-        str | None, typer.Option(metavar="SHARE,…", help="Of the Gaussians; default: 1,0.7,0.5,0.35,0.25,0.18.")
+        str | None,
+        typer.Option(metavar="SHARE,…", help="Fractions of the Gaussians to try; default: 1,0.7,0.5,0.35,0.25,0.18."),
     ] = None,
     steps: Annotated[
         int | None,
         typer.Option(
-            min=1, metavar="N", help="Of training after each pruning, and a fifth with each palette; default: 1000."
+            min=1, metavar="N", help="Training steps after each pruning, and a fifth for each palette; default: 1000."
         ),
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Prune, train and quantize a model until it meets a target; every file is measured as it is read back."""
+    """Prune, train and quantize a model to meet a target size or quality; each file is measured as written."""
     from clsplat.workflows.compress import table
 
     shares = _numbers("--keep", keep, "shares, separated by commas, such as 1,0.7,0.5")
@@ -205,20 +224,22 @@ def compress(
 @command("lod", "clsplat lod runs/splat_7k site/scene", "clsplat lod point_cloud.ply site/scene --levels 3")
 def lod(
     model: Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A model file, or a run folder.")],
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder to make, with its lod-meta.json.")],
-    levels: Annotated[int, typer.Option(metavar="N", help="Levels, with the model itself.")] = 4,
-    keep: Annotated[float, typer.Option(metavar="SHARE", help="Of the Gaussians of the level before.")] = 0.5,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to create, with lod-meta.json.")],
+    levels: Annotated[int, typer.Option(metavar="N", help="Number of levels, including the model itself.")] = 4,
+    keep: Annotated[
+        float, typer.Option(metavar="SHARE", help="Fraction of the Gaussians of the previous level.")
+    ] = 0.5,
     scene: SceneOption = None,
     steps: Annotated[
-        int | None, typer.Option(metavar="N", help="Of training each coarser level, 0: none; default: 500.")
+        int | None, typer.Option(metavar="N", help="Training steps of each coarser level; 0: none; default: 500.")
     ] = None,
     downscale: Annotated[
         float | None,
-        typer.Option(metavar="N", help="Divide the photographs' size in this training; default: as the run."),
+        typer.Option(metavar="N", help="Divisor of the image size in this training; default: that of the run."),
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Write a model in levels of detail for the web (streamed SOG); with photographs each level is trained."""
+    """Write a model in levels of detail for the web (streamed SOG); with photos, each level is trained."""
     from clsplat.workflows.lod import table
 
     found = commands.write_levels(
@@ -232,45 +253,49 @@ def lod(
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")
 def compare(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN…", help="Run folders; that of a matrix stands for all its runs.")
+        list[Path], typer.Argument(metavar="RUN…", help="Run folders; the folder of a matrix means all its runs.")
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path("compare.html"),
     published: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Published figures, shown below the runs, apart from them.")
+        Path | None, typer.Option(metavar="FILE.yaml", help="Published metrics, shown in a separate table.")
     ] = None,
 ) -> None:
-    """Show runs side by side on one page that opens offline."""
+    """Compare runs side by side on an HTML page that opens offline."""
     count = commands.compare_runs(runs, out, published)
     terminal.print_message(f"{count} runs compared in {out}")
 
 
-# The command that renders: pictures of views, and films.
+# Rendering of views, and of videos along a camera path.
 
 ScaleOption = Annotated[
     float | None,
-    typer.Option(min=1, metavar="N", help="Divide image sizes by this; default: as the run did, 1 for a file."),
+    typer.Option(
+        min=1, metavar="N", help="Divisor of the image size; default: that of the run, or 1 for a model file."
+    ),
 ]
 PathOption = Annotated[
     str | None,
-    typer.Option(metavar="PATH", help="A film: ellipse, spiral, orbit, through, views, fixed[:VIEW], or a path file."),
+    typer.Option(metavar="PATH", help="Video: ellipse, spiral, orbit, through, views, fixed[:VIEW], or a path file."),
 ]
 SideOption = Annotated[
-    str | None, typer.Option(metavar="photograph|MODEL", help="Video: the nearest photograph, or a model, beside it.")
+    str | None,
+    typer.Option(metavar="photograph|MODEL", help="Video: show the nearest photo, or another model, next to it."),
 ]
 
 
-FormatOption = Annotated[Literal["png", "npy"], typer.Option("--format", help="8-bit images, or float32 arrays.")]
+FormatOption = Annotated[Literal["png", "npy"], typer.Option("--format", help="8-bit images or float32 arrays.")]
 SizeOption = Annotated[
-    str | None, typer.Option(metavar="WxH", help="Film: px of a picture, even numbers; default: as the photographs.")
+    str | None,
+    typer.Option(metavar="WxH", help="Video: size of a frame in pixels, even numbers; default: that of the photos."),
 ]
 TimeOption = Annotated[
-    float | None, typer.Option(metavar="T", help="Of a model that moves: this moment, 0 to 1; default: of each view.")
+    float | None, typer.Option(metavar="T", help="Moving model: time, 0 to 1; default: the time of each view.")
 ]
 TimesOption = Annotated[
-    str | None, typer.Option(metavar="A..B", help="Film: moments of its first and its last frame; default: 0..1.")
+    str | None, typer.Option(metavar="A..B", help="Video: times of the first and last frame; default: 0..1.")
 ]
 SavePathOption = Annotated[
-    Path | None, typer.Option(metavar="FILE.json", help="Film: write its path, too, for nerfstudio or for --path.")
+    Path | None, typer.Option(metavar="FILE.json", help="Video: write the camera path, for nerfstudio or --path.")
 ]
 
 
@@ -289,37 +314,37 @@ def render(
     scale: ScaleOption = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the images.")] = Path("renders"),
     format_: FormatOption = "png",
-    depth: Annotated[bool, typer.Option("--depth", help="Also depths, NAME_depth: red is near.")] = False,
-    alpha: Annotated[bool, typer.Option("--alpha", help="Also how much is covered, NAME_alpha.")] = False,
+    depth: Annotated[bool, typer.Option("--depth", help="Write depths too, as NAME_depth; red is near.")] = False,
+    alpha: Annotated[bool, typer.Option("--alpha", help="Write opacities too, as NAME_alpha.")] = False,
     path: PathOption = None,
-    frames: Annotated[int | None, typer.Option(metavar="N", help="Film: its frames; default: 120.")] = None,
-    fps: Annotated[float | None, typer.Option(metavar="F", help="Film: frames a second; default: 30.")] = None,
+    frames: Annotated[int | None, typer.Option(metavar="N", help="Video: number of frames; default: 120.")] = None,
+    fps: Annotated[float | None, typer.Option(metavar="F", help="Video: frames per second; default: 30.")] = None,
     size: SizeOption = None,
-    file: Annotated[Path | None, typer.Option("--video", metavar="FILE", help="Film: .webm, or .mp4.")] = None,
+    file: Annotated[Path | None, typer.Option("--video", metavar="FILE", help="Video file, .webm or .mp4.")] = None,
     side: SideOption = None,
     time: TimeOption = None,
     times: TimesOption = None,
     save_path: SavePathOption = None,
     device: DeviceOption = None,
 ) -> None:
-    """Render a model at the views of a scene, one file for each, named as the view; or film it along a path."""
+    """Render a model at the views of a scene, one image per view, or make a video along a camera path."""
     if scale is not None and not math.isfinite(scale):
         raise ConfigError(f"--scale {scale}: expected a finite number of at least 1")
     if time is not None and times is not None:
-        raise ConfigError("--time and --times: expected one of them; --times A..B lets time run")
+        raise ConfigError("--time and --times exclude each other; use --times A..B for a video")
     if path is not None or file is not None:
         if split is not None:
-            raise ConfigError("--split is for pictures of views; of a film, --path views shows all views")
+            raise ConfigError("--split is for images of views; for a video of all views, use --path views")
         options: dict[str, Any] = {"path": path or "ellipse", "frames": frames, "fps": fps, "size": size, "side": side}
         options["times"] = times if time is None else time
         options |= {"depth": depth, "alpha": alpha, "save_path": save_path, "downscale": scale, "kind": format_}
         found = pictures.render_path(model, scene, file, out=out, device=device, **options)
-        terminal.print_message(_told(found, pictures_wide=1 if side is None else 2))
+        terminal.print_message(_video_text(found, pictures_wide=1 if side is None else 2))
         return
-    of_films: dict[str, Any] = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--times": times}
-    of_films["--save-path"] = save_path
-    if given := [name for name, value in of_films.items() if value is not None]:
-        raise ConfigError(f"{given[0]} is for films; give --path or --video, too")
+    video_options: dict[str, Any] = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--times": times}
+    video_options["--save-path"] = save_path
+    if used := [name for name, value in video_options.items() if value is not None]:
+        raise ConfigError(f"{used[0]} is for videos; add --path or --video")
     count = pictures.render_views(
         model,
         scene,
@@ -335,8 +360,8 @@ def render(
     terminal.print_message(f"{pluralize(count, 'image')} written to {out}")
 
 
-def _told(found: dict[str, Any], pictures_wide: int) -> str:
-    """What was filmed, in a line."""
+def _video_text(found: dict[str, Any], pictures_wide: int) -> str:
+    """Return one line about a video."""
     first, *others = (Path(name) for name in found["files"])
     width, height = found["size"]
     made = f"{found['frames']} frames of {pictures_wide * width} x {height} px in {found['took']:.1f} s"

@@ -1,4 +1,4 @@
-"""Commands about runs and pipelines."""
+"""Define the commands for runs and pipelines."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -6,14 +6,13 @@ from typing import Annotated, Any, Literal
 import typer
 
 from clsplat.api import commands
-from clsplat.api import commands as api
 from clsplat.cli.app import DeviceOption, JsonOption, LiveOption, PipelineArgument, SetOption, command, recipe_names
 from clsplat.core import terminal
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, OutputError, shell_quote
 
 OnOption = Annotated[
     Path | None,
-    typer.Option("--on", metavar="FILE", help="Where the cells of a matrix run: engine, store, devices."),
+    typer.Option("--on", metavar="FILE", help="Where cells or blocks run: engine, store, devices."),
 ]
 
 
@@ -29,37 +28,37 @@ def run(
     scene: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="A COLMAP, Blender or nerfstudio folder, or a run's; for `photos`, photographs."
+            metavar="DIR", help="Dataset folder (COLMAP, Blender, nerfstudio, …); for `photos`, a folder of photos."
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="The run folder; default: runs/NAME.")] = None,
     device: DeviceOption = None,
     set_: SetOption = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the newest checkpoint.")] = False,
     restart: Annotated[
-        bool, typer.Option("--restart", help="Begin again in a folder that holds a run, without its checkpoints.")
+        bool, typer.Option("--restart", help="Start over in the folder of an earlier run; removes its checkpoints.")
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
     live: LiveOption = None,
     minutes: Annotated[
         float | None,
-        typer.Option(metavar="M", help="The time that it takes, within about 15 %: trains in as many steps as fit."),
+        typer.Option(metavar="M", help="Train in as many steps as fit into this time, within about 15 %."),
     ] = None,
     on: OnOption = None,
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
     if minutes is not None and dry_run:
-        raise ConfigError("--minutes rehearses the pipeline on the device, which --dry-run does not; give one of them")
+        raise ConfigError("--minutes trains some steps to time them, which --dry-run cannot; use only one of them")
     if resume and restart:
-        raise ConfigError("--resume goes on with a run and --restart begins it again; give one of them")
+        raise ConfigError("--resume continues a run and --restart starts it over; use only one of them")
     start: Literal["new", "resume", "restart"] = "resume" if resume else "restart" if restart else "new"
     if dry_run:
         terminal.show(commands.describe_run(pipeline, scene, out, set=set_ or (), device=device, start=start, on=on))
     else:
-        found = commands.run(
+        folder = commands.run(
             pipeline, scene, out, set=set_ or (), device=device, start=start, live=live, minutes=minutes, on=on
         )
-        _show_summary(found)
+        _show_summary(folder)
 
 
 @command(
@@ -69,9 +68,9 @@ def run(
     "clsplat resume runs/splat_7k --scene moved/my_scene",
 )
 def resume(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.")],
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run or a matrix.")],
     scene: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where its photographs are now; default: where they were.")
+        Path | None, typer.Option(metavar="DIR", help="Where its photos are now; default: where they were.")
     ] = None,
     device: DeviceOption = None,
     steps: Annotated[
@@ -79,7 +78,7 @@ def resume(
         typer.Option(
             min=1,
             metavar="N",
-            help="Train to this step, further than before: optimize.steps, or train_field.steps.",
+            help="Train up to this step, to train longer than before.",
         ),
     ] = None,
     set_: SetOption = None,
@@ -87,7 +86,7 @@ def resume(
     live: LiveOption = None,
     on: OnOption = None,
 ) -> None:
-    """Go on with a run from its newest checkpoint, or train one that is done for longer."""
+    """Continue a run from its newest checkpoint, or train a finished run longer."""
     job = commands.resume_job(folder, scene, set_ or (), steps, on)
     if dry_run:
         terminal.show(job.describe(device))
@@ -112,13 +111,15 @@ def status(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            metavar="RUN|STORE", help="A folder of a run, a matrix or blocks, or a store of cells.", show_default=False
+            metavar="RUN|STORE",
+            help="The folder of a run, a matrix or blocks, or a store of cells.",
+            show_default=False,
         ),
     ] = None,
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of status.json.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the state of a run, its step and its metrics, or of all cells of a store, from the files alone."""
+    """Show the state, step and metrics of a run, or of all cells of a store, from its files."""
     from clsplat.runs.status import status_text
     from clsplat.sweeps.status import overview_text
     from clsplat.workflows.blocks import status_table
@@ -128,12 +129,12 @@ def status(
         return
     if folder is None:
         raise ConfigError("status: expected a run folder, or --schema")
-    found = commands.status(folder)
+    state = commands.status(folder)
     if as_json:
-        terminal.show_json(found)
+        terminal.show_json(state)
     else:
-        text = overview_text if "store" in found else status_table if "in_blocks" in found else status_text
-        terminal.show(text(found))
+        text = overview_text if "store" in state else status_table if "in_blocks" in state else status_text
+        terminal.show(text(state))
 
 
 @command(
@@ -150,7 +151,7 @@ def check(
             metavar="PIPELINE|RUN|MODEL",
             autocompletion=recipe_names,
             show_default=False,
-            help="As for run; or a run folder, or a model file.",
+            help="A pipeline as for run, a run folder, or a model file.",
         ),
     ] = "",
     schema: Annotated[
@@ -158,38 +159,38 @@ def check(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Validate a pipeline without running it, verify every file of a run folder, or look at a model file."""
+    """Validate a pipeline without running it, verify the files of a run folder, or inspect a model file."""
     if schema:
         terminal.show_json(commands.pipeline_schema())
         return
     if not pipeline:
         raise ConfigError("check: expected a pipeline, a run folder, a model, or --schema")
-    found = commands.check(pipeline)
-    if "objects" in found:
+    result = commands.check(pipeline)
+    if "objects" in result:
         from clsplat.runs.verify import lines, verdict
 
-        _show_findings(found, as_json, lines(found), verdict(found), None if found["whole"] else OutputError)
-    elif "model" in found:
+        _show_findings(result, as_json, lines(result), verdict(result), None if result["whole"] else OutputError)
+    elif "model" in result:
         from clsplat.gaussians.validate import lines, verdict
 
-        _show_findings(found, as_json, lines(found), verdict(found), None if found["valid"] else DataError)
+        _show_findings(result, as_json, lines(result), verdict(result), None if result["valid"] else DataError)
     elif as_json:
-        terminal.show_json({**found, "valid": True})
-    elif "parameters" in found:
-        terminal.show(f"{found['path']}: valid; a field of {found['parameters']:,} parameters")
-    elif "cells" in found:
-        terminal.show(f"{found['path']}: valid; {len(found['cells'])} cells: {', '.join(found['cells'])}")
+        terminal.show_json({**result, "valid": True})
+    elif "parameters" in result:
+        terminal.show(f"{result['path']}: valid; a field with {result['parameters']:,} parameters")
+    elif "cells" in result:
+        terminal.show(f"{result['path']}: valid; {len(result['cells'])} cells: {', '.join(result['cells'])}")
     else:
-        adapts = f"; from the photographs follow {', '.join(found['adapts'])}" if found["adapts"] else ""
-        terminal.show(f"{found['path']}: valid; {', '.join(found['stages'])}{adapts}")
+        adapts = f"; the photos decide {', '.join(result['adapts'])}" if result["adapts"] else ""
+        terminal.show(f"{result['path']}: valid; {', '.join(result['stages'])}{adapts}")
 
 
 def _show_findings(
-    found: dict[str, Any], as_json: bool, text: str, verdict: str, error: type[ClsplatError] | None
+    result: dict[str, Any], as_json: bool, text: str, verdict: str, error: type[ClsplatError] | None
 ) -> None:
-    """Show what `check` found, and the verdict on it, which is raised as an error where there is one."""
+    """Show the result of `check`, and its verdict, which is raised if it is an error."""
     if as_json:
-        terminal.show_json(found)
+        terminal.show_json(result)
     else:
         terminal.show(text)
     if error:
@@ -209,7 +210,7 @@ def pipelines(
     copy: Annotated[Path | None, typer.Option(metavar="FILE", help="Copy the pipeline to a new file.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the shipped pipelines, or the keys of one as --set takes them."""
+    """List the shipped pipelines, or the keys of one for --set."""
     if copy is not None:
         if not name:
             raise ConfigError("pipelines: --copy needs the name of a pipeline")
@@ -223,11 +224,11 @@ def pipelines(
     else:
         from clsplat.pipeline.recipes import manual_text, summaries_text
 
-        found = commands.pipelines(name or None)
-        terminal.show(manual_text(found) if name else summaries_text(found))
+        result = commands.pipelines(name or None)
+        terminal.show(manual_text(result) if name else summaries_text(result))
 
 
-# The command that trains a scene in blocks.
+# Training a large scene in blocks.
 
 
 @command(
@@ -240,47 +241,45 @@ def blocks(
     pipeline: PipelineArgument = "blocks",
     scene: Annotated[
         Path,
-        typer.Option(metavar="DIR", help="A COLMAP, Blender or nerfstudio folder, or a run's.", show_default=False),
+        typer.Option(metavar="DIR", help="Dataset or run folder.", show_default=False),
     ] = ...,  # type: ignore[assignment]
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the runs of all blocks and the model.")] = Path(
         "runs/blocks"
     ),
     count: Annotated[int, typer.Option("--blocks", metavar="N", help="Number of blocks.")] = 4,
     coarse: Annotated[
-        str, typer.Option(metavar="PIPELINE|MODEL|RUN", help="What makes the coarse model that is cut, or that model.")
+        str, typer.Option(metavar="PIPELINE|MODEL|RUN", help="The coarse model to cut, or a pipeline to train it.")
     ] = "blocks_coarse",
-    sight: Annotated[
-        float, typer.Option(metavar="SHARE", help="Of a view's pixels, above which it belongs to a block.")
+    min_coverage: Annotated[
+        float,
+        typer.Option(metavar="FRACTION", help="A view trains blocks that cover more of it."),
     ] = 0.05,
     steps: Annotated[
         Literal["each", "shared"],
-        typer.Option(help="Each block has the pipeline's steps, or its share of them by its views."),
+        typer.Option(help="Steps per block: all of the pipeline, or a share by its views."),
     ] = "each",
-    plan: Annotated[bool, typer.Option("--plan", help="Train the coarse model, show the plan, and stop.")] = False,
+    plan: Annotated[bool, typer.Option("--plan", help="Only train the coarse model and show the plan.")] = False,
     set_: SetOption = None,
     set_coarse: Annotated[
         list[str] | None,
-        typer.Option("--set-coarse", metavar="KEY=VALUE", help="As --set, of the coarse model; may be repeated."),
+        typer.Option("--set-coarse", metavar="KEY=VALUE", help="As --set, for the coarse model; may be repeated."),
     ] = None,
-    on: Annotated[
-        Path | None,
-        typer.Option("--on", metavar="FILE", help="Where blocks are trained, as cells of a store: engine, store."),
-    ] = None,
+    on: OnOption = None,
     as_json: JsonOption = False,
     device: DeviceOption = None,
 ) -> None:
-    """Train a large scene in blocks that fit the device, one after the other or on several, and merge them."""
+    """Train a large scene in blocks that fit the device, one by one or on several devices, and merge them."""
     from clsplat.workflows.blocks import table
 
     if as_json:
         terminal.keep_stdout_for_json()
-    found = api.train_in_blocks(
+    result = commands.train_in_blocks(
         scene,
         out,
         pipeline,
         blocks=count,
         coarse=coarse,
-        sight=sight,
+        min_coverage=min_coverage,
         steps=steps,
         overrides=set_ or (),
         coarse_overrides=set_coarse or (),
@@ -289,16 +288,16 @@ def blocks(
         device=device,
     )
     if as_json:
-        terminal.show_json(found)
+        terminal.show_json(result)
         return
-    terminal.show(table(found))
+    terminal.show(table(result))
     if plan:
-        terminal.print_message(f"{out}/partition.json: the plan; the same command without --plan trains the blocks")
+        terminal.print_message(f"{out}/partition.json: the plan; run the command without --plan to train the blocks")
     else:
-        terminal.print_message(f"`clsplat view {shell_quote(found['run'])}` shows the merged model")
+        terminal.print_message(f"`clsplat view {shell_quote(result['run'])}` shows the merged model")
 
 
-# Commands about the cells of a sweep.
+# Commands for the cells of a sweep.
 
 StoreOption = Annotated[Path, typer.Option("--store", metavar="DIR", help="The store of cells, a shared folder.")]
 
@@ -311,15 +310,15 @@ StoreOption = Annotated[Path, typer.Option("--store", metavar="DIR", help="The s
 def cell(
     pipeline: PipelineArgument,
     store: StoreOption,
-    scene: Annotated[Path | None, typer.Option(metavar="DIR", help="The photographs, as for run.")] = None,
+    scene: Annotated[Path | None, typer.Option(metavar="DIR", help="The dataset, as for run.")] = None,
     index: Annotated[
         int | None,
-        typer.Option(metavar="N", help="The cell of a matrix, counted from 0, such as $SLURM_ARRAY_TASK_ID."),
+        typer.Option(metavar="N", help="Index of the cell in a matrix, from 0, such as $SLURM_ARRAY_TASK_ID."),
     ] = None,
     device: DeviceOption = None,
     set_: SetOption = None,
 ) -> None:
-    """Run one cell of a matrix, unless its result is in the store; what every queue can call."""
+    """Run one cell of a matrix, unless its result is in the store; for job arrays of any queue."""
     commands.run_cell(pipeline, store, scene, index=index, set=set_ or (), device=device)
 
 
@@ -328,8 +327,8 @@ def cancel(
     store: Annotated[Path, typer.Argument(metavar="STORE", help="The store of cells.")],
     cell: Annotated[str | None, typer.Argument(metavar="[CELL]", help="A cell's name or key; default: all.")] = None,
 ) -> None:
-    """Let cells that run, on whatever machine, save their state and stop."""
-    terminal.print_message(f"{store}: {commands.cancel(store, cell)} asked to stop")
+    """Ask running cells, on any machine, to save their state and stop."""
+    terminal.print_message(f"{store}: asked to stop: {commands.cancel(store, cell)}")
 
 
 @command(
@@ -342,12 +341,12 @@ def worker(
     device: Annotated[
         list[str] | None, typer.Option("--device", metavar="NAME", help="A device; may be repeated; default: all.")
     ] = None,
-    tls_ca: Annotated[str | None, typer.Option(metavar="FILE", help="Certificate of the authority, PEM.")] = None,
+    tls_ca: Annotated[str | None, typer.Option(metavar="FILE", help="CA certificate, PEM.")] = None,
     tls_cert: Annotated[str | None, typer.Option(metavar="FILE", help="Certificate of this machine, PEM.")] = None,
     tls_key: Annotated[str | None, typer.Option(metavar="FILE", help="Its private key, PEM.")] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Without TLS: whoever reaches the scheduler's port can run code.")
+        bool, typer.Option("--insecure", help="Without TLS.  Anyone who reaches the scheduler's port can run code.")
     ] = False,
 ) -> None:
-    """Offer the devices of this machine to a Dask scheduler, one process a device, until it ends."""
-    commands.work_for(scheduler, device, tls=(tls_ca, tls_cert, tls_key), insecure=insecure)
+    """Offer the devices of this machine to a Dask scheduler, one process per device, until it ends."""
+    commands.run_worker(scheduler, device, tls=(tls_ca, tls_cert, tls_key), insecure=insecure)

@@ -1,4 +1,4 @@
-"""Commands about devices, datasets and speed."""
+"""Define the commands for devices, datasets and speed."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,7 +14,7 @@ from clsplat.core.errors import ConfigError, DataError, DeviceError
 
 @command("devices", "clsplat devices", "clsplat devices --json")
 def devices(as_json: JsonOption = False) -> None:
-    """List OpenCL devices, their limits, and whether each works; exit 4 when none does."""
+    """List OpenCL devices, their limits, and whether each works; exit code 4 if none does."""
     found = tools.devices()
     if as_json:
         terminal.show_json(found)
@@ -30,10 +30,10 @@ def doctor(
     device: DeviceOption = None,
     as_json: JsonOption = False,
     page: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Write a page, to be attached to a report.")
+        Path | None, typer.Option("--html", metavar="FILE", help="Write an HTML report, to attach to an issue.")
     ] = None,
 ) -> None:
-    """Prove that a device computes what the reference says; exit 4 when it does not."""
+    """Check that a device computes what the float64 reference does; exit code 4 if not."""
     from clsplat.conformance.doctor import check_html_path, write_page
 
     if as_json:
@@ -52,8 +52,8 @@ def doctor(
 
 
 BY_POINTS = (
-    "cut by the dataset's points, for the pipeline blocks; `clsplat blocks --plan` takes other pipelines and settings, "
-    "and cuts by a coarse model, which it trains"
+    "a cut by the points of the dataset, for the pipeline blocks; `clsplat blocks --plan` takes other pipelines and "
+    "settings, and cuts by a coarse model that it trains"
 )
 
 
@@ -64,25 +64,30 @@ BY_POINTS = (
     "clsplat inspect my_city --blocks 9",
 )
 def inspect(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A COLMAP, Blender or nerfstudio folder, or a run's.")],
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE", help="Dataset folder (COLMAP, Blender, nerfstudio, …) or run folder.")
+    ],
     as_json: JsonOption = False,
     page: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Write a page with the cameras and points in 3D.")
+        Path | None,
+        typer.Option("--html", metavar="FILE", help="Write an HTML page with the cameras and points in 3D."),
     ] = None,
     count: Annotated[
         int | None,
-        typer.Option("--blocks", metavar="N", help="Only show how its points would be cut: views, memory, time."),
+        typer.Option(
+            "--blocks", metavar="N", help="Only show how the points would be cut into N blocks: views, memory, time."
+        ),
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Tell whether a dataset will train, and what is wrong with it; exit 3 when it cannot train."""
+    """Report whether a dataset can be trained on, and its problems; exit code 3 if it cannot."""
     from clsplat.prepare.inspect.findings import show
     from clsplat.workflows.blocks import table
 
     if count is None and device is not None:
-        raise ConfigError("inspect: --device is for --blocks, which times some steps; leave it out")
+        raise ConfigError("inspect: --device needs --blocks, which times some steps")
     if count is not None and page is not None:
-        raise ConfigError("inspect: --blocks shows a table; leave --html out")
+        raise ConfigError("inspect: --blocks and --html exclude each other")
     if as_json:
         terminal.keep_stdout_for_json()
     if count is not None:
@@ -105,25 +110,23 @@ def inspect(
 
 @command("bench", "clsplat bench --json > before.json", "clsplat bench --against before.json")
 def bench(
-    scenes: Annotated[
-        str, typer.Option(metavar="NAME,…", help="Fixed scenes, of A, B and C, separated by commas.")
-    ] = "A",
+    scenes: Annotated[str, typer.Option(metavar="NAME,…", help="One or more of the fixed scenes A, B and C.")] = "A",
     model: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also time this splat or point cloud (PLY), at --scene.")
+        Path | None, typer.Option(metavar="FILE", help="Also time this splat or point cloud (PLY) with --scene.")
     ] = None,
     scene: Annotated[Path | None, typer.Option(metavar="DIR", help="The scene of --model.")] = None,
     pipeline: Annotated[
-        str, typer.Option(metavar="PIPELINE", help="The losses, statistics and filter of a step.")
+        str, typer.Option(metavar="PIPELINE", help="Pipeline whose losses, statistics and filters a step uses.")
     ] = "splat",
     repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Steps of each scene.")] = 20,
     as_json: JsonOption = False,
     against: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Compare with the JSON of an earlier run, which --json repeats.")
+        Path | None, typer.Option(metavar="FILE", help="Compare with the JSON of an earlier bench.")
     ] = None,
     schedule: Annotated[Literal["auto", "wide", "simt"], typer.Option(help="wide for CPUs, simt for GPUs.")] = "auto",
     device: DeviceOption = None,
 ) -> None:
-    """Time the stages of a training step on fixed scenes, beside the device's measured peaks."""
+    """Time the stages of a training step on fixed scenes, next to the measured peaks of the device."""
     if as_json:
         terminal.keep_stdout_for_json()
     earlier = tools.read_measurement(against, pipeline) if against else {}

@@ -100,7 +100,7 @@ class BlocksPlan:
     pipeline: str = "blocks"
     coarse: str = "blocks_coarse"  # a pipeline, or a model
     blocks: int = 4
-    sight: float = SIGHT  # share of a view's pixels from which on it belongs to a block
+    min_coverage: float = SIGHT  # fraction of a view's pixels above which it belongs to a block
     steps: Steps = "each"  # of a block: those of the pipeline, or its share of them by its views
     overrides: list[str] = field(default_factory=list)
     coarse_overrides: list[str] = field(default_factory=list)
@@ -108,8 +108,8 @@ class BlocksPlan:
     def __post_init__(self) -> None:
         if not 1 <= self.blocks <= MAX_BLOCKS:
             raise ConfigError(f"--blocks {self.blocks}: expected 1 to {MAX_BLOCKS}")
-        if not 0 <= self.sight < 1:
-            raise ConfigError(f"--sight {self.sight:g}: expected a share of a view's pixels from 0 to below 1")
+        if not 0 <= self.min_coverage < 1:
+            raise ConfigError(f"--min-coverage {self.min_coverage:g}: expected a fraction from 0 to below 1")
         if self.steps not in get_args(Steps):
             raise ConfigError(f"--steps {quote(self.steps)}: expected one of {', '.join(get_args(Steps))}")
 
@@ -145,7 +145,7 @@ class Blocks:
         pipelines = {"pipeline": without_start(self.pipeline), **({"coarse": self.coarse} if self.coarse else {})}
         texts = {name: json.dumps(with_content_hashes(one), sort_keys=True) for name, one in pipelines.items()}
         digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
-        asked = {"blocks": self.plan.blocks, "sight": self.plan.sight, "steps": self.plan.steps}
+        asked = {"blocks": self.plan.blocks, "min_coverage": self.plan.min_coverage, "steps": self.plan.steps}
         model = {"model": sha256(self.given)} if self.given else {}
         return {**asked, "photographs": self.scene.identity.digest, **model, **digests}
 
@@ -158,7 +158,7 @@ class Blocks:
         assert file is not None
         photographs = Photographs(self.device, self.scene.background, budget=0)  # each is used once in a pass
         work = Partitioner(load_model(file), self.scene.scene, self.device, photographs)
-        found = work.partition(self.plan.blocks, sha256(file), self.plan.sight)
+        found = work.partition(self.plan.blocks, sha256(file), self.plan.min_coverage)
         found.write(self.out)
         return found
 

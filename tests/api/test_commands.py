@@ -104,8 +104,8 @@ def test_rendered_files_are_pictures_of_the_renderer(runs, tiny_scene, tmp_path)
 
 def test_json(runs, tiny_scene):
     pairs = {
-        f"evaluate {runs[0]} --downscales 1,2": lambda: clsplat.evaluate(runs[0], downscales=[1, 2]),
-        f"evaluate {runs[0]}/point_cloud.ply --scene {tiny_scene}": lambda: clsplat.evaluate(
+        f"evaluate {runs[0]} --json --downscales 1,2": lambda: clsplat.evaluate(runs[0], downscales=[1, 2]),
+        f"evaluate {runs[0]}/point_cloud.ply --json --scene {tiny_scene}": lambda: clsplat.evaluate(
             runs[0] / "point_cloud.ply", tiny_scene
         ),
         f"inspect {tiny_scene} --json": lambda: clsplat.inspect_scene(tiny_scene).data(),
@@ -144,7 +144,7 @@ def test_views_of_other_kinds_and_splits_are_refused(runs, tmp_path, arguments, 
 
 
 def test_a_comparison_of_no_runs_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match=r"^no runs to compare; expected the folder of at least one$"):
+    with pytest.raises(ConfigError, match=r"^no runs to compare; give the folder of at least one run$"):
         clsplat.compare_runs([], tmp_path / "c.html")
     assert not (tmp_path / "c.html").exists()
 

@@ -61,8 +61,8 @@ def test_help_fits_a_terminal_of_80_columns_and_shows_examples(monkeypatch):
 
 def test_help_names_all_that_a_scene_may_be():
     texts = {name: " ".join(clsplat(name, "--help").stdout.replace("│", " ").split()) for name in ("run", "inspect")}
-    assert all("nerfstudio folder, or a run's" in text for text in texts.values())
-    assert "for `photos`, photographs" in texts["run"]
+    assert all("COLMAP, Blender, nerfstudio" in text for text in texts.values())
+    assert "for `photos`, a folder of photos" in texts["run"]
 
 
 def test_completion_knows_commands_and_pipelines_without_opencl():
@@ -130,7 +130,7 @@ def test_the_device_stands_before_the_command_or_after_it(finished):
 
 
 JSON = ["check smoke --json", "check --schema", "pipelines --json", "pipelines splat --json", "status RUN --json",
-        "inspect SCENE --json", "pipelines smoke --copy FILE --json", "evaluate RUN",
+        "inspect SCENE --json", "pipelines smoke --copy FILE --json", "evaluate RUN --json",
         "bench --scenes , --model RUN/point_cloud.ply --scene SCENE --repeats 1 --json"]  # fmt: skip
 
 
@@ -138,7 +138,7 @@ JSON = ["check smoke --json", "check --schema", "pipelines --json", "pipelines s
     ("run", "arguments"),
     [
         *((clsplat, line) for line in JSON),
-        (process, "evaluate RUN/point_cloud.ply --scene SCENE"),
+        (process, "evaluate RUN/point_cloud.ply --scene SCENE --json"),
     ],  # runtimes print too
 )
 def test_json_is_all_that_stdout_holds(run, arguments, finished, tiny_scene, tmp_path):
@@ -153,7 +153,7 @@ def test_pipelines_lists_every_recipe_on_a_line():
     assert [line.split()[0] for line in lines] == list(shipped())
     assert all(line.endswith(".") for line in lines)
     assert summary(shipped()["splat"]).endswith("the constants of the 2023 release.")
-    assert summary(shipped()["splat_7k"]).endswith("in 7 000 steps: a good scene in minutes.")
+    assert summary(shipped()["splat_7k"]).endswith("in 7,000 steps: a good scene in minutes.")
 
 
 def test_pipelines_shows_the_keys_of_one_as_set_takes_them():
@@ -181,14 +181,17 @@ def test_a_copy_of_a_pipeline_never_replaces_a_file(tmp_path):
 
 
 def test_a_run_folder_is_a_model_with_its_scene(finished, tiny_scene, tmp_path):
-    measured = json.loads(clsplat("evaluate", finished).stdout)
+    measured = json.loads(clsplat("evaluate", finished, "--json").stdout)
     assert measured["test"]["2"] == json.loads((finished / "metrics.json").read_text())["test"]["2"]
     assert list(measured["test"]) == ["2"], "the run's own downscale"
     clsplat("render", finished, "--out", tmp_path / "renders")
     own = {path.name: path.read_bytes() for path in (finished / "renders").rglob("*.png")}
     assert {path.name: path.read_bytes() for path in (tmp_path / "renders").rglob("*.png")} == own
-    again = json.loads(clsplat("evaluate", finished, "--scene", tiny_scene, "--downscales", "1").stdout)
+    again = json.loads(clsplat("evaluate", finished, "--scene", tiny_scene, "--downscales", "1", "--json").stdout)
     assert list(again["test"]) == ["1"]
+    table = clsplat("evaluate", finished).stdout.splitlines()[-3:]
+    assert table[0].split()[:4] == ["split", "size", "psnr", "ssim"]
+    assert table[1].split()[:2] == ["test", "1/2"]
 
 
 def test_a_run_folder_that_is_no_model_says_why(finished, tmp_path):
@@ -281,4 +284,4 @@ def test_status_tells_from_files(finished, tmp_path):
 def test_no_two_recipes_have_one_description():
     described = [one["summary"] for one in summaries()]
     assert len(set(described)) == len(described)
-    assert all("7 000 steps" in one["summary"] for one in summaries() if one["name"].endswith("_7k"))
+    assert all("7,000 steps" in one["summary"] for one in summaries() if one["name"].endswith("_7k"))

@@ -269,13 +269,13 @@ def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeyp
     pytest.importorskip("clsplat.sweeps.dask")
     monkeypatch.setattr("clsplat.sweeps.dask.places", lambda *words: pytest.fail("a device is proved"))
     with pytest.raises(ConfigError, match=r"tls.ca \(--tls-ca\): gone.pem"):
-        sweeps.work_for("tls://127.0.0.1:1", tls=("gone.pem", authority.cert, authority.key))
+        sweeps.run_worker("tls://127.0.0.1:1", tls=("gone.pem", authority.cert, authority.key))
 
 
 def test_a_device_is_not_chosen_for_a_scheduler(file, tmp_path):
     on = tmp_path / "lab.yaml"
     on.write_text("engine: dask://127.0.0.1:1\n")
-    with pytest.raises(ConfigError, match="--device: a scheduler has the devices that its workers offer"):
+    with pytest.raises(ConfigError, match="--device: with a scheduler, workers choose the devices"):
         commands.run(file, out=tmp_path / "out", on=on, device="pocl")
 
 

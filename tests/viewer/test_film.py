@@ -185,8 +185,8 @@ def test_a_picture_stands_in_the_middle_of_its_box():
 @pytest.mark.parametrize(
     ("options", "message"),
     {
-        ("--frames", "5"): "--frames is for films; give --path or --video, too",
-        ("--path", "orbit", "--split", "all"): "--split is for pictures of views",
+        ("--frames", "5"): "--frames is for videos; add --path or --video",
+        ("--path", "orbit", "--split", "all"): "--split is for images of views",
         ("--video", "x.avi"): "ends in .webm or .mp4",
     }.items(),
 )

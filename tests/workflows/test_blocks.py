@@ -35,7 +35,7 @@ def train(scene: Path, coarse: Path, out: Path, *overrides: str, **options) -> d
 def trained(tiny_scene: Path, few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     """A scene in three blocks; nothing is changed in it."""
     out = tmp_path_factory.mktemp("blocks") / "out"
-    return out, train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    return out, train(tiny_scene, few_steps, out, blocks=COUNT, min_coverage=NEVER)
 
 
 def boxes(found: dict) -> list:
@@ -54,7 +54,7 @@ def test_merged_model_is_the_whole_with_all_cameras_everywhere(tiny_scene, few_s
     coarse.logit_opacity[::50] = -9  # in no view
     coarse.save(tmp_path / "coarse.ply")
     whole = train(tiny_scene, tmp_path / "coarse.ply", tmp_path / "whole", *MIP, blocks=1)
-    parts = train(tiny_scene, tmp_path / "coarse.ply", tmp_path / "parts", *MIP, blocks=COUNT, sight=0)
+    parts = train(tiny_scene, tmp_path / "coarse.ply", tmp_path / "parts", *MIP, blocks=COUNT, min_coverage=0)
     assert [len(block["views"]) for block in parts["blocks"]] == [8] * COUNT
     assert [block["start"] for block in parts["blocks"]] == [whole["gaussians"]] * COUNT
     one, other = (clsplat.load(Path(found["run"]) / "point_cloud_raw.ply") for found in (whole, parts))
@@ -125,7 +125,7 @@ def test_killed_and_missing_blocks_go_on_with_equal_bits(trained, tiny_scene, fe
     shutil.rmtree(out / "block_02")
     shutil.rmtree(out / "merged")
     (out / "merged.ply").unlink()
-    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    train(tiny_scene, few_steps, out, blocks=COUNT, min_coverage=NEVER)
     assert "resumed at step 8" in (out / "block_01" / "log.txt").read_text()
     assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
     assert (out / "partition.json").read_bytes() == (trained[0] / "partition.json").read_bytes()
@@ -137,7 +137,7 @@ def test_a_folder_of_blocks_and_its_scene_can_move(trained, tiny_scene, few_step
     shutil.copytree(trained[0], out)
     for name in ("metrics.json", "checksums.json", "point_cloud.ply", "checkpoints/step_000012.npz"):
         (out / "block_01" / name).unlink()
-    train(scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    train(scene, few_steps, out, blocks=COUNT, min_coverage=NEVER)
     assert "resumed at step 8" in (out / "block_01" / "log.txt").read_text()
     assert "resumed at step 12" in (out / "block_00" / "log.txt").read_text()
     for name in ("merged.ply", "merged/point_cloud.ply", "partition.json"):
@@ -146,16 +146,16 @@ def test_a_folder_of_blocks_and_its_scene_can_move(trained, tiny_scene, few_step
 
 def test_what_is_done_is_left_alone(trained, tiny_scene, few_steps, monkeypatch):
     monkeypatch.setattr("clsplat.workflows.finetune.run_pipeline", lambda *_: pytest.fail("a run begins"))
-    again = train(tiny_scene, few_steps, trained[0], blocks=COUNT, sight=NEVER)
+    again = train(tiny_scene, few_steps, trained[0], blocks=COUNT, min_coverage=NEVER)
     assert again == trained[1]
 
 
 def test_a_block_that_fails_is_named_and_the_others_are_trained(tiny_scene, few_steps, tmp_path):
     (tmp_path / "out").mkdir()
-    train(tiny_scene, few_steps, tmp_path / "out", blocks=COUNT, sight=NEVER, only_plan=True)
+    train(tiny_scene, few_steps, tmp_path / "out", blocks=COUNT, min_coverage=NEVER, only_plan=True)
     (tmp_path / "out" / "block_01").write_text("in the way")
     with pytest.raises(ClsplatError, match=r"1 of 3 blocks failed; the first, block_01: .*the same command") as caught:
-        train(tiny_scene, few_steps, tmp_path / "out", blocks=COUNT, sight=NEVER)
+        train(tiny_scene, few_steps, tmp_path / "out", blocks=COUNT, min_coverage=NEVER)
     assert caught.value.exit_code == 7
     assert [(tmp_path / "out" / f"block_{i:02d}" / "metrics.json").is_file() for i in (0, 2)] == [True] * 2
     assert not (tmp_path / "out" / "merged.ply").exists()
@@ -167,7 +167,7 @@ def test_a_block_whose_checkpoints_are_all_damaged_begins_anew(trained, tiny_sce
     (out / "block_01" / "point_cloud.ply").unlink()
     for path in (out / "block_01" / "checkpoints").iterdir():
         path.write_bytes(b"damaged")
-    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    train(tiny_scene, few_steps, out, blocks=COUNT, min_coverage=NEVER)
     assert "block_01: no checkpoint is whole; it is trained again from the beginning" in caplog.text
     assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
 
@@ -183,7 +183,7 @@ def test_a_block_without_gaussians_at_its_end_is_left_out(
     out = tmp_path / "out"
     shutil.copytree(trained[0], out)
     monkeypatch.setattr("clsplat.workflows.blocks.train_in_folder", empty)
-    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    train(tiny_scene, few_steps, out, blocks=COUNT, min_coverage=NEVER)
     assert "block_01: no Gaussian is left in its cell; the model goes on without it" in caplog.text
     parts = [clsplat.load(trained[0] / f"block_{i:02d}").means for i in (0, 2)]
     np.testing.assert_array_equal(clsplat.load(out / "merged").means, np.concatenate(parts))
@@ -198,20 +198,20 @@ def test_a_box_without_gaussians_is_told_apart(few_steps, tiny_scene, tmp_path):
 
 
 def test_blocks_trained_in_a_store_are_those_trained_here(tiny_scene, few_steps, tmp_path, monkeypatch):
-    train(tiny_scene, few_steps, tmp_path / "here", blocks=2, sight=NEVER)
+    train(tiny_scene, few_steps, tmp_path / "here", blocks=2, min_coverage=NEVER)
     on, out, here = tmp_path / "lab.yaml", tmp_path / "out", []
     run = finetune.run_pipeline
     monkeypatch.setattr(finetune, "run_pipeline", lambda *words: here.append(words[1].out.name) or run(*words))
     on.write_text(f"engine: inline\nstore: '{tmp_path / 'store'}'\n")
     for _ in range(2):  # the second time all is done
-        train(tiny_scene, few_steps, out, blocks=2, sight=NEVER, on=on)
+        train(tiny_scene, few_steps, out, blocks=2, min_coverage=NEVER, on=on)
         assert here == ["merged"]
     assert (out / "merged.ply").read_bytes() == (tmp_path / "here" / "merged.ply").read_bytes()
     cells = clsplat.status(tmp_path / "store")["cells"]
     assert [(cell["name"], cell["state"]) for cell in cells] == [("block_00", "published"), ("block_01", "published")]
     on.write_text("engine: inline\n")
     with pytest.raises(ConfigError, match="--on: blocks are trained as cells of a store; expected the key store"):
-        train(tiny_scene, few_steps, out, blocks=2, sight=NEVER, on=on)
+        train(tiny_scene, few_steps, out, blocks=2, min_coverage=NEVER, on=on)
 
 
 def test_status_tells_of_each_run_of_a_scene_in_blocks(trained, tmp_path):
@@ -247,7 +247,7 @@ def test_check_finds_what_is_damaged_in_a_folder_of_blocks(trained, tmp_path, da
 
 
 def test_steps_are_shared_by_views_with_compensating_rates(tiny_scene, few_steps, tmp_path):
-    shared = {"blocks": 2, "sight": NEVER, "steps": "shared"}
+    shared = {"blocks": 2, "min_coverage": NEVER, "steps": "shared"}
     found = train(tiny_scene, few_steps, tmp_path / "out", "optimize.steps=16", **shared)
     for block in found["blocks"]:
         folder, share = tmp_path / "out" / block["name"], len(block["views"]) / 8
@@ -301,9 +301,9 @@ def test_a_scene_of_several_sizes_is_refused(tiny_scene, few_steps, tmp_path):
         train(tmp_path / "scene", few_steps, tmp_path / "out")
 
 
-@pytest.mark.parametrize(("option", "value"), [("blocks", 0), ("sight", 1.0), ("steps", "some")])
+@pytest.mark.parametrize(("option", "value"), [("blocks", 0), ("min_coverage", 1.0), ("steps", "some")])
 def test_options_out_of_bounds_are_refused(option, value, tiny_scene, few_steps, tmp_path):
-    with pytest.raises(ConfigError, match=f"--{option} "):
+    with pytest.raises(ConfigError, match=f"--{option.replace('_', '-')} "):
         train(tiny_scene, few_steps, tmp_path / "out", **{option: value})
 
 
