@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
+from clsplat.core.progress import counted
 from clsplat.scene.images import write_image
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
@@ -142,7 +142,7 @@ class Moving(SyntheticOptions):
         least: dict[int, NDArray[np.uint8]] = {}
         most: dict[int, NDArray[np.uint8]] = {}
         images = photographs(partial(_photograph, self), frames, workers)
-        for (split, i, moment), image in zip(frames, track(images, "rendering", total=len(frames)), strict=True):
+        for (split, i, moment), image in zip(frames, counted(images, "images rendered", len(frames)), strict=True):
             write_image(out / f"{_name(split, i, moment)}.png", image)
             if split == "train":
                 world, pose = self.world_at(moment), poses[split][i]

@@ -1,4 +1,4 @@
-"""Scenes that are ray-cast, so that every camera is known exactly: the still life, and the folder of any of them."""
+"""Ray-cast scenes with exact cameras: the still life, and the dataset folder of any such scene."""
 
 import json
 import os
@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from clsplat.core.errors import DataError, OutputError
 from clsplat.core.files import path_exists
+from clsplat.core.progress import counted
 from clsplat.core.reading import read_file
 from clsplat.scene.images import write_image
 from clsplat.scene.points import write_points_ply
@@ -27,16 +27,16 @@ from .shapes import Array, spiral
 from .still_life import SCENE, SCENE_RADIUS, SCENE_VERSION
 
 View = TypeVar("View")
-LOOK_AT = np.array([0.0, 0.0, 0.08])  # scene units: the point in the middle of every image
+LOOK_AT = np.array([0.0, 0.0, 0.08])  # scene units: the point in the center of every image
 CAMERA_DISTANCE = 3.75
 POINT_COUNT = 8000
 POINT_NOISE = 0.002 * SCENE_RADIUS
-STILL_LIFE = World(SCENE, camera_angle_x=0.69, grid=4)  # a field of view that just holds the table
+STILL_LIFE = World(SCENE, camera_angle_x=0.69, grid=4)  # a field of view that just covers the table
 
 
 @dataclass(frozen=True)
 class SyntheticOptions:
-    """Options of a data set: image size in pixels, numbers of views, seed of the surface points."""
+    """Options of a dataset: image size in pixels, numbers of views, and seed of the surface points."""
 
     size: int = 256
     train: int = 60
@@ -45,15 +45,15 @@ class SyntheticOptions:
 
     version = SCENE_VERSION
     points = POINT_COUNT
-    noise = POINT_NOISE  # scene units, of the points
+    noise = POINT_NOISE  # of the points, scene units
 
     @property
     def world(self) -> World:
-        """What is photographed."""
+        """The scene to render."""
         return STILL_LIFE
 
     def poses(self) -> dict[str, list[Array]]:
-        """Camera-to-world matrices of each split; the test cameras stand between the training ones."""
+        """Return the camera-to-world matrices of each split; test cameras are between training cameras."""
         splits = {"train": spiral(self.train, 10, 70), "test": spiral(self.test, 14, 66, phase=3.0)}
         return {
             split: [camera_pose(LOOK_AT + CAMERA_DISTANCE * direction, direction) for direction in directions]
@@ -61,29 +61,29 @@ class SyntheticOptions:
         }
 
     def manifest(self) -> str:
-        """The text of OUT/synthetic.json, which identifies a finished data set."""
+        """Return the text of OUT/synthetic.json, which identifies a finished dataset."""
         return json.dumps({"scene": self.version, **asdict(self)}) + "\n"
 
     def images(self) -> list[str]:
-        """The files of a finished data set beside its cameras, points and manifest."""
+        """Return the image files of a finished dataset."""
         return [f"{split}/r_{i:03}.png" for split, poses in self.poses().items() for i in range(len(poses))]
 
     def fill(self, out: Path, workers: int) -> str:
-        """Write images, cameras and points into `out`; return a line of text about them."""
+        """Write images, cameras and points into `out`; return a summary."""
         count = fill(out, self, workers)
         return f"{self.train} training and {self.test} test views, {self.size} px, {count:,} points"
 
 
 def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = None) -> str:
-    """Make folder `out`, all of it or nothing, and return a line of text about it.
+    """Write the folder `out`, all of it or nothing, and return a summary.
 
-    `workers` processes share the views (default: one per core; 1 = this process).  Raises DataError when `out` exists
-    and is another data set, OutputError when it cannot be written.
+    `workers` processes share the views (default: one per core; 1: this process).  Raises DataError when `out` exists
+    and is another dataset, OutputError when it cannot be written.
     """
     if path_exists(out):
         if is_complete(out, options):
-            return f"{out} is complete already: nothing to do"
-        raise DataError(f"{out} exists and is not this data set; remove it or choose another folder")
+            return f"{out} is already complete"
+        raise DataError(f"{out}: exists and is another dataset; remove it or choose another folder")
     partial_out = out.parent / f".{out.name}.{os.getpid()}.partial"
     try:
         partial_out.mkdir(parents=True)
@@ -91,14 +91,14 @@ def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = No
         (partial_out / "synthetic.json").write_text(options.manifest(), "utf-8")
         partial_out.rename(out)
     except OSError as error:
-        raise OutputError(f"{out}: cannot write the data set: {error}") from error
+        raise OutputError(f"{out}: cannot write the dataset: {error}") from error
     finally:
         shutil.rmtree(partial_out, ignore_errors=True)
     return f"wrote {out}: {text}"
 
 
 def is_complete(out: Path, options: SyntheticOptions) -> bool:
-    """Return whether `out` holds every file of the data set with these options."""
+    """Return whether `out` contains all files of the dataset with these options."""
     manifest = out / "synthetic.json"
     if not manifest.exists() or read_file(manifest).decode(errors="replace") != options.manifest():
         return False
@@ -114,7 +114,7 @@ def fill(out: Path, options: SyntheticOptions, workers: int) -> int:
     images = photographs(partial(world.photograph, size=options.size), [pose for _, _, pose in jobs], workers)
     rng = np.random.default_rng(options.seed)
     points = []
-    for (split, i, pose), image in zip(jobs, track(images, "rendering", total=len(jobs)), strict=True):
+    for (split, i, pose), image in zip(jobs, counted(images, "images rendered", len(jobs)), strict=True):
         write_image(out / split / f"r_{i:03}.png", image)
         if split == "train":
             points.append(surface_points(world, pose, image, -(-options.points // options.train), options.noise, rng))
@@ -129,7 +129,7 @@ def fill(out: Path, options: SyntheticOptions, workers: int) -> int:
 def photographs(
     render: Callable[[View], NDArray[np.uint8]], views: Sequence[View], workers: int
 ) -> Iterator[NDArray[np.uint8]]:
-    """Render views in order, in processes: threads would wait for the interpreter between NumPy calls this short."""
+    """Render views in order, in processes, since threads would wait for the GIL between short NumPy calls."""
     workers = min(workers, len(views))
     if workers == 1:
         yield from map(render, views)
@@ -139,7 +139,7 @@ def photographs(
 
 
 def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> None:
-    """Write the cameras of a split as the Blender data sets store them: camera-to-world, OpenGL axes."""
+    """Write the cameras of a split in the format of Blender datasets: camera-to-world, OpenGL axes."""
     table = {"camera_angle_x": world.camera_angle_x, "frames": frames}
     path.write_text(json.dumps(table, indent=1) + "\n", "utf-8")
 
@@ -147,7 +147,7 @@ def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> 
 def surface_points(
     world: World, pose: Array, image: NDArray[np.uint8], count: int, noise: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return noisy surface points of a view, as from structure from motion: positions and colors, [M, 3]."""
+    """Return noisy surface points of a view, like those of structure from motion: positions and colors, [M, 3]."""
     rows, columns = np.nonzero(image[..., 3] == 255)
     chosen = rng.integers(len(rows), size=count) if len(rows) else np.zeros(0, int)
     x, y = np.stack([columns[chosen], rows[chosen]]) + rng.random((2, len(chosen)))

@@ -1,4 +1,4 @@
-"""Datasets on the host.  A reader of another format needs these names: see `Reader`."""
+"""Datasets on the host.  A reader for another format needs these names; see `Reader`."""
 
 from clsplat.core.reading import read_file as read_file
 from clsplat.scene.camera import Camera as Camera

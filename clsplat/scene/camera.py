@@ -1,4 +1,4 @@
-"""The pinhole camera of all rendering."""
+"""Pinhole cameras for rendering, and lenses with distortion for photographs."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, quote
 
-MAX_SIDE = 4096 * 8  # px: the tiles that cl_kernels/tiles.h can name, of the smallest size that a device has
-MIN_FOCAL = 1e-3  # px, in a dataset: with less an image shows half of all directions
+MAX_SIDE = 4096 * 8  # px: tiles that cl_kernels/tiles.h can number, times the smallest tile size of a device
+MIN_FOCAL = 1e-3  # px, in a dataset: a shorter one would cover half of all directions
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Camera:
     def check(self) -> "Camera":
         """Return the camera.
 
-        Raises ValueError unless sizes are whole and at most MAX_SIDE, sizes and focal lengths positive, and all numbers
-        finite.
+        Raises ValueError unless sizes are positive integers up to MAX_SIDE, focal lengths are positive, and all numbers
+        are finite.
         """
         if not (isinstance(self.width, Integral) and isinstance(self.height, Integral)):
-            raise ValueError(f"the camera is {self.width}x{self.height}; expected whole numbers of pixels, of type int")
+            raise ValueError(f"the camera is {self.width}x{self.height}; expected integers")
         if max(self.width, self.height) > MAX_SIDE:
             raise ValueError(f"the camera is {self.width}x{self.height} pixels; expected at most {MAX_SIDE} to a side")
         if min(self.width, self.height, self.fx, self.fy) <= 0 or not all(map(math.isfinite, astuple(self))):
@@ -46,11 +46,11 @@ class Camera:
         return self
 
     def zoomed(self, factor: float) -> "Camera":
-        """Return the camera with both focal lengths times a factor."""
+        """Return the camera with both focal lengths multiplied by a factor."""
         return self if factor == 1 else replace(self, fx=factor * self.fx, fy=factor * self.fy)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """Return the camera of the same photograph resampled to another size."""
+        """Return the camera of the photograph resampled to another size."""
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
@@ -61,16 +61,16 @@ class Camera:
         return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
 
 
-# Lenses with distortion: COLMAP's camera models, and undistorted photographs.
+# Lenses with distortion: COLMAP's camera models, and undistortion of photographs.
 
 Floats = NDArray[np.float64]
 Distortion = Callable[[Floats, Floats, Sequence[float]], tuple[Floats, Floats]]
-BORDER_POINTS = 200  # along each edge of a photograph
-MAX_ROUNDS = 50  # of Newton's method
+BORDER_POINTS = 200  # per edge of a photograph
+MAX_ROUNDS = 50  # iterations of Newton's method
 MAX_ERROR = 1.0e-6  # of its result, normalized units
-MAX_DIFFERENCE = 1.0e-3  # of a ray that was distorted and undistorted, normalized units
+MAX_DIFFERENCE = 1.0e-3  # of a ray after distortion and undistortion, normalized units
 MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond, a pinhole image is mostly stretched edges
-MAX_GROWTH = 2.0  # of an undistorted photograph's size by the photograph's
+MAX_GROWTH = 2.0  # size of an undistorted photograph, relative to the original
 
 
 def _radial(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
@@ -120,7 +120,7 @@ def _fov(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
     return u * factor, v * factor
 
 
-MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and the distortion
+MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and the distortion function
     "SIMPLE_PINHOLE": (1, lambda u, v, k: (u, v)),
     "PINHOLE": (2, lambda u, v, k: (u, v)),
     "SIMPLE_RADIAL": (1, _radial),
@@ -137,13 +137,13 @@ MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and th
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera of a distorted photograph: size in pixels, a model of MODELS, its parameters in COLMAP's order."""
+    """The camera of a distorted photograph: its size in pixels, and a model of MODELS with COLMAP's parameters."""
 
     width: int
     height: int
     model: str
     params: tuple[float, ...]
-    whole: bool = False  # keep the whole photograph, with blank pixels, not only the part without them
+    whole: bool = False  # keep the whole photograph, with undefined pixels, instead of cropping them away
 
     @property
     def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
@@ -153,48 +153,51 @@ class Lens:
 
     @property
     def has_distortion(self) -> bool:
-        """Whether the lens has distortion; a fisheye always has it."""
+        """Whether the lens has distortion; a fisheye lens always has."""
         return "FISHEYE" in self.model or any(self._split[4])
 
     def distort(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
-        """Return the pixels of normalized coordinates."""
+        """Return the pixel coordinates of normalized coordinates."""
         fx, fy, cx, cy, rest = self._split
         x, y = MODELS[self.model][1](u, v, rest)
         return fx * x + cx, fy * y + cy
 
     def project(self, points: Floats) -> Floats:
-        """Return the pixels [M, 2] of points [M, 3] in camera space, in front of the camera."""
+        """Return the pixel coordinates, [M, 2], of points in front of the camera, [M, 3] in camera space."""
         return np.stack(self.distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]), axis=1)
 
     def undistort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return the normalized coordinates of pixels, by Newton's method; NaN where it does not converge."""
+        """Return the normalized coordinates of pixels by Newton's method; NaN where it does not converge."""
         fx, fy, cx, cy, rest = self._split
         distortion = MODELS[self.model][1]
         goal = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
-        found, moving = goal.copy(), np.arange(x.size)
+        point, moving = goal.copy(), np.arange(x.size)
         with np.errstate(all="ignore"):
             for _ in range(MAX_ROUNDS):
-                before = found[:, moving]
-                found[:, moving] = after = _nearer(distortion, rest, before, goal[:, moving])
-                moving = moving[(before.view(np.int64) != after.view(np.int64)).any(axis=0)]  # the others stay for ever
+                before = point[:, moving]
+                point[:, moving] = after = _newton_step(distortion, rest, before, goal[:, moving])
+                moving = moving[
+                    (before.view(np.int64) != after.view(np.int64)).any(axis=0)
+                ]  # a point that repeats its bits never moves again
                 if not moving.size:
                     break
-            error = np.abs(np.stack(distortion(found[0], found[1], rest)) - goal)
-            u, v = np.where((error < MAX_ERROR).all(axis=0), found, np.nan)
+            error = np.abs(np.stack(distortion(point[0], point[1], rest)) - goal)
+            u, v = np.where((error < MAX_ERROR).all(axis=0), point, np.nan)
         return u.reshape(x.shape), v.reshape(x.shape)
 
     @property
     def camera(self) -> Camera:
-        """The camera without the distortion, at the photograph's own size."""
+        """The camera without distortion, at the size of the photograph."""
         fx, fy, cx, cy, _ = self._split
         return Camera(self.width, self.height, fx, fy, cx, cy)
 
     @cached_property
     def pinhole(self) -> Camera:
-        """The camera of the undistorted photograph: same focal lengths, the largest upright part without blank pixels.
+        """The camera of the undistorted photograph, with the same focal lengths.
 
-        With `whole` it is the smallest image that contains the photograph, up to 60 degrees to each side and twice its
-        size.  Raises DataError when no such image exists.
+        It shows the largest rectangle in which all pixels are defined.  With `whole`, it shows the smallest rectangle
+        that contains the photograph, up to 60 degrees to each side and twice the size.  Raises DataError when there is
+        no such rectangle.
         """
         fx, fy, _, _, _ = self._split
         along_x, along_y = np.linspace(0, self.width, BORDER_POINTS), np.linspace(0, self.height, BORDER_POINTS)
@@ -215,19 +218,19 @@ class Lens:
         width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
         if min(width, height) < 1:
             raise DataError(
-                f"the lens {self.model} {quote(self.params)} leaves no pixel of its image; calibrate the camera again"
+                f"the lens {self.model} {quote(self.params)} leaves no pixel undistorted; calibrate the camera again"
             )
         return Camera(width, height, fx, fy, float(-u0 * fx), float(-v0 * fy))
 
     def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Return the undistorted photograph, as `pinhole` sees it, [H, W, C] of the same type."""
+        """Return the photograph undistorted to the camera `pinhole`, [H, W, C] of the same type."""
         camera = self.pinhole
         undistorted = cv2.remap(pixels, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return undistorted.reshape(camera.height, camera.width, -1)
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
-        """Which pixels of `pinhole`, [H, W], the photograph shows: distorted rays lie in it and undistort back."""
+        """Which pixels of `pinhole`, [H, W], the photograph covers: those whose ray distorts into it and back."""
         u, v = _rays(self.pinhole)
         x, y = self.distort(u, v)
         back_u, back_v = self.undistort(x, y)
@@ -236,7 +239,7 @@ class Lens:
 
 
 def _rays(camera: Camera) -> tuple[Floats, Floats]:
-    """Normalized coordinates of all pixel centers, [H, W] each."""
+    """The normalized coordinates of all pixel centers, [H, W] each."""
     u, v = np.meshgrid(
         (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
         (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
@@ -244,8 +247,8 @@ def _rays(camera: Camera) -> tuple[Floats, Floats]:
     return u, v
 
 
-def _nearer(distortion: Distortion, k: Sequence[float], point: Floats, goal: Floats) -> Floats:
-    """One step of Newton's method toward the points [2, M] that are distorted to `goal`."""
+def _newton_step(distortion: Distortion, k: Sequence[float], point: Floats, goal: Floats) -> Floats:
+    """One step of Newton's method toward the points, [2, M], whose distortion is `goal`."""
     step, (u, v) = 1e-7, point
     a, b = distortion(u, v, k)
     au, bu = distortion(u + step, v, k)
@@ -256,14 +259,14 @@ def _nearer(distortion: Distortion, k: Sequence[float], point: Floats, goal: Flo
     return np.stack([u + (j11 * da - j01 * db) / det, v + (j00 * db - j10 * da) / det])
 
 
-@lru_cache(maxsize=2)  # of a phone held upright and across; each has 8 bytes a pixel
+@lru_cache(maxsize=2)  # a phone held upright and sideways; each takes 8 bytes per pixel
 def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where in the photograph the pixels of `pinhole` lie, [H, W] each; OpenCV's pixels have whole centers."""
+    """The position in the photograph of each pixel of `pinhole`, [H, W] each; OpenCV's pixel centers are integers."""
     x, y = lens.distort(*_rays(lens.pinhole))
     return (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)
 
 
 @lru_cache(maxsize=64)
 def intern_lens(lens: Lens) -> Lens:
-    """Return the first lens that equals this one, so that views share what is slow to compute: `pinhole`, `shown`."""
+    """Return the first lens that equals this one, so that views share its slow properties `pinhole` and `shown`."""
     return lens

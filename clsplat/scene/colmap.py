@@ -1,4 +1,4 @@
-"""Read COLMAP folders: choose the model, find the photographs, make pinhole cameras."""
+"""Read COLMAP folders: choose the model, find its photographs, and make pinhole cameras."""
 
 import logging
 import math
@@ -393,8 +393,8 @@ def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
     if not models:
         raise DataError(f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0, sparse or .")
     best = max(models, key=lambda model: len(model[1]))
-    others = ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0])
-    logger.info("%s: %d images%s", best[0], len(best[1]), f"; left out the smaller models {others}" if others else "")
+    if others := ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0]):
+        logger.info("%s: used with %d images, the most of all models; not used: %s", best[0], len(best[1]), others)
     return best
 
 

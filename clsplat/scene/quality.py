@@ -1,4 +1,4 @@
-"""What is measured of a capture before training, for settings that follow from it."""
+"""Measure photographs before training, to adapt settings to them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,38 +14,38 @@ from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View, load_mask, load_transparency, sample_views
 
-NEAREST = 0.01  # share of the points that photographs show which may lie nearer: some of them are mistaken
+NEAREST = 0.01  # quantile of the depths of observed points: a few nearer ones are wrong
 
 
 @dataclass
 class Measures:
-    """What is known of photographs before training."""
+    """Measurements of the photographs before training."""
 
     photographs: int
-    """Number of training photographs; those for validation count."""
+    """Number of training photographs, including those for validation."""
     reprojection_error: float | None = None
-    """Mean distance between a point and where photographs show it, px at the size of training; None: not known."""
+    """Mean reprojection error of the points, px at the size of training; None: unknown."""
     scene: Scene | None = None
-    """The scene as it is trained on; None: not prepared yet."""
+    """The scene at the size of training; None: not prepared yet."""
     measure_sky: Callable[[], float | None] = lambda: None
 
     @cached_property
     def sky(self) -> float | None:
-        """The share of the training photographs that show a sky, for which all are read; None: not known."""
+        """The fraction of the training photographs that show a sky, which reads all of them; None: unknown."""
         return self.measure_sky()
 
 
 def measure_scene(scene: Scene, measure_sky: Callable[[], float | None] = lambda: None) -> Measures:
-    """Return the measures of a scene, as it is trained on."""
+    """Return the measurements of a scene at the size of training."""
     views = {view.name: view for view in reversed(scene.merge_validation().split("train"))}  # the largest size of each
     errors = reprojection_errors(scene.tracks, views.values())
     return Measures(len(views), None if errors is None else float(errors.mean()), scene, measure_sky)
 
 
 def near_depth(scene: Scene) -> float | None:
-    """Return the depth, scene units, that a hundredth of all points that training views show are nearer than.
+    """Return the depth in scene units below which 1 % of all observed points are, over the training views.
 
-    Views for validation count as training views.  None where the dataset does not tell which points views show.
+    Validation views count as training views.  None when the dataset does not say which views observe which points.
     """
     if scene.tracks is None:
         return None
@@ -55,14 +55,14 @@ def near_depth(scene: Scene) -> float | None:
     ]
     with np.errstate(all="ignore"):  # points of a damaged file
         depths = [points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3] for view, points in shown]
-    ahead = [one[(one > 0) & (one < np.inf)] for one in depths]
+    ahead = [depth[(depth > 0) & (depth < np.inf)] for depth in depths]
     return float(np.quantile(np.concatenate(ahead), NEAREST)) if any(map(len, ahead)) else None
 
 
-# How sharp a photograph is, by its small details.
+# Sharpness of photographs.
 
-BLURRED = 0.25  # share of the middle of a set: six captures have 0.4 and more, a blur of 1 px leaves 0.05 to 0.09
-SIDE = 480  # px: sharpness is measured at this size: at full size, noise counts as detail
+BLURRED = 0.25  # of the median of a set: six captures have at least 0.4, a blur of 1 px leaves 0.05 to 0.09
+SIDE = 480  # px: sharpness is measured at this size, since noise looks like detail at full size
 
 
 def sharpness(gray: NDArray[np.uint8]) -> float:
@@ -71,37 +71,36 @@ def sharpness(gray: NDArray[np.uint8]) -> float:
 
 
 def both_sharpnesses(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the sharpness of an image [H, W], and it by the square of its mean, which a darker copy has too, [2]."""
-    found = sharpness(gray)
-    return np.array([found, found / max(float(gray.mean()), 1.0) ** 2])
+    """Return the sharpness of an image [H, W] and, invariant to brightness, divided by its squared mean, [2]."""
+    value = sharpness(gray)
+    return np.array([value, value / max(float(gray.mean()), 1.0) ** 2])
 
 
 def sharpness_of(path: Path) -> NDArray[np.float64]:
-    """Return both sharpnesses of a photograph, reduced to SIDE px.  Raises DataError when it cannot be read."""
+    """Return both sharpness values of a photograph, reduced to SIDE px.  Raises DataError when it cannot be read."""
     return both_sharpnesses(read_gray(path, SIDE)[0])
 
 
-def is_blurred(own: NDArray[np.float64], middle: NDArray[np.float64]) -> bool:
-    """Return whether both sharpnesses of a photograph are far below the medians of a set, [2].
+def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool:
+    """Return whether both sharpness values of a photograph are far below the medians of a set, [2].
 
-    The first alone is small of a dark photograph, the second of a bright one among dark ones.
+    The first one is also small for a dark photograph, the second one for a bright photograph among dark ones.
     """
-    return bool((own < BLURRED * middle).all())
+    return bool((values < BLURRED * median).all())
 
 
-# How much detail photographs show at each pixel: there Gaussians are to lie densely.
+# Detail at each pixel, where Gaussians should be dense.
 
 Floats = NDArray[np.floating]
-MAX_SPACING = 0.1  # by the width of the photograph (Meuleman et al. 2025)
+MAX_SPACING = 0.1  # of the width of the photograph (Meuleman et al. 2025)
 
 
 def laplacian_probability(image: Floats) -> Floats:
-    """Return the chance, [H, W], with which a pixel of a photograph, [H, W, 3] in [0, 1], becomes a point.
+    """Return the probability, [H, W], that a pixel of a photograph, [H, W, 3] in [0, 1], becomes a point.
 
-    It is min(1, ‖∇²I‖₁) with the Laplacian of five points, summed over the colors (Meuleman et al. 2025).  There it is
-    averaged over a disc of weight 1; here photographs are so small that each pixel is an average already, and the
-    factor stays 1.  A pixel that differs from the mean of its neighbors by a twelfth of the range in each color has
-    the chance 1.
+    It is min(1, ‖∇²I‖₁) with the five-point Laplacian, summed over the colors (Meuleman et al. 2025).  The paper
+    averages it over a disc; these photographs are so small that each pixel is already an average.  A pixel that differs
+    from the mean of its neighbors by a twelfth of the range in each color has probability 1.
     """
     framed = np.pad(image.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")
     middle, around = framed[1:-1, 1:-1], (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
@@ -110,34 +109,34 @@ def laplacian_probability(image: Floats) -> Floats:
 
 
 def point_spacing(chance: Floats, width: int) -> Floats:
-    """Return the distance in pixels between points that are taken with some chances above 0: 1/√chance.
+    """Return the mean distance in pixels between points sampled with a probability: 1/√p.
 
-    It is at most MAX_SPACING by the width of the photograph, px.
+    It is at most MAX_SPACING of the width of the photograph, px.
     """
     distance: Floats = np.minimum(1 / np.sqrt(chance), MAX_SPACING * width)
     return distance
 
 
-# Whether photographs show a background behind them.
+# Transparency of photographs.
 
-LOOKED_AT = 3  # training photographs: what is shown may fill one of them
+LOOKED_AT = 3  # training photographs, since the object may fill one of them
 
 
 def is_transparent(scene: Scene) -> bool:
-    """Return whether one of some training photographs has transparent pixels that count.  Raises DataError."""
+    """Return whether a sampled training photograph has transparent pixels that are not masked.  Raises DataError."""
     return any(map(_is_transparent, sample_views(scene.split("train"), LOOKED_AT)))
 
 
 def background_shows(scene: Scene) -> bool:
-    """Return whether another background can be put behind one of some training photographs.
+    """Return whether a sampled training photograph can be composited on another background.
 
-    It cannot behind those with masks.  Raises DataError.
+    Photographs with masks cannot.  Raises DataError.
     """
     return any(load_transparency(view) is not None for view in sample_views(scene.split("train"), LOOKED_AT))
 
 
 def opaque_pixels(view: View) -> NDArray[np.bool_] | None:
-    """Return which pixels of a photograph count and show no background, [H, W], or None when all do.
+    """Return which pixels of a photograph are opaque and not masked, [H, W], or None when all are.
 
     Raises DataError.
     """

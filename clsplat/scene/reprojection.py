@@ -1,4 +1,4 @@
-"""How far the points of a dataset are from where its photographs show them."""
+"""Measure reprojection errors: how far points project from where photographs observe them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -11,23 +11,22 @@ from clsplat.scene.scene import PointCloud, Scene, Tracks
 from clsplat.scene.view import View, photo_lens
 
 Floats = NDArray[np.float64]
-NEAR = 1.0  # px at the size of training, ours: beyond it a pixel does not show the point
-EXACT = 1e-3  # px: below it places were computed from the cameras, and tell nothing of them
+MAX_ERROR = 1.0  # px at the size of training (ours): beyond it, the pixel does not show the point
+EXACT = 1e-3  # px: below it, observations were computed from the cameras and say nothing about them
 
 
-def reprojection_residuals(view: View, positions: NDArray[np.floating], places: Floats) -> Floats:
-    """Return the vectors, [K, 2] px, from where a view at its full size shows positions, [K, 3], to places, [K, 2] px
-    of the photograph as it was taken; NaN behind the camera, and for places far outside the photograph."""
-    taken = view.lens or view.camera
-    size = np.array([taken.width, taken.height])
-    # a place of a damaged file says nothing of cameras
-    near = np.all(np.abs(places - size / 2) <= size, axis=1, keepdims=True)
-    return np.where(near, places - project_points(view, positions), np.nan)
+def reprojection_residuals(view: View, positions: NDArray[np.floating], observed: Floats) -> Floats:
+    """Return the vectors, [K, 2] px, from the projections of `positions`, [K, 3], to `observed`, [K, 2] px of the
+    original photograph; NaN behind the camera, and for observations far outside the photograph."""
+    original = view.lens or view.camera
+    size = np.array([original.width, original.height])
+    near = np.all(np.abs(observed - size / 2) <= size, axis=1, keepdims=True)  # others come from damaged files
+    return np.where(near, observed - project_points(view, positions), np.nan)
 
 
 def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
-    """Return where a view at its full size shows positions, [K, 3]: [K, 2] px of the photograph as it was taken, NaN
-    behind the camera."""
+    """Return the projections of positions, [K, 3], into the original photograph of a view, [K, 2] px; NaN behind the
+    camera."""
     points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
     points[~(points[:, 2] > 0)] = np.nan
     with np.errstate(all="ignore"):
@@ -38,21 +37,20 @@ def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
 
 
 def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:
-    """Return a scene, at its full size, whose views have other cameras; photographs show its points where they did."""
-    tracks, missed = scene.tracks, dict[str, Floats]()
+    """Return a scene at full size with other cameras; the observations of its points stay where they are."""
+    tracks, residuals = scene.tracks, dict[str, Floats]()
     if tracks is not None:
         for old, new in zip(scene.views, views, strict=True):
             if old.name in tracks.residuals:
                 positions = tracks.positions[tracks.seen[old.name]]
                 moved = project_points(old, positions) - project_points(new, positions)
-                missed[old.name] = tracks.residuals[old.name] + moved
-        tracks = replace(tracks, residuals={**tracks.residuals, **missed})
+                residuals[old.name] = tracks.residuals[old.name] + moved
+        tracks = replace(tracks, residuals={**tracks.residuals, **residuals})
     return replace(scene, views=tuple(views), tracks=tracks)
 
 
 def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats | None:
-    """Return the mean distance for each point that views show, px at their sizes; None where the dataset does not tell
-    it."""
+    """Return the mean reprojection error of each point that views observe, px at their sizes; None if unknown."""
     if tracks is None or not tracks.residuals:
         return None
     sums, counts = np.zeros(len(tracks.positions)), np.zeros(len(tracks.positions))
@@ -66,23 +64,25 @@ def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats 
     return errors if len(errors) and errors.mean() > EXACT else None
 
 
-def filter_tracks(tracks: Tracks, views: Iterable[View], limit: float = NEAR) -> Tracks:
-    """Return the tracks without the points that views show `limit` px or more, at their sizes, from where the cameras
-    do; a view without known places keeps all of its points, and so do other views than these."""
-    seen, missed = dict(tracks.seen), dict(tracks.residuals)
-    for view in sorted(views, key=lambda view: -view.downscale):  # of a photograph in several sizes the largest one
+def filter_tracks(tracks: Tracks, views: Iterable[View], limit: float = MAX_ERROR) -> Tracks:
+    """Return the tracks without observations whose reprojection error is `limit` px or more at the size of the view.
+
+    Views without known observations, and views not in `views`, keep all points.
+    """
+    seen, residuals = dict(tracks.seen), dict(tracks.residuals)
+    for view in sorted(views, key=lambda view: -view.downscale):  # the largest size of a photograph is last and counts
         if view.name in tracks.residuals:
-            found = tracks.residuals[view.name]
-            kept = ~(np.linalg.norm(found, axis=1) / view.downscale >= limit)  # NaN: not known
-            seen[view.name], missed[view.name] = tracks.seen[view.name][kept], found[kept]
-    return Tracks(tracks.positions, seen, missed)
+            vectors = tracks.residuals[view.name]
+            near = ~(np.linalg.norm(vectors, axis=1) / view.downscale >= limit)  # True for NaN, unknown
+            seen[view.name], residuals[view.name] = tracks.seen[view.name][near], vectors[near]
+    return Tracks(tracks.positions, seen, residuals)
 
 
 def require_points_in_front(points: PointCloud, scene: Scene) -> None:
-    """Raise DataError when every point lies behind every training camera."""
+    """Raise DataError when all points are behind all training cameras."""
     poses = np.stack([view.world_to_camera for view in scene.split("train")])
     if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):
         raise DataError(
-            f"{scene.path}: all {len(points):,} points lie behind all training cameras; poses and points follow "
-            "different conventions: export both again, or use init: {source: sweep}"
+            f"{scene.path}: all {len(points):,} points are behind all training cameras; poses and points "
+            "use different conventions: export both again, or use init: {source: sweep}"
         )

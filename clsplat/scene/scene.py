@@ -1,11 +1,11 @@
-"""A dataset on the host: cameras, views, points and the split into training and test views.
+"""Hold a dataset on the host: cameras, views, points, and the split into training and test views.
 
 Conventions of the whole project
     camera      OpenCV: x right, y down, z forward; `world_to_camera` is row-major [3, 4]
     pixels      pixel (0, 0) has its center at (0.5, 0.5)
     quaternions (w, x, y, z)
     lengths     scene units; screen quantities in pixels
-    colors     as the image files store them, in [0, 1]
+    colors      as the image files store them, in [0, 1]
 """
 
 import logging
@@ -24,33 +24,31 @@ from clsplat.scene.view import Alpha, Floats, View, load_image
 
 LOG = logging.getLogger("clsplat")
 
-# Which points of a dataset each photograph shows, and where: what structure from motion has found.
-
 
 @dataclass(frozen=True)
 class Tracks:
-    """Points, and the photographs that show them."""
+    """Points from structure from motion, and the photographs in which each is seen."""
 
     positions: NDArray[np.floating]  # [M, 3], scene units
-    seen: Mapping[str, NDArray[np.int64]]  # rows of `positions`, ascending by id of the point, by the name of a view
-    residuals: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)  # of the views whose places are known:
-    # [K, 2] px of the photograph as it was taken, from where the camera shows each point to where the photograph does
+    seen: Mapping[str, NDArray[np.int64]]  # by name of the view: rows of `positions`, in order of the point ids
+    residuals: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    # by name of the view, [K, 2] px of the original photograph: from the projection of each point to its observation
 
     def shifted(self, origin: Floats) -> "Tracks":
         """Return the tracks in coordinates whose zero is at `origin`, [3] in the present coordinates."""
         return replace(self, positions=self.positions - origin) if origin.any() else self
 
     def renamed(self, names: Mapping[str, str]) -> "Tracks":
-        """Return the tracks of some views under other names, by their old ones."""
+        """Return the tracks of the views in `names`, with their new names by the old ones."""
         seen = {names[old]: rows for old, rows in self.seen.items() if old in names}
-        return Tracks(self.positions, seen, {names[old]: one for old, one in self.residuals.items() if old in names})
+        return Tracks(self.positions, seen, {names[old]: rows for old, rows in self.residuals.items() if old in names})
 
 
 Background = Literal["black", "white"]
-HOLDOUT = 8  # every 8th view is for testing where the dataset has no split: the default of pipelines
+HOLDOUT = 8  # every 8th view is a test view if the dataset has no split: the default of pipelines
 MAX_DISTANCE = 10.0  # median distances: evenly spaced cameras on a line reach 2, an orbit 1, a close-up about 4
 MAX_OFFSET = 100  # x the median distance of the points; float32 then places them to 1e-5 of that distance
-MAX_STRAYED_SHARE = 0.2  # of the cameras
+MAX_OUTLIERS = 0.2  # fraction of the cameras
 MAX_THUMBNAILS = 4
 SPLITS = ("train", "test", "validation")
 
@@ -61,26 +59,26 @@ class PointCloud:
 
     positions: Floats  # [M, 3] float32, scene units; as a file has them until make_scene subtracts the origin
     colors: Floats  # [M, 3] float32, in [0, 1]
-    times: Floats | None = None  # [M] float32, in [0, 1], at which they were seen, where a moving scene has that
-    sizes: Floats | None = None  # [M] float32, scene units, of the Gaussians they become; NaN and None: unknown
+    times: Floats | None = None  # [M] float32, timestamps in [0, 1], if a moving scene has them
+    sizes: Floats | None = None  # [M] float32, scene units, of the initial Gaussians; NaN and None: unknown
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def joined(self, other: "PointCloud") -> "PointCloud":
-        """Return these points, then those of another cloud; with times where both have them, sizes where one has."""
+        """Return these points followed by another cloud, with times if both have them and sizes if one has."""
         pairs = [(self.positions, other.positions), (self.colors, other.colors)]
         pairs += [(self.times, other.times)] if self.times is not None and other.times is not None else []
         both = PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
         if self.sizes is None and other.sizes is None:
             return both
-        sizes = [np.full(len(one), np.nan) if one.sizes is None else one.sizes for one in (self, other)]
+        sizes = [np.full(len(c), np.nan) if c.sizes is None else c.sizes for c in (self, other)]
         return replace(both, sizes=np.concatenate(sizes).astype(np.float32))
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Photographs with their cameras, and the split that every stage uses."""
+    """Photographs with their cameras, points, and the split that all stages use."""
 
     path: Path
     views: tuple[View, ...]
@@ -88,18 +86,18 @@ class Scene:
     test: tuple[int, ...]
     points: PointCloud | None
     extent: float  # radius of the training cameras, scene units
-    background: Background = "black"  # on which papers show the photographs
-    validation: tuple[int, ...] = ()  # kept out of the training, to choose by
-    tracks: Tracks | None = None  # which points the photographs show, where the dataset has that
+    background: Background = "black"  # as in papers on this dataset
+    validation: tuple[int, ...] = ()  # held out to choose the best model
+    tracks: Tracks | None = None  # which photographs see which points, if the dataset has that
     origin: Floats = field(default_factory=lambda: np.zeros(3))  # [3] float64, world coordinates of this scene's zero
-    skipped: tuple[str, ...] = ()  # names of views that the dataset names and whose photographs are missing
+    skipped: tuple[str, ...] = ()  # names of views whose photographs are missing
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of `train`, `test`, `validation` or `all`.  Raises ValueError for another name."""
         if name == "all":
             return self.views
         if name not in SPLITS:
-            raise ValueError(f"no split '{name}'; there are {', '.join(SPLITS)} and all")
+            raise ValueError(f"no split '{name}'; expected {', '.join(SPLITS)} or all")
         return tuple(self.views[i] for i in self.indices[name])
 
     @property
@@ -117,22 +115,22 @@ class Scene:
         return replace(self, views=views, points=points, tracks=tracks, origin=np.zeros(3))
 
     def merge_validation(self) -> "Scene":
-        """Return the scene with the validation views among those that are trained on."""
+        """Return the scene with the validation views moved to the training views."""
         return replace(self, train=tuple(sorted(self.train + self.validation)), validation=())
 
     def with_alpha(self, alpha: Alpha) -> "Scene":
-        """Return the scene with the fourth channel of its photographs taken as transparency or as mask."""
+        """Return the scene with the fourth channel of its photographs used as transparency or as mask."""
         return replace(self, views=tuple(replace(view, alpha=alpha) for view in self.views))
 
     @property
     def downscales(self) -> tuple[float, ...]:
-        """The divisors of the photographs' sizes in the scene, ascending."""
+        """The downscale factors of the photographs in the scene, ascending."""
         return tuple(sorted({view.downscale for view in self.views}))
 
     def downscaled(self, *downscales: float) -> "Scene":
         """Return the scene with every photograph at 1 / downscale of its original size, for each of `downscales`.
 
-        Where the dataset has views of that size, they are used; otherwise the largest photographs are resampled.
+        It uses views of that size if the dataset has them, and otherwise resamples the largest ones.
         Raises DataError for a size larger than the largest in the dataset.
         """
         if downscales == self.downscales:
@@ -148,9 +146,9 @@ class Scene:
                 )
             source = downscale if downscale in self.downscales else smallest
             for name, indices in splits.items():
-                found = [view for view in self.split(name) if view.downscale == source]
-                indices += range(len(views), len(views) + len(found))
-                views += [view.resized(downscale) for view in found]
+                sources = [view for view in self.split(name) if view.downscale == source]
+                indices += range(len(views), len(views) + len(sources))
+                views += [view.resized(downscale) for view in sources]
         train, test, validation = (tuple(splits[name]) for name in SPLITS)
         return replace(self, views=tuple(views), train=train, test=test, validation=validation)
 
@@ -178,7 +176,7 @@ class Scene:
         return summary(rows, list(self._thumbnails()))
 
     def _thumbnails(self) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-        """Some photographs, evenly spaced, with their names; those that cannot be read are left out."""
+        """Some evenly spaced photographs with their names, without unreadable ones."""
         for i in np.unique(np.linspace(0, len(self.views) - 1, MAX_THUMBNAILS).astype(int)):
             with suppress(DataError):
                 yield self.views[i].name, load_image(self.views[i])
@@ -192,7 +190,7 @@ def make_scene(
     Raises DataError when there is no view, when names repeat or when a pose or a camera is impossible.
     """
     if not views:
-        raise DataError(f"{path}: the dataset holds no images; expected at least one posed image")
+        raise DataError(f"{path}: the dataset has no images; expected at least one image with a pose")
     seen: set[str] = set()
     for view in views:
         if view.name in seen:
@@ -241,7 +239,7 @@ def choose_origin(views: Sequence[View], points: PointCloud | None) -> Floats:
 def camera_extent(views: list[View]) -> float:
     """Return the radius of the cameras: 1.1 x the largest distance of a center from their mean (Kerbl et al. 2023).
 
-    Cameras far away from all others do not count: one wrong pose changes every size and rate of the scene.
+    Outliers are ignored, since one wrong pose would change all sizes and learning rates of the scene.
     """
     centers = np.stack([v.position for v in views])[~outlier_cameras(views)]
     radius = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
@@ -249,18 +247,18 @@ def camera_extent(views: list[View]) -> float:
 
 
 def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:
-    """Return which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median center.
+    """Return which cameras, [N], are more than MAX_DISTANCE times the median distance from the median center.
 
-    Where that is more than MAX_STRAYED_SHARE of all, the scene has several groups of cameras, and all are False.
+    If those are more than MAX_OUTLIERS of all, the scene has several groups of cameras, and all are False.
     """
     centers = np.stack([v.position for v in views])
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     far = distance > MAX_DISTANCE * np.median(distance)
-    return far if np.median(distance) > 0 and far.mean() <= MAX_STRAYED_SHARE else np.zeros(len(views), bool)
+    return far if np.median(distance) > 0 and far.mean() <= MAX_OUTLIERS else np.zeros(len(views), bool)
 
 
 def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
-    """Return the indices of the names that are held out: every `holdout`-th by name, from the place `offset` on."""
+    """Return the indices of the held-out names: every `holdout`-th in order of name, starting at `offset`."""
     if holdout <= 0:
         return set()
     order = sorted(range(len(names)), key=lambda i: names[i])
@@ -268,5 +266,5 @@ def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
 
 
 def scene_name(folder: str | Path) -> str:
-    """Return what pages call a scene: the user's folder, not that of what was prepared of it, which is a hash."""
+    """Return the name of a scene on pages: the user's folder, since the name of a prepared folder is a hash."""
     return Path(folder).resolve().name

@@ -1,4 +1,4 @@
-"""A photograph with its camera: reading its pixels at the size of the camera."""
+"""Pair a photograph with its camera, and read its pixels at the size of the camera."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -16,28 +16,26 @@ from clsplat.formats.splats import EXPECTED_TIME, is_timestamp
 from clsplat.scene.camera import MODELS, Camera, Lens
 from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_image
 
-# What a view says of its place: a pose with a rotation, and the moment of a scene that moves.
-
 Floats = NDArray[np.floating]
-ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are read to 1e-3, and an inverse has a little more
+ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are checked to 1e-3, and inverting adds to the error
 
 
 def validate_pose(name: str, pose: ArrayLike) -> Floats:
     """Return a world-to-camera pose, [3, 4] float64, of the view `name`.  Raises PoseError without a rotation."""
-    found = np.asarray(pose, np.float64)
-    if found.shape != (3, 4):
-        raise PoseError(f"the pose of {quote(name)} has shape {found.shape}; expected (3, 4)")
-    rotation = found[:, :3]
-    if not np.isfinite(found).all():
+    matrix = np.asarray(pose, np.float64)
+    if matrix.shape != (3, 4):
+        raise PoseError(f"the pose of {quote(name)} has shape {matrix.shape}; expected (3, 4)")
+    rotation = matrix[:, :3]
+    if not np.isfinite(matrix).all():
         raise PoseError(f"the pose of {quote(name)} has values that are not finite; expected finite numbers")
-    with np.errstate(all="ignore"):  # numbers near the end of the range
-        turned = rotation @ rotation.T
-    if not np.allclose(turned, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
+    with np.errstate(all="ignore"):  # huge numbers overflow
+        product = rotation @ rotation.T
+    if not np.allclose(product, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
         raise PoseError(
             f"the pose of {quote(name)} has no rotation in its first three columns; "
-            "expected axes of length 1 at right angles, not mirrored"
+            "expected an orthonormal matrix without reflection"
         )
-    return found
+    return matrix
 
 
 def validate_time(name: str, time: float | None) -> float | None:
@@ -54,32 +52,30 @@ def validate_time(name: str, time: float | None) -> float | None:
 Size = tuple[int, int]  # width, height, px
 Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
 BLACK = (0.0, 0.0, 0.0)
-NO_FILE = Path()  # of a view that is made by hand
-MIN_WHITE = 0.99  # share of the largest value: JPEG does not store white exactly
+NO_FILE = Path()  # of a view without a photograph
+MIN_WHITE = 0.99  # fraction of the largest value: JPEG does not store white exactly
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera with its photograph.  `name` is unique in its scene: the path below the image folder.
+    """A camera with its photograph.  `name` is unique in the scene: the path below the image folder.
 
-    Two views are equal only when they are one object; compare names, downscales or poses.
-
-    A view that only serves to render a model needs no photograph.  Raises PoseError without a rotation, and for a time
-    outside [0, 1].
+    Views compare by identity; compare names, downscales or poses instead.  A view that only renders a model needs no
+    photograph.  Raises PoseError for a pose without a rotation, and for a time outside [0, 1].
     """
 
     name: str
     camera: Camera
     world_to_camera: Floats  # [3, 4] float64
     image_path: Path = NO_FILE
-    mask_path: Path | None = None  # an image of the photograph's size, white in pixels that count
+    mask_path: Path | None = None  # an image of the photograph's size, white in valid pixels
     alpha: Alpha = "transparency"
-    lens: Lens | None = None  # of the photograph on disk, where it has distortion
+    lens: Lens | None = None  # of the photograph on disk, if it has distortion
     downscale: float = 1  # divisor of the original photograph's size
-    time: float | None = None  # in [0, 1], of the scene's first to last moment; None: the scene does not move
-    static_path: Path | None = None  # an image of the photograph's size, white in pixels that show nothing that moves
+    time: float | None = None  # timestamp in [0, 1]; None: the scene is static
+    static_path: Path | None = None  # an image of the photograph's size, white in pixels that show only static things
     camera_to_world: Floats | None = None  # [4, 4] float64, as a file has it, until make_scene
-    response: Callable[..., Any] | None = None  # workspace, camera, planes -> those as the camera takes them; measured
+    response: Callable[..., Any] | None = None  # (workspace, camera, planes) -> planes with the camera's response
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "world_to_camera", validate_pose(self.name, self.world_to_camera))
@@ -89,9 +85,9 @@ class View:
     def looking_at(
         cls, position: ArrayLike, target: ArrayLike, up: ArrayLike, camera: Camera, name: str = "view"
     ) -> "View":
-        """Return a view from a position to a target, with `up` upwards in the image; each [3], in scene units.
+        """Return a view from a position toward a target, with `up` pointing up in the image; each [3], in scene units.
 
-        Raises ValueError where there is no such view: the target is the position, or lies along `up`.
+        Raises ValueError when the target is at the position or in the direction of `up`.
         """
         center, point, above = (np.asarray(vector, np.float64) for vector in (position, target, up))
         if not center.shape == point.shape == above.shape == (3,):
@@ -100,7 +96,7 @@ class View:
         right = np.cross(forward, above)
         axes = np.stack([right, np.cross(forward, right), forward])
         if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(above):
-            raise ValueError(f"{quote(name)}: expected a target away from the position, and not along `up`")
+            raise ValueError(f"{quote(name)}: expected a target away from the position and not along `up`")
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
         return cls(name, camera, np.column_stack([axes, -axes @ center]))
 
@@ -120,7 +116,7 @@ class View:
         return -rotation.T @ translation
 
     def resized(self, downscale: float) -> "View":
-        """Return the same photograph with 1 / `downscale` of its original size.
+        """Return the view at 1 / `downscale` of the original size of its photograph.
 
         Raises ValueError unless `downscale` is positive and finite.
         """
@@ -135,9 +131,9 @@ class View:
     def photograph(self, background: ArrayLike = 0.0) -> NDArray[np.float32]:
         """Return the photograph at the camera's size, [height, width, 3] in [0, 1].
 
-        background: behind what is transparent, one number or three in [0, 1]; that of a picture is
-        `picture.background`.  Raises DataError when the file cannot be read or is not the camera's image, ValueError
-        for another background.
+        background: behind transparent pixels, one number or three in [0, 1]; that of a render is
+        `picture.background`.  Raises DataError when the file cannot be read or does not fit the camera, ValueError for
+        an invalid background.
         """
         red, green, blue = color_of(background).tolist()
         return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)
@@ -160,14 +156,14 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     """Return the photograph of `view` at its camera's size, RGB, [H, W, 3]; alpha is composited on `background`.
 
     `background` is a color in [0, 1], black by default.  Raises DataError when the file cannot be read as an 8- or
-    16-bit image, or when it is not the camera's image before downscaling.
+    16-bit image, or when its size does not fit the camera.
     """
     pixels = _as_taken(view, view.image_path)
     width, height = view.camera.width, view.camera.height
     opaque, resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
     if opaque and not resized and pixels.dtype == np.uint8:
         return pixels
-    # Double precision where the reference has it, to truncate alike; single saves memory on large photographs.
+    # Double precision with alpha, to truncate as the reference does; single precision saves memory otherwise.
     values: NDArray[Any] = pixels.astype(np.float32 if opaque else np.float64)
     if resized:  # not premultiplied by alpha, as in the reference (multi-scale Blender)
         values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
@@ -182,8 +178,8 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
 
 
 def load_rgba(view: View) -> NDArray[np.uint8] | None:
-    """Return the photograph of `view` at its camera's size with its alpha, [H, W, 4], not premultiplied; None where it
-    has no transparency, or pixels that do not count.
+    """Return the photograph of `view` at its camera's size with straight alpha, [H, W, 4]; None when it has no
+    alpha, or has a mask.
 
     Raises DataError as load_image does.
     """
@@ -196,7 +192,7 @@ def load_rgba(view: View) -> NDArray[np.uint8] | None:
 
 
 def load_transparency(view: View) -> NDArray[np.uint8] | None:
-    """Return how much of a background shows through the photograph of `view`, [H, W] up to 255; None where none does.
+    """Return the transparency of the photograph of `view`, [H, W] from 0 to 255; None when it is opaque.
 
     Raises DataError as load_image does.
     """
@@ -205,10 +201,10 @@ def load_transparency(view: View) -> NDArray[np.uint8] | None:
 
 
 def load_mask(view: View) -> NDArray[np.bool_] | None:
-    """Return which pixels of `load_image` count, [H, W], or None when all do.
+    """Return which pixels of `load_image` are valid, [H, W], or None when all are.
 
-    A pixel counts when its whole area is white in the mask file, opaque in the photograph (with alpha as mask) and not
-    blank (with a `whole` lens).
+    A pixel is valid when its whole area is white in the mask file, opaque in the photograph (with alpha as mask) and
+    covered by the photograph (with a `whole` lens).
     Raises DataError as load_image does.
     """
     layers = []
@@ -246,10 +242,10 @@ def _as_taken(view: View, path: Path) -> NDArray[Any]:
 
 
 def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool:
-    """Return whether a view's photograph or mask has its camera's size only when the EXIF rotation is applied.
+    """Return whether a photograph or mask fits the camera of its view only after its EXIF rotation.
 
-    COLMAP ignores that tag.  `size` returns (width, height) of the file as stored, or with True upright.
-    Raises DataError when neither is the camera's.
+    COLMAP ignores that tag.  `size` returns (width, height) of the file as stored, or upright with True.
+    Raises DataError when neither fits.
     """
     found = size(False)
     if fits_camera(view, found):
@@ -266,11 +262,11 @@ def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool
     )
 
 
-def sample_views(views: Sequence[View], most: int) -> Sequence[View]:
-    """Return at most so many views, from the middles of as many equal parts."""
-    if len(views) <= most:
+def sample_views(views: Sequence[View], max_count: int) -> Sequence[View]:
+    """Return at most `max_count` evenly spaced views."""
+    if len(views) <= max_count:
         return views
-    return [views[(2 * i + 1) * len(views) // (2 * most)] for i in range(most)]
+    return [views[(2 * i + 1) * len(views) // (2 * max_count)] for i in range(max_count)]
 
 
 def fits_camera(view: View, size: Size) -> bool:
@@ -281,17 +277,16 @@ def fits_camera(view: View, size: Size) -> bool:
 
 
 def _scales_to(file: Size, camera: Size) -> bool:
-    """Return whether one divisor >= 1 takes the file's size to the camera's, rounded as in Camera.downscaled."""
+    """Return whether one divisor >= 1 reduces the file's size to the camera's, rounded as in Camera.downscaled."""
     smallest = max(1.0, *(f / (c + 0.5) for f, c in zip(file, camera, strict=True)))
     largest = min(f / (c - 0.5) if c > 1 else np.inf for f, c in zip(file, camera, strict=True))
     return smallest <= largest
 
 
-# Lenses whose focal length is another one than was calibrated: the photograph that they undistort stays the same.
+# Lenses with a changed focal length: the undistorted photograph stays the same.
 
 ROUNDING = 1e-12
-
-DEGREES: dict[str, tuple[int, ...]] = {  # n of each coefficient after the middle, in COLMAP's order
+DEGREES: dict[str, tuple[int, ...]] = {  # power of the focal length in each coefficient, in COLMAP's order
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
     "SIMPLE_RADIAL": (2,),
@@ -302,21 +297,21 @@ DEGREES: dict[str, tuple[int, ...]] = {  # n of each coefficient after the middl
 
 
 def can_zoom(lens: Lens) -> bool:
-    """Return whether there is such a lens for any factor: a fisheye has none of its model."""
+    """Return whether `zoom_lens` supports the model of a lens; it does not support fisheye lenses."""
     return lens.model in DEGREES
 
 
 def zoom_lens(lens: Lens, factor: float) -> Lens:
-    """Return a lens with the focal length times a factor, whose undistorted photograph is the same.
+    """Return a lens whose focal length is multiplied by a factor, with the same undistorted photograph.
 
-    Raises DataError where its model has none.
+    Raises DataError when its model does not support that.
     """
     if factor == 1:
         return lens
     if not can_zoom(lens):
         raise DataError(
-            f"the lens {lens.model} has no form with another focal length; expected one of {', '.join(DEGREES)}: "
-            "`clsplat data undistort` first"
+            f"the focal length of a {lens.model} lens cannot be changed; expected one of {', '.join(DEGREES)}: "
+            "run `clsplat data undistort` first"
         )
     focals = MODELS[lens.model][0]
     lengths, middle, rest = lens.params[:focals], lens.params[focals : focals + 2], lens.params[focals + 2 :]
@@ -325,9 +320,9 @@ def zoom_lens(lens: Lens, factor: float) -> Lens:
 
 
 def photo_lens(view: View) -> Lens:
-    """Return the lens of a view's photograph as it is on disk: a pinhole where it has no distortion.
+    """Return the lens of a view's photograph on disk, a pinhole lens if it has no distortion.
 
-    Raises DataError where its focal length was learned and its model has none with another.
+    Raises DataError when the focal length was optimized and the model of the lens does not support that.
     """
     c, lens = view.camera, view.lens
     if lens is None:
@@ -336,27 +331,24 @@ def photo_lens(view: View) -> Lens:
     return lens if math.isclose(factor, 1, rel_tol=ROUNDING) else zoom_lens(lens, factor)
 
 
-# What cameras noted of the exposures of views.
-
-
 def load_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
-    """Return the exposure of each view: what lies beside its image, or else what its image tells; None: nothing.
+    """Return the exposure of each view, from the exposures file of its folder or from EXIF; None: unknown.
 
-    Raises DataError where a file cannot be read.
+    Raises DataError when a file cannot be read.
     """
-    beside = cache(read_exposures)
-    found: list[CameraExposure | None] = []
+    sidecars = cache(read_exposures)
+    exposures: list[CameraExposure | None] = []
     for view in views:
         if view.image_path == NO_FILE:
-            found.append(None)
+            exposures.append(None)
             continue
-        told = (beside(folder).get(name) for folder, name in _below(view))
-        found.append(next(filter(None, told), None) or read_exif_exposure(view.image_path))
-    return found
+        candidates = (sidecars(folder).get(name) for folder, name in _below(view))
+        exposures.append(next(filter(None, candidates), None) or read_exif_exposure(view.image_path))
+    return exposures
 
 
 def _below(view: View) -> Iterator[tuple[Path, str]]:
-    """The folders of its image, up to that below which the name of the view is a path, and its path below each."""
+    """The folders that contain the image, up to the one that the view's name starts from, and its path below each."""
     parts = PurePosixPath(view.name).parts
     for number, folder in enumerate(view.image_path.parents[: len(parts)], 1):
         if view.image_path.parts[-number:] == parts[-number:]:
@@ -365,7 +357,7 @@ def _below(view: View) -> Iterator[tuple[Path, str]]:
 
 @dataclass(frozen=True)
 class PosedView:
-    """A view with the name of its image below the folder of all images, and its lens with distortion."""
+    """A view, the name of its image below the image folder, and whether it is a test view."""
 
     name: str
     view: View
@@ -373,5 +365,5 @@ class PosedView:
 
     @property
     def lens(self) -> Lens:
-        """The lens of the photograph as it is on disk: that of the view, or its pinhole camera."""
+        """The lens of the photograph on disk."""
         return photo_lens(self.view)

@@ -155,7 +155,7 @@ def test_same_arguments_same_bytes(dataset: Path, tmp_path: Path) -> None:
 
 def test_a_finished_data_set_is_kept(dataset: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in dataset.rglob("*")}
-    assert "complete already" in write_dataset(dataset, TINY)
+    assert "already complete" in write_dataset(dataset, TINY)
     assert before == {p: p.stat().st_mtime_ns for p in dataset.rglob("*")}
     with pytest.raises(DataError, match="not this data set"):
         write_dataset(dataset, SyntheticOptions(size=24, train=4, test=2, seed=1))

@@ -96,7 +96,7 @@ def test_the_folder_is_the_same_each_time(folder, tmp_path):
     files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     assert len(files) == 10 + 6 + 1 + 4
     assert all((folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes() for name in files)
-    assert "complete already" in write_dataset(folder, SMALL)
+    assert "already complete" in write_dataset(folder, SMALL)
 
 
 def test_inspect_tells_the_moments_and_the_places(folder):
