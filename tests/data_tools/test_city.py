@@ -51,5 +51,5 @@ def test_any_number_of_views_lies_evenly_above_the_city(count: int) -> None:
 def test_another_city_in_its_place_is_refused(folder: Path) -> None:
     assert "already complete" in write_dataset(folder, TINY)
     for other in (City(size=16, train=4, test=1, lots=4), SyntheticOptions(size=16, train=4, test=1)):
-        with pytest.raises(DataError, match="not this data set"):
+        with pytest.raises(DataError, match="is another dataset"):
             write_dataset(folder, other)

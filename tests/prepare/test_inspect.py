@@ -312,7 +312,7 @@ def test_points_behind_all_cameras(tmp_path):
     flipped = [replace(image, translation=(0.0, 0.0, -4.0)) for image in model.images]  # all look outwards
     inspection = Inspection.from_folder(write(tmp_path, replace(model, images=flipped)))
     assert inspection.facts.points.behind == 1.0
-    assert "all 200 points lie behind all training cameras" in said(inspection, "error")
+    assert "all 200 points are behind all training cameras" in said(inspection, "error")
     moved = replace(flipped[4], translation=(0.0, 0.0, 0.0))  # stands in the middle and sees some
     inspection = Inspection.from_folder(write(tmp_path, replace(model, images=[*flipped[:4], moved, *flipped[5:]])))
     assert 0.1 < inspection.facts.points.behind < 0.9

@@ -36,7 +36,7 @@ def test_pixels_that_settled_have_the_bits_of_all_rounds(lens):
     found = goal
     with np.errstate(all="ignore"):
         for _ in range(MAX_ROUNDS):
-            found = lens_room._nearer(MODELS[lens.model][1], rest, found, goal)
+            found = lens_room._newton_step(MODELS[lens.model][1], rest, found, goal)
     u, v = (one.ravel() for one in lens.undistort(x, y))
     good = np.isfinite(u)
     assert good.mean() > 0.5
