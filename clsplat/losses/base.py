@@ -1,4 +1,4 @@
-"""The base of losses and penalties: each adds to a gradient and returns its value, which is read on request."""
+"""Define the base classes of losses and penalties: each adds to a gradient, and returns its value lazily."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -19,11 +19,10 @@ from clsplat.render.workspace import Workspace
 
 @dataclass
 class Comparison:
-    """A rendered image beside its photograph, float planes [3, rows, stride], and the gradient that losses add to.
+    """A render and its photograph, float planes [3, rows, stride], and the gradient that losses add to.
 
-    Image and gradient have a fourth plane, such as the entropy of blend weights, where a loss reads it.
-
-    Losses are means over the whole image, masked or not, so that a threshold means the same with and without a mask.
+    Image and gradient have a fourth plane, such as the entropy of blend weights, if a loss reads it.  Losses are means
+    over the whole image, masked or not, so that thresholds mean the same with and without a mask.
     """
 
     workspace: Workspace
@@ -34,7 +33,7 @@ class Comparison:
     mask: Array | None = None  # [1, rows, stride] 0 or 1
     step: int = 0  # global; schedules are taken at it
     accumulate: bool = False  # False: the next loss overwrites the gradient
-    depths: KnownDepths | None = None  # at pixels of the photograph, where a loss reads them
+    depths: KnownDepths | None = None  # at pixels of the photograph, if a loss reads them
 
     @property
     def values(self) -> int:
@@ -43,7 +42,7 @@ class Comparison:
 
     @property
     def counted(self) -> int:
-        """Number of values in pixels that count; waits for the device when there is a mask."""
+        """Number of values in pixels that count; waits for the device if there is a mask."""
         return self.values if self.mask is None else 3 * int(self.mask.get().sum())
 
 
@@ -56,7 +55,7 @@ class LossValue:
 
 
 def returned(loss: "Loss", value: object) -> LossValue:
-    """Return what the `add` of a loss returned.  Raises ConfigError when that is no LossValue."""
+    """Return the result of a loss's `add`.  Raises ConfigError if it is not a LossValue."""
     if not isinstance(value, LossValue):
         raise ConfigError(
             f"the loss {type(loss).__name__}: expected a LossValue from 'add', got {type(value).__name__}"
@@ -71,11 +70,11 @@ class ViewLosses:
     frame: Frame
     comparison: Comparison
     losses: list[LossValue]
-    step: Any = field(default=None, kw_only=True)  # the Step of a trainer that it is of
+    step: Any = field(default=None, kw_only=True)  # the TrainingStep
 
     @property
     def loss(self) -> float:
-        """The sum of the losses; waits for the device.  Those of penalties are among them after an update."""
+        """The sum of the losses, including penalties after an update; waits for the device."""
         return sum(loss.value() for loss in self.losses)
 
 
@@ -87,24 +86,24 @@ class ViewGradients(ViewLosses):
 
 
 class Loss(Settings):
-    """A summand of the objective, which training minimizes."""
+    """A term of the objective."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
 
     weight: Schedule = 1.0
-    """Factor of the loss; by step."""
+    """Weight of the loss; by step."""
 
 
 class ImageLoss(Loss):
-    """A loss that compares the rendered image with the photograph."""
+    """A loss on the rendered image."""
 
     symmetric: ClassVar[bool] = False
-    """Whether it has the same value with image and photograph exchanged; the module `haar` needs that."""
+    """Whether the value stays the same if image and photograph are exchanged, as the module `haar` requires."""
     reads_photograph: ClassVar[bool] = True
-    """Whether it compares; one that does not needs no symmetry, and is no loss to train on alone."""
+    """Whether it compares the image with the photograph; training needs at least one loss that does."""
 
     def reads(self, step: int) -> Content:
-        """Return what it reads of the image at a global step: colors, or a fourth plane, which then exists."""
+        """Return what it reads of the image at a global step: only colors, or also a fourth plane."""
         return "color"
 
     @abstractmethod
@@ -128,7 +127,7 @@ class PenaltyInputs:
         return -(-self.gaussians.count // int(self.gaussians.device.tuning["LANES"]))
 
     def sums(self, name: str) -> Array:
-        """Return an array for the sum of each item, [items]; `name` must be unique among the penalties of a step."""
+        """Return an array for the sums of work-items, [items].  name: unique among the penalties of a step."""
         return self.workspace.array(f"{name} sums", self.items)
 
     def arguments(self, parameter: str) -> dict[str, Any]:
@@ -147,7 +146,7 @@ class Penalty(Loss):
 
     @property
     def tables(self) -> set[str]:
-        """Tables of the Gaussians that the penalty reads beside the parameters."""
+        """Tables of the Gaussians that the penalty reads in addition to the parameters."""
         return set()
 
     @abstractmethod
@@ -158,7 +157,7 @@ class Penalty(Loss):
 def content_of(losses: Sequence[Loss], step: int) -> Content:
     """Return what losses read of the image at a global step.
 
-    Raises ConfigError for what is neither an ImageLoss nor a Penalty, and where two fourth planes are read.
+    Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, and for two different fourth planes.
     """
     for loss in losses:
         if not isinstance(loss, ImageLoss | Penalty):
@@ -166,6 +165,6 @@ def content_of(losses: Sequence[Loss], step: int) -> Content:
     planes = {loss.reads(step) for loss in losses if isinstance(loss, ImageLoss)} - {"color"}
     if len(planes) > 1:
         raise ConfigError(
-            f"losses read {' and '.join(sorted(planes))} of an image; expected one of them: leave one out"
+            f"losses read {' and '.join(sorted(planes))} of an image, but only one of them is possible; remove one"
         )
     return planes.pop() if planes else "color"

@@ -1,4 +1,4 @@
-"""Depths that are known: what a pixel's splats show of them, against what structure from motion has found."""
+"""Supervise depths by points of structure from motion, or by depth maps."""
 
 from typing import ClassVar, Literal
 
@@ -12,19 +12,19 @@ from clsplat.render.rasterizer import Content
 
 
 class InverseDepth(ImageLoss):
-    """Mean over a photograph's points of q |D - 1/z|, times the scene's extent: D = Σ w / z is the blended inverse
-    depth of the pixel that a point falls on, z the point's depth.
+    """Mean over a photograph's points of q |D - 1/z|, times the scene's extent, where z is the depth of a point and D =
+    Σ w / z the blended inverse depth of its pixel.
 
-    q is 1 for points that four photographs show, and less for others.  It is 0 in a photograph that shows the point a
-    pixel or more from where its camera does, at the size of training, where the dataset tells that.  D counts nothing
-    behind the splats, so that they also become opaque where a point is.  A weight of 0.02 that falls to 0 over the
-    first half of the steps is ours.  It needs points with tracks, as those of COLMAP; no poses are learned with it.
+    q is 1 for points in at least four photographs, less for others, and 0 in photographs with a reprojection error of a
+    pixel or more at training size, if the dataset has it.  Nothing behind the splats adds to D, so that splats also
+    become opaque at points.  We use a weight of 0.02 that falls to 0 over the first half of the steps.  The loss needs
+    points with tracks, as in COLMAP models, and does not optimize poses.
     """
 
     type: Literal["inverse_depth"] = "inverse_depth"
     folder: InputPath | None = None
-    """Folder of depth maps, one for each photograph: `a.png` for a.jpg, 8 or 16 bits, bright is near, linear in 1/z.
-    Each is fitted to the points of its photograph, and compared with in their place; without it, the points alone."""
+    """Folder of depth maps, one per photograph: `a.png` for a.jpg, 8 or 16 bits, bright is near, linear in 1/z.
+    Each is fitted to the points of its photograph and used instead of them.  Default: only points."""
     reads_photograph: ClassVar[bool] = False
 
     def reads(self, step: int) -> Content:
@@ -36,7 +36,7 @@ class InverseDepth(ImageLoss):
             return LossValue("inverse_depth", lambda: 0.0)
         if len(comparison.image.shape) != 3 or comparison.image.shape[0] < 4:
             raise ConfigError(
-                "the loss inverse_depth needs a frame whose content is 'inverse_depth'; the trainer makes one"
+                "the loss inverse_depth needs a frame with the content 'inverse_depth', as the trainer renders it"
             )
         count = known.pixels.shape[0]
         scale = weight * known.extent / count

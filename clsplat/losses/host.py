@@ -1,4 +1,4 @@
-"""A loss in NumPy, for those who try one."""
+"""Wrap a NumPy function as a loss, for experiments."""
 
 import math
 from collections.abc import Callable
@@ -16,16 +16,16 @@ HostFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[float,
 
 
 class HostLoss(ImageLoss):
-    """A loss in NumPy: `function(image, photograph)` returns its value and its derivative by the image.
+    """A loss in NumPy: `function(image, photograph)` returns its value and its gradient by the image.
 
-    Arrays are [height, width, 3] float32.  Each step copies both images to the host and the derivative back.
+    Arrays are [height, width, 3] float32.  Each step copies both images to the host and the gradient back.
     """
 
     weight: NonNegative = 1.0
     _function: HostFunction = PrivateAttr()
 
     def __init__(self, function: HostFunction, weight: Schedule = 1.0) -> None:
-        """Raise ConfigError for a weight that is no schedule of numbers from 0 on."""
+        """Raise ConfigError for a weight that is not a schedule of nonnegative numbers."""
         try:
             super().__init__(weight=weight.item() if isinstance(weight, np.generic) else weight)
         except ValidationError as error:
@@ -58,14 +58,14 @@ class HostLoss(ImageLoss):
         return LossValue(self.name, lambda: weight * value)
 
     def _call(self, image: NDArray[np.float32], photograph: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
-        """Value and derivative.  Raises ValueError where the function returns no such pair."""
-        found: Any = self._function(image, photograph)
+        """Return value and gradient.  Raises ValueError if the function returns anything else."""
+        result: Any = self._function(image, photograph)
         try:
-            value, derivative = found
+            value, derivative = result
             value, derivative = float(value), np.asarray(derivative, np.float32)
         except (TypeError, ValueError):
             raise ValueError(
-                f"the loss '{self.name}' returned {quote(found)}; expected (value, derivative by the image)"
+                f"the loss '{self.name}' returned {quote(result)}; expected (value, derivative by the image)"
             ) from None
         if derivative.shape != image.shape:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Photometric losses: L1, L2 and D-SSIM of the rendered image and the photograph."""
+"""Define photometric losses, L1, L2 and D-SSIM, and the entropy of blend weights."""
 
 import math
 from typing import ClassVar, Literal
@@ -92,11 +92,7 @@ def psnr(comparison: Comparison) -> float:
 
 
 def view_error(comparison: Comparison) -> Array:
-    """Return the sum over pixels of |gradient (x - y)|, [1]: how far the image is from the photograph, as the
-    losses see it.
-
-    The gradient is that of all image losses, by the image.
-    """
+    """Return the sum over pixels of |gradient (x - y)|, [1], the error of the image as the losses weight it."""
     camera, workspace = comparison.camera, comparison.workspace
     rows, error = workspace.array("row_errors", (3, camera.rows)), workspace.array("view_error", 1)
     program = workspace.device.program("loss.cl")
@@ -115,13 +111,13 @@ def view_error(comparison: Comparison) -> Array:
 def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
     """Return the derivatives of the SSIM map [3, 3, rows, stride] and the map's sums [3, height, blocks].
 
-    Raises DataError for pictures of more than SSIM_PIXELS_MAX pixels, in whole tiles.
+    Raises DataError for images of more than SSIM_PIXELS_MAX pixels, in whole tiles.
     """
     camera, array = comparison.camera, comparison.workspace.array
     if camera.rows * camera.stride > SSIM_PIXELS_MAX:
         raise DataError(
-            f"SSIM of a picture of {camera.width}x{camera.height} pixels; expected at most {SSIM_PIXELS_MAX:,}: "
-            "downscale the image"
+            f"an image of {camera.width}x{camera.height} pixels is too large for SSIM, at most {SSIM_PIXELS_MAX:,}; "
+            "downscale it"
         )
     blocks = -(-camera.stride // SSIM_BLOCK)
     maps = array("ssim_maps", (3, 3, camera.rows, camera.stride))
@@ -137,14 +133,14 @@ def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
     return maps, sums
 
 
-# The entropy of blend weights: a pressure on pixels to be made of few Gaussians.
+# The entropy of blend weights, which encourages few Gaussians per pixel.
 
 
 class WeightEntropy(ImageLoss):
-    """Mean over pixels of -Σ w ln w - T ln T, w = alpha T the weights of a pixel's splats and T what they leave.
+    """Mean over pixels of -Σ w ln w - T ln T, with the blend weights w of a pixel and the final transmittance T.
 
-    It makes lists of splats shorter (Liu and Han 2026, with the weight 0.015), and opacities sharper.  Pixels that a
-    mask leaves out do not count.
+    It shortens the lists of splats per tile (Liu and Han 2026, with a weight of 0.015) and sharpens opacities.  Masked
+    pixels do not count.
     """
 
     type: Literal["weight_entropy"] = "weight_entropy"
@@ -156,7 +152,9 @@ class WeightEntropy(ImageLoss):
     def add(self, comparison: Comparison) -> LossValue:
         camera, weight = comparison.camera, at_step(self.weight, comparison.step)
         if len(comparison.image.shape) != 3 or comparison.image.shape[0] < 4:
-            raise ConfigError("the loss weight_entropy needs a frame whose content is 'entropy'; the trainer makes one")
+            raise ConfigError(
+                "the loss weight_entropy needs a frame with the content 'entropy', as the trainer renders it"
+            )
         scale = weight / (camera.width * camera.height)
         sums = comparison.workspace.array("entropy_sums", camera.rows)
         comparison.workspace.device.program("loss.cl").weight_entropy(

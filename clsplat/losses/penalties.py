@@ -1,7 +1,4 @@
-"""Penalties on the sizes, shapes and opacities of Gaussians: each adds to the gradient of its parameter.
-
-The trace of the covariance bounds the size of a Gaussian, not its anisotropy, which has a penalty of its own.
-"""
+"""Define penalties on the sizes, shapes and opacities of Gaussians."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal
@@ -18,15 +15,15 @@ from clsplat.render.filters import AT_REST
 class CovarianceTrace(Penalty):
     """Mean over Gaussians of max(tr Σ - τ, 0), in extents² (Micro-splatting, Lee et al. 2025).
 
-    τ is `above`, or, with `pixels`, 3 s², where s is the length of so many pixels at the nearest training view at the
-    last edit.
+    τ is `above`, or, with `pixels`, 3 s², where s is the length of that many pixels in the nearest training view, as of
+    the last edit.
     """
 
     type: Literal["covariance_trace"] = "covariance_trace"
     above: Annotated[float, Field(ge=0)] = 3.0e-4
-    """τ in extents²; the default is a standard deviation of 1 % of the extent along each axis."""
+    """τ, extents²; the default is a standard deviation of 1% of the extent along each axis."""
     pixels: Annotated[float, Field(gt=0)] | None = None
-    """s in px of the nearest training view; replaces `above`."""
+    """s, px of the nearest training view; replaces `above`."""
 
     @property
     def tables(self) -> set[str]:

@@ -1,4 +1,4 @@
-"""PSNR and SSIM of two images as in papers: 8 bits a channel, SSIM with an 11 x 11 Gaussian window."""
+"""Compute PSNR and SSIM of two images as in papers: 8 bits per channel, SSIM with an 11 x 11 Gaussian window."""
 
 import math
 
@@ -12,9 +12,9 @@ Mask = NDArray[np.bool_]
 
 
 def to_8_bits(image: NDArray[np.generic]) -> Image:
-    """Return an image with values in [0, 1] as 8 bits: clamped, rounded to the nearest; uint8 stays as it is.
+    """Convert an image with values in [0, 1] to 8 bits: clamp and round to nearest; uint8 is returned unchanged.
 
-    Raises ValueError for other values, such as integers of 16 bits.
+    Raises ValueError for other types, such as 16-bit integers.
     """
     if image.dtype == np.uint8:
         return image.astype(np.uint8, copy=False)
@@ -27,7 +27,7 @@ def psnr(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask
     """Return the peak signal-to-noise ratio in dB over all channels of the pixels that count.
 
     image, photograph: [height, width, 3], uint8, or floats in [0, 1] that are rounded to 8 bits; mask: [height, width].
-    Raises ValueError for other values, for shapes that differ, and where no pixel counts.
+    Raises ValueError for other types, for different shapes, and if no pixel counts.
     """
     image, photograph = _checked(image, photograph, mask)
     squared = (image.astype(np.float64) - photograph) ** 2
@@ -38,14 +38,14 @@ def psnr(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask
 def ssim(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask | None = None) -> float:
     """Return the structural similarity (Wang et al. 2004), the mean over the pixels that count.
 
-    Arguments and errors are those of psnr.
+    Arguments and errors are as in `psnr`.
     """
     similarity = ssim_map(*_checked(image, photograph, mask))
     return float((similarity if mask is None else similarity[mask]).mean())
 
 
 def _checked(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask | None) -> tuple[Image, Image]:
-    """Two images as 8 bits.  Raises ValueError where they cannot be compared."""
+    """Return both images as 8 bits.  Raises ValueError if they cannot be compared."""
     shape = image.shape
     if shape != photograph.shape or len(shape) != 3 or shape[2] != 3 or image.size == 0:
         raise ValueError(

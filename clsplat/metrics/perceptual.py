@@ -1,4 +1,4 @@
-"""Perceptual metrics of 8-bit images, on the host: MS-SSIM, FLIP and LPIPS."""
+"""Compute perceptual metrics of 8-bit images on the host: MS-SSIM, FLIP and LPIPS."""
 
 import hashlib
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.reading import read_file
 
-# LPIPS with a network in a local ONNX file, on OpenCV's DNN module: without downloads and without torch.
+# LPIPS with a network in a local ONNX file, by OpenCV's DNN module, without downloads or torch.
 
 InputRange = Literal["-1..1", "0..1"]
 INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
@@ -60,7 +60,7 @@ class Lpips:
         return float(output.ravel()[0])
 
     def origin(self) -> dict[str, str]:
-        """Return input range and network: figures are comparable only where both are equal."""
+        """Return input range and network; only values with the same of both are comparable."""
         return {"lpips_input": self.inputs, "lpips_model": f"{self.path.name} sha256:{self.digest[:16]}"}
 
     def _planes(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -69,7 +69,7 @@ class Lpips:
 
 
 def _short(error: cv2.error) -> str:
-    """The last line of OpenCV's message, without file and line."""
+    """Return the last line of OpenCV's message."""
     return (error.err or str(error)).strip().splitlines()[-1][:120]
 
 
@@ -85,21 +85,21 @@ C1, C2 = 0.01**2, 0.03**2
 
 @dataclass(frozen=True)
 class Perceptual:
-    """The metrics beside PSNR and SSIM."""
+    """The metrics in addition to PSNR and SSIM."""
 
     names: tuple[Metric, ...] = ()
     lpips: Lpips | None = None
 
     @classmethod
     def open(cls, names: Sequence[Metric], lpips: str | Path | None, lpips_input: InputRange) -> "Perceptual":
-        """Load what the metrics need.  Raises ConfigError for a missing package, DataError for a missing network."""
+        """Load the metrics.  Raises ConfigError for a missing package, DataError for a missing network."""
         chosen = tuple(name for name in METRICS[2:] if name in names)
         if "flip" in chosen:
             _flip_package()
         return cls(chosen, Lpips(Path(lpips), lpips_input) if lpips is not None else None)
 
     def measure(self, image: Image, photograph: Image) -> dict[str, float | None]:
-        """Return the figures of one view, by name.  image, photograph: [height, width, 3]."""
+        """Return the values of one view, by name.  image, photograph: [height, width, 3]."""
         values: dict[str, float | None] = {}
         if "ms_ssim" in self.names:
             values["ms_ssim"] = ms_ssim(image, photograph)
@@ -111,7 +111,7 @@ class Perceptual:
         return values
 
     def mean(self, views: Sequence[dict[str, float | None]]) -> dict[str, Any]:
-        """Return averages over views with the keys of metrics.json, and the reason for each missing figure."""
+        """Return means over views with the keys of metrics.json, and the reason for each missing value."""
         averages: dict[str, Any] = {name: _mean(views, name) for name in self.names}
         if "ms_ssim" in self.names:
             averages["ms_ssim_scales"] = min(int(view["ms_ssim_scales"] or 0) for view in views)
@@ -144,10 +144,10 @@ def ms_ssim(image: Image, photograph: Image) -> float | None:
     """Return the multi-scale structural similarity (Wang, Simoncelli and Bovik 2003), in double precision.
 
     For each channel, the product over scales of the mean contrast-structure factor, at the coarsest scale times the
-    luminance factor, to the power of the scale's weight; then the mean of the channels.  A scale is the one before,
-    averaged over 2 x 2 pixels and halved.  Means are over the pixels whose 11 x 11 Gaussian window lies inside the
-    image; a negative mean counts as 0.  An image with a side below 176 px has room for fewer scales: the weights of
-    those that fit are divided by their sum.  None when not even one fits.
+    luminance factor, to the power of the scale's weight; then the mean of the channels.  Each scale is
+    the one before, averaged over 2 x 2 pixels.  Means are over the pixels whose 11 x 11 Gaussian window is inside the
+    image; a negative mean counts as 0.  Images with a side below 176 px have fewer scales, whose weights are
+    renormalized.  Returns None if not even one scale fits.
     """
     scales = ms_ssim_scales(image)
     if scales == 0:
@@ -165,7 +165,7 @@ def ms_ssim(image: Image, photograph: Image) -> float | None:
 
 
 def _halved(image: Floats) -> Floats:
-    """Averages of 2 x 2 pixels; an odd last row or column is left out."""
+    """Average 2 x 2 pixels; an odd last row or column is dropped."""
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     even = image[:height, :width]
     mean: Floats = (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
@@ -180,7 +180,7 @@ def ssim_map(image: Image, photograph: Image) -> Floats:
 
 
 def _ssim_factors(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Luminance and contrast-structure of every pixel with a whole window (Wang et al. 2004)."""
+    """Return luminance and contrast-structure of every pixel with a full window (Wang et al. 2004)."""
     mx, my = _window_mean(x), _window_mean(y)
     variances = _window_mean(x * x) - mx * mx + _window_mean(y * y) - my * my
     covariance = _window_mean(x * y) - mx * my

@@ -1,4 +1,4 @@
-"""The metrics of a model at the views of a scene, and their means."""
+"""Measure a model at the views of a scene, and average the metrics."""
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,17 +22,17 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.times import camera_key, distinct_times, group_by_camera
 from clsplat.scene.view import View, load_mask
 
-# What should not move, measured: PSNR of the static pixels of a scene that moves, and how much its pictures flicker.
+# Static parts of a dynamic scene: PSNR of static pixels, and flicker.
 
-STILL = 3.0  # levels of standard deviation: the noise of a camera; what moves through a pixel gives more
-MOST_CAMERAS = 8  # whose sums are held, 48 bytes a pixel each
-LEAST_MOMENTS = 2
+STILL = 3.0  # levels of standard deviation: camera noise; motion gives more
+MAX_CAMERAS = 8  # whose sums are held, 48 bytes per pixel each
+MIN_TIMESTAMPS = 2
 FLICKER, OF_PHOTOGRAPHS, STATIC, SHARE = "flicker", "flicker_photographs", "psnr_static", "static_share"
 
 
 @dataclass
 class Spread:
-    """Sums over the moments of one camera, exact in whole numbers, in whatever order they come."""
+    """Sums over the timestamps of one camera, in integers, so that order does not matter."""
 
     count: int = 0
     total: NDArray[np.uint32] = field(default_factory=lambda: np.zeros((), np.uint32))  # [H, W, 3]
@@ -45,7 +45,7 @@ class Spread:
         self.total, self.squares = self.total + values, self.squares + values * values
 
     def deviation(self) -> NDArray[np.float64]:
-        """Return the standard deviation over the moments, [H, W, 3], levels."""
+        """Return the standard deviation over timestamps, [H, W, 3], levels."""
         mean = self.total / self.count
         return np.asarray(np.sqrt(np.maximum(self.squares / self.count - mean * mean, 0)))
 
@@ -57,20 +57,17 @@ class Station:
     views: list[str] = field(default_factory=list)
     renders: Spread = field(default_factory=Spread)
     photographs: Spread = field(default_factory=Spread)
-    counted: Mask | None = None  # static by the file, and counted by the masks of all moments
-    told: bool = False  # whether a file says what is static
+    counted: Mask | None = None  # static by the file, and counted by the masks of all timestamps
+    has_static_file: bool = False
 
 
 class Stillness:
-    """Gathers the views of a measurement, camera by camera.
-
-    Of a camera that shows one moment, as of one that moves, nothing is held.
-    """
+    """Gathers the views of a measurement by camera; cameras with one timestamp, or that move, are ignored."""
 
     def __init__(self, views: Sequence[View]) -> None:
-        """views: all that are to be added, in any order."""
-        cameras = [group for group in group_by_camera(views) if len(distinct_times(group)) >= LEAST_MOMENTS]
-        self._stations = {camera_key(group[0]): Station() for group in cameras[:MOST_CAMERAS]}
+        """views: all views that will be added, in any order."""
+        cameras = [group for group in group_by_camera(views) if len(distinct_times(group)) >= MIN_TIMESTAMPS]
+        self._stations = {camera_key(group[0]): Station() for group in cameras[:MAX_CAMERAS]}
 
     @property
     def held(self) -> int:
@@ -78,7 +75,7 @@ class Stillness:
         return len(self._stations)
 
     def add(self, view: View, rendered: Image, photograph: Image, counted: Mask | None) -> dict[str, float]:
-        """Take a view's 8-bit images, [H, W, 3]; return its PSNR of static pixels where a file says which these are."""
+        """Add a view's 8-bit images, [H, W, 3]; return its PSNR of static pixels, if a file marks them."""
         still = static_pixels(view)
         known = still if counted is None else counted if still is None else still & counted
         if view.time is not None:
@@ -87,62 +84,61 @@ class Stillness:
             return {}
         return {STATIC: psnr(rendered, photograph, known)}
 
-    def _gather(self, view: View, rendered: Image, photograph: Image, known: Mask | None, told: bool) -> None:
+    def _gather(self, view: View, rendered: Image, photograph: Image, known: Mask | None, has_file: bool) -> None:
         if (station := self._stations.get(camera_key(view))) is None:
             return
         station.views.append(view.name)
         station.renders.add(rendered)
         station.photographs.add(photograph)
-        station.told |= told
+        station.has_static_file |= has_file
         if known is not None:
             station.counted = known if station.counted is None else station.counted & known
 
     def figures(self) -> dict[str, dict[str, float]]:
-        """Return the flicker of each view's camera by the name of the view; none of cameras with one moment."""
-        found = dict[str, dict[str, float]]()
+        """Return the flicker of each view's camera by the name of the view; none for cameras with one timestamp."""
+        figures = dict[str, dict[str, float]]()
         for station in self._stations.values():
-            if station.renders.count < LEAST_MOMENTS:
+            if station.renders.count < MIN_TIMESTAMPS:
                 continue
             shown, taken = station.renders.deviation(), station.photographs.deviation()
             still = np.ones(shown.shape[:2], bool) if station.counted is None else station.counted
-            if not station.told:
+            if not station.has_static_file:
                 still = still & (taken.max(axis=2) <= STILL)
             if still.any():
-                one = {FLICKER: float(shown[still].mean()), OF_PHOTOGRAPHS: float(taken[still].mean())}
-                found |= {name: {**one, SHARE: float(still.mean())} for name in station.views}
-        return found
+                values = {FLICKER: float(shown[still].mean()), OF_PHOTOGRAPHS: float(taken[still].mean())}
+                figures |= {name: {**values, SHARE: float(still.mean())} for name in station.views}
+        return figures
 
 
 def static_pixels(view: View) -> Mask | None:
-    """Return which pixels of a view show nothing that moves, [H, W]; None where no file says that."""
+    """Return which pixels of a view are static, [H, W]; None if no file says so."""
     if view.static_path is None:
         return None
     return load_mask(replace(view, mask_path=view.static_path, alpha="transparency"))
 
 
 def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Return the mean of each figure over the views that have it, in the order in which the figures came."""
+    """Return the mean of each metric over the views that have it, in order of appearance."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     return {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
 
 
-# PSNR of a rendered image in the colors of its photograph, which no training has seen.
+# PSNR of a render after a color transform fitted to its photograph.
 
-GUESSED = 1.0  # dB by which figures in the photographs' colors are better, from which on the log says why
-
-LEAST = 1e-3  # slope of a regression, below which there is nothing to divide by
-# Usable pixels for each number that is fitted to a channel: p numbers of n independent errors add p / n of their
-# variance to what is measured elsewhere, here 1 / 64, which is 0.07 dB.
+NOTABLE_GAIN = 1.0  # dB by which a color transform must raise PSNR for the log to say why
+MIN_SLOPE = 1e-3  # of a regression that is divided by
+# Usable pixels per fitted parameter: p parameters fitted to n independent errors add p / n of their variance to the
+# error elsewhere, here 1 / 64, which is 0.07 dB.
 PIXELS = 64
 
 
 class Fitted(Protocol):
-    """Colors of photographs that can be fitted to one."""
+    """A color model that can be fitted to a photograph."""
 
-    fitted_to_a_channel: ClassVar[int]  # numbers that `fitted` finds for each of red, green and blue
+    fitted_to_a_channel: ClassVar[int]  # parameters per channel that `fitted` fits
 
     def fitted(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the matrix, [3, 4], that brings an image nearest to a photograph, pixels [M, 3]."""
+        """Return the matrix, [3, 4], that fits an image to a photograph, pixels [M, 3]."""
 
 
 class Gains:
@@ -151,8 +147,7 @@ class Gains:
     fitted_to_a_channel: ClassVar[int] = 1
 
     def fitted(self, image: NDArray[np.float64], photograph: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the matrix, [3, 4], of the gains that bring an image nearest to a photograph by least squares, pixels
-        [M, 3]."""
+        """Return the matrix, [3, 4], of the gains that fit an image to a photograph by least squares, pixels [M, 3]."""
         squares, products = (image * image).sum(axis=0), (image * photograph).sum(axis=0)
         gains = np.where((squares > 0) & (products > 0), products / np.where(squares > 0, squares, 1), 1.0)
         return np.column_stack([np.diag(gains), np.zeros(3)])
@@ -161,10 +156,10 @@ class Gains:
 def color_figures(
     image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: Fitted
 ) -> dict[str, float]:
-    """Return `psnr_color` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
+    """Return `psnr_color` and `psnr_affine`, dB, of a render and a photograph, [height, width, 3].
 
-    mask: pixels that count, [height, width].  Without `psnr_color` where a half has too few pixels to fit colors to.
-    Of the image NaN counts as black, and what is infinite as white or black.
+    mask: pixels that count, [height, width].  `psnr_color` is missing if a half has too few pixels for the fit.  NaN in
+    the render counts as black, infinity as white or black.
     """
     truth, finite = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
     counted = np.ones(truth.shape[:2], bool) if mask is None else mask
@@ -175,10 +170,10 @@ def color_figures(
 
 
 def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
-    """Return the averages over views of what color_figures returned, with the keys of metrics.json.
+    """Average the results of color_figures over views, with the keys of metrics.json.
 
-    Where views have no `psnr_color`, `psnr_color_views` is the number of those that have, and `psnr_color_reason`
-    says why; where none has, it is None.
+    If some views have no `psnr_color`, `psnr_color_views` counts those that do, and `psnr_color_reason` says why; if
+    none has, `psnr_color` is None.
     """
     found, has = means(rows), [row for row in rows if "psnr_color" in row]
     if not found or len(has) == len(rows):
@@ -190,22 +185,21 @@ def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
 def in_colors_of(
     image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: Fitted
 ) -> NDArray[np.float64] | None:
-    """Return the image with each half, left and right, in the colors that the other half of the photograph asks for.
+    """Transform each half of the image, left and right, by the colors fitted on the other half.
 
-    Pixels that are black or white in the photograph say nothing of its colors.  None where a half has fewer than
-    PIXELS others for each number that is fitted to a channel: that depends on the photograph and the mask alone, so
-    that models are compared on the same views.  Those beyond white in the image are left out of the fit where enough
-    others are left; else all count.
+    Pixels that are black or white in the photograph are not used for the fit.  Returns None if a half has fewer than
+    PIXELS others per fitted parameter; this depends only on the photograph and the mask, so that models are compared on
+    the same views.  Pixels beyond white in the image are not used either, if enough others remain.
     """
     usable = counted & ((photograph > 0) & (photograph < 255)).all(axis=2)
     middle, truth, changed = image.shape[1] // 2, photograph / 255.0, image.copy()
     left, right = np.s_[:, :middle], np.s_[:, middle:]
-    fewest = PIXELS * model.fitted_to_a_channel
-    if min(np.count_nonzero(usable[half]) for half in (left, right)) < fewest:
+    min_pixels = PIXELS * model.fitted_to_a_channel
+    if min(np.count_nonzero(usable[half]) for half in (left, right)) < min_pixels:
         return None
     for half, other in ((left, right), (right, left)):
         below = usable[other] & (image[other] < 1).all(axis=2)
-        fitted_to = below if np.count_nonzero(below) >= fewest else usable[other]
+        fitted_to = below if np.count_nonzero(below) >= min_pixels else usable[other]
         matrix = model.fitted(image[other][fitted_to], truth[other][fitted_to])
         changed[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
     return changed
@@ -214,22 +208,22 @@ def in_colors_of(
 def corrected_by_regression(
     image: NDArray[np.float64], truth: NDArray[np.float64], counted: Mask
 ) -> NDArray[np.float64]:
-    """Return (image - b) / a of each channel, where a truth + b is nearest to the image (gsplat).
+    """Return (image - b) / a of each channel, where a truth + b is fitted to the image (gsplat).
 
-    Regressing the image on the photograph divides by a slope that noise makes too small: no least-squares correction.
+    Noise makes the slope `a` too small, so this is not the least-squares correction of the image.
     """
     corrected = image.copy()
     for channel in range(3):
         x, y = truth[..., channel][counted], image[..., channel][counted]
         variance = float(np.mean((x - x.mean()) ** 2))
         slope = float(np.mean((x - x.mean()) * (y - y.mean()))) / variance if variance > 0 else 1.0
-        if abs(slope) > LEAST:
+        if abs(slope) > MIN_SLOPE:
             corrected[..., channel] = (image[..., channel] - (y.mean() - slope * x.mean())) / slope
     return np.clip(corrected, 0, 1)
 
 
-def tell_of_colors(averages: dict[str, Any]) -> None:
-    """Log the figures of a split in the photographs' colors, where there are any."""
+def log_color_figures(averages: dict[str, Any]) -> None:
+    """Log the metrics of a split after color fitting, if there are any."""
     if "psnr_color" not in averages:
         return
     figure, reason = averages["psnr_color"], averages.get("psnr_color_reason")
@@ -241,20 +235,20 @@ def tell_of_colors(averages: dict[str, Any]) -> None:
             *(figure, pluralize(averages["psnr_color_views"], "view"), reason),
         )
     else:
-        differ = figure - averages["psnr"] > GUESSED
+        differ = figure - averages["psnr"] > NOTABLE_GAIN
         why = "; exposures of these photographs differ, which PSNR counts as errors" if differ else ""
         LOG.info("in the photographs' colors: PSNR %.2f dB%s", figure, why)
 
 
-# PSNR of a scene that moves, apart for moments that training has seen and for those that it has not.
+# PSNR of a dynamic scene, separately for timestamps in and not in the training views.
 
 HELD_OUT, OTHERS = "psnr_held_out_moments", "psnr_other_moments"
 
 
 def by_moment(psnr: Mapping[str, float], views: Sequence[View], trained: Sequence[View]) -> dict[str, dict[str, float]]:
-    """Return the PSNR of views, dB, by their names, once more by whether the moment is one of the views trained on.
+    """Return the PSNR of views, dB, by name, keyed by whether their timestamp is one of the training views.
 
-    There is none where only one of both kinds is there, as where nothing moves.
+    Empty if all views are of one kind, as in static scenes.
     """
     known, times = set(distinct_times(trained)), {view.name: view.time for view in views}
     kinds = {name: OTHERS if time in known else HELD_OUT for name, time in times.items() if time is not None}
@@ -269,18 +263,18 @@ PSNR_AND_SSIM = Perceptual()
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """One view's figures."""
+    """The metrics of one view."""
 
     view: str
     psnr: float  # dB
     ssim: float
     perceptual: dict[str, float | None] = field(default_factory=dict)
-    colors: dict[str, float] = field(default_factory=dict)  # dB, by name, where photographs have colors of their own
-    still: dict[str, float] = field(default_factory=dict)  # of static pixels, where the scene moves
-    moments: dict[str, float] = field(default_factory=dict)  # dB, by whether the moment is held out
+    colors: dict[str, float] = field(default_factory=dict)  # dB, after color fitting
+    still: dict[str, float] = field(default_factory=dict)  # of static pixels, in dynamic scenes
+    moments: dict[str, float] = field(default_factory=dict)  # dB, by whether the timestamp is held out
 
     def line(self) -> dict[str, Any]:
-        """Return the figures as in a line of metrics.jsonl."""
+        """Return the metrics as a line of metrics.jsonl."""
         return {
             "view": self.view,
             "psnr": self.psnr,
@@ -293,28 +287,28 @@ class ViewMetrics:
 
 
 def render_view(painter: Painter, camera: DeviceCamera) -> Image:
-    """Render to 8 bits, [height, width, 3]: clamped to [0, 1], rounded to the nearest."""
+    """Render to 8 bits, [height, width, 3]: clamped to [0, 1] and rounded to nearest."""
     return to_8_bits(render_floats(painter, camera))
 
 
 def render_floats(painter: Painter, camera: DeviceCamera, response: Any = None) -> NDArray[np.float32]:
-    """Render to floats, [height, width, 3], as they are, or as a camera with that response takes them."""
-    picture = painter.paint(camera)
-    planes = (response(painter.workspace, camera, picture) if response else picture).get()
+    """Render to floats, [height, width, 3], not clamped.  response: the camera response to apply."""
+    image = painter.paint(camera)
+    planes = (response(painter.workspace, camera, image) if response else image).get()
     return np.ascontiguousarray(planes[:, : camera.height, : camera.width].transpose(1, 2, 0))
 
 
 def require_finite(image: NDArray[np.float32], view: View) -> None:
-    """Raise NumericError where a picture has values that are not finite."""
+    """Raise NumericError if a render has values that are not finite."""
     if not np.isfinite(image).all():
         raise NumericError(
-            f"view '{view.name}': its picture is not finite, since values of the model are too large for 32 bits; "
+            f"view '{view.name}': the render is not finite, since values of the model are too large for float32; "
             "export the model again, or train it with lower rates"
         )
 
 
 def device_ssim(workspace: Workspace, photograph: Photograph, image: Image) -> float:
-    """Return the SSIM of an 8-bit image, [height, width, 3], and the photograph, computed on the device."""
+    """Return the SSIM of an 8-bit image, [height, width, 3], and a photograph, computed on the device."""
     camera = photograph.camera
     pixels = workspace.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
     rendered = unpack(workspace, camera, pixels, 1 / 255, "rendered")
@@ -335,16 +329,15 @@ def measure(
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
-    Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.
-    colors: the photographs' in training, for figures in their colors beside PSNR; counted: the views, of somebody who
-    counts them; trained: the views that were trained on, for the figures of moments of a scene that moves.
-    With `finite`, NumericError is raised for a picture that is not finite, which counts as black otherwise.
+    Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.  finite: raise NumericError
+    for a render that is not finite, instead of counting it as black; colors: color model for `psnr_color`; counted: the
+    views wrapped by a progress counter; trained: the training views, for metrics by timestamp.
     """
     results, stillness = list[ViewMetrics](), Stillness(views)
     for view in views if counted is None else counted:
         photograph = photographs.get(view)
         if photograph.empty:
-            LOG.warning("%s: not measured, since its mask leaves out every pixel; look at the mask", view.name)
+            LOG.warning("%s: not measured, since its mask excludes every pixel; check the mask", view.name)
             continue
         floats = render_floats(painter, photograph.camera, view.response)
         if finite:
@@ -368,9 +361,9 @@ def measure(
 
 
 def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
-    """Return averages over views, with the keys of metrics.json."""
+    """Return means over views, with the keys of metrics.json."""
     if not results:
-        raise DataError("no view can be measured: the masks leave out every pixel; fix the masks")
+        raise DataError("no view can be measured, since the masks exclude every pixel; fix the masks")
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),

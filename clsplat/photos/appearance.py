@@ -1,4 +1,4 @@
-"""What is common to the colors of photographs, and tables of numbers with a row for each photograph."""
+"""Store parameters per photograph in a run's scalars, and update them by Adam."""
 
 import json
 import math
@@ -19,21 +19,21 @@ LUMINANCE = np.array([0.299, 0.587, 0.114])  # BT.601
 IDENTITY = np.eye(3, 4)
 MEANING = "a color c of the model, red, green and blue, is min(1, E c + b) in the photograph"
 
-# Adam on numbers by name, which lie in one dictionary with their moments, as a run keeps it in its checkpoints.
+# Adam on scalars in a dictionary, which also holds their moments, and is saved in checkpoints.
 
 ADAM = constants("adam.h")
 ByNumber = dict[str, float]
 
 
 def adam_step(scalars: dict[str, float], values: Mapping[str, float], gradients: ByNumber, rate: float) -> None:
-    """Change some numbers by Adam (Kingma and Ba 2015), as the parameters of the Gaussians are changed.
+    """Update scalars by Adam (Kingma and Ba 2015), with the constants of the Gaussians' Adam.
 
-    values: the numbers now, by name; beside each, `numbers` keeps NAME/updates, NAME/moment1 and NAME/moment2.
+    values: current values by name; `scalars` also holds NAME/updates, NAME/moment1 and NAME/moment2.
     """
     beta1, beta2 = ADAM["BETA1"], ADAM["BETA2"]
     for name, value in values.items():
-        names = [f"{name}/{kept}" for kept in ("updates", "moment1", "moment2")]
-        updates, moment1, moment2 = (scalars.get(kept, 0.0) for kept in names)
+        names = [f"{name}/{key}" for key in ("updates", "moment1", "moment2")]
+        updates, moment1, moment2 = (scalars.get(key, 0.0) for key in names)
         updates, gradient = updates + 1, gradients[name]
         moment1 = beta1 * moment1 + (1 - beta1) * gradient
         moment2 = beta2 * moment2 + (1 - beta2) * gradient**2
@@ -42,12 +42,12 @@ def adam_step(scalars: dict[str, float], values: Mapping[str, float], gradients:
         scalars |= dict(zip(names, (updates, moment1, moment2), strict=True))
 
 
-# A table of numbers with a row for each photograph, and Adam of its own: a step changes the row of its photograph.
+# A table with a row of parameters for each photograph; a step updates the row of its photograph.
 
 
 @dataclass(frozen=True)
 class ViewTable:
-    """The names of a table, of its rows, and of its columns; each number is 0 before the first step."""
+    """The layout of a table in a dictionary of scalars; all are 0 before the first step."""
 
     name: str
     views: tuple[str, ...]  # names of the training views, each once
@@ -55,7 +55,7 @@ class ViewTable:
     is_centered: bool = True  # whether the mean of each column over the views stays 0
 
     def keys(self, view: str) -> list[str]:
-        """Return the names of a row's numbers."""
+        """Return the keys of a row."""
         return [f"{self.name}/{view}/{column}" for column in self.columns]
 
     def row(self, scalars: Mapping[str, float], view: str) -> Floats:
@@ -63,25 +63,25 @@ class ViewTable:
         return np.array([scalars.get(key, 0.0) for key in self.keys(view)])
 
     def begun(self, scalars: Mapping[str, float]) -> bool:
-        """Whether the dictionary holds the table."""
+        """Return whether the dictionary holds the table."""
         return self.keys(self.views[0])[0] in scalars
 
     def begin(self, scalars: dict[str, float], rows: Mapping[str, Floats]) -> None:
-        """Set every row, to 0 where none is given, then `center`."""
+        """Set all rows, to 0 if not given, then `center`."""
         for view in self.views:
             values = rows.get(view, np.zeros(len(self.columns)))
             scalars.update(zip(self.keys(view), map(float, values), strict=True))
         self.center(scalars)
 
     def update(self, scalars: dict[str, float], view: str, gradient: Floats, rate: float) -> None:
-        """Change the row of a view by Adam, with a count of updates of its own, then `center` where it is centered."""
+        """Update the row of a view by Adam, with its own update count, then `center` a centered table."""
         values = {key: scalars.get(key, 0.0) for key in self.keys(view)}
         adam_step(scalars, values, dict(zip(values, map(float, gradient), strict=True)), rate)
         if self.is_centered:
             self.center(scalars)
 
     def center(self, scalars: dict[str, float]) -> None:
-        """Subtract from each column its mean over the views; the sum is exact, so that no order matters."""
+        """Subtract from each column its mean over the views; the sum is exact, so order does not matter."""
         for column in zip(*map(self.keys, self.views), strict=True):
             mean = math.fsum(scalars[key] for key in column) / len(column)
             for key in column:
@@ -93,9 +93,9 @@ class ViewTable:
         write_text(path, json.dumps({"photographs": named}, indent=1) + "\n")
 
     def read(self, path: Path) -> dict[str, Floats]:
-        """Return the rows of a side file by the name of a view; none where there is no file.
+        """Return the rows of a side file by the name of a view; empty without a file.
 
-        Raises DataError where it is damaged.
+        Raises DataError if it is damaged.
         """
         if not path.is_file():
             return {}
@@ -106,6 +106,6 @@ class ViewTable:
             rows = {"": np.array([np.nan])}
         if not all(np.isfinite(row).all() for row in rows.values()):
             raise DataError(
-                f"{path}: expected {len(self.columns)} finite numbers of each photograph; train again, or remove it"
+                f"{path}: expected {len(self.columns)} finite numbers for each photograph; train again, or remove it"
             )
         return rows

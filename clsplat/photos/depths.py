@@ -1,7 +1,8 @@
-"""Depth maps that other programs have made of the photographs: one image each, fitted to the points of the scene.
+"""Read depth maps of other programs, one image per photograph, and fit them to the points of the scene.
 
-A value is the inverse depth, bright is near, up to a factor and an offset of each map, as networks for single images
-give it.  Both come from the points that the photograph shows, by least absolute differences: some points are wrong.
+A value is an inverse depth, bright is near, up to a scale and an offset per map, as networks for monocular depth
+predict it.  Both are fitted to the points that the photograph shows, by least absolute differences, since some points
+are wrong.
 """
 
 import logging
@@ -23,12 +24,12 @@ from clsplat.scene.scene import Tracks
 
 LOG = logging.getLogger("clsplat")
 Floats = NDArray[np.floating]
-FEWEST = 10  # points of a photograph that a map is fitted to
-MOST = 32_768  # pixels of a map that are compared
+MIN_POINTS = 10  # per photograph, to fit a map
+MAX_PIXELS = 32_768  # of a map, used as supervision
 ROUNDS = 20
-EXACT = 1e-3  # of the points' own spread: smaller differences weigh no more
-TINY = 1e-12  # scene units⁻¹: points that are all as far
-FITS = 0.5  # of the points' own spread: a map that leaves more of it does not show these depths
+EXACT = 1e-3  # of the points' spread: smaller differences do not get larger weights
+TINY = 1e-12  # scene units⁻¹, if all points have the same depth
+MAX_RESIDUAL = 0.5  # of the points' spread; a map that leaves more does not fit
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,11 @@ class DepthMaps:
     folder: Path
 
     def require(self, names: Iterable[str]) -> None:
-        """Raise DataError where one of the photographs has no map."""
+        """Raise DataError if a photograph has no map."""
         for name in names:
             if not self._file(name).is_file():
                 raise DataError(
-                    f"{self._file(name)}: no such file; expected the depth map of {name}, or --set another folder"
+                    f"{self._file(name)}: the depth map of {name} is missing; add it, or --set another folder"
                 )
 
     def _file(self, name: str) -> Path:
@@ -62,27 +63,27 @@ class DepthMaps:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats] | None:
         """Return rows, columns and inverse depths at an even grid of pixels of a photograph of size (width, height).
 
-        rows, columns: [K] pixels that points show, with their inverse depths [K].  None, with a warning, where the map
-        does not fit to these.  Raises DataError as `read`.
+        rows, columns: [K] pixels of points, with their inverse depths [K].  Returns None, with a warning, if the map
+        does not fit these.  Raises DataError like `read`.
         """
         values = self.read(name, *size)
-        found = fitted(values[rows, columns], inverse)
-        if found is None:
-            LOG.warning("%s: its depth map does not fit to the points that it shows; it is left out", name)
+        fit = fit_scale_and_offset(values[rows, columns], inverse)
+        if fit is None:
+            LOG.warning("%s: the depth map does not fit the points of the photograph; it is ignored", name)
             return None
-        step = math.ceil(math.sqrt(values.size / MOST))
+        step = math.ceil(math.sqrt(values.size / MAX_PIXELS))
         down, across = np.mgrid[step // 2 : size[1] : step, step // 2 : size[0] : step].reshape(2, -1)
-        depths = found[0] * values[down, across] + found[1]
-        near = depths > 0  # others lie beyond all that the map tells
+        depths = fit[0] * values[down, across] + fit[1]
+        near = depths > 0  # others are beyond the range of the map
         return down[near], across[near], depths[near]
 
 
-def fitted(values: Floats, inverse: Floats) -> tuple[float, float] | None:
-    """Return factor and offset from values of a map to inverse depths, [K] each; None where they do not go together.
+def fit_scale_and_offset(values: Floats, inverse: Floats) -> tuple[float, float] | None:
+    """Return scale and offset from values of a map to inverse depths, [K] each; None if they do not fit.
 
-    Least absolute differences, by least squares in turn with weights 1 / difference.
+    Least absolute differences, by iteratively reweighted least squares.
     """
-    if len(values) < FEWEST:
+    if len(values) < MIN_POINTS:
         return None
     x, y = np.asarray(values, np.float64), np.asarray(inverse, np.float64)
     spread = float(np.abs(y - np.median(y)).mean())
@@ -95,28 +96,28 @@ def fitted(values: Floats, inverse: Floats) -> tuple[float, float] | None:
         offset = float(middle_y - factor * middle_x)
         weights = 1 / np.maximum(np.abs(factor * x + offset - y), EXACT * spread + TINY)
     left = float(np.median(np.abs(factor * x + offset - y)))
-    return (factor, offset) if factor > 0 and left <= FITS * spread else None
+    return (factor, offset) if factor > 0 and left <= MAX_RESIDUAL * spread else None
 
 
-# Depths that are known at some pixels of the training photographs: of the points that they show, or of depth maps.
+# Known depths at some pixels of the training photographs, of points or of depth maps.
 
-SURE = 4  # photographs that show a point whose depth counts whole; those of fewer count less
+SURE = 4  # photographs that must show a point for full weight
 
 
 @dataclass(frozen=True)
 class KnownDepths:
     """Depths at pixels of one view, on the device."""
 
-    pixels: Array  # [K] places in a plane [rows, stride], each once
+    pixels: Array  # [K] indices into a plane [rows, stride], each once
     inverse: Array  # [K] 1 / depth, scene units⁻¹
     weights: Array  # [K] in (0, 1]
-    extent: float  # of the scene, scene units: makes the loss free of units
+    extent: float  # of the scene, scene units: makes the loss unitless
 
 
 class PointDepths:
-    """The points that structure from motion has found in each training view, by the number of the view.
+    """The structure-from-motion points in each training view, by index of the view.
 
-    maps: are compared with in the place of the points, which they are fitted to.
+    maps: depth maps, fitted to the points and used instead of them.
     """
 
     def __init__(
@@ -129,9 +130,9 @@ class PointDepths:
         self._held: dict[tuple[int, int, int], KnownDepths | None] = {}
 
     def at(self, camera: DeviceCamera) -> KnownDepths | None:
-        """Return what is known at the size of a camera with a number; None where nothing is.
+        """Return the known depths for a training camera; None if there are none.
 
-        Raises DataError where a depth map cannot be read.
+        Raises DataError if a depth map cannot be read.
         """
         if camera.view is None:
             return None
@@ -159,9 +160,9 @@ class PointDepths:
 def nearest_in_pixels(
     camera: DeviceCamera, positions: NDArray[np.floating]
 ) -> tuple[NDArray[np.intp], NDArray[np.floating], NDArray[np.intp]]:
-    """Return the places in a plane that positions [M, 3] fall on, ascending [K], their depths and their rows.
+    """Return the plane indices that positions [M, 3] project to, ascending [K], their depths and their rows.
 
-    Of those in one pixel the nearest one stays, the first of equal ones; those outside the image are left out.
+    Of several in one pixel, the nearest is kept, the first of equally near ones.  Those outside the image are dropped.
     """
     values = camera.values
     pose = np.asarray(values["world_to_camera"], np.float64).reshape(3, 4)

@@ -1,7 +1,4 @@
-"""The size at which photographs are worth training on, from how much of their detail each size shows.
-
-After DashGaussian (Chen et al. 2025).
-"""
+"""Choose the resolution of photographs by step, from their frequency content (DashGaussian, Chen et al. 2025)."""
 
 from collections.abc import Iterable, Sequence
 from typing import Annotated, ClassVar, Literal
@@ -15,17 +12,17 @@ from clsplat.core.schedule import EverySteps, Points, count_fired, fire_step
 from clsplat.core.settings import Settings
 
 Floats = NDArray[np.float64]
-LEVELS = 2048  # bounds of the frequency, from 0 to the highest of each direction
-KNOTS = 32  # published
+LEVELS = 2048  # frequency bounds, from 0 to the highest frequency of each direction
+KNOTS = 32  # as published
 NO_DETAIL = 1e-3  # of the amplitudes: the rounding of an image of one color
-LEAST = 0.25  # of the amplitudes, that the smallest size of any photograph shows: published
+MIN_SHARE = 0.25  # of the amplitudes, at the smallest size of any photograph; as published
 
 
 class Spectrum:
     """The amplitudes of images, summed over channels and all frequencies up to a bound."""
 
     def __init__(self, within: Floats) -> None:
-        """within: sums at bounds of 0 to 1 times the highest frequency, at equal distances, [LEVELS + 1]."""
+        """within: sums up to equally spaced bounds from 0 to 1 times the highest frequency, [LEVELS + 1]."""
         self.within = within
 
     @classmethod
@@ -35,7 +32,7 @@ class Spectrum:
         amplitudes = np.abs(scipy.fft.rfft2(image.astype(np.float32), axes=(1, 0))).sum(axis=2, dtype=np.float64)
         down, right = (np.abs(scipy.fft.fftfreq(size)) * 2 for size in (height, width))
         down = down[: height // 2 + 1]
-        twice = np.where((down == 0) | (down == 1), 1, 2)  # the transform of a real image has only one of a pair
+        twice = np.where((down == 0) | (down == 1), 1, 2)  # rfft returns only one of each conjugate pair
         bound = np.maximum(down[:, None], right[None, :])
         level = np.ceil(bound * LEVELS).astype(np.int64)
         sums = np.bincount(level.ravel(), (amplitudes * twice[:, None]).ravel(), LEVELS + 1)
@@ -47,23 +44,22 @@ class Spectrum:
         return float(self.within[-1])
 
     def divisor(self, amplitude: float) -> float:
-        """Return the divisor of the size that keeps the frequencies whose amplitudes have a sum; inf where none is
-        needed for it."""
+        """Return the downscale factor that keeps frequencies with this sum of amplitudes; inf for 0."""
         bounds = np.linspace(0, 1, LEVELS + 1)
         bound = float(np.interp(amplitude, self.within, bounds))
         return 1 / bound if bound else np.inf
 
     def at(self, divisor: float) -> float:
-        """Return the sum of what an image of 1 / `divisor` of the size shows."""
+        """Return the sum of amplitudes that an image downscaled by `divisor` keeps."""
         return float(np.interp(1 / divisor, np.linspace(0, 1, LEVELS + 1), self.within))
 
 
 def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Floats, Floats]:
-    """Return steps, and the divisor of the photographs' size at each, falling from at most `largest` to 1 at `until`.
+    """Return steps and downscale factors, which fall from at most `largest` to 1 at step `until`.
 
-    Equal shares of the amplitudes take times that fall as their sum grows.  Without detail to gain it is 1 from step 0.
+    Each further share of the amplitudes takes less time than the one before.  Without detail to gain, the factor is 1.
     """
-    first = min(largest, *(spectrum.divisor(LEAST * spectrum.total) for spectrum in spectra))
+    first = min(largest, *(spectrum.divisor(MIN_SHARE * spectrum.total) for spectrum in spectra))
     mean = Spectrum(np.mean([spectrum.within for spectrum in spectra], axis=0))
     least = mean.at(first) if first > 1 else mean.total
     if not 0 < least < (1 - NO_DETAIL) * mean.total:
@@ -74,10 +70,10 @@ def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Fl
 
 
 class DetailDivisor(Settings):
-    """The size grows as fast as the photographs' detail asks for (DashGaussian, Chen et al. 2025).
+    """Increase the resolution with the frequency content of the photographs (DashGaussian, Chen et al. 2025).
 
-    Small photographs first: those that show a quarter of the amplitudes of their spectrum.  The time that a share of
-    the amplitudes is waited for falls as their sum grows.  The divisor is a whole number, which changes with edits.
+    Training starts at a size that keeps a quarter of the amplitudes of the spectrum; each further share of them takes
+    less time than the one before.  The downscale factor is an integer that changes at edits.
     """
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"until", "every", "start"})
@@ -85,27 +81,26 @@ class DetailDivisor(Settings):
     follows: Literal["detail"]
     """`detail`: the mean spectrum of the training photographs."""
     until: Annotated[int, Field(gt=0, le=10**6)]
-    """Global step at which the photographs have their full size, at the latest; up to a million."""
+    """Global step at which photographs are at full size; up to a million."""
     largest: Annotated[float, Field(ge=1)] = 8
-    """Largest divisor."""
+    """Largest downscale factor."""
     every: EverySteps = 100
-    """Steps from one change to the next, as those between edits, which need not be whole; the size stays as it is up to
-    `start`."""
+    """Steps between changes, as between edits; may be fractional."""
     start: Annotated[int, Field(ge=0)] = 500
-    """Global step after which it changes."""
+    """Global step after which the size changes."""
 
     @property
     def changes(self) -> list[int]:
-        """The steps before those at which the size may change; at the last one it is the full size."""
+        """The steps after which the size may change; after the last it is the full size."""
         first, last = count_fired(self.every, self.start) + 1, count_fired(self.every, self.until - 1) + 1
         return [fire_step(self.every, number) for number in range(first, last + 1)]
 
     def of(self, photographs: Iterable[NDArray[np.uint8]]) -> Points:
-        """Return the divisors of training photographs, each [height, width, 3], by step."""
+        """Return the downscale factor by step for training photographs, each [height, width, 3]."""
         steps, divisors = knots([Spectrum.of(image) for image in photographs], self.until, self.largest)
 
         def at(places: Floats) -> Floats:
-            """Linear in the number of pixels."""
+            """Interpolate linearly in the number of pixels."""
             pixels = np.interp(places, steps, divisors**-2.0)
             return np.where(places < self.until, np.floor(pixels**-0.5 + 1e-9), 1.0)
 
@@ -117,14 +112,14 @@ class DetailDivisor(Settings):
 
 
 def course(sizes: Points) -> str:
-    """Say in words at which sizes photographs are trained on."""
+    """Describe at which sizes photographs are trained on."""
     (_, first), *rest = sizes.points
     if not rest and first == 1:
-        return "photographs are trained on in full size: smaller ones would show too little of their detail"
+        return "photographs are trained on at full size, since smaller ones would lose too much detail"
     later = [f"{share(divisor)} from step {step:.0f}" for step, divisor in rest]
     return f"photographs are trained on at {', '.join([f'{share(first)} of their size', *later])}"
 
 
 def share(divisor: float) -> str:
-    """A share of the size in words."""
+    """Name a size."""
     return "full size" if divisor == 1 else f"1/{divisor:g}"

@@ -1,9 +1,9 @@
-"""How bright photographs are beside each other, from the pixels in which they show the same points.
+"""Estimate the relative exposures of photographs from the pixels in which they show the same points.
 
-ln y = e + a for a photograph's exposure e and a point's color a, for each channel.  Both come from the least sum of
-|ln y - e - a| exp(a), so that many of a photograph's points may be hidden, glossy or misplaced: a difference counts as
-much as it is in the image, where haze on a dark point is little.  They are found by least squares, in turn with weights
-1 / |ln y - e - a|, by conjugate gradients on sums in a fixed order.
+For each channel, ln y = e + a, with the exposure e of a photograph and the color a of a point.  Both minimize the sum
+of |ln y - e - a| exp(a), which is robust to hidden, glossy or misplaced points, and weights differences as they appear
+in the image, where haze on a dark point is small.  The solver is iteratively reweighted least squares, by conjugate
+gradients on sums in a fixed order.
 """
 
 import math
@@ -19,60 +19,60 @@ from clsplat.photos.photographs import Mask
 from clsplat.scene.scene import Tracks
 from clsplat.scene.view import View, load_exposures
 
-DARKEST, BRIGHTEST = 0.05, 0.95  # of values that count: beyond them noise and clipping decide
-SIDE = 3  # px, of the square about a point whose mean is its value
+DARKEST, BRIGHTEST = 0.05, 0.95  # valid values; beyond them, noise and clipping dominate
+SIDE = 3  # px, side of the square around a point that is averaged
 GAMMA = 2.2  # of the values of images
-FEWEST = 20  # values of a photograph whose exposure is measured
+MIN_VALUES = 20  # per photograph
 ROUNDS = 10
-EXACT = 0.01  # of a logarithm: smaller differences weigh no more
+EXACT = 0.01  # log units: smaller differences do not get larger weights
 CONVERGED = 1e-6  # of the first residual
-ROUNDING = 1e-9  # of a logarithm: residuals of such differences are none
+ROUNDING = 1e-9  # log units: differences that count as zero
 Integers = NDArray[np.intp]
 Read = Callable[[View], tuple[NDArray[np.uint8], Mask | None]]
 
 
 @dataclass(frozen=True)
 class Exposures:
-    """Logarithms of gains by the name of a view, of red, green and blue, [3]; their mean is 0."""
+    """Log gains of red, green and blue, [3], by the name of a view; their mean is 0."""
 
     log_gains: dict[str, Floats]
     source: str  # in words
-    explained: float = 1.0  # share of the differences between photographs of one point that the gains take away
+    explained: float = 1.0  # share of the differences between photographs of one point that the gains remove
 
     @property
     def spread(self) -> float:
-        """The standard deviation of the logarithms of the photographs' exposures; 0 where none is known."""
+        """The standard deviation of log exposures; 0 if none is known."""
         return float(np.std([LUMINANCE @ gains for gains in self.log_gains.values()])) if self.log_gains else 0.0
 
     @property
     def text(self) -> str:
-        """What was found, in words."""
+        """A summary in words."""
         if not self.log_gains:
             return self.source
         return f"exposures of {len(self.log_gains)} photographs differ by {self.spread:.1%} {self.source}"
 
 
-UNKNOWN = Exposures({}, "neither tracks of points nor cameras tell the exposures")
+UNKNOWN = Exposures({}, "exposures are unknown, from tracks as well as from EXIF")
 
 
 def noted(views: Sequence[View]) -> Exposures:
-    """Return what cameras noted: EV = log2(t ISO / N²), from light to the values of images by a power of 1 / 2.2.
+    """Return exposures from EXIF: EV = log2(t ISO / N²), with a gamma of 2.2.
 
-    Tone curves differ from that, so that it is where to begin.
+    Real tone curves differ, so this is only an initial value.
     """
     values = {view.name: one.value for view, one in zip(views, load_exposures(views), strict=True) if one}
     if not values:
         return UNKNOWN
     mean = math.fsum(values.values()) / len(values)
     gains = {name: np.full(3, math.log(2) * (value - mean) / GAMMA) for name, value in values.items()}
-    return Exposures(gains, "as their cameras noted")
+    return Exposures(gains, "by EXIF")
 
 
 def with_noted(shown: Exposures, noted: Exposures) -> Exposures:
-    """Return what tracks show, and what cameras noted of the photographs of which tracks do not tell it.
+    """Complete exposures measured on tracks by those from EXIF.
 
-    What was noted is moved by the mean difference from what is shown, over the photographs that have both; without
-    any, nothing is added.
+    Those from EXIF are shifted by the mean difference over the photographs that have both; if there are none, they are
+    not used.
     """
     if not shown.log_gains:
         return noted
@@ -87,9 +87,9 @@ def with_noted(shown: Exposures, noted: Exposures) -> Exposures:
 
 
 def measured(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
-    """Return what `views` show of the exposures of their photographs; a name that comes again is left out.
+    """Measure the exposures of photographs on tracks; views of a name that was seen before are skipped.
 
-    read: returns the photograph of a view, [height, width, 3], and which pixels count.
+    read: returns the photograph of a view, [height, width, 3], and its mask.
     """
     by_name: dict[str, View] = {}
     for view in views:
@@ -114,7 +114,7 @@ def measured(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
 
 
 def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | None) -> tuple[Integers, Floats]:
-    """Return the points that a photograph shows, rows [S], and their values there, [S, 3] in [0, 1]."""
+    """Return the points in a photograph, rows [S], and their colors there, [S, 3] in [0, 1]."""
     rows = tracks.seen.get(view.name, np.empty(0, np.int64))
     camera, (height, width) = view.camera, image.shape[:2]
     turned = np.einsum("ij,nj->in", view.world_to_camera[:, :3], tracks.positions[rows])  # no sum depends on threads
@@ -133,9 +133,9 @@ def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | N
 def _fitted(
     photograph: Integers, point: Integers, values: Floats, count: int, rounds: int = ROUNDS
 ) -> tuple[Floats, float]:
-    """The exposures of so many photographs, [count], NaN for one with too few values, and the sum of what they leave.
+    """Return the exposures of photographs, [count], NaN for one with too few values, and the sum of residuals.
 
-    rounds: 0 leaves the exposures alike.
+    rounds: 0 to keep all exposures equal.
     """
     exposures, logarithms, weights = np.zeros(count), np.log(values), np.ones(len(values))
     left = np.zeros(len(values))
@@ -145,13 +145,12 @@ def _fitted(
         of_points = _means(point, logarithms - exposures[photograph], weights)[point]
         left = np.abs(logarithms - exposures[photograph] - of_points)
         weights = np.exp(of_points) / np.maximum(left, EXACT)
-    few = np.bincount(photograph, minlength=count) < FEWEST
+    few = np.bincount(photograph, minlength=count) < MIN_VALUES
     return np.where(few, np.nan, exposures), float(left.sum())
 
 
 def _corrections(photograph: Integers, point: Integers, rest: Floats, weights: Floats, count: int) -> Floats:
-    """The exposures, [count], that with a color of each point leave least of the squares of `rest`, by conjugate
-    gradients."""
+    """Return the exposures, [count], that fit `rest` best with a color per point, by conjugate gradients."""
 
     def gathered(values: Floats) -> Floats:
         left = weights * (values - _means(point, values, weights)[point])
@@ -173,6 +172,6 @@ def _corrections(photograph: Integers, point: Integers, rest: Floats, weights: F
 
 
 def _means(group: Integers, values: Floats, weights: Floats) -> Floats:
-    """Weighted means of groups; 0 for an empty one."""
+    """Return weighted means of groups; 0 for an empty one."""
     sums = np.bincount(group, weights)
     return np.bincount(group, weights * values) / np.where(sums > 0, sums, 1)

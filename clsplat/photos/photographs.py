@@ -1,4 +1,4 @@
-"""Photographs on the device, 8 bits a channel, and the float planes that losses compare with."""
+"""Hold photographs on the device, 8 bits per channel, and convert them to float planes for losses."""
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -31,7 +31,7 @@ class Photograph:
     colors: Array  # [3, height, width] uint8
     mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None: all count
     empty: bool = False  # whether the mask leaves out every pixel
-    transparency: Array | None = None  # [1, height, width] uint8, 255: the background alone; None: opaque, or not kept
+    transparency: Array | None = None  # [1, height, width] uint8, 255: only the background; None: opaque, or not kept
 
     @property
     def nbytes(self) -> int:
@@ -42,7 +42,7 @@ class Photograph:
         return np.asarray(self.colors.get().transpose(1, 2, 0))
 
     def counted(self) -> Mask | None:
-        """Return which pixels count, [height, width], or None when all do."""
+        """Return which pixels count, [height, width]; None if all do."""
         return np.asarray(self.mask.get()[0] > 0) if self.mask else None
 
     def planes(
@@ -54,7 +54,7 @@ class Photograph:
     ) -> Planes:
         """Return the photograph as float planes of whole tiles, after the transforms of a global step.
 
-        backgrounds: that of the photographs, and what is behind transparent pixels in its place; each [3] in [0, 1].
+        backgrounds: the background of the photographs, and the one that replaces it; each [3] in [0, 1].
         """
         colors = unpack(workspace, self.camera, self.colors, 1 / 255, "photograph")
         if backgrounds and self.transparency:
@@ -67,7 +67,7 @@ class Photograph:
 
 
 class Pixels(NamedTuple):
-    """A photograph on the host: [height, width] uint8 of each channel."""
+    """A photograph on the host, uint8 planes."""
 
     colors: NDArray[np.uint8]  # [3, height, width]
     mask: NDArray[np.uint8]  # [0 or 1, height, width]
@@ -82,9 +82,9 @@ def _key(view: View) -> Key:
 
 
 class Photographs:
-    """The photographs of a scene by view, up to `budget` bytes of them on the device; others are read again.
+    """A cache of the photographs of a scene, up to `budget` bytes on the device; others are read again.
 
-    A thread reads views that are announced; the result is the same as without.
+    A thread reads announced views ahead; results are the same as without.
     """
 
     def __init__(
@@ -101,14 +101,14 @@ class Photographs:
         self._transparency = False
 
     def keep_transparency(self) -> None:
-        """Keep the transparency of photographs too, for drawn backgrounds."""
+        """Keep the transparency of photographs too, for random backgrounds."""
         if not self._transparency:
             self._transparency = True
             self._held.clear()
             self._reading.clear()
 
     def fresh(self) -> "Photographs":
-        """Return an empty copy, for views that are used once."""
+        """Return an empty cache, for views that are used once."""
         return Photographs(self.device, self.background_name, undistorted=self.undistorted)
 
     def camera(self, view: View) -> DeviceCamera:
@@ -117,9 +117,9 @@ class Photographs:
         return placed_camera(held.camera, view) if held else upload_camera(self.device, view)
 
     def get(self, view: View) -> Photograph:
-        """Return the photograph of a view, with the camera that the view has now.
+        """Return the photograph of a view, with the view's current camera.
 
-        Raises DataError when its file cannot be read.
+        Raises DataError if its file cannot be read.
         """
         key = _key(view)
         photograph = self._held.pop(key, None)
@@ -136,22 +136,22 @@ class Photographs:
         return photograph
 
     def of_sizes(self, view: View, original: View, number: int | None = None) -> Photograph:
-        """Return the photograph of a view, or of the larger `original` where a mask leaves nothing of the smaller one.
+        """Return the photograph of a view, or of the larger `original` if the mask excludes all pixels of the smaller.
 
-        number: of the view, see DeviceCamera.  Raises DataError when the mask leaves out every pixel at that size too.
+        number: index of the view, see DeviceCamera.  Raises DataError if the mask excludes all of `original` too.
         """
         photograph = self.get(view)
         if photograph.empty and view is not original:
             photograph = self.get(original)
         if photograph.empty:
             raise DataError(
-                f"{original.mask_path or original.image_path}: the mask leaves out every pixel of '{original.name}'; "
-                "expected some that count: remove the photograph from the dataset, or fix its mask"
+                f"{original.mask_path or original.image_path}: the mask excludes every pixel of '{original.name}'; "
+                "fix the mask, or remove the photograph from the dataset"
             )
         return replace(photograph, camera=replace(photograph.camera, view=number))
 
     def announce(self, views: Iterable[View]) -> None:
-        """Start to read the photographs of views that are used next, unless they are on the device."""
+        """Start to read the photographs of views that are used next."""
         for view in views:
             key = _key(view)
             if key not in self._held and key not in self._reading:
@@ -190,9 +190,9 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
 def change_background(
     workspace: Workspace, camera: DeviceCamera, colors: Array, transparency: Array, background: Array, behind: Array
 ) -> None:
-    """Put the color `behind`, [3], in the place of the `background` of colors [3, rows, stride].
+    """Replace the color `background` by `behind`, [3], in colors [3, rows, stride].
 
-    transparency: [1, height, width] uint8, 255 where the background alone is seen.
+    transparency: [1, height, width] uint8, 255 where only the background is seen.
     """
     shown = unpack(workspace, camera, transparency, 1 / 255, "transparency")
     pixels = camera.rows * camera.stride
@@ -230,7 +230,7 @@ def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, nam
 
 
 def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mask: Array | None) -> Array:
-    """Return gradient magnitudes, but -1 at pixels that the mask, [1, rows, stride], leaves out, and beside them."""
+    """Return gradient magnitudes, and -1 at masked pixels and their neighbors.  mask: [1, rows, stride]."""
     magnitude = image_gradient(workspace, camera, image)
     if mask is not None:
         workspace.device.program("texture.cl").hide_masked(
@@ -245,7 +245,7 @@ def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mas
 
 
 def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], share: float) -> float:
-    """Return the magnitude, per px, to 1 / 4000, that `share` of all pixels that count stay below."""
+    """Return the quantile `share` of the magnitude over all pixels that count, per px, in steps of 1 / 4000."""
     counts = np.zeros(BINS, np.int64)
     for photograph in photographs:
         camera, planes = photograph.camera, photograph.planes(workspace)

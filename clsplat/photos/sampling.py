@@ -1,4 +1,4 @@
-"""The sample of a training step: a view, at a size, with transforms of its photograph."""
+"""Choose the sample of each training step: a view, its size, and transforms of its photograph."""
 
 import logging
 from abc import abstractmethod
@@ -17,13 +17,13 @@ from clsplat.photos.detail import DetailDivisor, course
 from clsplat.photos.transforms import PhotographTransform
 from clsplat.scene.view import View
 
-# The view of each training step: it depends on the seed and the step alone, so a resumed run uses the same views.
+# The view of each step depends only on the seed and the step, so a resumed run uses the same views.
 
-FINEST_SHARE = 0.3  # of the steps, which use a random view of the finest size (released code of Mip-Splatting)
+FINEST_SHARE = 0.3  # of steps with a random view of the finest size (released code of Mip-Splatting)
 
 
 class ViewPool:
-    """The training views, which may come at several sizes, and permutations of them."""
+    """The training views, possibly at several sizes, and permutations of them."""
 
     def __init__(self, views: Sequence[View], seed: int) -> None:
         finest = min(view.downscale for view in views)
@@ -32,12 +32,12 @@ class ViewPool:
         self._epoch, self._permutation = (-1, -1), np.empty(0, np.int64)
 
     def shuffled(self, entries: Sequence[int], step: int) -> View:
-        """Return the view of a step; each pass uses all `entries`, indices into `views`, in a new order."""
-        epoch, place = divmod(step - 1, len(entries))
-        return self.views[entries[int(self._shuffle(epoch, len(entries))[place])]]
+        """Return the view of a step; each epoch uses all `entries`, indices into `views`, in a new order."""
+        epoch, index = divmod(step - 1, len(entries))
+        return self.views[entries[int(self._shuffle(epoch, len(entries))[index])]]
 
     def random(self, step: int) -> np.random.Generator:
-        """Return random numbers that depend on the seed and the step alone."""
+        """Return a generator that depends only on the seed and the step."""
         return np.random.default_rng([self.seed, step, len(self.views)])
 
     def _shuffle(self, epoch: int, count: int) -> NDArray[Any]:
@@ -52,11 +52,11 @@ class Order(Settings):
 
     @abstractmethod
     def at(self, pool: ViewPool, step: int) -> View:
-        """Return the view of a step, counted from 1; it may depend on the pool, its seed and the step only."""
+        """Return the view of a step, counted from 1; it must depend only on the pool, its seed and the step."""
 
 
 class Uniform(Order):
-    """All views of every size, in a new random order in each pass."""
+    """All views at all sizes, in a new random order in each epoch."""
 
     type: Literal["uniform"] = "uniform"
 
@@ -91,18 +91,17 @@ LOG = logging.getLogger("clsplat")
 
 
 class ViewSettings(Settings):
-    """The sample of each step: a view, its size and transforms of its photograph."""
+    """The view of each step, its size, and transforms of its photograph."""
 
     order: OneOf[Order] = Uniform()
     """Which view a step trains on."""
     resolution: Annotated[DetailDivisor | AtLeastOne, explain_schedule(", or {follows: detail, until, …}")] = 1.0
-    """Divisor of the photographs' size beside `scene.downscale`, at least 1: by step, or from their detail."""
+    """Downscale factor, at least 1, in addition to `scene.downscale`; by step, or from the photographs' detail."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
     """Transforms of the photograph, in order."""
 
     def settled(self, photographs: Callable[[], Iterable[NDArray[np.uint8]]]) -> "ViewSettings":
-        """Return settings in which what follows from the training photographs, each [height, width, 3], is a number by
-        step."""
+        """Return settings whose resolution is a schedule.  photographs: of training, each [height, width, 3]."""
         if not isinstance(self.resolution, DetailDivisor):
             return self
         found = self.resolution.of(photographs())
@@ -110,14 +109,16 @@ class ViewSettings(Settings):
         return self.model_copy(update={"resolution": found})
 
     def divisor(self, step: int) -> float:
-        """Return the divisor of the photographs' size at a global step.  Raises ConfigError before it is settled."""
+        """Return the downscale factor at a global step.  Raises ConfigError if `settled` was not called."""
         if isinstance(self.resolution, DetailDivisor):
-            raise ConfigError("a resolution that follows detail needs photographs: expected what `settled` returns")
+            raise ConfigError(
+                "a resolution that follows detail needs photographs; use the settings that `settled` returns"
+            )
         return at_step(self.resolution, step)
 
     @property
     def changes(self) -> list[float]:
-        """The global steps between which the size stays, or changes evenly; none where it does not change."""
+        """The global steps between which the size is constant or linear; empty if it never changes."""
         resolution = self.resolution
         if isinstance(resolution, DetailDivisor):
             return [float(step) for step in resolution.changes]
@@ -126,11 +127,11 @@ class ViewSettings(Settings):
 
     @property
     def last_change(self) -> float:
-        """The global step of the last change of the size, at the latest; 0 where it does not change."""
+        """The latest global step at which the size may change; 0 if it never changes."""
         return self.resolution.until if isinstance(self.resolution, DetailDivisor) else max([0.0, *self.changes])
 
     def full_size(self, last: int) -> int:
-        """Return the first step up to `last` whose photographs are larger than 1/2 of their size."""
+        """Return the first step up to `last` with photographs larger than half their size."""
         return next((step for step in range(1, last + 1) if self.divisor(step) < 2), last)
 
 
@@ -139,14 +140,14 @@ class Sample:
     """The sample of one step."""
 
     view: View  # at the size of the step
-    original: View  # at the size that is trained on
-    number: int  # of it among the training views
+    original: View  # at full training size
+    number: int  # its index among the training views
     transforms: Sequence[PhotographTransform]
     step: int  # global
 
 
 class Sampler:
-    """Samples by step: they depend on the views, the seed and the step."""
+    """Returns the sample of each step, which depends only on the views, the seed and the step."""
 
     def __init__(self, views: Sequence[View], settings: ViewSettings, seed: int) -> None:
         self.settings, self._pool = settings, ViewPool(views, seed)

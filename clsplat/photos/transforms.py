@@ -1,4 +1,4 @@
-"""Transforms of the photograph before a step compares it: each depends on the photograph and the step."""
+"""Transform the photograph of a step before the comparison, depending on the step."""
 
 import math
 from abc import abstractmethod
@@ -25,11 +25,11 @@ class Planes:
 
 
 class PhotographTransform(Settings):
-    """A change of the photograph before it is compared with the rendered image; the file stays unchanged."""
+    """A transform of the photograph before it is compared with the render."""
 
     @abstractmethod
     def apply(self, planes: Planes, step: int) -> Planes:
-        """Return the photograph of a global step; it may depend on its arguments only."""
+        """Return the photograph at a global step; the result must depend only on the arguments."""
 
 
 class Blur(PhotographTransform):
@@ -37,7 +37,7 @@ class Blur(PhotographTransform):
 
     type: Literal["blur"] = "blur"
     sigma: NonNegative
-    """Standard deviation in px of the photograph at its training size; by step."""
+    """Standard deviation, px at training size; by step."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
         sigma = at_step(self.sigma, step)
@@ -45,18 +45,18 @@ class Blur(PhotographTransform):
 
 
 class MeanFilter(PhotographTransform):
-    """Replace a pixel by the mean of a square about it (Opti3DGS, Farooq et al. 2025); masked pixels do not count."""
+    """Replace each pixel by the mean of a square around it (Opti3DGS, Farooq et al. 2025), without masked pixels."""
 
     type: Literal["mean_filter"] = "mean_filter"
     width: NonNegative
-    """Side of the square as a share of the photograph's width; the nearest odd number of px is taken; by step."""
+    """Side of the square as a share of the photograph's width, rounded to an odd number of px; by step."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
         return _averaged(planes, math.floor(at_step(self.width, step) * planes.camera.width / 2), 0.0)
 
 
 def _averaged(planes: Planes, reach: int, falloff: float) -> Planes:
-    """Average the pixels within `reach` px in x and in y, by weights exp(-falloff distance²); falloff: px⁻²."""
+    """Average the pixels within `reach` px in x and y, with weights exp(-falloff distance²).  falloff: px⁻²."""
     if reach == 0:
         return planes
     camera, device = planes.camera, planes.workspace.device

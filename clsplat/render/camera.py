@@ -1,4 +1,4 @@
-"""A view's camera on the device, and the size of its planes."""
+"""Upload the camera of a view, and size its image planes."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -12,7 +12,7 @@ from clsplat.scene.view import View
 
 RAY_MARGIN = constants()["RAY_MARGIN"]
 TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # to a side
-PIXELS_MAX = 2**30  # of whole tiles: kernels index up to four planes of a picture in 32 bits
+PIXELS_MAX = 2**30  # in whole tiles: kernels index up to four planes of an image in 32 bits
 
 # camera_t of cl_kernels/common.h
 CAMERA = np.dtype(
@@ -36,7 +36,7 @@ class DeviceCamera:
     tiles_x: int
     tiles_y: int
     tile: int
-    view: int | None = None  # its number in the table HIDDEN; without one every Gaussian is drawn
+    view: int | None = None  # its index in the table HIDDEN; None draws every Gaussian
     time: float | None = None  # of the scene, in [0, 1], at which moving Gaussians are shown
     values: NDArray[Any] = field(default_factory=lambda: np.zeros((), CAMERA), repr=False, compare=False)  # on the host
 
@@ -72,7 +72,7 @@ def moved_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zo
 
 
 def placed_camera(camera: DeviceCamera, view: View) -> DeviceCamera:
-    """Return the camera of a view of the same size as one that is on the device: that one, where it has its values."""
+    """Return the camera of a view with the size of an uploaded one, which is reused if its values are equal."""
     values = camera_values(view, camera.tile)
     if values == camera.values:
         return camera
@@ -80,7 +80,7 @@ def placed_camera(camera: DeviceCamera, view: View) -> DeviceCamera:
 
 
 def upload_camera(device: Device, view: View) -> DeviceCamera:
-    """Copy a view's camera to the device.  Raises DataError as `camera_values`."""
+    """Copy a view's camera to the device.  Raises DataError like `camera_values`."""
     tile = int(device.tuning["TILE"])
     values = camera_values(view, tile)
     tiles_x, tiles_y = int(values["tiles_x"]), int(values["tiles_y"])
@@ -92,8 +92,8 @@ def upload_camera(device: Device, view: View) -> DeviceCamera:
 def camera_values(view: View, tile: int) -> NDArray[Any]:
     """Return a view's camera_t, [].
 
-    Rays are clamped 30 % of half the field of view beyond the image's edges (gsplat's off-center form).
-    Raises DataError when the image has more tiles to a side than kernels can name, or more pixels than they can index.
+    Rays are clamped at 30% of half the field of view beyond the image's edges (gsplat's off-center form).  Raises
+    DataError if the image has more tiles per side, or more pixels, than kernels can index.
     """
     camera = view.camera
     tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)

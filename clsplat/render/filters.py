@@ -1,7 +1,7 @@
-"""The settings of `model:`: the degree of the colors and the two low-pass filters, as numbers.
+"""Define the settings of `model:`: the degree of the harmonics, and two low-pass filters.
 
 A world filter writes `filter_variance`, scene units², which is added to the squared scales of each Gaussian.  A screen
-filter is three numbers of the model.  Rendering reads these numbers and has no case for a filter.
+filter is three numbers of the model.  Rendering only reads these numbers and does not know the filters.
 """
 
 from abc import abstractmethod
@@ -25,7 +25,7 @@ BOX_VARIANCE = 1 / 12  # px²
 
 
 class FilterViews:
-    """The views that sample the Gaussians: their cameras on the device, [V] camera_t, and focal lengths, [V] px."""
+    """The cameras that sample the Gaussians, on the device, [V] camera_t, and their focal lengths, [V] px."""
 
     def __init__(self, device: Device, views: Sequence[View]) -> None:
         tile = int(device.tuning["TILE"])
@@ -41,7 +41,7 @@ class WorldFilter(Settings):
 
     @abstractmethod
     def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
-        """Write `filter_variance`, [S] scene units², for the present means; `near`: smallest depth, scene units."""
+        """Write `filter_variance`, [S] scene units², for the current means.  near: smallest depth, scene units."""
 
 
 class NoWorldFilter(WorldFilter):
@@ -138,15 +138,15 @@ class Mip(ScreenFilter):
 
 def _of_a_box(variance: float) -> float:
     if variance != BOX_VARIANCE:
-        raise ValueError(f"expected no variance beside the type 'box', or {BOX_VARIANCE}: write `screen_filter: box`")
+        raise ValueError(f"'box' has a fixed variance of {BOX_VARIANCE}; write `screen_filter: box`")
     return variance
 
 
 class BoxFilter(ScreenFilter):
-    """Integrate every splat over the box of each pixel, instead of taking its value at the pixel's center.
+    """Integrate every splat over the box of each pixel, instead of evaluating it at the pixel's center.
 
-    Where a splat is larger than a pixel this differs little from a Gaussian blur of the box's variance, 1/12 px², which
-    programs that know no box draw instead.  The integral is that of `cl_kernels/pixel_box.h`.
+    For splats larger than a pixel this is close to a Gaussian blur with the box's variance, 1/12 px², which programs
+    without a box filter use instead.  The integral is in `cl_kernels/pixel_box.h`.
     """
 
     pixel_box: ClassVar[bool] = True

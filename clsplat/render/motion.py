@@ -1,4 +1,4 @@
-"""A moving model at the moment of a camera: Gaussians like any others, and the gradients back to their motion."""
+"""Evaluate a moving model at the timestamp of a camera, and backpropagate to its motion."""
 
 import copy
 import logging
@@ -14,19 +14,19 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 
 LOG = logging.getLogger("clsplat")
-FIRST = 0.0  # the moment that a camera without a time shows
+FIRST = 0.0  # timestamp for cameras without a time
 
 
 def at_moment(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> DeviceModel:
-    """Return a model as it is at the time of a camera, in memory that the next one reuses; a static one as it is.
+    """Return the model at the time of a camera, in memory that the next call reuses; a static model is unchanged.
 
-    A camera without a time shows the first moment, which is told once.
+    A camera without a time shows the first timestamp, with one warning.
     """
     gaussians = model.gaussians
     if not gaussians.is_moving:
         return model
     if camera.time is None:
-        _tell_of_the_first()
+        _warn_of_first_timestamp()
     stride = gaussians.capacity
     means, logit = workspace.array("moved means", (3, stride)), workspace.array("moved logit", (1, stride))
     gaussians.device.program("motion.cl").move_forward(
@@ -47,8 +47,7 @@ def at_moment(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) ->
 
 
 def to_centers(model: DeviceModel, camera: DeviceCamera, gradients: GaussianGradients) -> None:
-    """Make gradients by a moving model at the time of a camera those by the model and its motion; a static one has
-    them already."""
+    """Convert gradients of the model at the time of a camera to those of the model and its motion, in place."""
     gaussians = model.gaussians
     if not gaussians.is_moving:
         return
@@ -78,17 +77,17 @@ def _arguments(gaussians: Gaussians, camera: DeviceCamera) -> dict[str, Any]:
 
 
 def _shape(gaussians: Gaussians) -> tuple[int, bool]:
-    """The degree of the polynomials, and whether Gaussians turn."""
+    """Return the degree of the polynomials, and whether Gaussians rotate."""
     return WIDTHS[gaussians.tables[MOTION].components]
 
 
 def _turn(gaussians: Gaussians) -> dict[str, int]:
-    """The first plane of the turn, where there is one."""
+    """Return the first plane of the rotation, if there is one."""
     return {"first": gaussians.tables[MOTION].components - TURN} if _shape(gaussians)[1] else {}
 
 
 def _with_tables(gaussians: Gaussians, arrays: dict[str, Array]) -> Gaussians:
-    """The same Gaussians with other arrays in the place of some; the tables of the first stay as they are."""
+    """Return a copy of Gaussians with some tables replaced."""
     moved = copy.copy(gaussians)
     own = {name: Table(array, array.shape[0], zero_fresh=False) for name, array in arrays.items()}
     moved.tables = {**gaussians.tables, **own}
@@ -96,8 +95,8 @@ def _with_tables(gaussians: Gaussians, arrays: dict[str, Array]) -> Gaussians:
 
 
 @cache
-def _tell_of_the_first() -> None:
+def _warn_of_first_timestamp() -> None:
     LOG.warning(
-        "a view without a time, as on the live page, shows the first moment of a moving model; where it can have one, "
-        "give it: `--time T` of a command, `View.time` in Python"
+        "a view without a time shows a moving model at its first timestamp; set `--time T` in commands, `View.time` in "
+        "Python"
     )

@@ -1,4 +1,4 @@
-"""A layer of splats of its own before an image: the colors of both, and the gradients of each."""
+"""Composite a separate layer of splats over an image, and compute the gradients of both."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ from clsplat.render.workspace import Workspace
 
 @dataclass(frozen=True)
 class OverlayLayer:
-    """A layer and the image behind it; valid until the next layer."""
+    """A layer composited over an image; valid until the next layer."""
 
-    frame: Frame  # of the layer alone, before black
-    image: Array  # [3 or 4, rows, stride] of both
-    behind: Array  # [1, rows, stride] T dL/dT of the loss of what the layer covers
+    frame: Frame  # of only the layer, over black
+    image: Array  # composite, [3 or 4, rows, stride]
+    behind: Array  # T dL/dT of the loss on the layer's alpha, [1, rows, stride]
     loss: Callable[[], float]  # its value; waits for the device
 
 
 def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> OverlayLayer:
-    """Return a layer, rendered before black, with the image behind it, [3 or 4, rows, stride].
+    """Composite a layer, rendered over black, over an image, [3 or 4, rows, stride].
 
-    scale: factor of the loss of what the layer covers, the sum of 1 - T over pixels.
+    scale: weight of the loss on the layer's alpha, the sum of 1 - T over pixels.
     """
     camera = frame.camera
     both, sums = workspace.array("image and layer", image.shape), workspace.array("layer sums", camera.rows)
@@ -44,7 +44,7 @@ def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> 
 
 
 def look_behind(workspace: Workspace, frame: Frame, gradient: Array) -> None:
-    """Make the gradient by the colors of both, [3 or 4, rows, stride], that by the image behind, in place."""
+    """Convert the gradient of the composite, [3 or 4, rows, stride], to that of the image behind, in place."""
     camera = frame.camera
     workspace.device.program("layer.cl").look_behind(
         groups=(1, camera.rows),

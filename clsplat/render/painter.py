@@ -1,4 +1,4 @@
-"""What renders views, whatever it is that a run trains."""
+"""Define the interface that renders views, of Gaussians as well as of fields."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,22 +12,20 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace
 
-# What a view shows, on the host: color, coverage and depth.
-
 Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Layers:
-    """A rendered view, layer by layer."""
+    """A rendered view on the host: color, alpha and depth."""
 
     image: Floats  # [height, width, 3], background included
-    alpha: Floats  # [height, width] in [0, 1], how much of a pixel the model covers
-    depth: Floats | None  # [height, width] scene units, mean depth of what covers a pixel; 0 where nothing does
+    alpha: Floats  # [height, width] in [0, 1]
+    depth: Floats | None  # [height, width] scene units, alpha-weighted mean; 0 where alpha is 0
 
     @property
     def arrays(self) -> list[Floats]:
-        """All layers that were rendered."""
+        """All rendered layers."""
         return [self.image, self.alpha, *([] if self.depth is None else [self.depth])]
 
 
@@ -55,17 +53,17 @@ def _depth(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera) -> 
 
 
 class Painter(Protocol):
-    """Renders the view of a camera, at whatever size that has."""
+    """Renders the view of a camera, at any size."""
 
     @property
     def workspace(self) -> Workspace:
-        """Device memory that pictures reuse."""
+        """Device memory that renders reuse."""
 
     def paint(self, camera: DeviceCamera) -> Array:
-        """Return the picture, [3, rows, stride], not clamped; it is valid until the next."""
+        """Return the render, [3, rows, stride], not clamped; valid until the next one."""
 
     def layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
-        """Return the picture on the host, with coverage, and with depth where that is asked for."""
+        """Return the render on the host, with alpha, and with depth on request."""
 
 
 @dataclass(frozen=True)

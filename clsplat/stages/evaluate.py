@@ -10,7 +10,7 @@ from clsplat.core.files import invalid_output_reason
 from clsplat.core.settings import InputPath
 from clsplat.gaussians.model import load
 from clsplat.metrics.perceptual import InputRange, Metric, Perceptual
-from clsplat.metrics.views import mean, measure, tell_of_colors
+from clsplat.metrics.views import log_color_figures, mean, measure
 from clsplat.render.painter import Painter, SplatPainter
 from clsplat.scene.view import sample_views
 from clsplat.training.modules.base import color_model, learned_scene
@@ -107,4 +107,4 @@ class Evaluate(Scheduled):
                 *(run.model_step, f"{self.file}, " if self.file else "", self.split, downscale),
                 *(averages["psnr"], averages["ssim"], pluralize(len(results), "view")),
             )
-            tell_of_colors(averages)
+            log_color_figures(averages)

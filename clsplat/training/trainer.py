@@ -1,4 +1,4 @@
-"""One training step: render a view, compare it with its photograph, differentiate, update, count."""
+"""Run one training step: render a view, compare it with its photograph, differentiate, update, count statistics."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 class StepTrainer:
     """The objects of a training step; pipelines, benchmarks and notebooks call the same `step`.
 
-    A loop of one's own, on the training views of a scene, from a model of `clsplat.load`:
+    A custom loop over the training views of a scene, from a model of `clsplat.load`:
 
         model = model.upload(device)
         photographs = Photographs(device, scene.background)
@@ -48,8 +48,8 @@ class StepTrainer:
             gradients = trainer.step(photographs.get(view), step)
             print(gradients.loss)
 
-    Between two steps the Gaussians may be changed (`model.gaussians.set`) or moved (`clsplat.density.edit`).  In a loop
-    that applies its own update, `differentiate` is the step without Adam; `compare` and `backward` are its two parts.
+    Between two steps the Gaussians may be changed (`model.gaussians.set`) or moved (`clsplat.density.edit`).  A loop
+    with its own optimizer calls `differentiate`, the step without Adam, or its two parts, `compare` and `backward`.
     """
 
     rasterizer: Rasterizer
@@ -61,7 +61,7 @@ class StepTrainer:
     rates: Rates
     extent: float = 1.0  # scene units
     rows: Rows = "all"  # Gaussians that a step changes
-    modules: Sequence[ModuleState] = ()  # that take part in a step: forward in this order, backward in reverse
+    modules: Sequence[ModuleState] = ()  # forward in this order, backward in reverse
 
     def step(
         self,
@@ -70,9 +70,9 @@ class StepTrainer:
         transforms: Sequence[PhotographTransform] = (),
         stale: Collection[str] = (),
     ) -> ViewLosses:
-        """Train on one view at a global step; parameters named in `stale` are not updated.
+        """Train on one view at a global step.  stale: parameters that are not updated.
 
-        Returns the view's losses and, unless a module skips the step, its gradients, valid until the next step.
+        Returns the losses and, unless a module skips the step, the gradients; valid until the next step.
         """
         view = self.differentiate(photograph, step, transforms)
         self.update(view, stale)
@@ -81,18 +81,18 @@ class StepTrainer:
     def differentiate(
         self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()
     ) -> ViewLosses:
-        """Return the derivative of the losses at one view, as sums over pixels; nothing is updated.
+        """Return the gradient of the losses at one view, as sums over pixels, without an update.
 
-        Raises ConfigError as `compare` does.
+        Raises ConfigError like `compare`.
         """
         view = self.compare(photograph, step, transforms)
         return view if view.step.skipped else self.backward(view)
 
     def compare(self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()) -> ViewLosses:
-        """Render one view and compare it with its photograph; nothing is updated.
+        """Render one view and compare it with its photograph, without an update.
 
         Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, for two that read different fourth
-        planes, and for one that a module does not go with.
+        planes, and for one that a module does not support.
         """
         content = content_of(self.losses, step)
         workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings
@@ -110,7 +110,7 @@ class StepTrainer:
             module.after_render(now)
         target, mask = now.planes.colors, now.planes.mask
         now.comparison = comparison = Comparison(workspace, camera, now.image, target, now.gradient, mask, step)
-        if content != "color":  # losses of colors overwrite three planes alone
+        if content != "color":  # color losses overwrite only the first three planes
             now.gradient.fill(0)
             comparison.accumulate = True
         if mask is not None:  # pixels that do not count are black in both images and have no gradient
@@ -125,7 +125,7 @@ class StepTrainer:
         return ViewLosses(now.frame, comparison, now.losses, step=now)
 
     def backward(self, view: ViewLosses) -> ViewGradients:
-        """Return the derivative of the losses that `compare` returned, as sums over pixels."""
+        """Return the gradient of the losses from `compare`, as sums over pixels."""
         now, workspace, count = view.step, self.rasterizer.workspace, self.stats.pixel_sums
         mask = now.planes.mask
         if mask is not None:
@@ -142,13 +142,13 @@ class StepTrainer:
         return ViewGradients(now.frame, now.comparison, now.losses, now.pixel_sums, step=now)
 
     def update(self, view: ViewLosses, stale: Collection[str] = ()) -> None:
-        """Apply what `differentiate` returned: change parameters, moments and statistics, and the modules' own."""
+        """Apply the result of `differentiate`: update parameters, moments, statistics and modules."""
         if not isinstance(view, ViewGradients):
             for module in view.step.modules:
                 module.update_skipped(view.step)
             return
         grad_mean2d = self._update(view, stale)
-        for module in reversed(view.step.modules):  # what the device had ready first is waited for first
+        for module in reversed(view.step.modules):  # first wait for what the device finished first
             module.update(view.step)
         self.rasterizer.device.timings.section = "statistics"
         self.stats.add(view, grad_mean2d)
@@ -157,7 +157,7 @@ class StepTrainer:
         """Update the parameters and add the penalties to the view's losses.
 
         Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters, motion
-        and depths, gradients are not written to memory.
+        and depths, a fused kernel never writes gradients to memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step
@@ -166,8 +166,8 @@ class StepTrainer:
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
         waits = self.rows == "deferred" or self.model.gaussians.on_host
-        open_ones = gradients.without_deferred() if waits else gradients
-        inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, open_ones, self.extent, step)
+        current = gradients.without_deferred() if waits else gradients
+        inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, current, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
         view.losses.extend(returned(penalty, penalty.add(inputs)) for penalty in penalties)
         self.adam.step(self.model, view.frame, gradients, rates, stale, self.rows)

@@ -69,7 +69,7 @@ def test_a_picture_with_values_that_are_not_finite_is_an_error(device, rng, monk
 
     renderer.render(case.view)
     monkeypatch.setattr(renderer.rasterizer, "forward", broken)
-    with pytest.raises(NumericError, match=f"^view '{case.view.name}': its picture is not finite"):
+    with pytest.raises(NumericError, match=f"^view '{case.view.name}': the render is not finite"):
         renderer.render(case.view)
 
 

@@ -144,7 +144,7 @@ def test_steps_with_the_loss_bring_depths_to_the_known_ones(device, rng):
 @on_one_setting
 def test_two_fourth_planes_are_refused(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1(), InverseDepth(), WeightEntropy()])
-    with pytest.raises(ConfigError, match="losses read entropy and inverse_depth of an image; expected one of them"):
+    with pytest.raises(ConfigError, match="read entropy and inverse_depth of an image, but only one of them"):
         trainer.step(photograph, 1)
     trainer.losses = [L1(), InverseDepth(weight=[[0, 1.0], [5, 0.0]]), WeightEntropy()]
     assert trainer.compare(photograph, 6).frame.content == "entropy", "a loss without weight reads nothing"

@@ -162,7 +162,7 @@ def test_value_and_gradient_of_the_loss(device, rng, width, height):
 @on_one_setting
 def test_a_frame_without_the_plane_is_refused(device, rng):
     x = rng.uniform(0, 1, (3, 5, 5)).astype(np.float32)
-    with pytest.raises(ConfigError, match="weight_entropy needs a frame whose content is 'entropy'"):
+    with pytest.raises(ConfigError, match="weight_entropy needs a frame with the content 'entropy'"):
         WeightEntropy().add(comparison_of(device, x, x))
 
 

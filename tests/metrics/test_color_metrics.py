@@ -11,8 +11,8 @@ from clsplat.metrics.views import (
     color_figures,
     corrected_by_regression,
     in_colors_of,
+    log_color_figures,
     mean_figures,
-    tell_of_colors,
 )
 from clsplat.stages.optimize import compared
 from clsplat.training.modules.exposure import Affine, Gain
@@ -109,7 +109,7 @@ def test_a_mean_says_of_how_many_views_it_is():
 def test_the_log_says_of_how_many_views_the_mean_is(caplog):
     caplog.set_level("INFO", "clsplat")
     whole = {"psnr": 20.0, "psnr_color": 24.0}
-    tell_of_colors({"psnr": 20.0})
+    log_color_figures({"psnr": 20.0})
     assert not caplog.messages
     for averages, said in (
         (whole, r"PSNR 24.00 dB; exposures of these photographs differ"),
@@ -120,7 +120,7 @@ def test_the_log_says_of_how_many_views_the_mean_is(caplog):
         ),
     ):
         caplog.clear()
-        tell_of_colors(averages)
+        log_color_figures(averages)
         (message,) = caplog.messages
         assert re.search(said, message)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.photos.depths import FEWEST, MOST, DepthMaps, PointDepths, fitted
+from clsplat.photos.depths import MAX_PIXELS, MIN_POINTS, DepthMaps, PointDepths, fit_scale_and_offset
 from clsplat.pipeline.input_files import contents
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
@@ -62,9 +62,9 @@ def test_maps_that_show_other_depths_are_left_out_and_named(tmp_path, rng, caplo
     with caplog.at_level(logging.WARNING):
         for name in ("dark.jpg", "plain.jpg"):
             assert DepthMaps(tmp_path).at(name, (40, 30), rows, columns, inverse[rows, columns]) is None
-            assert f"{name}: its depth map does not fit to the points" in caplog.text
-    few = slice(0, FEWEST - 1)
-    assert fitted(inverse[rows, columns][few], inverse[rows, columns][few]) is None
+            assert f"{name}: the depth map does not fit the points" in caplog.text
+    few = slice(0, MIN_POINTS - 1)
+    assert fit_scale_and_offset(inverse[rows, columns][few], inverse[rows, columns][few]) is None
     assert DepthMaps(tmp_path).at("good.jpg", (40, 30), rows, columns, inverse[rows, columns]) is not None
 
 
@@ -74,12 +74,12 @@ def test_of_a_large_map_an_even_grid_is_compared(tmp_path):
     rows, columns = np.arange(300), np.arange(300)
     found = DepthMaps(tmp_path).at("a.jpg", (400, 300), rows, columns, inverse[rows, columns])
     assert found is not None
-    assert MOST / 2 < len(found[0]) <= MOST
+    assert MAX_PIXELS / 2 < len(found[0]) <= MAX_PIXELS
     assert set(np.diff(np.unique(found[0]))) == set(np.diff(np.unique(found[1]))) == {2}
 
 
 def test_a_map_that_is_missing_or_damaged_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"a\.png: no such file; expected the depth map of a\.jpg"):
+    with pytest.raises(DataError, match=r"a\.png: the depth map of a\.jpg is missing"):
         DepthMaps(tmp_path).read("a.jpg", 4, 3)
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n")
     with pytest.raises(DataError, match=r"a\.png: "):

@@ -103,7 +103,7 @@ def test_the_rate_of_the_means_is_constant_up_to_the_full_size():
 
 def test_rates_waiting_for_full_size_are_resolved_before_use():
     rates = load("dash").settings.training.rates
-    with pytest.raises(ConfigError, match=r"start: full_size.* expected what `settled\(step\)` returns"):
+    with pytest.raises(ConfigError, match=r"start: full_size.* the rates that `settled\(step\)` returns"):
         rates.at(1, 1.0)
     assert rates.settled(1).at(1, 1.0)["means"] == pytest.approx(rates.means.initial, rel=1e-3)
 

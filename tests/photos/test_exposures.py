@@ -77,7 +77,7 @@ def test_a_run_begins_with_both(rng, tmp_path):
         status=SimpleNamespace(counted=lambda views, *_: views),
     )
     found = exposures_of(run)
-    assert found.text.endswith("those of 1 as their cameras noted")
+    assert found.text.endswith("those of 1 by EXIF")
     assert found.log_gains["2.png"].mean() == pytest.approx(wall.log_gains[2].mean(), abs=0.01)
 
 

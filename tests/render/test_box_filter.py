@@ -34,7 +34,7 @@ def test_it_has_no_number_that_could_be_changed():
     settings = load_pipeline("splat_7k", [BOX]).settings.model
     assert settings.screen_filter.pixel_box
     assert settings.screen_filter.variance == 1 / 12
-    with pytest.raises(ConfigError, match=r"expected no variance beside the type 'box', .* `screen_filter: box`"):
+    with pytest.raises(ConfigError, match=r"'box' has a fixed variance of .* `screen_filter: box`"):
         load_pipeline("splat_7k", ["model.screen_filter.type=box"])
 
 

@@ -30,7 +30,7 @@ def save(path: Path, rng: np.random.Generator, value: float) -> Path:
 @pytest.mark.parametrize("work", WORK)
 def test_nonfinite_image_is_refused_by_the_name_of_its_view(work, rng, tiny_scene, tmp_path):
     file = save(tmp_path / "m.ply", rng, 3e38)
-    with pytest.raises(NumericError, match=r"^view 'test/r_000(\.png)?': its picture is not finite.*too large"):
+    with pytest.raises(NumericError, match=r"^view 'test/r_000(\.png)?': the render is not finite.*too large"):
         WORK[work](file, tiny_scene, tmp_path / "out")
     assert not [path for path in (tmp_path / "out").rglob("*.*") if path.name != ".renders.json"]
 

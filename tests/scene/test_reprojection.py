@@ -172,7 +172,7 @@ def test_poses_that_are_switched_on_take_the_place_of_a_sky(tmp_path, rng):
     ("changes", "fault"),
     [
         (["optimize.during.0={snapshot: {every: 2, view: nosuch}}"], "the scene has no view 'nosuch'"),
-        (["optimize.losses=[l1, {type: inverse_depth, folder: nosuch}]"], "no such file; expected the depth map of"),
+        (["optimize.losses=[l1, {type: inverse_depth, folder: nosuch}]"], "nosuch.*: the depth map of .* is missing"),
         (
             ["optimize.losses=[l1, inverse_depth]", "optimize.modules.camera_optimizer={start: 1}"],
             "cannot be combined with inverse_depth",

@@ -121,7 +121,7 @@ def test_choice_is_written_with_its_reason_and_off_keeps_bits(tiny_scene, tmp_pa
     run_pipeline(asked, RunState.read(tmp_path / "run"), None, "new")
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
     assert found.chosen == "off"
-    assert found.reason == "neither tracks of points nor cameras tell the exposures"
+    assert found.reason == "exposures are unknown, from tracks as well as from EXIF"
     assert f"optimize.modules.exposure: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
     assert digest(tmp_path / "run") == digest(few_steps)
     assert RunState.read(tmp_path / "run").is_whole(asked), "the same command finds it up to date"
