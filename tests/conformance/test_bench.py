@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.bench.cases import BenchCase, BenchResult, Peaks, Work, case, run_bench, synthetic
-from clsplat.conformance.bench.measurement import beside, read_measurement, table
+from clsplat.conformance.bench.measurement import compare_conditions, read_measurement, table
 from clsplat.core.errors import ConfigError
 from clsplat.core.text_table import text_table
 from clsplat.formats.splats import MOTION, PARAMETERS
@@ -93,28 +93,30 @@ def test_measurement_is_read_without_its_own_baseline(tmp_path):
         (measurement(scenes={"A": {"stages": {}}}), "scenes.A.host"),
     ],
 )
-def test_what_is_no_measurement_is_refused_with_its_place(data, place, tmp_path):
+def test_an_invalid_measurement_is_refused_with_its_key(data, place, tmp_path):
     (tmp_path / "x.json").write_text(json.dumps(data))
     with pytest.raises(ConfigError, match=rf"x\.json: {place}: .*expected the JSON of an earlier"):
         read_measurement(tmp_path / "x.json", "splat")
 
 
 def test_the_same_device_as_fast_as_before_needs_no_remark():
-    assert beside(measurement(), measurement()) == ["earlier: 60 GFLOP/s, 3.0 Gexp/s, copy 10.0 GB/s"]
+    assert compare_conditions(measurement(), measurement()) == ["earlier: 60 GFLOP/s, 3.0 Gexp/s, copy 10.0 GB/s"]
 
 
 def test_another_device_is_named():
-    assert "  of another device: 'a chip'" in beside(measurement(device="another"), measurement())
+    assert "  on another device: 'a chip'" in compare_conditions(measurement(device="another"), measurement())
 
 
-def test_a_machine_that_gives_less_is_told():
+def test_a_slower_machine_is_reported():
     slower = measurement(peaks={**PEAKS, "gflops": 45.0})
-    told = "0.75 of its GFLOP/s, 1.00 of its Gexp/s, 1.00 of its GB/s"
-    assert told in "".join(beside(slower, measurement()))
+    changes = "0.75 of its GFLOP/s, 1.00 of its Gexp/s, 1.00 of its GB/s"
+    assert changes in "".join(compare_conditions(slower, measurement()))
 
 
-def test_a_scene_that_was_not_measured_is_told():
-    assert "  has not measured: B; there are A" in beside(measurement(scenes={"A": TIMES, "B": TIMES}), measurement())
+def test_a_scene_that_was_not_measured_is_reported():
+    assert "  without scenes: B; it has A" in compare_conditions(
+        measurement(scenes={"A": TIMES, "B": TIMES}), measurement()
+    )
 
 
 def test_a_table_in_text_is_plain_and_never_cut(monkeypatch):

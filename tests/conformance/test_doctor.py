@@ -245,10 +245,10 @@ def memory_of(monkeypatch, largest: int, deviation: Deviation = RIGHT) -> tuple[
 @pytest.mark.parametrize(
     ("largest", "words"),
     [
-        (2**30 + 4, "wrote and read 1.00 GiB of the 1.00 GiB that one buffer may have; that is all"),
-        (2**28, "wrote and read 0.25 GiB of the 1.00 GiB that one buffer may have; a buffer of 512 MiB is refused: "
-         "other programs may hold memory of the device; end them and run `clsplat doctor` again to see what it gives"),
-        (0, "wrote and read 0.00 GiB of the 1.00 GiB that one buffer may have; a buffer of 128 MiB is refused: other"),
+        (2**30 + 4, "wrote and read 1.00 GiB of the 1.00 GiB that one buffer may have; the largest size works"),
+        (2**28, "wrote and read 0.25 GiB of the 1.00 GiB that one buffer may have; a buffer of 512 MiB cannot be "
+         "allocated: other programs may use the device's memory; close them and run `clsplat doctor` again"),
+        (0, "wrote and read 0.00 GiB of the 1.00 GiB that one buffer may have; a buffer of 128 MiB cannot be"),
     ],
 )  # fmt: skip
 def test_memory_held_by_other_programs_is_no_device_fault(monkeypatch, largest, words):

@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.images import LOSSES, camera_of, check_loss, comparison_of
-from clsplat.conformance.checks.images import pictures as images
+from clsplat.conformance.checks.images import image_pair as images
 from clsplat.core.errors import DataError
 from clsplat.core.settings import variants
 from clsplat.losses.base import ImageLoss

@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.checks.images import comparison_of, pictures
+from clsplat.conformance.checks.images import comparison_of, image_pair
 from clsplat.conformance.scenes import random_case
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
@@ -27,7 +27,7 @@ COLUMNS = ("screen_grad", "gain")
 @on_devices("width, height", SIZES)
 def test_the_error_of_a_view_is_that_of_its_loss(device, rng, width, height):
     """L1 itself, and twice L2: the gradient by the image times what is missing to the photograph."""
-    x, y = pictures(rng, width, height)
+    x, y = image_pair(rng, width, height)
     for loss, value, factor in ((L1(weight=0.7), ref.l1, 1), (L2(weight=0.7), ref.l2, 2)):
         comparison = comparison_of(device, x, y)
         loss.add(comparison)
@@ -37,7 +37,7 @@ def test_the_error_of_a_view_is_that_of_its_loss(device, rng, width, height):
 
 @on_one_setting
 def test_equal_pictures_have_no_error(device, rng):
-    x, _ = pictures(rng, 40, 30)
+    x, _ = image_pair(rng, 40, 30)
     assert view_error(comparison_of(device, x, x)).get() == 0
 
 

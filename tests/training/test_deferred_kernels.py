@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.training import behind_each_fifth, check_deferred, seen_rows, trained
+from clsplat.conformance.checks.training import behind_each_fifth, check_deferred, seen_rows, train
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.core.errors import ConfigError
 from clsplat.gaussians.deferred import Deferred
@@ -118,7 +118,7 @@ def test_the_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
     found = []
     for longest in (1, 2, 7, 32):
         monkeypatch.setattr("clsplat.conformance.checks.training.LONGEST", longest)
-        found.append(trained(device, case.model(device), seen, gradients, "deferred"))
+        found.append(train(device, case.model(device), seen, gradients, "deferred"))
     for name in Deferred.names:
         for tables in found[1:]:
             np.testing.assert_array_equal(tables[name].view(np.uint32), found[0][name].view(np.uint32))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.checks.images import comparison_of
-from clsplat.conformance.checks.images import pictures as images
+from clsplat.conformance.checks.images import image_pair as images
 from clsplat.core.errors import ConfigError
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.conversion import from_points

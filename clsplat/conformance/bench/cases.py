@@ -1,4 +1,4 @@
-"""Whole training steps of several scenes in turns, so that a slow moment of the machine affects all; medians count."""
+"""Time training steps of several scenes in turns, so that a slow moment of the machine affects all; take medians."""
 
 import statistics
 import time
@@ -35,14 +35,12 @@ from clsplat.training.motion import MotionRates
 from clsplat.training.records import stage_milliseconds
 from clsplat.training.trainer import StepTrainer
 
-# Peak rates of a device, from which the floors of stages are computed.
-
-LEAST = 2e-3  # s of a measurement: the first launch and the wait for the last take some 0.02 ms of it
+MIN_SECONDS = 2e-3  # shortest measurement: the first launch and the final wait take about 0.02 ms of it
 
 
 @dataclass(frozen=True)
 class Peaks:
-    """Peak rates of the device."""
+    """Peak rates of a device, from which the floors of stages are computed."""
 
     gflops: float  # multiply-adds count as two
     gexp: float  # 10⁹ exponentials per second
@@ -50,14 +48,14 @@ class Peaks:
 
 
 def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
-    """Measure the rates of multiply-adds, exponentials and copies: the best of `repeats`."""
+    """Measure the rates of multiply-adds, exponentials and copies; return the best of `repeats`."""
     program, lanes = device.program("peak.cl"), int(device.tuning["LANES"])
     group = int(device.tuning["GROUP"])
     is_cpu = device.info.kind == "CPU"
-    items = 64 * group * max(1, device.info.units // (8 if is_cpu else 2))  # a unit of a GPU runs some 2048 at once
+    items = 64 * group * max(1, device.info.units // (8 if is_cpu else 2))  # a GPU unit runs about 2048 at once
     result = device.empty(items * lanes)
 
-    def spent(launch: Callable[[], None], times: int) -> float:
+    def time_launches(launch: Callable[[], None], times: int) -> float:
         device.finish()
         start = time.perf_counter()
         for _ in range(times):
@@ -67,12 +65,12 @@ def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
 
     def seconds(launch: Callable[[], None]) -> float:
         times = 1
-        spent(launch, times)  # builds it
-        while (taken := spent(launch, times)) < LEAST:
+        time_launches(launch, times)  # the first launch compiles
+        while (taken := time_launches(launch, times)) < MIN_SECONDS:
             times *= 4
-        return min([taken, *(spent(launch, times) for _ in range(repeats - 1))]) / times
+        return min([taken, *(time_launches(launch, times) for _ in range(repeats - 1))]) / times
 
-    piece, whole = max(lanes, 4), program.peak_copy.group[0]  # floats that an item copies, and items of a group
+    piece, whole = max(lanes, 4), program.peak_copy.group[0]  # floats per item, and items per group
     rounds = 40_000 if is_cpu else 4000  # long enough for the system to spread the threads
     fma = seconds(lambda: program.peak_fma(items=items, result=result, factor=0.5, rounds=rounds))
     exp = seconds(lambda: program.peak_exp(items=items, result=result, step=1e-3, rounds=rounds))
@@ -83,25 +81,22 @@ def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
     return Peaks(16 * work / fma / 1e9, 2 * work / exp / 1e9, 8 * length / copy / 1e9)
 
 
-# The work of a step, and a lower bound of its time.
-
-
 @dataclass(frozen=True)
 class Work:
     """The work of one step."""
 
     gaussians: int
     pairs: int
-    rows: int  # (pair, pixel row) combinations that blending computes, 16 pixels each
+    rows: int  # (pair, row of 16 pixels) combinations that blending computes
     pixels: int
 
 
 def floors(work: Work, peaks: Peaks) -> dict[str, float]:
-    """Return the lower bound of each stage, ms.
+    """Return a lower bound on the time of each stage, ms.
 
-    Blending is counted in vector instructions of 16 lanes (31 a row forward; 80 a row and 60 a pair backward), which
-    issue at the rate of multiply-adds; the other stages in operations and bytes (473 operations and 236 bytes of
-    parameters a Gaussian, 59 parameters with gradient and two moments, 64 bytes a record, …).
+    Blending is counted in vector instructions of 16 lanes (31 per row forward; 80 per row and 60 per pair backward),
+    issued at the rate of multiply-adds.  Other stages are counted in operations and bytes (236 bytes of parameters per
+    Gaussian, 59 parameters with a gradient and two moments, 64 bytes per record, …).
     """
     n, pairs, pixels = work.gaussians, work.pairs, work.pixels
 
@@ -124,12 +119,12 @@ def floors(work: Work, peaks: Peaks) -> dict[str, float]:
 
 SPLAT_Y_MIN, SPLAT_Y_MAX = (int(constants("splat.h")[name]) for name in ("SPLAT_Y_MIN", "SPLAT_Y_MAX"))
 WARM_UP_STEPS = 3  # compile kernels and grow buffers
-LEAST_RATE = 1e-30  # changes nothing, so that every step does the same work; at a rate of 0 harmonics have no update
+TINY_RATE = 1e-30  # changes nothing, so that all steps do the same work; at a rate of 0, harmonics are not updated
 
 
 @dataclass
 class BenchResult:
-    """One scene's deviations, in milliseconds."""
+    """The times of one scene, ms."""
 
     work: Work
     stages: dict[str, float]
@@ -142,9 +137,9 @@ class BenchResult:
 
 
 class BenchCase:
-    """One scene for training steps with a pipeline's losses, statistics and rendering.
+    """A scene for training steps with a pipeline's losses, statistics and rendering.
 
-    An exported model has the world filter in its scales, so the filter takes no time here.
+    An exported model has the 3D filter baked into its scales, so that the filter takes no time here.
     """
 
     def __init__(
@@ -158,8 +153,8 @@ class BenchCase:
         color = device.zeros(3)
         color.fill(1.0 if background == "white" else 0.0)
         model = settings.model.model(gaussians, gaussians.sh_degree)
-        least: dict[str, Any] = dict.fromkeys(PARAMETERS, LEAST_RATE)
-        motion = MotionRates(**dict.fromkeys(MotionRates.model_fields, LEAST_RATE))
+        rates: dict[str, Any] = dict.fromkeys(PARAMETERS, TINY_RATE)
+        motion = MotionRates(**dict.fromkeys(MotionRates.model_fields, TINY_RATE))
         self.trainer = StepTrainer(
             Rasterizer(device, "radix"),
             model,
@@ -167,7 +162,7 @@ class BenchCase:
             SplatStats(gaussians, optimize.statistics),
             color,
             optimize.losses,
-            Rates(**least, motion=motion),
+            Rates(**rates, motion=motion),
             rows=optimize.update,
         )
         self.clock: list[float] = []
@@ -181,7 +176,7 @@ class BenchCase:
         self.memory = device.peak - self._before
 
     def step(self, record: bool, stale: Collection[str] = ()) -> None:
-        """Do one training step; `record` keeps its times, parameters in `stale` are not updated."""
+        """Do one training step.  record: keep its times.  stale: parameters that are not updated."""
         self.device.finish()
         self.device.timings.sampling = record
         start = time.perf_counter()
@@ -196,7 +191,7 @@ class BenchCase:
                 self.stages[name].append(milliseconds)
 
     def edit(self) -> None:
-        """Do one density edit that moves every table and changes nothing."""
+        """Do one density edit that rearranges all tables and changes nothing."""
         self.device.finish()
         start = time.perf_counter()
         edit = Edit(self.trainer.model.gaussians, self.trainer.stats, SceneScale(1.0), step=1, seed=0)
@@ -235,7 +230,7 @@ class BenchCase:
 
 
 def run_bench(cases: dict[str, BenchCase], peaks: Peaks, repeats: int) -> dict[str, BenchResult]:
-    """Time every scene `repeats` times, one scene after the other; return the results by name."""
+    """Time each scene `repeats` times, in turns; return the results by name."""
     for _ in range(repeats):
         for case in cases.values():
             case.step(record=True)
@@ -245,15 +240,13 @@ def run_bench(cases: dict[str, BenchCase], peaks: Peaks, repeats: int) -> dict[s
     return {name: case.result(peaks) for name, case in cases.items()}
 
 
-# The scenes of the benchmark: synthetic ones with a fixed seed, and real ones from files.
-
-FOCAL = 400.0  # px, of the synthetic scenes
+FOCAL = 400.0  # px, focal length of the synthetic scenes
 SIZE = 2.2  # px, standard deviation of their splats
 SIZES = {"A": (400, 400, 50_000), "B": (800, 800, 300_000), "C": (1920, 1080, 1_000_000)}
 
 
 def synthetic(width: int, height: int, count: int) -> tuple[Parameters, View]:
-    """Return flat Gaussians that face the camera, of about SIZE px, with log-normal sizes and random opacities."""
+    """Return flat Gaussians of about SIZE px that face the camera, with log-normal sizes and random opacities."""
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-8, width + 8, count), rng.uniform(-8, height + 8, count)
     sizes = SIZE * np.exp(rng.normal(0, 0.5, (count, 2)))
@@ -284,7 +277,7 @@ def case(device: Device, width: int, height: int, count: int, settings: Pipeline
 
 
 def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> BenchCase:
-    """Return a splat PLY, or the Gaussians that `init` makes of a point cloud, at a scene's first training view."""
+    """Return a scene with a splat file, or with Gaussians from a point cloud, at the first training view."""
     opened, background = settings.scene.read(scene)
     photographs = Photographs(device, background)
     parameters = load(model).tables() if detect(model) else from_points(read_points_ply(model), 0.1, 3)

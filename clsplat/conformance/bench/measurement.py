@@ -1,4 +1,4 @@
-"""A benchmark: its cases, the device's peaks, the times, and their tables."""
+"""Run a benchmark, and compare its times with the device's peaks and with an earlier measurement."""
 
 import textwrap
 from collections.abc import Sequence
@@ -16,11 +16,9 @@ from clsplat.opencl.device import Device, open_device
 from clsplat.opencl.discovery import Schedule
 from clsplat.pipeline.loading import load
 
-# An earlier measurement: its file, and what it does not share with one of now.
-
 EXPECTED = "the JSON of an earlier `clsplat bench --json`"
 UNITS: dict[str, str] = {"gflops": "GFLOP/s", "gexp": "Gexp/s", "gbytes": "GB/s"}
-ALIKE = 1.1  # largest ratio of two peaks of a machine that has as much to give as before
+MAX_PEAK_RATIO = 1.1  # largest ratio of two peaks for times to be comparable
 
 
 class _Peaks(BaseModel):
@@ -37,7 +35,7 @@ class _Times(BaseModel):
 
 
 class _Earlier(BaseModel):
-    """What a comparison reads of an earlier measurement."""
+    """The part of an earlier measurement that a comparison reads."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -59,33 +57,30 @@ def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
         raise ConfigError(f"{path}: {place}: {first['msg']}; expected {EXPECTED}: make it again") from error
     if found.pipeline != name:
         raise ConfigError(f"{path}: expected the pipeline '{name}', it has {quote(found.pipeline)}")
-    return {key: value for key, value in data.items() if key != "against"}  # that of one still earlier
+    return {key: value for key, value in data.items() if key != "against"}  # its own baseline
 
 
 def peaks_text(peaks: dict[str, float]) -> str:
-    """Return the peaks of a device, as the `data` of a measurement has them, in words."""
+    """Return the peaks of a device, as in the `data` of a measurement, as text."""
     return f"{peaks['gflops']:.0f} GFLOP/s, {peaks['gexp']:.1f} Gexp/s, copy {peaks['gbytes']:.1f} GB/s"
 
 
-def beside(now: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
-    """Return lines about what the `data` of two measurements do not share, for whoever compares their times."""
+def compare_conditions(now: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
+    """Return lines about what differs between the `data` of two measurements, other than times."""
     lines = [f"earlier: {peaks_text(earlier['peaks'])}"]
     if earlier["device"] != now["device"]:
-        lines.append(f"  of another device: {quote(earlier['device'])}")
+        lines.append(f"  on another device: {quote(earlier['device'])}")
     ratios = {unit: now["peaks"][key] / earlier["peaks"][key] for key, unit in UNITS.items() if earlier["peaks"][key]}
-    if any(not 1 / ALIKE <= ratio <= ALIKE for ratio in ratios.values()):
-        told = ", ".join(f"{ratio:.2f} of its {unit}" for unit, ratio in ratios.items())
-        lines.append(f"  the device gives {told}: compare ratios to the floors")
+    if any(not 1 / MAX_PEAK_RATIO <= ratio <= MAX_PEAK_RATIO for ratio in ratios.values()):
+        changes = ", ".join(f"{ratio:.2f} of its {unit}" for unit, ratio in ratios.items())
+        lines.append(f"  the device now gives {changes}: compare ratios to the floors")
     if missing := [name for name in now["scenes"] if name not in earlier["scenes"]]:
-        lines.append(f"  has not measured: {', '.join(missing)}; there are {', '.join(earlier['scenes']) or 'none'}")
+        lines.append(f"  without scenes: {', '.join(missing)}; it has {', '.join(earlier['scenes']) or 'none'}")
     return lines
 
 
-# The deviations as text.
-
-
 def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str:
-    """Return one scene as text; `earlier` is the same scene of an earlier run's JSON."""
+    """Return the times of one scene as text.  earlier: the same scene in an earlier measurement."""
     work, mib = result.work, 2**20
     counts = f"{work.gaussians:,} Gaussians, {work.pairs:,} pairs, {work.rows:,} rows, {work.pixels:,} pixels"
     rows = [(stage, ms, result.floors.get(stage)) for stage, ms in result.stages.items()]
@@ -100,13 +95,13 @@ def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str
         ratio = (f"{floor:.2f}", f"{ms / floor:.2f}") if floor else ("", "")
         compared = (f"{was[stage]:.2f}", f"{ms / was[stage]:.2f}") if was.get(stage, 0) > 0 else ()
         cells.append([stage, f"{ms:.2f}", *ratio, *compared])
-    memory = f"memory {result.memory / mib:,.0f} MiB at most; training plans {result.planned / mib:,.0f} MiB"
+    memory = f"memory {result.memory / mib:,.0f} MiB at peak; training plans {result.planned / mib:,.0f} MiB"
     return f"scene {name}: {counts}\n" + textwrap.indent(f"{text_table(cells, left=1)}\n{memory}", "  ")
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Times of a training step, scene by scene."""
+    """The times of a training step for each scene."""
 
     device: str
     pipeline: str
@@ -114,16 +109,16 @@ class Measurement:
     results: dict[str, BenchResult]
 
     def data(self) -> dict[str, Any]:
-        """Return everything as plain data."""
+        """Return the measurement as plain data."""
         scenes = {name: asdict(result) for name, result in self.results.items()}
         return {"device": self.device, "pipeline": self.pipeline, "peaks": asdict(self.peaks), "scenes": scenes}
 
     def text(self, earlier: dict[str, Any]) -> str:
-        """Return tables of the times, beside the `data` of an earlier measurement unless that is empty."""
+        """Return tables of the times, next to the `data` of an earlier measurement unless that is empty."""
         head = [f"device: {self.device}", f"peaks: {peaks_text(asdict(self.peaks))}"]
         was = earlier.get("scenes", {})
         tables = [table(name, result, was.get(name)) for name, result in self.results.items()]
-        return "\n".join([*head, *(beside(self.data(), earlier) if earlier else ()), *tables])
+        return "\n".join([*head, *(compare_conditions(self.data(), earlier) if earlier else ()), *tables])
 
 
 def measure(
@@ -136,7 +131,7 @@ def measure(
     schedule: Schedule = "auto",
     device: str | Device | None = None,
 ) -> Measurement:
-    """Time a training step on fixed scenes, and of a model at the views of its scene.  Raises ClsplatError."""
+    """Time a training step on fixed scenes, and on a model with a view of its scene.  Raises ClsplatError."""
     if unknown := [name for name in scenes if name not in SIZES]:
         raise ConfigError(f"--scenes: no scene named '{unknown[0]}'; there are {', '.join(SIZES)}")
     if (model is None) != (scene is None):

@@ -1,4 +1,4 @@
-"""The colors of a photograph by place and luminance: a change of an image, its derivatives, and the tables."""
+"""Check the bilateral grid, color matrices and camera responses: images, their gradients, and updates of tables."""
 
 from dataclasses import replace
 from typing import Any
@@ -20,7 +20,7 @@ from clsplat.training.modules.camera_response import by_parameters, respond
 from clsplat.training.modules.exposure import color_gradients, transform_colors
 
 CHECKS = Checks()
-MARGIN = 1e-3  # from white, from black and between two levels, where a derivative is that of one side
+MARGIN = 1e-3  # distance from black, white and the grid's levels, where derivatives are one-sided
 CASES = (  # width, height, nodes
     (1, 1, (4, 4, 4)),
     (17, 33, (4, 4, 4)),
@@ -33,19 +33,19 @@ CASES = (  # width, height, nodes
 
 
 def grids_of(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> GridState:
-    """The second of three photographs has matrices about no change, and the others have others."""
-    found = GridState(BilateralGrid(grid_shape=list(nodes), weight=weight), ("a", "b", "c"), device)
-    found.load({}, {"values": rng.normal(0, 0.2, found.shape).astype(np.float32)})
-    return found
+    """Return random grids of three photographs."""
+    grids = GridState(BilateralGrid(grid_shape=list(nodes), weight=weight), ("a", "b", "c"), device)
+    grids.load({}, {"values": rng.normal(0, 0.2, grids.shape).astype(np.float32)})
+    return grids
 
 
 def of_photograph(grids: GridState, values: NDArray[Any]) -> NDArray[Any]:
-    """The grid of a photograph, of so many values, as [3, 4, nz, ny, nx] in double."""
+    """Reshape the values of one photograph's grid to [3, 4, nz, ny, nx], float64."""
     return values.reshape(3, 4, *grids.shape[2:]).astype(np.float64)
 
 
-def picture_of(rng: np.random.Generator, grid: NDArray[Any], width: int, height: int, channels: int) -> NDArray[Any]:
-    """An image with values below black and beyond white, and none near a decision."""
+def image_for(rng: np.random.Generator, grid: NDArray[Any], width: int, height: int, channels: int) -> NDArray[Any]:
+    """Return an image with values below black and above white, and none within MARGIN of a threshold."""
     image = rng.uniform(-0.2, 1.4, (channels, height, width)).astype(np.float32)
     exact = image[:3].astype(np.float64)
     luminance = np.einsum("a,ahw->hw", LUMINANCE, exact)
@@ -60,11 +60,11 @@ def picture_of(rng: np.random.Generator, grid: NDArray[Any], width: int, height:
 def check_grid(
     device: Device, rng: np.random.Generator, width: int, height: int, nodes: tuple[int, ...], channels: int = 3
 ) -> Results:
-    """Compare an image, its gradient, and that by the grid."""
+    """Compare an image, its gradient, and the gradient of the grid."""
     what = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
     grids = grids_of(device, rng, nodes)
     grid = of_photograph(grids, grids.tables()["values"][1])
-    image = picture_of(rng, grid, width, height, channels)
+    image = image_for(rng, grid, width, height, channels)
     gradient = rng.normal(size=image.shape).astype(np.float32)
     camera, workspace = camera_of(device, width, height), Workspace(device)
     for name in ("colored", "grad_colored"):
@@ -94,7 +94,7 @@ def check_grid(
 
 
 def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Results:
-    """Compare the smoothness of a grid, three updates of it, and what they leave of the others."""
+    """Compare the smoothness of a grid and three updates of it, which leave the other grids unchanged."""
     what, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
     grids, workspace = grids_of(device, rng, nodes, weight), Workspace(device)
     expected = grids.tables()["values"].astype(np.float64).reshape(3, -1)
@@ -114,8 +114,8 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
         grids.learn(workspace, 1, device.upload(gradient), step)
         whole = gradient.astype(np.float64) + by_smoothness
         expected[1], moment1, moment2 = ref.adam_step(expected[1], whole, moment1, moment2, step, rate)
-        own = np.stack([of_photograph(grids, one) for one in expected])
-        expected = ref.centered_grids(own).reshape(expected.shape)
+        updated = np.stack([of_photograph(grids, values) for values in expected])
+        expected = ref.centered_grids(updated).reshape(expected.shape)
     tables = {name: table.reshape(3, -1) for name, table in grids.tables().items()}
     for kernel in ("color_grid_update", "color_grid_center"):
         yield by_element(kernel, f"grids, {what}", tables["values"], expected, 2e-6, floor=1.0)
@@ -138,11 +138,8 @@ def color_grid_tables(device: Device, rng: np.random.Generator) -> Results:
         yield from check_table(device, rng, nodes)
 
 
-# The colors of a photograph: a change of an image and its derivatives.
-
-
 def check_color(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
-    """Compare an image with a third of its pixels beyond white, its gradient, and that by the matrix."""
+    """Compare an image with a third of its pixels above white, its gradient, and the gradient of the matrix."""
     what = f"{width} x {height} px"
     matrix = (IDENTITY + rng.normal(0, 0.2, (3, 4))).astype(np.float32).astype(np.float64)
     image = rng.uniform(-0.2, 1.6, (channels, height, width)).astype(np.float32)
@@ -178,12 +175,8 @@ def colors(device: Device, rng: np.random.Generator) -> Results:
     yield from check_color(device, rng, 33, 18, channels=4)
 
 
-# What a camera makes of light.
-
-
 def check_response(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
-    """Compare what a camera makes of an image with values below black and beyond white, its gradient, and that by the
-    numbers."""
+    """Compare the response of a camera to an image with values below black and above white, and both gradients."""
     what, kernel = f"{width} x {height} px", "camera_response"
     row = np.concatenate([rng.normal(0, 0.1, 5), rng.normal(0, 0.4, 12)])
     image = rng.uniform(-0.3, 1.5, (channels, height, width)).astype(np.float32)

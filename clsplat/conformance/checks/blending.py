@@ -1,4 +1,4 @@
-"""The two schedules of blending: images, and the sums over pixels from which gradients come."""
+"""Check blending: images, the sums over pixels from which gradients come, inverse depths, and layers."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -23,7 +23,7 @@ from clsplat.render.workspace import Workspace
 
 CHECKS = Checks()
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
-MARGIN = 1e-5  # of alpha and transmittance: float32 is off by about 3e-6 there
+MARGIN = 1e-5  # distance of alpha and transmittance from thresholds: float32 errors are about 3e-6
 ALL_SUMS = SQUARE + 1
 Sums = tuple[NDArray[Any], Frame, Rasterizer]
 
@@ -33,7 +33,7 @@ def render(device: Device, case: Case, sort: Sort = "radix") -> Frame:
 
 
 def check_blend(device: Device, case: Case, what: str, sort: Sort = "radix") -> Results:
-    """Compare image and transmittance of a scene with the reference; outside the image they are zero."""
+    """Compare the image and the transmittance of a scene; both are zero outside the image."""
     frame, (width, height) = render(device, case, sort), case.size
     image, transmittance = frame.image.get(), frame.transmittance.get()
     outside = np.concatenate([image, transmittance[None]])
@@ -54,7 +54,7 @@ def pixel_sums_of(
     budget: RenderLimits | None = None,
     texture: NDArray[Any] | None = None,
 ) -> NDArray[Any]:
-    """Sums over each Gaussian's pixels under the loss Σ weights · image, [N, count]."""
+    """Return the sums over each Gaussian's pixels for the loss Σ weights · image, [N, count]."""
     rasterizer, model, camera = Rasterizer(device, sort, budget), case.model(device), case.device_camera(device)
     frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
     planes = np.zeros((4, camera.rows, camera.stride), np.float32)
@@ -62,13 +62,13 @@ def pixel_sums_of(
     if texture is not None:
         planes[3, : camera.height, : camera.width] = texture
     uploaded = None if texture is None else device.upload(planes[3])
-    rasterizer.workspace.array("pair_sums", (frame.lists.pairs, RECORD)).fill(np.nan)  # none of these may stay
+    rasterizer.workspace.array("pair_sums", (frame.lists.pairs, RECORD)).fill(np.nan)  # all must be overwritten
     pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), count, uploaded)
     return pixel_sums.get()[:, : model.gaussians.count].T.astype(np.float64)
 
 
 def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], what: str) -> Results:
-    """Compare sums over pixels, [N, PIXEL_SUMS or more], as the gradients of splats."""
+    """Compare sums over pixels, [N, PIXEL_SUMS or more], after conversion to gradients of splats."""
     kernel, splats = "blend_backward", case.project()
     truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
     mean2d, conic = gradients_of_sums(splats, m)
@@ -87,7 +87,7 @@ def _opaque(parameters: dict[str, NDArray[Any]]) -> None:
 
 
 def dim(parameters: dict[str, NDArray[Any]]) -> None:
-    """Transmittance falls below 0.01 in a batch of 256, and 40 more still show."""
+    """Make splats so faint that transmittance falls below 0.01 within a batch of 256, and 40 more still contribute."""
     parameters["log_scales"] += 4
     parameters["logit_opacity"][:] = -3.7
 
@@ -162,7 +162,7 @@ def entropy_of_weights(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("blend_backward")
 def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
-    """A loss of the transmittance alone is that of an image of black splats before one white channel."""
+    """A loss of the transmittance is a loss of an image of black splats in front of one white channel."""
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
         case, what = safe_case(rng, count, width, height, MARGIN), f"with the transmittance, {count} Gaussians"
         rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
@@ -210,7 +210,7 @@ def sums_of_records(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("blend_forward", "blend_backward")
 def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.Generator) -> Results:
     case = random_case(rng, 150, 50, 70)
-    case.parameters["log_scales"][:10] += 1.5  # some over many rows of tiles, and too many tiles for a mask
+    case.parameters["log_scales"][:10] += 1.5  # some cover many rows of tiles, and too many tiles for a mask
     weights = rng.normal(size=(3, 70, 50)).astype(np.float32)
     image, sums = render(device, case).image.get(), pixel_sums_of(device, case, weights)
     yield equal("sort_tiles", "pixels, against the radix sort", render(device, case, "bitonic").image.get(), image)
@@ -221,7 +221,7 @@ def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.G
     yield equal("blend_backward", "sums over pixels, a second time", pixel_sums_of(device, case, weights), sums)
 
 
-# inverse_depth.cl, and the fourth plane of blending that it reads.
+# inverse_depth.cl, and the fourth plane of blending, which it reads.
 
 Floats = NDArray[Any]
 
@@ -229,8 +229,8 @@ Floats = NDArray[Any]
 def gradients_of(
     device: Device, case: Case, weights: Floats, budget: RenderLimits | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Image [4, H, W], sums over pixels [N, PIXEL_SUMS], those of inverse depths [N], and the gradient of the means
-    [N, 3], under the loss Σ weights · (image, inverse depth)."""
+    """Return values for the loss Σ weights · (image, inverse depth): image, [4, H, W], sums over pixels,
+    [N, PIXEL_SUMS], sums of inverse depths, [N], and the gradient of the means, [N, 3]."""
     rasterizer, model, camera = Rasterizer(device, "radix", budget), case.model(device), case.device_camera(device)
     frame, (width, height) = rasterizer.forward(model, camera, device.upload(BACKGROUND), "inverse_depth"), case.size
     planes = np.zeros((4, camera.rows, camera.stride), np.float32)
@@ -291,7 +291,7 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Results:
         flat = rng.permutation(width * height)[:count]
         places = flat // width, flat % width
         targets, weights = rng.uniform(0, 1, (2, count)).astype(np.float32)
-        targets[:1] = x[3][places][:1]  # no gradient where they are equal
+        targets[:1] = x[3][places][:1]  # equal values have no gradient
         pixels = device.upload((places[0] * camera.stride + places[1]).astype(np.uint32))
         comparison.depths = KnownDepths(pixels, device.upload(targets), device.upload(weights), 3.0)
         value, scale = InverseDepth(weight=0.5).add(comparison).value(), 0.5 * 3 / count
@@ -306,11 +306,11 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Results:
         yield by_element("inverse_depth_loss", f"gradient, {what}", found, truth, SUM, floor=1e-9)
 
 
-# A layer of splats before an image.
+# overlay: a layer of splats in front of an image.
 
 
 def check_layer(device: Device, rng: np.random.Generator, width: int, height: int, channels: int) -> Results:
-    """Compare the colors of both, the loss and the derivatives; a sign of T says something else."""
+    """Compare the composite, the loss and the gradients; the sign of T does not matter."""
     camera, workspace = camera_of(device, width, height), Workspace(device)
     layer, image = (rng.random((number, height, width)).astype(np.float32) for number in (3, channels))
     left = rng.random((height, width)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""density.cl, saddle.cl and noise.cl: statistics of views, rules, the rows of an edit, and means moved at random."""
+"""Check density control: statistics of views, rules, the rows of an edit, noise, scores and clusters."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -75,8 +75,7 @@ def statistics(device: Device, rng: np.random.Generator) -> Results:
         yield equal("count_seen", f"views of {count} Gaussians", gaussians.get(SEEN)[:, 0], 2.0 * seen)
         for (name, kernel), values in columns.items():
             found = gaussians.get(f"stats/{name}")[:, 0]
-            of_all = name == "view_error"  # counts for those that the view does not see too
-            expected = 2 * values * (seen | of_all)
+            expected = 2 * values * (seen | (name == "view_error"))  # view_error also counts for unseen Gaussians
             yield by_element(kernel, f"{name} of {count} Gaussians", found, expected, SUM, floor=0.1)
 
 
@@ -100,7 +99,7 @@ def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
 
 
 def _edited(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:
-    """Random Gaussians on both sides of every threshold, before and after an edit."""
+    """Return the tables of random Gaussians on both sides of each threshold before an edit, and the Gaussians after."""
     case = random_case(rng, count)
     p = case.parameters
     sizes = EXTENT * rng.choice([0.003, 0.03, 0.12, 0.4], (count, 1))
@@ -218,13 +217,13 @@ def noise(device: Device, rng: np.random.Generator) -> Results:
         yield by_norm("add_noise", f"means of {count} Gaussians", found, p["means"] + moved, SUM)
 
 
-# What compression of a model computes on the device: each Gaussian's contribution, and clusters for a palette.
+# Compression of a model: the contribution of each Gaussian, and clusters for a palette.
 
-SIZES = ((1, 16, 16), (17, 33, 15), (30, 40, 30))  # Gaussians, and px: tiles that end at the edge, and beyond it
+SIZES = ((1, 16, 16), (17, 33, 15), (30, 40, 30))  # Gaussians, width, height: with whole tiles, and with parts
 
 
 def photograph_of(device: Device, case: Case, mask: Mask | None = None) -> Photograph:
-    """A black photograph at the camera of a scene."""
+    """Return a black photograph at the camera of a scene."""
     camera = case.device_camera(device)
     colors = device.upload(np.zeros((3, camera.height, camera.width), np.uint8))
     return Photograph(camera, colors, None if mask is None else device.upload(mask[None].astype(np.uint8)))
@@ -255,7 +254,7 @@ def _render_views(
 
 
 def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray[Any]:
-    """(dI/dG)² summed over the pixels of a mask and the channels, [N]."""
+    """Return (dI/dG)² summed over the channels and the pixels of a mask, [N]."""
     width, height = case.size
     counted, total = np.ones((height, width)) if mask is None else mask, np.zeros(len(case.project().opacity))
     for channel in range(3):
@@ -266,10 +265,10 @@ def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray
 
 @CHECKS.add("most_alike")
 def alike(device: Device, rng: np.random.Generator) -> Results:
-    """Whole numbers: every product is exact."""
+    """Compare labels; values are integers, so that all products are exact."""
     for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
         points, vectors = (rng.integers(-511, 512, (rows, components)).astype(np.float32) for rows in (count, entries))
-        vectors[-1] = vectors[0]  # the first counts
+        vectors[-1] = vectors[0]  # a tie, which the first wins
         found, expected = most_alike(device, points, vectors), (points @ vectors.T).argmax(axis=1)
         yield equal("most_alike", f"labels of {count} points and {entries} vectors", found, expected)
 
@@ -279,7 +278,7 @@ def shared_means(device: Device, rng: np.random.Generator) -> Results:
     for count, clusters in ((1, 1), (17, 3), (130, 40)):
         gaussians = random_case(rng, count).model(device).gaussians
         values, labels = gaussians.get("sh_rest"), rng.integers(0, clusters, count)
-        weights = rng.random(count).astype(np.float32) * (labels != 0)  # of one cluster all are zero
+        weights = rng.random(count).astype(np.float32) * (labels != 0)  # one cluster has no weight
         set_clusters(gaussians, labels, weights)
         share(gaussians, "sh_rest")
         what, found = f"means of {clusters} clusters of {count} Gaussians", gaussians.get("sh_rest")

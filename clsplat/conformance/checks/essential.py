@@ -1,4 +1,4 @@
-"""The two-second form: the kernels of every training step, each once, on one small scene."""
+"""Check the kernels that every training step uses, once each, on one small scene: it takes two seconds."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from clsplat.conformance.scenes import random_case, safe_case, with_world_filter
 from clsplat.opencl.device import Device
 
 CHECKS = Checks()
-BITONIC = Checks()  # only where a run may sort so
+BITONIC = Checks()  # for runs that may use the bitonic sort
 
 
 @CHECKS.add("project_forward", "project_backward", "emit_pairs", "blend_forward", "blend_backward", "sum_records")
@@ -41,7 +41,7 @@ def large_splats(device: Device, rng: np.random.Generator) -> Results:
 def sorting(device: Device, rng: np.random.Generator) -> Results:
     for count in (1025, 40_001):  # one block, and several
         yield tiles.check_scan(device, rng.integers(0, 100, count).astype(np.uint32))
-    yield tiles.check_scan(device, np.full(40_001, 2**31, np.uint32))  # sums that would wrap
+    yield tiles.check_scan(device, np.full(40_001, 2**31, np.uint32))  # sums that would overflow
     yield from tiles.check_radix(device, rng.integers(0, 2**20, 1025).astype(np.uint32), 20)
 
 
@@ -52,7 +52,7 @@ def sorting_in_tiles(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient", "update_gaussians")
 def learning(device: Device, rng: np.random.Generator) -> Results:
-    x, y = images.pictures(rng, 33, 17)
+    x, y = images.image_pair(rng, 33, 17)
     for loss, oracle, kernel in images.LOSSES:
         yield from images.check_loss(device, loss(weight=0.7), 0.7, oracle, kernel, x, y)
     yield from training.check_fused(device, rng, random_case(rng, 40), "40 Gaussians")

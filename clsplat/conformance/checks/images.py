@@ -1,4 +1,4 @@
-"""Losses, masks, blur and texture: kernels on planes of pixels."""
+"""Check kernels on planes of pixels: losses, masks, blur, texture, and transients."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.training.modules.transients import mask_transients, measure_residuals
 
 CHECKS = Checks()
-SIZES = ((1, 1), (11, 11), (17, 33), (257, 9))  # around the window, tiles and the columns of a group
+SIZES = ((1, 1), (11, 11), (17, 33), (257, 9))  # at the limits of the SSIM window, of tiles, and of a group's columns
 LOSSES = ((L1, ref.l1, "pixel_loss"), (L2, ref.l2, "pixel_loss"), (Dssim, ref.dssim, "ssim_gradient"))
 
 
@@ -29,29 +29,29 @@ def camera_of(device: Device, width: int, height: int) -> DeviceCamera:
 
 
 def planes_of(device: Device, camera: DeviceCamera, image: NDArray[Any]) -> Array:
-    """An image [C, height, width] as planes of whole tiles, zero outside."""
+    """Upload an image, [C, height, width], as planes of whole tiles, zero outside."""
     planes = np.zeros((len(image), camera.rows, camera.stride), np.float32)
     planes[:, : camera.height, : camera.width] = image
     return device.upload(planes)
 
 
 def outside(camera: DeviceCamera, planes: NDArray[Any]) -> NDArray[Any]:
-    """The planes with the image itself set to zero."""
+    """Return the planes with the image itself set to zero."""
     rest = planes.copy()
     rest[..., : camera.height, : camera.width] = 0
     return rest
 
 
 def comparison_of(device: Device, x: NDArray[Any], y: NDArray[Any]) -> Comparison:
-    """x, y: [3, H, W]."""
+    """Return a comparison of a render x and a photograph y, [3, H, W]."""
     camera = camera_of(device, x.shape[2], x.shape[1])
     gradient = device.empty((3, camera.rows, camera.stride))
     gradient.fill(7)
     return Comparison(Workspace(device), camera, planes_of(device, camera, x), planes_of(device, camera, y), gradient)
 
 
-def pictures(rng: np.random.Generator, width: int, height: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """A photograph and a noisy rendering of it, [3, H, W]: rendering first.  Some pixels are equal."""
+def image_pair(rng: np.random.Generator, width: int, height: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return a noisy render and its photograph, [3, H, W].  Some pixels are equal."""
     y = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
     x = (y + rng.normal(0, 0.2, y.shape)).astype(np.float32)
     x[:, 1::3, 1::4] = y[:, 1::3, 1::4]
@@ -61,7 +61,7 @@ def pictures(rng: np.random.Generator, width: int, height: int) -> tuple[NDArray
 def check_loss(
     device: Device, loss: ImageLoss, weight: float, oracle: Any, kernel: str, x: NDArray[Any], y: NDArray[Any]
 ) -> Results:
-    """Compare value and gradient of a loss of weight `weight`."""
+    """Compare the value and the gradient of a loss."""
     comparison, what = comparison_of(device, x, y), f"{type(loss).__name__}, {x.shape[2]} x {x.shape[1]} px"
     found = loss.add(comparison)
     value, gradient = oracle(x.astype(np.float64), y.astype(np.float64))
@@ -78,14 +78,14 @@ def check_loss(
 @CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient")
 def losses(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
-        x, y = pictures(rng, width, height)
+        x, y = image_pair(rng, width, height)
         for loss, oracle, kernel in LOSSES:
             yield from check_loss(device, loss(weight=0.7), 0.7, oracle, kernel, x, y)
 
 
 @CHECKS.add("pixel_loss", "ssim_gradient")
 def losses_that_add_up(device: Device, rng: np.random.Generator) -> Results:
-    x, y = pictures(rng, 50, 20)
+    x, y = image_pair(rng, 50, 20)
     comparison = comparison_of(device, x, y)
     expected = np.zeros(x.shape)
     for weight, (loss, oracle, _) in zip((0.8, 3.0, 0.2), LOSSES, strict=True):
@@ -98,7 +98,7 @@ def losses_that_add_up(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("view_error", "sum_errors")
 def errors_of_views(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
-        (x, y), what = pictures(rng, width, height), f"{width} x {height} px"
+        (x, y), what = image_pair(rng, width, height), f"{width} x {height} px"
         gradient, comparison = rng.normal(size=x.shape).astype(np.float32), comparison_of(device, x, y)
         comparison.gradient = planes_of(device, comparison.camera, gradient)
         found = view_error(comparison).get()
@@ -167,7 +167,7 @@ def blur(device: Device, rng: np.random.Generator) -> Results:
 def check_haar(
     device: Device, rng: np.random.Generator, width: int, height: int, share: float | None, taps: NDArray[Any]
 ) -> Results:
-    """Compare a photograph that passed the Haar transform, and the derivatives by its filter."""
+    """Compare a photograph after the Haar transform, and the gradient of its filter."""
     image, gradient = rng.uniform(0, 1, (3, height, width)).astype(np.float32), rng.normal(size=(3, height, width))
     mask = None if share is None else rng.random((height, width)) < share
     camera, workspace, what = camera_of(device, width, height), Workspace(device), f"{width} x {height} px, h = {taps}"
@@ -195,7 +195,7 @@ def haar(device: Device, rng: np.random.Generator) -> Results:
 
 
 def magnitude_of(image: NDArray[Any]) -> NDArray[Any]:
-    """|Sobel| / 8 of the luminance of [3, H, W], float64."""
+    """Return |Sobel| / 8 of the luminance of an image, [3, H, W], in float64."""
     luminance = np.tensordot([0.299, 0.587, 0.114], image.astype(np.float64), axes=1)
     across, down = (ndimage.sobel(luminance, axis=axis, mode="nearest") for axis in (1, 0))
     return np.hypot(across, down) / 8
@@ -219,16 +219,14 @@ def texture(device: Device, rng: np.random.Generator) -> Results:
             yield equal(kernel, f"texture outside the image, {what}", outside(camera, found), 0.0)
 
 
-# Residuals, their numbers by size, and the mask without the large ones.
-
-SCALES = (1.0, 1e-2, 8.0)  # of the differences: some lie beyond the bins, on either side
+SCALES = (1.0, 1e-2, 8.0)  # factors on differences: some are outside the histogram on either side
 
 
 def check_transient(
     device: Device, rng: np.random.Generator, width: int, height: int, scale: float, share: float | None
 ) -> Results:
-    """Compare residuals and masks of a picture of which a mask leaves a share; bins and masks are exact."""
-    x, y = pictures(rng, width, height)
+    """Compare residuals, their histogram, and masks; a mask keeps `share` of the pixels."""
+    x, y = image_pair(rng, width, height)
     x = (y + np.float32(scale) * (x - y)).astype(np.float32)
     counted = np.ones((height, width), bool) if share is None else rng.random((height, width)) < share
     camera, workspace = camera_of(device, width, height), Workspace(device)

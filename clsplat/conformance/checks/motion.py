@@ -1,4 +1,4 @@
-"""motion.cl: Gaussians at a moment, the gradients by their motion, and its update."""
+"""Check motion: Gaussians at a time, the gradient of their motion, its update, and penalties."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ EXTENT = 2.0
 
 
 def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
-    """Gaussians that move about their places; some come and go, a tenth is not there at TIME, a tenth always."""
+    """Return moving Gaussians; some appear and disappear, a tenth is absent at TIME, and a tenth is always present."""
     case, fields = random_case(rng, count), motion_fields(width)
     motion = rng.normal(0, 0.3, (count, width))
     center, duration = rng.uniform(0, 1, count), rng.normal(-1, 0.5, count)
@@ -40,7 +40,7 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
 
 
 def check_moment(device: Device, rng: np.random.Generator, count: int, width: int) -> Results:
-    """The tables at a moment, and the gradients by them carried back."""
+    """Compare the tables at a time, and the gradients of the motion."""
     case, (degree, turns) = moving_case(rng, count, width), WIDTHS[width]
     model, camera, what = case.model(device), case.device_camera(device), f"{count} of {width} columns"
     p = {name: table.astype(np.float64) for name, table in case.parameters.items()}
@@ -73,7 +73,7 @@ def check_moment(device: Device, rng: np.random.Generator, count: int, width: in
 
 
 def check_still(device: Device, rng: np.random.Generator) -> Results:
-    """A motion of none gives the bits of none."""
+    """Check that Gaussians with a motion of zero give the same bits as static ones."""
     case = random_case(rng, 65)
     motion = np.zeros((65, motion_width(3, True)), np.float32)
     motion[:, 3], motion[:, 4] = rng.uniform(0, 1, 65), STATIC_LOG_DURATION
@@ -88,7 +88,7 @@ def check_still(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_step(device: Device, rng: np.random.Generator, count: int, width: int, every: int = 0xFFFFFFFF) -> Results:
-    """Two updates, in which durations reach their bound.  every: as in motion_step."""
+    """Compare two updates in which durations reach their bound.  every: as in motion_step."""
     case = moving_case(rng, count, width)
     model, rates = case.model(device), MotionRates(log_duration=0.5, min_duration=0.3).at(3, EXTENT)
     gaussians, min_duration = model.gaussians, float(np.log(0.3))

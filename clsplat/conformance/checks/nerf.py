@@ -1,4 +1,4 @@
-"""Cones of pixels, their samples, and the encodings of these, which a field reads."""
+"""Check fields: cones of pixels, samples, encodings, the network, composited colors, and updates."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +18,7 @@ from clsplat.nerf.training import AdamStep, LearnedField
 from clsplat.opencl.device import Array, Device
 
 CHECKS = Checks()
-RAYS = (1, 63, 64, 65)  # around a tile of samples, and a chunk of tiles
+RAYS = (1, 63, 64, 65)  # at the limits of a tile of samples and a chunk of tiles
 SHAPE = FieldShape(
     near=0.2,
     depth=3,
@@ -32,26 +32,26 @@ SHAPE = FieldShape(
 )
 BACKGROUND = np.array([1.0, 0.7, 0.4], np.float32)
 WIDTH, HEIGHT = 19, 13
-ENCODING = 4e-5  # of a sine: 2^4 times a distance of about 6, rounded to 32 bits
-EDGES = 2e-6  # of the distances, in shares of the farthest
+ENCODING = 4e-5  # bound on a sine: 2^4 times a distance of about 6, in float32
+EDGES = 2e-6  # bound on distances, as a share of the largest
 
 
 @dataclass(frozen=True)
 class GridLevel:
-    """A level of a grid, and where its entries lie among the parameters."""
+    """A level of a grid, and the position of its entries among the parameters."""
 
     level: ref.HashLevel
     first: int
 
-    def of(self, parameters: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Its entries, [entries, FEATURES]."""
-        own = parameters[self.first : self.first + FEATURES * self.level.entries]
-        return own.reshape(-1, FEATURES).astype(np.float64)
+    def entries(self, parameters: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return its entries, [entries, FEATURES]."""
+        values = parameters[self.first : self.first + FEATURES * self.level.entries]
+        return values.reshape(-1, FEATURES).astype(np.float64)
 
 
 @dataclass(frozen=True)
 class FieldCase:
-    """Random parameters, and a camera before a random photograph."""
+    """A field with random parameters, and rays of a camera with a random photograph."""
 
     shape: FieldShape
     levels: Levels
@@ -59,18 +59,18 @@ class FieldCase:
     photograph: NDArray[np.float32]  # [3, HEIGHT, WIDTH]
     planes: Array
     rays: Rays
-    cones: NDArray[np.float64]  # with those that fill tiles
+    cones: NDArray[np.float64]  # including padding to whole tiles
 
     @classmethod
-    def of(cls, device: Device, rng: np.random.Generator, rays: int, draw: Draw, **keys: Any) -> "FieldCase":
-        """Return a case of drawn rays."""
+    def sample(cls, device: Device, rng: np.random.Generator, rays: int, draw: Draw, **keys: Any) -> "FieldCase":
+        """Return a case with random rays.  keys: changes of SHAPE."""
         shape = FieldShape.model_validate({**SHAPE.model_dump(), **keys})
         parameters = shape.first_parameters(int(rng.integers(100)))
         for layer in shape.layers:
             parameters[layer.first_bias : layer.first_bias + layer.outputs] = rng.normal(0, 0.3, layer.outputs)
         if shape.grid:
-            own = parameters[shape.of_network : shape.of_network + shape.grid.learned]
-            own[:] = rng.normal(0, 0.5, len(own))
+            entries = parameters[shape.of_network : shape.of_network + shape.grid.learned]
+            entries[:] = rng.normal(0, 0.5, len(entries))
         scene = random_case(rng, 1, WIDTH, HEIGHT)
         camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)
         field = Field(shape, device.upload(parameters), device.upload(BACKGROUND))
@@ -85,33 +85,35 @@ class FieldCase:
         return self.levels.workspace.device.upload(self.parameters)
 
     def units(self, samples: int, kind: int) -> NDArray[np.float64]:
-        """Random numbers of the edges of each ray."""
+        """Return the random numbers for the edges of each ray."""
         draw = self.rays.draw or Draw(0, 0, 0)
-        own = [ref.units(draw.first + i, samples + 1, kind, draw.seed, draw.step) for i in range(self.rays.count)]
-        return np.stack(own)
+        count = self.rays.count
+        return np.stack([ref.units(draw.first + i, samples + 1, kind, draw.seed, draw.step) for i in range(count)])
 
-    def wanted(self) -> NDArray[np.float64]:
-        """The photograph's colors of the rays that count, [counted, 3]."""
+    def target_colors(self) -> NDArray[np.float64]:
+        """Return the photograph's colors of the rays that count, [counted, 3]."""
         pixels = self.rays.pixels.get()
         return self.photograph[:, pixels // WIDTH, pixels % WIDTH].T.astype(np.float64)
 
     def encoded(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Encoded positions and directions of samples, [S, features]."""
+        """Return encoded positions and directions of samples, [S, features]."""
         means, variances = ref.frustums(self.cones, edges.astype(np.float64))
         sines = ref.encoded_frustums(means, variances, self.shape.degrees)
         direction = ref.encoded_directions(self.cones, self.shape.direction_degrees)
-        of_grid = [own.level.forward(own.of(self.parameters), *self.places(edges)) for own in self.grid_levels()]
+        of_grid = [
+            grid.level.forward(grid.entries(self.parameters), *self.places(edges)) for grid in self.grid_levels()
+        ]
         position = np.concatenate([*of_grid, sines.reshape(sines.shape[0] * sines.shape[1], sines.shape[2])], axis=1)
         return position, np.repeat(direction, edges.shape[1] - 1, axis=0)
 
     def places(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Places of samples in the grid's cube, [S, 3], and their variances, [S]."""
+        """Return positions of samples in the grid's cube, [S, 3], and their variances, [S]."""
         assert self.shape.grid is not None
-        means, variances = (one.reshape(-1, 3) for one in ref.frustums(self.cones, edges.astype(np.float64)))
+        means, variances = (table.reshape(-1, 3) for table in ref.frustums(self.cones, edges.astype(np.float64)))
         return ref.places(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)
 
     def grid_levels(self) -> list[GridLevel]:
-        """The levels of the grid; none without one."""
+        """Return the levels of the grid; an empty list without a grid."""
         table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.of_network
         return [
             GridLevel(ref.HashLevel(cells, entries), first + FEATURES * before) for cells, before, entries, _ in table
@@ -119,15 +121,15 @@ class FieldCase:
 
 
 def rows_of(table: Array, first: int, count: int) -> NDArray[Any]:
-    """[tiles, rows, SAMPLES] -> the features `first` to `first + count` of each sample, [S, count]."""
+    """Return features `first` to `first + count` of each sample, [S, count], from [tiles, rows, SAMPLES]."""
     return np.asarray(table.get()[:, first : first + count].transpose(0, 2, 1).reshape(-1, count))
 
 
 @CHECKS.add("draw_pixels", "cast_rays", "spread_edges", "resample_edges")
 def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
-    """Pixels, rays and where they are cut, drawn and even."""
+    """Compare pixels, rays, and the edges of samples, random and evenly spaced."""
     for count in RAYS:
-        case = FieldCase.of(device, rng, count, Draw(7, 11, 5))
+        case = FieldCase.sample(device, rng, count, Draw(7, 11, 5))
         pixels = ref.drawn_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
         yield equal("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
         yield by_element("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
@@ -151,9 +153,9 @@ def _check_edge(case: FieldCase, what: str) -> Results:
 
 @CHECKS.add("encode_frustums", "encode_directions")
 def encodings(device: Device, rng: np.random.Generator) -> Results:
-    """What the network reads of a sample."""
+    """Compare the encoded positions and directions that the network reads."""
     for count in RAYS:
-        case = FieldCase.of(device, rng, count, Draw(1, 2, 0))
+        case = FieldCase.sample(device, rng, count, Draw(1, 2, 0))
         level = next(case.levels.render(case.on_device, case.rays))
         position, direction = case.encoded(level.edges.get())
         (table, first), (seen, row) = (
@@ -167,7 +169,7 @@ def encodings(device: Device, rng: np.random.Generator) -> Results:
         yield equal("encode_directions", f"what fills blocks, {count} rays", found[:, direction.shape[1] :], 0.0)
 
 
-# A grid of features: places of samples in it, features, and derivatives by its entries.
+# A grid of features: positions of samples in it, features, and gradients of its entries.
 
 GRID: dict[str, Any] = {
     "levels": 3,
@@ -177,11 +179,11 @@ GRID: dict[str, Any] = {
     "corner": [-1.0, -1.1, -1.2],
     "side": 2.5,
 }
-CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, places along an axis, keys of the grid
+CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, range of positions, keys of the grid
     *((tiles, (-0.1, 1.1), {}) for tiles in (1, 2, 17)),
     (2, (0.0, 1.0), {"levels": 1, "coarsest": 1, "finest": 1, "entries": 16}),  # one cell, all of its corners
-    (2, (-0.1, 1.1), {"entries": 16}),  # all levels share
-    (2, (-0.1, 1.1), {"entries": 8192}),  # none shares
+    (2, (-0.1, 1.1), {"entries": 16}),  # all levels use the hash
+    (2, (-0.1, 1.1), {"entries": 8192}),  # no level uses the hash
     (2, (1.1, 2.0), {}),  # no sample in the cube
     (2, (0.0, 1.0), {"finest": 4096}),  # finer than most samples
 ]
@@ -189,28 +191,28 @@ CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, place
 
 @CHECKS.add("grid_places", "grid_forward", "grid_backward")
 def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
-    """Where samples are in a grid, what a network reads of it there, and derivatives by its numbers."""
+    """Compare positions of samples in a grid, the features there, and the gradients of its entries."""
     for count in RAYS:
-        case = FieldCase.of(device, rng, count, Draw(1, 2, 0), grid=GRID)
+        case = FieldCase.sample(device, rng, count, Draw(1, 2, 0), grid=GRID)
         level = next(case.levels.render(case.on_device, case.rays))
         at, variances = case.places(level.edges.get())
         found = rows_of(case.levels.encoding.places(level.raw_colors.shape[0]), 0, PLACE_ROWS)
         yield by_element("grid_places", f"means of {count} rays", found[:, :3], at, 1e-5, 1.0)
         yield by_element("grid_places", f"variances of {count} rays", found[:, 3], variances, 1e-3)
     for tiles, ends, keys in CASES:
-        case = FieldCase.of(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
+        case = FieldCase.sample(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
         yield from _check_grid(device, rng, case, _places(rng, tiles, ends))
 
 
 def _places(rng: np.random.Generator, tiles: int, ends: tuple[float, float]) -> NDArray[np.float32]:
-    """Random samples of all sizes, [tiles, PLACE_ROWS, SAMPLES]; a sixth of the means lie on faces of cells."""
+    """Return random samples of all sizes, [tiles, PLACE_ROWS, SAMPLES]; a sixth of the means are on faces of cells."""
     at = rng.uniform(*ends, (tiles, 3, SAMPLES))
     faces = np.where(rng.random(at.shape) < 1 / 6, np.rint(4 * at) / 4, at)
     return np.concatenate([faces, 10.0 ** rng.uniform(-9, 0, (tiles, 1, SAMPLES))], axis=1).astype(np.float32)
 
 
 def _by_sample(table: NDArray[np.float32]) -> NDArray[np.float64]:
-    """[tiles, rows, SAMPLES] -> [S, rows]."""
+    """Reshape [tiles, rows, SAMPLES] to [S, rows]."""
     return table.transpose(0, 2, 1).reshape(-1, table.shape[1]).astype(np.float64)
 
 
@@ -223,7 +225,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, place
     table, first = case.levels.network.position(tiles)
     features = rows_of(table, first, shape.grid_rows)
     by_features = rng.normal(size=(tiles, shape.grid_rows, SAMPLES)).astype(np.float32)
-    by_features[:, :, ::3] = 0  # samples without derivatives
+    by_features[:, :, ::3] = 0  # samples without a gradient
     gradients = list[NDArray[np.float32]]()
     for parts in (encoding.parts, 1, 3):
         encoding.parts, sums = parts, device.zeros(shape.parameters)
@@ -235,18 +237,18 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, place
     by_sample = _by_sample(by_features)
     at, variances = np.split(_by_sample(places), [3], axis=1)
     variances = variances[:, 0]
-    for number, own in enumerate(case.grid_levels()):
+    for number, grid in enumerate(case.grid_levels()):
         rows = slice(FEATURES * number, FEATURES * (number + 1))
-        wanted = own.level.forward(own.of(case.parameters), at, variances)
-        yield by_element("grid_forward", f"level {number}, {what}", features[:, rows], wanted, 5e-5, 1.0)
-        wanted, by_entries = own.level.backward(by_sample[:, rows], at, variances), own.of(found)
-        yield by_norm("grid_backward", f"level {number}, {what}", by_entries, wanted, GRADIENT)
-        untouched = np.all(wanted == 0, axis=1)
+        expected = grid.level.forward(grid.entries(case.parameters), at, variances)
+        yield by_element("grid_forward", f"level {number}, {what}", features[:, rows], expected, 5e-5, 1.0)
+        expected, by_entries = grid.level.backward(by_sample[:, rows], at, variances), grid.entries(found)
+        yield by_norm("grid_backward", f"level {number}, {what}", by_entries, expected, GRADIENT)
+        untouched = np.all(expected == 0, axis=1)
         yield equal("grid_backward", f"entries without samples, level {number}, {what}", by_entries[untouched], 0.0)
     yield equal("grid_backward", f"parameters of the network, {what}", found[: shape.of_network], 0.0)
 
 
-# A field: its network, colors of rays, all derivatives, pictures and updates.
+# A field: its network, colors of rays, all gradients, images and updates.
 
 FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
     *((count, {}) for count in RAYS),
@@ -260,28 +262,28 @@ FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
     *("composite_forward", "composite_backward"),
 )
 def fields(device: Device, rng: np.random.Generator) -> Results:
-    """Colors of rays and derivatives by all parameters, through both levels."""
+    """Compare colors of rays and the gradients of all parameters, through both levels."""
     for count, keys in FIELDS_CASES:
-        case = FieldCase.of(device, rng, count, Draw(3, 4, 2), **keys)
+        case = FieldCase.sample(device, rng, count, Draw(3, 4, 2), **keys)
         gradient = device.zeros(case.shape.parameters)
         errors, expected = device.zeros(2 + count), list[ref.Weights]()
-        by_entries = [np.zeros_like(own.of(case.parameters)) for own in case.grid_levels()]
+        by_entries = [np.zeros_like(grid.entries(case.parameters)) for grid in case.grid_levels()]
         parameters = case.on_device
         for scale, level in zip((0.1, 1.0), case.levels.render(parameters, case.rays), strict=True):
-            comparison = _Comparison.of(case, level, scale)
+            comparison = _Comparison.from_level(case, level, scale)
             yield from comparison.deviations(f"{count} rays, {level.samples} samples")
             case.levels.differentiate(parameters, level, RayTarget(case.planes, scale, errors), gradient)
             squares = (comparison.differences[:count] ** 2).sum(axis=1)
             yield by_element("composite_backward", f"squares of {count} rays", errors.get()[2:], squares, SUM, 1e-3)
             by_weights, by_position = comparison.backward(count)
             expected.append(by_weights)
-            for number, own in enumerate(case.grid_levels()):
+            for number, grid in enumerate(case.grid_levels()):
                 by_features = by_position[:, FEATURES * number : FEATURES * (number + 1)]
-                by_entries[number] += own.level.backward(by_features, *case.places(level.edges.get()))
-        for number, (own, wanted) in enumerate(zip(case.grid_levels(), by_entries, strict=True)):
+                by_entries[number] += grid.level.backward(by_features, *case.places(level.edges.get()))
+        for number, (grid, truth) in enumerate(zip(case.grid_levels(), by_entries, strict=True)):
             what = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
             for name in ("dense_backward", "grid_backward"):
-                yield by_norm(name, what, own.of(gradient.get()), wanted, GRADIENT)
+                yield by_norm(name, what, grid.entries(gradient.get()), truth, GRADIENT)
         yield from _check_gradient(case.shape, gradient.get(), expected, f"{count} rays")
 
 
@@ -302,7 +304,7 @@ def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[re
 
 @dataclass(frozen=True)
 class _Comparison:
-    """A level in double precision."""
+    """A level, computed in float64 to compare with the device."""
 
     level: SampleLevel
     scale: float
@@ -314,11 +316,9 @@ class _Comparison:
     differences: NDArray[np.float64]
 
     @classmethod
-    def of(cls, case: FieldCase, level: SampleLevel, scale: float) -> "_Comparison":
-        network, weights = (
-            ref.DenseNetwork(case.shape.depth, case.shape.skip),
-            case.shape.weights(case.parameters),
-        )
+    def from_level(cls, case: FieldCase, level: SampleLevel, scale: float) -> "_Comparison":
+        network = ref.DenseNetwork(case.shape.depth, case.shape.skip)
+        weights = case.shape.weights(case.parameters)
         edges, samples = level.edges.get().astype(np.float64), level.samples
         colors, densities, inputs = network.forward(weights, *case.encoded(edges))
         lengths = np.diff(edges, axis=1) * case.cones[:, 7:8]
@@ -326,7 +326,7 @@ class _Comparison:
             colors.reshape(-1, samples, 3), densities.reshape(-1, samples), lengths, BACKGROUND.astype(np.float64)
         )
         differences = composite.colors()
-        differences[: case.rays.counted] -= case.wanted()
+        differences[: case.rays.counted] -= case.target_colors()
         return cls(level, scale, network, weights, (colors, densities), inputs, composite, differences)
 
     def deviations(self, what: str) -> Results:
@@ -336,8 +336,8 @@ class _Comparison:
         for name, found, expected in (("colors", colors, self.raw[0]), ("densities", densities, self.raw[1])):
             yield by_element("dense_forward", f"raw {name}, {what}", found, expected, 1e-4, 1.0)
         weights, left = self.composite.weights()
-        for name, table, wanted in (("weights", self.level.weights, weights), ("left", self.level.left, left)):
-            yield by_element("composite_forward", f"{name}, {what}", table.get(), wanted, 1e-4, 1.0)
+        for name, table, truth in (("weights", self.level.weights, weights), ("left", self.level.left, left)):
+            yield by_element("composite_forward", f"{name}, {what}", table.get(), truth, 1e-4, 1.0)
         yield by_element("composite_forward", what, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
 
     def backward(self, counted: int) -> tuple[ref.Weights, NDArray[np.float64]]:
@@ -349,8 +349,8 @@ class _Comparison:
 
 @CHECKS.add("place_colors")
 def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
-    """A whole picture: the pixels in their places, zeros around them."""
-    case = FieldCase.of(device, rng, 1, Draw(0, 1, 0))
+    """Check that a whole image has each pixel at its position, and zeros outside."""
+    case = FieldCase.sample(device, rng, 1, Draw(0, 1, 0))
     field = Field(case.shape, case.on_device, device.upload(BACKGROUND))
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)
     *_, fine = case.levels.render(case.on_device, case.levels.cast(case.rays.camera, device.upload(pixels)))
@@ -361,7 +361,7 @@ def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("dense_update")
 def updates_of_fields(device: Device, rng: np.random.Generator) -> Results:
-    """Adam, over some updates of gradients of all sizes."""
+    """Compare three updates by Adam from gradients of all magnitudes."""
     learned = LearnedField.first(SHAPE, 0, device.upload(BACKGROUND))
     count = SHAPE.parameters
     values, moment1, moment2 = SHAPE.first_parameters(0).astype(np.float64), np.zeros(count), np.zeros(count)

@@ -1,4 +1,4 @@
-"""Splats that are integrated over the box of each pixel: records, images, sums over pixels, gradients, updates."""
+"""Check the box filter, which integrates splats over each pixel: records, images, sums, gradients, updates."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ from clsplat.render.rasterizer import RenderLimits
 
 CHECKS = Checks()
 BOX: dict[str, Any] = {"variance": 0.0, "pixel_box": 1.0}
-SIZES = {"of pixels": 0.0, "far below a pixel": -2.5, "of many pixels": 2.0}  # added to the logarithms of scales
+SIZES = {"of pixels": 0.0, "far below a pixel": -2.5, "of many pixels": 2.0}  # added to the log scales
 
 
 def of_size(size: float, rng: np.random.Generator, count: int, width: int, height: int) -> Case:

@@ -1,4 +1,4 @@
-"""project.cl and what reads splats: records, gradients, depth, the world filter."""
+"""Check projection: splat records, gradients, depth, the 3D filter, and gradients of the camera pose."""
 
 from dataclasses import replace
 from typing import Any
@@ -34,7 +34,7 @@ FILTERS = ((0.3, 1.0), (0.1, 1.0), (0.0, 0.0))  # variance, compensate
 
 
 def splats_of(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Records [N, RECORD], depth keys [N] and radii [N] of the kernel."""
+    """Return records, [N, RECORD], depth keys, [N], and radii, [N], from the kernel."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     keys = rasterizer.workspace.array("depth_key", len(case.parameters["means"]), np.uint32).get()
@@ -46,7 +46,7 @@ def check_record(device: Device, case: Case, what: str) -> Results:
     kernel = "project_forward"
     records, keys, radius = splats_of(device, case)
     truth, (width, height) = case.project(), case.size
-    # the kernel also drops what no pixel of the image can see: those must be outside or too faint
+    # the kernel also culls splats that no pixel of the image can see: they must be outside or too faint
     drawn = records[:, 5] > 0
     x, y = truth.mean2d.T
     unseen = (x < 0) | (y < 0) | (x > width) | (y > height) | (truth.opacity < 1.001 / 255)
@@ -68,21 +68,21 @@ def check_record(device: Device, case: Case, what: str) -> Results:
         yield by_element(kernel, f"reaches, {what}", record[:, 13], power_min, PROJECTION, floor=1)
     hidden = records[:, 5] <= 0
     yield wrong(kernel, f"culled splats, {what}", (keys[hidden] != CULLED) | (records[hidden] != 0).any(axis=1))
-    # ceil() may jump by a pixel where the radius is almost whole
+    # ceil() may jump by a pixel where the radius is close to an integer
     yield wrong(kernel, f"radii, {what}", ~(np.abs(radius - truth.radius) <= 1))
     yield wrong(kernel, f"exact radii, {what}", radius != truth.radius, allowed=0.02 * len(radius))
     yield wrong(kernel, f"extents, {what}", _wrong_extents(record, truth, drawn))
 
 
 def covariances_of(record: NDArray[Any]) -> NDArray[Any]:
-    """V, [N, 3], from the fields of records for the pixel's box."""
+    """Return covariances, [N, 3], from the fields of records for the box filter."""
     k, s, t, turned = (record[:, field].astype(np.float64) for field in (2, 3, 4, 13))
     xx, xy, yy = t**2 + k**2 * s**2, k * s**2, s**2
     return np.stack([np.where(turned > 0, yy, xx), xy, np.where(turned > 0, xx, yy)], axis=1)
 
 
 def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any]) -> NDArray[Any]:
-    """Extents that do not hold the pixels where alpha falls to 1/255, or much more than those."""
+    """Return which extents miss pixels where alpha is 1/255 or more, or are much larger than needed."""
     reach2 = 2 * np.log(255 * truth.opacity[drawn])
     a, b, c = truth.conic[drawn].T
     half_x, half_y = np.sqrt(reach2 * c / (a * c - b * b)), np.sqrt(reach2 * a / (a * c - b * b))
@@ -97,7 +97,7 @@ def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any])
 
 
 def check_gradient(device: Device, case: Case, rng: np.random.Generator, what: str) -> Results:
-    """Give the kernel and the reference the same sums over a Gaussian's pixels; compare the parameters' gradients."""
+    """Compare the gradients of the parameters from the same sums over each Gaussian's pixels."""
     model, camera = case.model(device), case.device_camera(device)
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(model, camera, device.zeros(3))
@@ -115,7 +115,7 @@ def check_gradient(device: Device, case: Case, rng: np.random.Generator, what: s
 
 
 def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Gradients of all parameters, and of the projected means, from the sums over pixels, [N, PIXEL_SUMS]."""
+    """Return the gradients of all parameters, and of the projected means, from sums over pixels, [N, PIXEL_SUMS]."""
     grad_mean2d, grad_conic = gradients_of_sums(truth, m)
     grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
     upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
@@ -132,7 +132,7 @@ def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[s
 
 
 def not_drawable(rng: np.random.Generator) -> Case:
-    """40 Gaussians; the first nine are behind the camera, huge, faint or not numbers."""
+    """Return 40 Gaussians; the first nine are behind the camera, huge, faint, or NaN."""
     case = random_case(rng, 40)
     p, pose = case.parameters, case.view.world_to_camera
     p["means"][0] = (np.array([0, 0, -3]) - pose[:, 3]) @ pose[:, :3]
@@ -148,7 +148,7 @@ def not_drawable(rng: np.random.Generator) -> Case:
 
 
 def beyond_the_clamp(rng: np.random.Generator) -> Case:
-    """Wide Gaussians whose rays lie beyond the limits of the linear projection."""
+    """Return wide Gaussians whose rays are beyond the limits of the linear projection."""
     case = random_case(rng, 30)
     depth, far = rng.uniform(1, 2, 30), rng.choice([-1, 1], 30) * rng.uniform(0.9, 1.3, 30)
     in_camera = np.stack([far * depth, 0.2 * depth, depth], axis=1)
@@ -180,7 +180,7 @@ def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator)
 
 
 def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: int) -> Results:
-    """Hide Gaussians in training views; compare each view's picture with that of the others alone."""
+    """Hide Gaussians in training views; compare each view's image with an image of only the other Gaussians."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     left_out = rng.random((views, count)) < 0.5
     hide(model.gaussians, left_out)
@@ -250,11 +250,11 @@ def depth(device: Device, rng: np.random.Generator) -> Results:
         yield by_element("paint_depth", f"depths, {count} Gaussians", painted, expected, DEPTH, floor=1)
 
 
-# poses.cl: derivatives by the place and the focal length of a camera.
+# poses.cl: gradients of the pose and the focal length of a camera.
 
 
 def check_pose(device: Device, case: Case, rng: np.random.Generator, what: str) -> Results:
-    """Give the kernel and the reference the same sums over a Gaussian's pixels; compare the pose's derivatives."""
+    """Compare the gradients of the pose from the same sums over each Gaussian's pixels."""
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device, "radix")
     frame, count = rasterizer.forward(model, camera, device.zeros(3)), model.gaussians.count
     pixel_sums = np.full((PIXEL_SUMS, model.gaussians.capacity), np.nan, np.float32)

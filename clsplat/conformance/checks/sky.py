@@ -1,4 +1,4 @@
-"""A background of directions: pictures, derivatives, what covers it, and its Adam."""
+"""Check the sky, an environment map behind the Gaussians: images, gradients, the cover loss, and updates."""
 
 from dataclasses import replace
 from typing import Any
@@ -17,12 +17,12 @@ from clsplat.render.sky import Skies
 from clsplat.render.workspace import Workspace
 
 CHECKS = Checks()
-SIZES = ((1, 1, 8), (17, 33, 8), (65, 40, 13), (257, 5, 24))  # px, texels of a side: around vectors, tiles and seams
-NEAR = 2e-6  # of a texel's weight: places are differences of numbers up to 512
+SIZES = ((1, 1, 8), (17, 33, 8), (65, 40, 13), (257, 5, 24))  # width, height, texels along a side
+NEAR = 2e-6  # bound on a texel's weight: positions are differences of numbers up to 512
 
 
 def wide_case(rng: np.random.Generator, width: int, height: int) -> Case:
-    """A camera of a wide lens that looks anywhere."""
+    """Return a camera with a wide lens in a random direction."""
     case = random_case(rng, 1, width, height)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     pose = np.column_stack([turn * np.linalg.det(turn), case.view.world_to_camera[:, 3]])
@@ -31,7 +31,7 @@ def wide_case(rng: np.random.Generator, width: int, height: int) -> Case:
 
 
 class SkyView:
-    """A camera before a random map, with what splats leave of each pixel."""
+    """A camera, a random environment map, and a random transmittance of each pixel."""
 
     def __init__(self, device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> None:
         case = wide_case(rng, width, height)
@@ -53,12 +53,12 @@ class SkyView:
 
 
 def planes_in_rows(texels: NDArray[Any]) -> NDArray[np.float32]:
-    """[side, side, C] -> [C, side * side]."""
+    """Reshape [side, side, C] to [C, side * side]."""
     return np.ascontiguousarray(texels.reshape(-1, texels.shape[2]).T, np.float32)
 
 
 def check_sky(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
-    """Compare a picture and the derivative by the map; finished pixels have a negative transmittance."""
+    """Compare an image and the gradient of the map; finished pixels have a negative transmittance."""
     view, what = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels a side"
     image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
     planes = view.planes(image)
@@ -78,7 +78,7 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
 
 
 def check_cover(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
-    """Compare the loss of what covers the sky; photographs are far from the difference that decides."""
+    """Compare the loss of Gaussians that cover the sky; no pixel is close to the threshold on differences."""
     view, what, difference, weight = SkyView(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
     sky = ref.sky_image(view.texels.astype(np.float64), view.directions)
     far = np.where(rng.random((height, width)) < 0.3, 2.0, 0.4) * difference
@@ -112,7 +112,7 @@ def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("sky_update")
 def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
-    """Three updates; texels that the view does not show stay."""
+    """Compare three updates; texels that the view does not show stay unchanged."""
     side = 16
     view, texels = SkyView(device, rng, 9, 7, side), side**2
     shown = view.skies.runs(view.camera, side).shown.get()

@@ -1,4 +1,4 @@
-"""Scans, sorts and tile lists, which are exact."""
+"""Check scans, sorts and tile lists; results are exact."""
 
 from dataclasses import replace
 from typing import Any
@@ -14,8 +14,8 @@ from clsplat.render.tiles import Sort, Tiler
 from clsplat.render.workspace import Workspace
 
 CHECKS = Checks()
-LENGTHS = (0, 1, 2, 3, 63, 64, 65, 1023, 1024, 1025, 0, 2047, 2048, 2049, 300, 0)  # around what local memory holds
-# around the teams' runs (8 * 64) and the shortest run of one item
+LENGTHS = (0, 1, 2, 3, 63, 64, 65, 1023, 1024, 1025, 0, 2047, 2048, 2049, 300, 0)  # at the limits of local memory
+# at the limits of the teams' runs (8 * 64) and of the shortest run of one item
 COUNTS = (1, 63, 64, 65, 511, 513, 1025, 16385, 40001)
 
 
@@ -24,7 +24,7 @@ def tiler_of(device: Device, sort: Sort = "radix") -> Tiler:
 
 
 def check_scan(device: Device, values: NDArray[Any]) -> Deviation:
-    """Compare an exclusive prefix sum, which stays at the largest number."""
+    """Compare an exclusive prefix sum, which saturates at the largest number."""
     offsets = tiler_of(device).scan(device.upload(values), len(values), "test").get()
     expected = np.minimum(np.concatenate([[0], np.cumsum(values, dtype=np.uint64)]), 2**32 - 1).astype(np.uint32)
     return equal("scan_offsets", f"sums of {len(values)} values", offsets, expected)
@@ -58,7 +58,7 @@ def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, 
 def scans(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         yield check_scan(device, rng.integers(0, 100, count).astype(np.uint32))
-    yield check_scan(device, rng.integers(0, 2**31, 40_001, dtype=np.uint32))  # sums that would wrap
+    yield check_scan(device, rng.integers(0, 2**31, 40_001, dtype=np.uint32))  # sums that would overflow
 
 
 @CHECKS.add("radix_count", "radix_scatter")
@@ -88,7 +88,7 @@ def tile_lists(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_list(device: Device, case: Case, sort: Sort, what: str) -> Results:
-    """Every tile lists the splats that reach it, front to back, once, and hardly any other."""
+    """Check that each tile lists the splats that reach it, front to back, once, and few others."""
     rasterizer = Rasterizer(device, sort)
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     lists, tiles, count = frame.lists, frame.camera.tiles, len(case.parameters["means"])
@@ -118,9 +118,9 @@ def check_list(device: Device, case: Case, sort: Sort, what: str) -> Results:
 
 
 def _strongest(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Largest alpha of each record in each tile, [T, N], and whether it bounds the list there.
+    """Return the largest alpha of each record in each tile, [T, N], and whether it decides which pairs are allowed.
 
-    Tiles that leave the image, and splats thinner than a few pixels, may be listed without a pixel that is reached.
+    Tiles at the edge of the image, and splats thinner than a few pixels, may be listed although they reach no pixel.
     """
     records, camera = frame.splats.get().astype(np.float64), frame.camera
     (width, height), tile = case.size, camera.tile
@@ -140,16 +140,16 @@ def _strongest(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
     return strongest, inside[:, None] & ~thin
 
 
-# Splats that reach more tiles than a mask has bits: their rectangles are shared among the items of a group.
+# Splats that reach more tiles than a mask has bits: the items of a group share their rectangles.
 
 TALL = (3, 130)  # tiles: two or three rows for each of 64 items, none for the last
 WHOLE = ((8, 4), (11, 3))  # tiles: as many as a mask has bits, and one more
-SURPLUS = (-7, -1, 5)  # of a count that another compiler makes
+SURPLUS = (-7, -1, 5)  # errors of a count, as another compiler might make
 UNTOUCHED = 0xDEADBEEF
 
 
 def case_of(device: Device, rng: np.random.Generator, columns: int, rows: int, count: int = 6) -> Case:
-    """Gaussians of half the picture's longer side, and some a tenth of it, in a picture of so many tiles."""
+    """Return Gaussians of half the image's longer side, and some of a tenth; columns, rows: of tiles."""
     tile = int(device.tuning["TILE"])
     width, height, side = columns * tile, rows * tile, max(columns, rows) * tile
     case = random_case(rng, count, side, side)
@@ -164,7 +164,7 @@ def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_all(device: Device, rng: np.random.Generator) -> Results:
-    """Compare lists of pictures with many rows, of rectangles around a mask's size, and of wrong counts."""
+    """Compare lists of images with many rows, of rectangles at the limits of a mask, and of wrong counts."""
     for columns, rows in (TALL, *WHOLE):
         case, what = case_of(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
         yield from check_list(device, case, "radix", what)
@@ -172,7 +172,7 @@ def check_all(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_miscounted(device: Device, case: Case) -> Results:
-    """Each splat lists as many tiles of the image as were counted, whatever that is, each once."""
+    """Check that each splat lists exactly as many tiles as were counted, right or wrong, each once."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     number, camera = len(case.parameters["means"]), frame.camera

@@ -1,4 +1,4 @@
-"""Adam, penalties, and the rows of tables."""
+"""Check what changes tables: Adam, deferred updates, penalties, rows, averages, and dropout."""
 
 from dataclasses import replace
 from typing import Any
@@ -31,7 +31,7 @@ SPLAT_OPACITY = int(constants("splat.h")["SPLAT_OPACITY"])
 
 
 def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
-    """Three updates from gradients of very different sizes."""
+    """Compare three updates from gradients of very different magnitudes."""
     case = random_case(rng, count)
     model = case.model(device)
     adam, rates = Adam(model.gaussians), Rates().at(3, extent=2.0)
@@ -54,7 +54,7 @@ def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
     for name in PARAMETERS:
         moved, what = float(np.abs(values[name] - case.parameters[name]).max()), f"{name}, {count} Gaussians"
         found = model.gaussians.get(name)
-        # the value itself is rounded to float32, its change to 2e-5 of the largest
+        # values are rounded to float32, and their changes to 2e-5 of the largest change
         yield by_element("adam_step", what, found, values[name], 3e-7, floor=2e-5 * moved / 3e-7)
         # 1 - 0.999f is off by 1.3e-5 in float32
         for moment, expected, bound in zip(moment_tables(name), moments[name], (SUM, 3 * SUM), strict=True):
@@ -66,7 +66,7 @@ def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
 def _sums_of(
     device: Device, rng: np.random.Generator, case: Case, rasterizer: Rasterizer, model: DeviceModel
 ) -> tuple[Frame, Array]:
-    """The frame of a case, and its sums over pixels for a random gradient of the image."""
+    """Return the frame of a case, and its sums over pixels for a random gradient of the image."""
     camera = case.device_camera(device)
     frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
     weights = np.zeros((3, camera.rows, camera.stride), np.float32)
@@ -75,7 +75,7 @@ def _sums_of(
 
 
 def check_fused(device: Device, rng: np.random.Generator, case: Case, what: str) -> Results:
-    """One update on the way: moments against the reference's gradients, values against the device's own moments."""
+    """Compare one fused update: moments with the reference's gradients, values with the device's own moments."""
     kernel, count = "update_gaussians", len(case.parameters["means"])
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
     gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
@@ -94,7 +94,7 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, what: str)
 
 
 def check_seen(device: Device, rng: np.random.Generator, case: Case, what: str) -> Results:
-    """The fifth update, of seen rows alone, with moments from before, by each kernel from the same gradients."""
+    """Compare the fifth update, only of visible rows, with earlier moments, by each kernel from the same gradients."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
         name: (rng.normal(size=values.shape), rng.uniform(0.5, 2, values.shape))
@@ -128,7 +128,7 @@ def check_seen(device: Device, rng: np.random.Generator, case: Case, what: str) 
 
 
 def behind_each_fifth(case: Case) -> Case:
-    """Return the case with each fifth Gaussian behind the camera."""
+    """Return the case with every fifth Gaussian behind the camera."""
     case.parameters["means"][1::5] -= 20 * case.view.world_to_camera[2, :3]
     return case
 
@@ -162,7 +162,7 @@ def check_penalty(
     interval: NDArray[Any] | None = None,
     parameter: str = "log_scales",
 ) -> Results:
-    """Compare value and gradient of a penalty of weight 3, for Gaussians of many sizes and forms."""
+    """Compare the value and the gradient of a penalty of weight 3, for Gaussians of many sizes and shapes."""
     case = random_case(rng, count)
     case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
     gaussians = case.model(device).gaussians
@@ -233,21 +233,21 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
         yield Deviation("count_not_finite", f"tables with {value}", len(mistaken), 0, counts=True)
 
 
-# Updates of harmonics that wait until a view sees their Gaussians.
+# Deferred updates of harmonics: they wait until a view sees their Gaussians.
 
 DEFERRED_COUNTS = (1, 15, 17, 65, 150)
 CULLED = 0xFFFFFFFF
-LONGEST = 5  # below the number of steps, so that the list is full once
+LONGEST = 5  # fewer than the steps, so that the list is full once
 STEPS = 8
 
 
 def seen_rows(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
-    """Return which rows a view sees: few, in few of the blocks of 16."""
+    """Return the rows that a view sees: few, and in few of the blocks of 16."""
     blocks = rng.random(-(-count // 16)) < 0.4
     return blocks.repeat(16)[:count] & (rng.random(count) < 0.5)
 
 
-def trained(
+def train(
     device: Device, model: DeviceModel, seen: list[NDArray[np.bool_]], gradients: list[NDArray[np.float32]], rows: Rows
 ) -> dict[str, NDArray[np.float32]]:
     """Update a model once for each view, and return the harmonics and their moments.
@@ -274,7 +274,7 @@ def trained(
 
 
 def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Results:
-    """Compare waiting updates with the reference, and with the bits of updates at once."""
+    """Compare deferred updates with the reference, and with the bits of immediate updates."""
     case = random_case(rng, count)
     before = case.parameters["sh_rest"]
     seen = [seen_rows(rng, count) for _ in range(STEPS)]
@@ -283,8 +283,8 @@ def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Resu
     for step, gradient in enumerate(gradients, 1):
         rate = Rates().at(step, extent=2.0)["sh_rest"]
         values, moment1, moment2 = ref.adam_step(values, gradient.astype(np.float64), moment1, moment2, step, rate)
-    found = trained(device, case.model(device), seen, gradients, "deferred")
-    at_once = trained(device, case.model(device), seen, gradients, "all")
+    found = train(device, case.model(device), seen, gradients, "deferred")
+    at_once = train(device, case.model(device), seen, gradients, "all")
     moved = max(float(np.abs(values - before).max(initial=0)), 1e-6)
     yield by_element("replay_updates", f"{count} Gaussians", found["sh_rest"], values, 3e-7, 2e-5 * moved / 3e-7)
     for name, expected, bound in zip(Deferred.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
@@ -301,9 +301,6 @@ def updates_that_wait(device: Device, rng: np.random.Generator) -> Results:
         yield from check_deferred(device, rng, count)
 
 
-# Averages of the parameters over steps.
-
-
 @CHECKS.add("add_to_average", "count_step", "take_average")
 def averages(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
@@ -311,7 +308,7 @@ def averages(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_average(device: Device, rng: np.random.Generator, count: int) -> Results:
-    """The average of three steps, where the last row, if it is not the only one, is new after the first step."""
+    """Compare the average of three steps; the last of several rows is new after the first step."""
     steps = [random_case(rng, count).parameters for _ in range(3)]
     gaussians = random_case(rng, count).model(device).gaussians
     adam.attach(gaussians)
@@ -334,20 +331,20 @@ def check_average(device: Device, rng: np.random.Generator, count: int) -> Resul
         yield by_element("take_average", f"average of {name}, {count} Gaussians", found, expected, SUM, floor=1)
 
 
-# dropout.cl: what a step leaves out, and what projection makes of the others.
+# dropout.cl, and the projection of the Gaussians that it keeps.
 
 SEED, STEP = 0x9E3779B9, 700
 DROPOUT = DropoutMask(0.3, SEED, STEP)
 
 
 def check_dropout(device: Device, case: Case, rng: np.random.Generator, what: str) -> Results:
-    """Compare the records, and the gradients of the parameters, of a step that leaves Gaussians out."""
+    """Compare the records and the gradients of a step that drops Gaussians."""
     yield from check_record(device, case, what)
     yield from check_gradient(device, case, rng, what)
 
 
 def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Results:
-    """Hide Gaussians in a view of which others are dropped; the records are those without both."""
+    """Hide some Gaussians in a view and drop others; compare the records without both."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     left_out = rng.random((2, count)) < 0.5
     hide(model.gaussians, left_out)

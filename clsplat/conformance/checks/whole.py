@@ -1,4 +1,4 @@
-"""A training, the memory, and the speed of a device."""
+"""Check a whole training, the memory and the speed of a device."""
 
 import time
 from dataclasses import asdict
@@ -27,18 +27,18 @@ from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import StepTrainer
 
 CHECKS = Checks()
-SPEED = Checks()  # needed once for a device, not for each schedule
+SPEED = Checks()  # run once per device, not for each schedule
 STEPS = 60
-PATIENCE = 40.0  # s of training after which a slow device does as many steps as it has done
-MEMORY_SHARE = 0.25  # of what device and host have free, which they may share: nothing must be swapped out
+MAX_TRAINING_S = 40.0  # time after which a slow device stops early
+MEMORY_SHARE = 0.25  # share of free memory to use, since device and host may share it and must not swap
 FIRST_BUFFER = 128 << 20  # bytes
-TOUCH_SECONDS = 4.0  # of writing a buffer, after which no larger one is tried
-CLAIMED = "other programs may hold memory of the device; end them and run `clsplat doctor` again to see what it gives"
+MAX_TOUCH_S = 4.0  # longest time to write a buffer
+CLAIMED = "other programs may use the device's memory; close them and run `clsplat doctor` again"
 BENCH = (256, 256, 20_000)  # width, height, Gaussians
 
 
 def _photographs(device: Device, case: Case) -> Photograph:
-    """The scene as the device itself shows it, 8 bits."""
+    """Return the scene as the device renders it, in 8 bits."""
     camera = case.device_camera(device)
     frame = Rasterizer(device, "radix").forward(case.model(device), camera, device.zeros(3))
     image = frame.image.get()[:, : camera.height, : camera.width]
@@ -48,7 +48,7 @@ def _photographs(device: Device, case: Case) -> Photograph:
 def train(
     device: Device, case: Case, start: dict[str, NDArray[Any]], steps: int
 ) -> tuple[list[float], dict[str, NDArray[Any]]]:
-    """Train `start` on the picture of a scene, with one density edit; return the losses and all tables."""
+    """Train `start` on the render of a scene, with one density edit; return the losses and all tables."""
     photograph = _photographs(device, case)
     model = Case(start, case.view).model(device)
     gaussians, rasterizer = model.gaussians, Rasterizer(device, "radix")
@@ -56,13 +56,13 @@ def train(
     losses = [L1(weight=0.8), Dssim(weight=0.2)]
     trainer = StepTrainer(rasterizer, model, adam, stats, device.zeros(3), losses, Rates(sh_base=0.03))
     values: list[float] = []
-    began = time.monotonic()
+    start_time = time.monotonic()
     for step in range(1, steps + 1):
         values.append(trainer.step(photograph, step).loss)
         if step == STEPS // 2:
             edit = Edit(gaussians, stats, SceneScale(4.0), step, seed=0)
             densify(edit, [Clone(gradient_above=1e-3), SplitLarge(gradient_above=1e-3), PruneFaint()], rasterizer.tiler)
-        if time.monotonic() - began > PATIENCE and len(values) < steps:
+        if time.monotonic() - start_time > MAX_TRAINING_S and len(values) < steps:
             break
     return values, {name: gaussians.get(name) for name in gaussians.tables}
 
@@ -93,35 +93,35 @@ def training(device: Device, rng: np.random.Generator) -> Results:
 
 @SPEED.add()
 def memory(device: Device, rng: np.random.Generator) -> Results:
-    """Allocate buffers of growing size, write all of each, and read samples: up to what one buffer may have.
+    """Allocate buffers of growing size up to the largest allowed, write each, and read samples.
 
-    A refusal is no fault of the device: other programs may hold its memory, which OpenCL does not tell.
+    A failed allocation is no failure of the device: other programs may use its memory, which OpenCL does not report.
     """
     promised, free = device.info.allocation, available_memory()
     room = int(MEMORY_SHARE * min(device.info.memory, device.info.memory if free is None else free))
     limit = min(promised, room) // 64 * 64  # allocations are rounded up to 64
     held, size = 0, min(FIRST_BUFFER, limit)
-    stopped = "more was not tried, for want of free memory"
+    stopped = "more was not tried, because too little memory is free"
     while size > held:
         started = time.perf_counter()
         try:
             yield from _check_buffer(device, size)
         except MemoryLimitError:
-            stopped = f"a buffer of {size / 2**20:,.0f} MiB is refused: {CLAIMED}"
+            stopped = f"a buffer of {size / 2**20:,.0f} MiB cannot be allocated: {CLAIMED}"
             break
         held, size = size, min(2 * size, limit)
-        if 2 * (time.perf_counter() - started) > TOUCH_SECONDS and size > held:
-            stopped = "more was not tried, for it takes too long"
+        if 2 * (time.perf_counter() - started) > MAX_TOUCH_S and size > held:
+            stopped = "more was not tried, because it would take too long"
             break
     if held == promised // 64 * 64:
-        stopped = "that is all"
+        stopped = "the largest size works"
     yield Note("memory", {"promised": promised, "held": held, "free": free, "stopped": stopped})
 
 
 def _check_buffer(device: Device, size: int) -> Results:
     whole = device.empty(size // 4)
     whole.fill(1.5)
-    Array(device, whole.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not be seen at the other end
+    Array(device, whole.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not show up at the other end
     places = [*range(0, size // 4, max(1, size // 4 // 64)), size // 4 - 1]
     found = np.array([whole.get_item(i) for i in places])
     expected = np.where(np.arange(len(found)) == 0, 2.5, 1.5)
