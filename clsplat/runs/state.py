@@ -1,4 +1,4 @@
-"""The folder of a run, read once: how far the run is, and which of its files are lost."""
+"""Read a run folder once: the phase of the run, and which of its files are lost."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -19,33 +19,33 @@ from clsplat.training.status import read_status
 
 
 class Phase(IntEnum):
-    """How far the run of a folder is."""
+    """The phase of the run in a folder."""
 
     EMPTY = 0
     """There is no run."""
     PREPARING = 1
-    """There is a status.json only: no stage has begun."""
+    """There is only a status.json: no stage has started."""
     BEGUN = 2
-    """It is running, or it has stopped before its end."""
+    """It is running, or stopped before its end."""
     STATELESS = 3
-    """It has begun, and both its status and its checkpoints are lost."""
+    """It has started, but both its status and its checkpoints are lost."""
     DONE = 4
-    """It has come to its end; `RunState.lost` has the files that were lost since."""
+    """It has finished; `RunState.lost` lists files that were lost since."""
 
 
 @dataclass(frozen=True)
 class RunState:
-    """What the folder of a run, or of a matrix, holds at one moment."""
+    """The content of the folder of a run or a matrix, when it was read."""
 
     out: Path
     names: frozenset[str]  # of the files and folders in it
-    status: Mapping[str, Any]  # of status.json; empty where that is missing or damaged
+    status: Mapping[str, Any]  # content of status.json; empty if missing or damaged
     checkpoints: tuple[Path, ...]  # from old to new
-    sums: Mapping[str, str] | None  # SHA-256 by path in the folder; None where the list is missing or damaged
+    sums: Mapping[str, str] | None  # SHA-256 by path in the folder; None if the list is missing or damaged
 
     @classmethod
     def read(cls, out: Path) -> "RunState":
-        """Read a folder, which need not exist.  Its pipeline and its outputs are read at their first use."""
+        """Read a folder, which need not exist.  Its pipeline and its outputs are read on first use."""
         names = frozenset[str]()
         with suppress(OSError):
             names = frozenset(path.name for path in out.iterdir())
@@ -53,7 +53,7 @@ class RunState:
 
     @cached_property
     def phase(self) -> Phase:
-        """How far the run is."""
+        """The phase of the run."""
         has_begun = PIPELINE in self.names or self.checkpoints or (self.status and self.sums is not None)
         if self.status.get("state") == "done" and (has_begun or Owner.from_record(self.status)):
             return Phase.DONE
@@ -64,39 +64,39 @@ class RunState:
 
     @property
     def state_name(self) -> str:
-        """The state as status.json names it; `killed` where its process has ended without a word."""
+        """The state in status.json, or `killed` if the process is gone."""
         owner = Owner.from_record(self.status) if self.status.get("state") not in END_STATES else None
         return "killed" if owner and owner.has_ended else str(self.status.get("state", "unknown"))
 
     @cached_property
     def pipeline(self) -> Pipeline:
-        """The pipeline of the run.  Raises ConfigError where its file is missing or damaged."""
+        """The pipeline of the run.  Raises ConfigError if its file is missing or damaged."""
         return load(str(self.out / PIPELINE))
 
     @cached_property
     def lost(self) -> list[str]:
-        """The files that are missing or changed since they were written; of a run that is done the list of them too."""
+        """The files that were lost or changed since they were written, and of a finished run a lost list of them."""
         if self.sums is None:
             return [CHECKSUMS] if self.phase is Phase.DONE and "cells" not in self.status else []
         return not_whole(self.out, self.sums)
 
     def difference(self, pipeline: Pipeline) -> str:
-        """Say in which setting another pipeline differs, or why that of the run cannot be read; "" where in none."""
+        """Return how another pipeline differs, or why that of the run cannot be read; "" if they are the same."""
         try:
             return str(_difference(self.pipeline, pipeline) or "")
         except ConfigError as error:
             return one_line(error)
 
     def require_same(self, pipeline: Pipeline) -> None:
-        """Raise ConfigError where a run that is done was one of another pipeline."""
+        """Raise ConfigError if a finished run had other settings."""
         is_known = self.phase is Phase.DONE and PIPELINE in self.names
         if is_known and (difference := self.difference(pipeline)) and PIPELINE not in self.lost:
             raise ConfigError(
-                f"{self.out}: was run with other settings: {difference}; use another folder, or those settings"
+                f"{self.out}: was run with other settings: {difference}; use another folder, or the same settings"
             )
 
     def is_whole(self, pipeline: Pipeline) -> bool:
-        """Whether a run of a pipeline is done, and has all its files as they were written."""
+        """Whether a run of this pipeline is finished, with all its files as they were written."""
         return self.phase is Phase.DONE and not self.difference(pipeline) and not self.lost
 
     @property
@@ -108,34 +108,31 @@ class RunState:
 
     @property
     def restart(self) -> str:
-        """The command that begins the run again."""
+        """The command that starts the run over."""
         pipeline = "…"
-        with suppress(ConfigError):  # where it is lost
+        with suppress(ConfigError):  # the pipeline is lost
             pipeline = shell_quote(self.pipeline.path)
         return f"`clsplat run {pipeline} --out {shell_quote(self.out)} --restart`"
 
 
 def has_pipeline(folder: Path) -> bool:
-    """Whether a folder holds the pipeline of a run, or of a matrix."""
+    """Whether a folder has the pipeline of a run or a matrix."""
     return (folder / PIPELINE).is_file()
 
 
 def _difference(before: Pipeline, now: Pipeline) -> Difference | None:
-    """The first setting in which what was asked of a run is another now, by what the run decided; None: there is none.
-
-    Raises ConfigError.
-    """
-    old, new = (without_auto(one.resolved()) for one in (before, with_decisions(now, before.decisions)))
+    """Return the first setting that differs, apart from what the run decided itself.  Raises ConfigError."""
+    old, new = (without_auto(pipeline.resolved()) for pipeline in (before, with_decisions(now, before.decisions)))
     return first_difference({**old, "adapt": None}, {**new, "adapt": None})
 
 
-def is_below(file: Path, places: Iterable[Path]) -> bool:
-    """Whether a file is one of some files, or lies in one of some folders."""
-    return any(file.is_relative_to(place) for place in places)
+def is_below(file: Path, paths: Iterable[Path]) -> bool:
+    """Whether a file is one of the paths, or in a folder among them."""
+    return any(map(file.is_relative_to, paths))
 
 
 def read_sums(out: Path) -> dict[str, str] | None:
-    """The list of checksums; None where it is missing or damaged."""
+    """Return the list of checksums; None if it is missing or damaged."""
     try:
         sums = read_json(out / CHECKSUMS)
     except DataError:
@@ -149,7 +146,7 @@ def not_whole(out: Path, sums: Mapping[str, str]) -> list[str]:
 
 
 def sum_of(file: Path) -> str | None:
-    """The SHA-256 of a file; None where it cannot be read."""
+    """Return the SHA-256 of a file; None if it cannot be read."""
     with suppress(DataError):
         return sha256(file)
     return None

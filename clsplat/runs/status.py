@@ -1,4 +1,4 @@
-"""The state of a run, or of a matrix, from the files of its folder alone."""
+"""Report the state of a run or a matrix from the files of its folder."""
 
 import logging
 import time
@@ -22,27 +22,28 @@ LOG = logging.getLogger("clsplat")
 
 
 def run_status(state: RunState) -> dict[str, Any]:
-    """Return what status.json says, the last report and the metrics of a run folder; of a matrix no step.
+    """Return the content of status.json, the last report and the metrics of a run; a matrix has no step.
 
-    state: as there, or killed where its process on this machine has ended; silent: seconds since the heartbeat of a run
-    that has not ended, on whatever machine it runs; ahead: seconds by which that is in the future, from a minute on;
-    advice: how to continue a run that has stopped before its end, else "".
-    Raises DataError when the folder holds no run, or a damaged status.json or metrics.json.
+    state: as in the file, or killed if its process, on this machine, is gone
+    silent: seconds since the last heartbeat of a run that has not ended, on any machine
+    ahead: seconds by which that heartbeat is in the future, if at least a minute
+    advice: how to continue a run that stopped early, or ""
+    Raises DataError if the folder has no run, or if status.json or metrics.json is damaged.
     """
     out = state.out
     if not (status := dict(state.status)):
-        raise DataError(f"{out}: has no readable status.json; expected the folder of a run")
+        raise DataError(f"{out}: has no readable status.json; expected a run folder")
     try:
         known = status_of(status)
     except DataError as error:
         raise DataError(
-            f"{out / STATUS}: damaged ({error}); `clsplat check {shell_quote(out)}` tells what else is"
+            f"{out / STATUS}: damaged ({error}); `clsplat check {shell_quote(out)}` checks the other files"
         ) from error
     if known is None:
         raise DataError(f"{out / STATUS}: of a newer clsplat; update clsplat to read it")
     status["state"] = state.state_name
-    for own in ("silent", "ahead"):
-        status.pop(own, None)
+    for key in ("silent", "ahead"):
+        status.pop(key, None)
     if status["state"] not in (*END_STATES, "killed"):
         silent = round(time.time() - known.time)
         status["silent"] = max(0, silent)
@@ -57,7 +58,7 @@ def run_status(state: RunState) -> dict[str, Any]:
 
 
 def _last(out: Path) -> dict[str, Any] | None:
-    """The last report; None where there is none, or the records are damaged, which a warning says."""
+    """Return the last report; None if there is none, or, with a warning, if the records are damaged."""
     try:
         lines = Records(out).read("train")
     except DataError as error:
@@ -67,12 +68,12 @@ def _last(out: Path) -> dict[str, Any] | None:
 
 
 def status_text(status: dict[str, Any]) -> str:
-    """Return what run_status found as lines of text."""
+    """Return the result of `run_status` as text."""
     lines = [f"{status['run']}: {status['state']}{_progress(status)}"]
     if status.get("silent", 0) >= HEARTBEAT_TIMEOUT:
-        lines.append(f"no sign of life for {status['silent']} s{_place(status)}")
+        lines.append(f"no heartbeat for {status['silent']} s{_process(status)}")
     if status.get("ahead"):
-        lines.append(f"its clock is ahead by {status['ahead']} s{_place(status)}: its silence cannot be told")
+        lines.append(f"its clock is ahead by {status['ahead']} s{_process(status)}; whether it still runs is unknown")
     if status.get("message"):
         lines.append(status["message"])
     if status["advice"]:
@@ -94,15 +95,15 @@ def _advice(state: RunState) -> str:
     if PIPELINE not in state.names or resume in message or "--restart" in message:
         return ""
     if "cells" in status or state.checkpoints:
-        return f"`{resume}` goes on with it"
-    if status.get("checkpoint"):  # without which it does not go on
+        return f"`{resume}` continues it"
+    if status.get("checkpoint"):  # it cannot continue without one
         again = f"`clsplat run {shell_quote(out / PIPELINE)} --out {shell_quote(out)} --restart`"
-        return f"its checkpoints are gone; {again} begins it again"
-    return f"no checkpoint was saved; `{resume}` begins it again"
+        return f"its checkpoints are gone; {again} starts it over"
+    return f"no checkpoint was saved; `{resume}` starts it over"
 
 
 def _progress(status: dict[str, Any]) -> str:
-    """Where the run is, and how far its stage."""
+    """Return the progress of the run and of its stage."""
     if "cells" in status:
         failed = status["failed"] if isinstance(status.get("failed"), dict) else {}
         return f", {status.get('done')} of {status['cells']} cells, {len(failed)} of them failed"
@@ -127,21 +128,20 @@ def _figures(values: dict[str, Any], names: tuple[str, ...]) -> str:
     )
 
 
-def _place(status: dict[str, Any]) -> str:
+def _process(status: dict[str, Any]) -> str:
     owner = Owner.from_record(status)
     elsewhere = owner is not None and not owner.is_local
     return f"; it runs on {status.get('host')}" if elsewhere else f"; process {status.get('process')}"
 
 
-# What a run has come to, in a few lines: its quality, its files, its photographs, its time, and what comes next.
+# The summary of a finished run: its quality, files, photos and time, and what to do next.
 
-# of what these stages write; others give their own names
-TITLES = {"export": "model", "export_field": "field", "render": "renders", "optimize": "pictures"}
-SHORTEST = 0.5  # seconds of a stage that is told
+TITLES = {"export": "model", "export_field": "field", "render": "renders", "optimize": "previews"}  # of stages' files
+MIN_SECONDS = 0.5  # shorter stages are not listed
 
 
 def summary(folder: Path) -> list[str]:
-    """Return the lines; none for a run that is not done, or a matrix.  Raises DataError where a file is damaged."""
+    """Return the lines; none for an unfinished run or a matrix.  Raises DataError if a file is damaged."""
     if not (folder / METRICS).exists():
         return []
     metrics = read_json(folder / METRICS)
@@ -158,27 +158,24 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     yield f"{quality}{size}; {metrics['train_seconds']:.0f} s of training"
     placed = summarize_placement(metrics.get("preparation", {}))
     if kept := metrics.get("kept"):
-        name, what = (
-            ("refit", "steps on all of its photographs") if kept["refit"] else ("kept", "steps, the best model")
-        )
-        yield f"  {name:<8} {kept['step']:,} {what}, by a validation PSNR of {kept['validation']:.2f} dB"
+        model = "best     model of step {:,}" if not kept["refit"] else "refit    {:,} steps on all photos"
+        yield f"  {model.format(kept['step'])}, by a validation PSNR of {kept['validation']:.2f} dB"
     yield f"  scene    {metrics['scene']}" + (f"; {placed}" if placed else "")
     files = {stage: folder / name for stage, name in metrics["files"].items()}
-    of_modules = {file: what for kind in variants(TrainingModule).values() for file, what in kind.side_files.items()}
-    told = {
-        of_modules.get(file.name) or TITLES.get(stage, stage): file for stage, file in files.items() if file.exists()
+    titles = {file: title for kind in variants(TrainingModule).values() for file, title in kind.side_files.items()}
+    existing = {
+        titles.get(path.name) or TITLES.get(stage, stage): path for stage, path in files.items() if path.exists()
     }
-    for name, file in told.items():
-        yield f"  {name:<{max(8, *map(len, told))}} {file}"
-    steps = {name: found.get("seconds", 0) for name, found in metrics.get("preparation", {}).items()}
-    spent = {**steps, **metrics["seconds"]}
-    if long := [f"{name} {seconds:.0f} s" for name, seconds in spent.items() if seconds >= SHORTEST]:
-        yield f"  time     {', '.join(long)}"
+    for title, path in existing.items():
+        yield f"  {title:<{max(8, *map(len, existing))}} {path}"
+    seconds = {name: step.get("seconds", 0) for name, step in metrics.get("preparation", {}).items()}
+    if times := [f"{name} {s:.0f} s" for name, s in {**seconds, **metrics["seconds"]}.items() if s >= MIN_SECONDS]:
+        yield f"  time     {', '.join(times)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
         more = f"; `clsplat resume {shell_quote(folder)} --steps {2 * metrics['steps']}` trains longer"
         if metrics.get("overfit"):
-            more = "; the photographs are learned by heart: more of them help most"
-        elif kept and (kept["refit"] or kept["step"] < kept["last"]["step"]):  # validation has found where to end
+            more = "; the model overfits: more photos help most"
+        elif kept and (kept["refit"] or kept["step"] < kept["last"]["step"]):  # validation found the best step already
             more = ""
         yield f"next: open {page} in a browser{more}"

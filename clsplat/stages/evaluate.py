@@ -102,9 +102,10 @@ class Evaluate(Scheduled):
             averages = mean(results, perceptual)
             run.records.add(run.model_step, "evaluate", split=self.split, downscale=downscale, **averages)
             run.metrics.setdefault(self.split, {})[f"{downscale:g}"] = averages
-            LOG.info(
-                "step %d  %s%s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%s)",
-                *(run.model_step, f"{self.file}, " if self.file else "", self.split, downscale),
-                *(averages["psnr"], averages["ssim"], pluralize(len(results), "view")),
-            )
+            views_text = f"{f'{self.file}, ' if self.file else ''}{self.split} views at 1/{downscale:g}"
+            quality = f"PSNR {averages['psnr']:.2f} dB  SSIM {averages['ssim']:.4f}"
+            line = f"step {run.model_step}  {views_text}: {quality}  ({pluralize(len(results), 'view')})"
+            if run.cache.get("evaluated") != line:  # the last evaluation of a training may be the same
+                run.cache["evaluated"] = line
+                LOG.info("%s", line)
             log_color_figures(averages)

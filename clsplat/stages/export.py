@@ -78,7 +78,7 @@ class Export(Scheduled):
             except DataError as error:
                 raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
             of_sky = f" and {sky:,} of the sky" if sky else ""
-            LOG.info("%s Gaussians%s written to %s", f"{len(saved) - sky:,}", of_sky, file)
+            LOG.debug("%s Gaussians%s written to %s", f"{len(saved) - sky:,}", of_sky, file)
         run.model_hashes.pop(_name(sky_path, run), None)
         if sky_path.is_file():
             run.model_hashes[_name(sky_path, run)] = sha256(sky_path)

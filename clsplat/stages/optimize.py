@@ -34,6 +34,7 @@ from clsplat.training.trainer import StepTrainer
 LOG = logging.getLogger("clsplat")
 EVALUATIONS, SHORTEST = 20, 100  # of a training at most; steps from one to the next at least
 PSNR_AND_SSIM = ("psnr", "ssim")
+ROOMY = 8  # times the first number of Gaussians fit: growth then rarely reaches the limit
 SHOWN = 8  # training views that are measured beside the validation views, at most
 
 
@@ -292,7 +293,8 @@ class Optimize(Keeping):
         memory, count = run.memory_plan(), run.model.gaussians.count
         if run.harmonics != "auto" or memory.host == 0:  # else it was looked at before they moved
             memory.check(count, more_room(run))
-        LOG.info(memory.text(count))
+        is_tight = memory.host or memory.limit < ROOMY * count
+        LOG.log(logging.INFO if is_tight else logging.DEBUG, memory.text(count))
         forecast = Forecast.of(run.step, last_step, [stage.due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
         self.act_between(run)

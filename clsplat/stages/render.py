@@ -49,7 +49,7 @@ class Render(Stage):
             camera = upload_camera(run.device, view)
             write_image(path, render_view(run.painter(), camera))
         if views:
-            LOG.info("%s written to %s", pluralize(len(views), "image"), run.out / self.folder)
+            LOG.debug("%s written to %s", pluralize(len(views), "image"), run.out / self.folder)
 
 
 def image_paths(folder: Path, views: Sequence[str], suffix: str = ".png") -> list[Path]:
@@ -103,4 +103,4 @@ class Viewer(Stage):
             )
             page = Page(page.title, {run.name: pack(model, number)}, viewpoint, name, views)
         page.write(path)
-        LOG.info("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)
+        LOG.debug("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)

@@ -390,7 +390,7 @@ class HtmlReport(Stage):
             settings=_settings(run),
         )
         write_text(run.out / self.file, page)
-        LOG.info("report written to %s", run.out / self.file)
+        LOG.debug("report written to %s", run.out / self.file)  # the summary of the run names its files
         for text in advised:
             LOG.info("advice: %s", text)
 

@@ -189,7 +189,7 @@ def test_folders_that_are_missing_or_taken_are_refused(tiny_scene, tmp_path):
     with pytest.raises(DataError, match="nowhere"):
         clsplat.Trainer(tmp_path / "nowhere", "smoke")
     clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
-    with pytest.raises(ConfigError, match="already holds a run"):
+    with pytest.raises(ConfigError, match="already has a run"):
         clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
     no_training = tmp_path / "no.yaml"
     no_training.write_text("name: no\nstages: [init, export]\n")

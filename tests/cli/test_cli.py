@@ -31,7 +31,7 @@ def test_run_names_the_device_first_and_says_where_things_are(tiny_scene, tmp_pa
     assert any("test PSNR" in line for line in lines)
     assert any(str(tmp_path / "run" / "report.html") in line for line in lines)
     assert any(re.match(r"\d+,\d{3} Gaussians from ", line) for line in lines)
-    assert any(re.match(r"\d+,\d{3} Gaussians written to ", line) for line in lines)
+    assert any(re.match(r"  model    .*\.ply", line) for line in lines)
     log = (tmp_path / "run" / "log.txt").read_text()
     assert "loss" in log
     assert [line for line in lines if line not in log] == []

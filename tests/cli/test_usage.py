@@ -101,7 +101,7 @@ NEAR = {
     "check lodout": "no pipeline named 'lodout', and no such file or folder; `clsplat pipelines` lists pipelines",
     "run smoke --scene x --set steps=3": "--set steps=3: no key 'steps' at the top of a pipeline; did you mean",
     "resume nowhere": "nowhere: has no pipeline.yaml; expected the folder of a run",
-    "status nowhere": "nowhere: has no readable status.json; expected the folder of a run",
+    "status nowhere": "nowhere: has no readable status.json; expected a run folder",
     "pipelines --copy x": "--copy needs the name of a pipeline",
     "evaluate x.ply": "x.ply: not found; expected a model file or a run folder",
     "evaluate x.ply --scene y --downscales nan": "expected downscale factors from 1 on, got nan",
@@ -271,7 +271,7 @@ def test_status_tells_from_files(finished, tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train", "loss": 0.25, "psnr": 20.0}\ncut')
     assert status_text(run_status(RunState.read(tmp_path))) == (
         f"{tmp_path}: killed at step 7 of 9\n"
-        f"  no checkpoint was saved; `clsplat resume {tmp_path}` begins it again\n"
+        f"  no checkpoint was saved; `clsplat resume {tmp_path}` starts it over\n"
         "  last report: step 5, loss 0.25, psnr 20"
     )
     matrix = {"state": "failed", "cells": 4, "done": 4, "failed": {"a": "no"}, "message": "1 of 4 cells failed"}

@@ -154,7 +154,7 @@ def test_two_runs_in_one_folder(tiny_scene, tmp_path):
             assert process.poll() is None
             time.sleep(0.05)
         status = json.loads((out / "status.json").read_text())
-        assert f"{out}: already holds a run; " in command(*arguments, expect=2).stderr
+        assert f"{out}: already has a run; " in command(*arguments, expect=2).stderr
         for more in ("--resume", "--restart"):
             refused = command(*arguments, more, expect=7)
             assert f"{out}: is in use by process {process.pid} on " in refused.stderr

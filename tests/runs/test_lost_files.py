@@ -151,7 +151,7 @@ REFUSALS = {
     "no checkpoint": (
         ConfigError,
         {},
-        r"has no checkpoint to go on from; `clsplat run \S+ --out \S+ --restart` trains",
+        r"has no checkpoint to continue from; `clsplat run \S+ --out \S+ --restart` trains",
     ),
     "a damaged checkpoint": (OutputError, {}, "and so are all others"),
     "another setting": (ConfigError, {"init.count": 51}, "was made with other settings"),
@@ -214,18 +214,18 @@ def test_a_rung_that_lost_its_model_is_trained_again(content, few_steps, info, t
     model = load_model(source.file)
     tuning = Tuning("rungs", source, model, 3, Device(info))
     pipeline = tuning.pipeline(("init", "optimize"), {"init.file": str(source.file.resolve())})
-    file = tuning.trained(pipeline, tmp_path / "rung")
+    file = tuning.train(pipeline, tmp_path / "rung")
     whole = file.read_bytes()
     file.unlink()
     if content is not None:
         file.write_bytes(content)
-    assert tuning.trained(pipeline, tmp_path / "rung").read_bytes() == whole
+    assert tuning.train(pipeline, tmp_path / "rung").read_bytes() == whole
     written = file.stat().st_mtime_ns
-    tuning.trained(pipeline, tmp_path / "rung")
+    tuning.train(pipeline, tmp_path / "rung")
     assert file.stat().st_mtime_ns == written
     shutil.rmtree(tmp_path / "rung" / "checkpoints")
     (tmp_path / "rung" / "status.json").unlink()  # no command of theirs has --restart
-    assert tuning.trained(pipeline, tmp_path / "rung").read_bytes() == whole
+    assert tuning.train(pipeline, tmp_path / "rung").read_bytes() == whole
 
 
 def test_run_killed_before_it_began_says_how_to_begin(tmp_path):

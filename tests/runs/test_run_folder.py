@@ -132,7 +132,7 @@ def test_a_run_does_not_take_the_place_of_a_users_file(tiny_scene: Path, tmp_pat
     own = tmp_path / "pipeline.yaml"
     own.write_bytes(shipped()["smoke"].read_bytes())
     for act in (lambda job: job.describe(), lambda job: job.run()):
-        with pytest.raises(ConfigError, match=r"pipeline.yaml: is not that of a run.*give another folder"):
+        with pytest.raises(ConfigError, match=r"pipeline.yaml: was not written by a run.*use another folder"):
             act(Job.open(str(own), tiny_scene, tmp_path, start=start))
     assert own.read_bytes() == shipped()["smoke"].read_bytes()
     assert list(tmp_path.iterdir()) == [own]

@@ -79,7 +79,9 @@ def test_finished_run_without_checkpoints_is_not_retrained(tiny_scene, tmp_path)
     pipeline.write_text("name: plain\nstages:\n" + "".join(f"  - {stage}\n" for stage in stages))
     out = clsplat.run(pipeline, tiny_scene, tmp_path / "run")
     before = digest(out)
-    with pytest.raises(ConfigError, match=r"is done, and has no checkpoint to go on from; .* --restart` trains it"):
+    with pytest.raises(
+        ConfigError, match=r"is finished, but has no checkpoint to continue from; .* --restart` trains it"
+    ):
         clsplat.resume(out, set={"optimize.steps": 4})
     assert digest(out) == before
 
@@ -99,7 +101,7 @@ def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
     folder = shutil.copytree(done, tmp_path / "run")
     metrics = json.loads((folder / "metrics.json").read_text())
     (folder / "metrics.json").write_text(json.dumps({**metrics, "overfit": True}))
-    assert summary(folder)[-1].endswith("in a browser; the photographs are learned by heart: more of them help most")
+    assert summary(folder)[-1].endswith("in a browser; the model overfits: more photos help most")
 
 
 def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):

@@ -38,15 +38,15 @@ def test_a_run_elsewhere_is_judged_by_its_heartbeat_alone(elsewhere, tmp_path):
     assert found["state"] == "running"
     assert 199 < found["silent"] < 300
     place = f"it runs on {elsewhere.get('host', StatusFile(tmp_path).now.host)}"
-    assert f"\n  no sign of life for {found['silent']} s; {place}" in reading.status_text(found)
-    assert "no sign" not in reading.status_text(put(tmp_path, time=time.time() - 2, **elsewhere))
+    assert f"\n  no heartbeat for {found['silent']} s; {place}" in reading.status_text(found)
+    assert "no heartbeat" not in reading.status_text(put(tmp_path, time=time.time() - 2, **elsewhere))
 
 
-def test_a_process_that_is_stopped_shows_no_sign_of_life(tmp_path):
+def test_a_stopped_process_has_no_heartbeat(tmp_path):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         found = put(tmp_path, process=process.pid)
         process.communicate(b"\n")
-    assert f"no sign of life for {found['silent']} s; process {process.pid}" in reading.status_text(found)
+    assert f"no heartbeat for {found['silent']} s; process {process.pid}" in reading.status_text(found)
 
 
 def test_the_lines_name_the_stage_and_what_is_left(tmp_path):
@@ -68,7 +68,7 @@ def test_clock_that_is_ahead_gives_no_negative_time_and_is_noted(tmp_path):
     found = put(tmp_path, host="a", time=time.time() + 500)
     assert found["silent"] == 0
     assert 490 < found["ahead"] <= 500
-    assert f"\n  its clock is ahead by {found['ahead']} s; it runs on a: " in reading.status_text(found)
+    assert f"\n  its clock is ahead by {found['ahead']} s; it runs on a; whether " in reading.status_text(found)
     found = put(tmp_path, host="a", time=time.time() + 5)
     assert "ahead" not in found
     assert "its clock" not in reading.status_text(found)
@@ -79,13 +79,13 @@ def test_the_advice_is_a_command_that_works(state, tmp_path):
     more = {} if state == "killed" else {"state": state, "message": "stopped at step 7; --resume continues from there"}
     (tmp_path / "pipeline.yaml").touch()
     text = reading.status_text(put(tmp_path, **more))
-    assert f"no checkpoint was saved; `clsplat resume {tmp_path}` begins it again" in text
+    assert f"no checkpoint was saved; `clsplat resume {tmp_path}` starts it over" in text
     gone = reading.status_text(put(tmp_path, checkpoint="checkpoints/step_000005.npz", **more))
-    assert f"are gone; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` begins" in gone
+    assert f"are gone; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` starts" in gone
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "step_000007.npz").touch()
     text = reading.status_text(put(tmp_path, **more))
-    assert f"`clsplat resume {tmp_path}` goes on with it" in text
+    assert f"`clsplat resume {tmp_path}` continues it" in text
     assert "--restart" not in text
 
 

@@ -126,7 +126,7 @@ def test_a_matrix_that_has_lost_its_status_goes_on(finished, tmp_path):
     mine = tmp_path / "mine"
     mine.mkdir()
     shutil.copy(finished[0], mine / "pipeline.yaml")
-    with pytest.raises(ConfigError, match="is not that of a run"):
+    with pytest.raises(ConfigError, match="was not written by a run"):
         experiment.run_matrix(load_experiment(finished[0]), RunState.read(mine), None, "restart")
 
 
@@ -191,7 +191,7 @@ def test_cells_run_with_other_settings_are_not_taken_for_done(finished, tmp_path
 
 
 def test_folders_are_not_mixed(finished, tiny_scene, tmp_path):
-    with pytest.raises(ConfigError, match="already holds a run"):
+    with pytest.raises(ConfigError, match="already has a run"):
         experiment.run_matrix(load_experiment(finished[0]), RunState.read(finished[1]), None, "new")
     (tmp_path / "pipeline.yaml").write_text("name: single\nstages: []\n")
     with pytest.raises(ConfigError, match="holds a single run"):
@@ -206,7 +206,7 @@ def test_check_and_dry_run_list_the_cells(finished, tmp_path):
     assert "would run 4 cells" in done.stdout
     assert re.findall(r"^  (\S+)$", done.stdout, re.MULTILINE) == names(load_experiment(finished[0]))
     assert not (tmp_path / "new").exists()
-    assert "already holds a run" in clsplat("run", finished[0], "--out", finished[1], "--dry-run", expect=2).stderr
+    assert "already has a run" in clsplat("run", finished[0], "--out", finished[1], "--dry-run", expect=2).stderr
     done = clsplat("run", finished[0], "--out", finished[1], "--resume", "--dry-run")
     assert done.stdout.count("  done") == 4
 

@@ -119,7 +119,7 @@ def test_its_metrics_are_those_of_that_model(best):
     assert found["train"]["1"]["psnr"] == found["kept"]["train"] == psnr_of(best, "train")[BEST]
     assert found["train"]["1"]["views"] == 6
     assert found["test"]["1"]["psnr"] == psnr_of(best, "test")[BEST]
-    assert f"kept     {BEST} steps, the best model" in "\n".join(summary(best))
+    assert f"best     model of step {BEST}" in "\n".join(summary(best))
     assert summary(best)[-1].endswith("in a browser"), "more steps were no better"
 
 

@@ -135,7 +135,7 @@ def test_restoring_reads_no_other_run(few_steps, tmp_path):
     """A folder with checkpoints and no pipeline.yaml is a run too."""
     out = shutil.copytree(few_steps, tmp_path / "run")
     (out / "pipeline.yaml").unlink()
-    with pytest.raises(ConfigError, match="already holds a run; give another folder, --resume or --restart"):
+    with pytest.raises(ConfigError, match="already has a run; use another folder, --resume or --restart"):
         run_folder.check_run_folder(RunState.read(out), "new")
     assert CHECKSUMS in {path.name for path in out.iterdir()}
 

@@ -128,7 +128,7 @@ def test_a_checkpoint_of_another_format_is_refused(tiny_scene, tmp_path, monkeyp
 def test_other_settings_are_refused_on_resume(killed_run, tiny_scene):
     with pytest.raises(ConfigError, match=r"stages\[0\].init.count was 60, is 1000"):
         train(tiny_scene, killed_run, *FEW, "init.count=1000", resume=True)
-    with pytest.raises(ConfigError, match="already holds a run"):
+    with pytest.raises(ConfigError, match="already has a run"):
         train(tiny_scene, killed_run)
 
 
