@@ -1,4 +1,4 @@
-"""What compact formats share: quaternions as their three smallest components, an order that compresses, bytes."""
+"""Help to write compact formats: smallest-three quaternions, Morton order, WebP images, hashed output."""
 
 import hashlib
 import logging
@@ -16,24 +16,24 @@ from clsplat.core.errors import DataError, OutputError
 from clsplat.core.files import open_atomic
 
 LOG = logging.getLogger("clsplat")
-MORTON_BITS = 21  # an axis: three fit into 63 bits
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the components beside each, in order
+MORTON_BITS = 21  # per axis: three fit into 63 bits
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the other components of each, in order
 _SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3))
 
 
 def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Return the index of each unit quaternion's largest component, [N], and the others in order, [N, 3].
 
-    Their sign is that with which the largest is positive.
+    Signs are chosen so that the largest is positive.
     """
     largest = np.argmax(np.abs(quats), axis=1)
     rows = np.arange(len(quats))
-    turned = np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None] * quats
-    return largest, turned[rows[:, None], _OTHERS[largest]]
+    positive = np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None] * quats
+    return largest, positive[rows[:, None], _OTHERS[largest]]
 
 
 def from_smallest_three(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return unit quaternions [N, 4] from what `smallest_three` returns."""
+    """Return unit quaternions [N, 4] from the result of `smallest_three`."""
     quats = np.empty((len(others), 4))
     rows = np.arange(len(others))
     quats[rows[:, None], _OTHERS[largest]] = others
@@ -42,7 +42,7 @@ def from_smallest_three(largest: NDArray[np.integer], others: NDArray[np.floatin
 
 
 def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Return the rows [N] along a Morton curve through the box of the means: neighbors get similar numbers."""
+    """Return the order of rows, [N], along a Morton curve through the bounding box of the means."""
     if not len(means):
         return np.zeros(0, np.intp)
     low = means.min(axis=0).astype(np.float64)
@@ -55,34 +55,34 @@ def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
 
 
 def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Two zero bits before each of 21 bits."""
+    """Insert two zero bits before each of 21 bits."""
     for shift, mask in (*_SPREAD, (2, 0x1249249249249249)):
         values = (values | (values << np.uint64(shift))) & np.uint64(mask)
     return values
 
 
 def outside_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which levels no byte holds, by more than rounding, as the shape of `levels`."""
+    """Return which levels are outside of the range of a byte, before rounding, with the shape of `levels`."""
     return (levels < -0.5) | (levels > 255.5)
 
 
 def warn_clipped(path: Path, name: str, what: str, beyond: NDArray[np.bool_]) -> None:
-    """Log how many Gaussians, rows of `beyond`, have values outside of what a format holds."""
+    """Warn how many Gaussians, rows of `beyond`, have values outside of a format's range."""
     if count := int(beyond.any(axis=1).sum()):
-        LOG.warning("%s: %s holds %s; those of %s Gaussians were cut", path, name, what, f"{count:,}")
+        LOG.warning("%s: %s stores %s; values of %s Gaussians were clipped", path, name, what, f"{count:,}")
 
 
-# Lossless WebP images of 8-bit RGBA pixels, which hold numbers.
+# Lossless WebP images of 8-bit RGBA pixels that store numbers.
 
-LOSSLESS = 101  # OpenCV's quality beyond 100
-MAX_SIDE = 16383  # px, of the format
+LOSSLESS = 101  # a quality above 100 makes OpenCV write lossless WebP
+MAX_SIDE = 16383  # px, limit of the format
 BGRA = [2, 1, 0, 3]
 
 
 def encode(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
-    """Return an image of pixels [n, 4], row by row, filled up with zeros; alpha must be 1 at least.
+    """Encode pixels [n, 4] as an image, row by row, padded with zeros; alpha must be at least 1.
 
-    It is decoded again, for the color under an alpha of 0 would be lost.  Raises OutputError where that differs.
+    WebP drops the color under an alpha of 0, so the image is decoded to verify it.  Raises OutputError if it differs.
     """
     height = -(-len(pixels) // width)
     image = np.zeros((height * width, 4), np.uint8)
@@ -91,32 +91,32 @@ def encode(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
     bgra = np.ascontiguousarray(image[:, BGRA].reshape(height, width, 4))
     done, data = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, LOSSLESS])
     if not done or not np.array_equal(_rgba(data), image):
-        raise OutputError(f"{path}: OpenCV {cv2.__version__} writes no lossless WebP here; install another version")
+        raise OutputError(f"{path}: OpenCV {cv2.__version__} cannot write lossless WebP here; install another version")
     return bytes(data.tobytes())
 
 
 def decode(path: Path, name: str, data: bytes, least: int, most: int) -> NDArray[np.uint8]:
-    """Return the pixels of an image, [n, 4] RGBA, row by row, where `least` <= n <= `most`.
+    """Decode the pixels of an image, [n, 4] RGBA, row by row, with `least` <= n <= `most`.
 
-    Raises DataError for another size, before it is decoded, and for another format.
+    Raises DataError for another size, before decoding, and for another format.
     """
     width, height = size(path, name, data)
     if not least <= width * height <= most:
         raise DataError(
-            f"{path}: {name} has {width} x {height} px; expected {least} at least and {most} at most for the numbers "
-            "that it holds: export the file again"
+            f"{path}: {name} has {width} x {height} px; expected {least} to {most} px for its numbers; export the file "
+            "again"
         )
     try:
         pixels = _rgba(np.frombuffer(data, np.uint8))
     except (cv2.error, ValueError):
         pixels = np.zeros((0, 4), np.uint8)
     if len(pixels) != width * height:
-        raise DataError(f"{path}: {name} cannot be decoded; expected a WebP image: copy or export the file again")
+        raise DataError(f"{path}: {name} cannot be decoded; expected a WebP image; copy or export the file again")
     return pixels
 
 
 def _rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Decoded pixels; where all alphas are 255 there may be no fourth channel."""
+    """Decode pixels; the fourth channel may be missing if all alphas are 255."""
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8 or image.ndim != 3:
         return np.zeros((0, 4), np.uint8)
@@ -126,7 +126,7 @@ def _rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def size(path: Path, name: str, data: bytes) -> tuple[int, int]:
-    """Return width and height that the header declares.  Raises DataError for another format."""
+    """Return width and height from the header.  Raises DataError for another format."""
     kind = data[12:16]
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
         if kind == b"VP8L":
@@ -135,14 +135,14 @@ def size(path: Path, name: str, data: bytes) -> tuple[int, int]:
         if kind == b"VP8X":
             sides = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
             return next(sides), next(sides)
-    raise DataError(f"{path}: {name} is no lossless WebP image; expected one: export the file again")
+    raise DataError(f"{path}: {name} is not a lossless WebP image; export the file again")
 
 
-# Files as they are written, with their SHA-256.
+# Output files that compute their SHA-256.
 
 
 class Output:
-    """A file that is written once, from start to end."""
+    """A file that is written once from start to end."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self._sum = file, hashlib.sha256()
@@ -153,7 +153,7 @@ class Output:
 
     @property
     def sha256(self) -> str:
-        """Of what was written so far, as `sha256sum` prints it."""
+        """The SHA-256 of what was written so far, as `sha256sum` prints it."""
         return self._sum.hexdigest()
 
 

@@ -1,12 +1,12 @@
-"""The PLY layout of the 3DGS reference: written in its order, read by property name in any order.
+"""Read and write the PLY of 3DGS: written in its property order, read by property name in any order.
 
     x y z nx ny nz f_dc_0..2 f_rest_0..(3(K-1)-1) opacity scale_0..2 rot_0..3    float32, before activation
 
 f_rest is channel-major (all red, all green, all blue); opacity is a logit, scales are logarithms, rot is (w, x, y, z).
-Normals are written as zeros.  Where a world filter is not yet part of scales and opacity, `filter_3D` follows, its
-standard deviation (Mip-Splatting); where Gaussians move, the columns of their motion (clsplat/formats/splats.py).
-Comments hold the numbers that a rasterizer needs, and the mode for viewers: `SplatRenderMode: mip` when a screen filter
-reduces opacities to keep their energy, else `default`.
+Normals are written as zeros.  `filter_3D` follows if a world filter is not baked into scales and opacity: its standard
+deviation (Mip-Splatting).  For moving Gaussians, the columns of their motion follow (clsplat/formats/splats.py).
+Comments contain the numbers for rendering, and the mode for viewers: `SplatRenderMode: mip` if a screen filter reduces
+opacities to conserve energy, else `default`.
 """
 
 import json
@@ -37,9 +37,9 @@ from clsplat.formats.splats import (
     sh_coefficients,
 )
 
-# The header of a PLY file: comments, and place and properties of its vertices.
+# The header of a PLY file: comments, and position and properties of its vertices.
 
-ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}  # of bytes, as NumPy writes them
+ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}  # byte orders in NumPy's notation
 MAX_HEADER = 1 << 16  # bytes; real headers have about 1.5 KB
 END = re.compile(rb"\nend_header[ \t]*\r?\n")
 COUNT = re.compile("[0-9]{1,18}")
@@ -61,7 +61,7 @@ class Section:
 
     count: int
     dtype: np.dtype[Any]  # of one row, in the byte order of the file
-    start: int  # bytes before its rows
+    start: int  # offset of its rows, bytes
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,9 @@ class PlyHeader:
     comments: tuple[str, ...]
     count: int
     dtype: np.dtype[Any]  # of one vertex, in the byte order of the file
-    start: int  # bytes before the vertices; of an ascii file those of the header
-    lines_before: int  # of an ascii file: lines between header and vertices
-    sections: dict[str, Section] = field(default_factory=dict)  # of a binary file: all elements before one with a list
+    start: int  # offset of the vertices, bytes; in an ascii file, size of the header
+    lines_before: int  # in an ascii file: lines between header and vertices
+    sections: dict[str, Section] = field(default_factory=dict)  # in a binary file: all elements before one with a list
 
 
 @dataclass
@@ -86,15 +86,15 @@ class _Element:
 
 
 def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
-    """Return the header of a PLY file from its first MAX_HEADER bytes, or more; `path` is for messages.
+    """Parse the header of a PLY file from at least its first MAX_HEADER bytes; `path` is for messages.
 
-    Elements before the vertices must have no lists; elements after them may.
-    Raises DataError when it is not a PLY file, has no vertices, or has vertices with lists.
+    Elements before the vertices must not have lists; elements after them may.
+    Raises DataError if it is not a PLY file, has no vertices, or has vertices with lists.
     """
     end = END.search(data, 0, MAX_HEADER)
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
         raise DataError(
-            f"{path}: not a PLY file; expected a header from 'ply' to 'end_header' in its first {MAX_HEADER} bytes: "
+            f"{path}: not a PLY file; expected a header from 'ply' to 'end_header' in its first {MAX_HEADER} bytes; "
             "copy or export it again"
         )
     form = ""
@@ -127,7 +127,7 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
 def format_ply_header(comments: Iterable[str], **elements: tuple[int, Iterable[str]]) -> bytes:
     """Return the header of a binary little-endian file.
 
-    elements: by name the number of rows and the properties of each element, such as `float x`, in their order.
+    elements: name, number of rows, and properties such as `float x` of each element, in order.
     """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
     for name, (count, properties) in elements.items():
@@ -144,7 +144,7 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
     *before, vertex = elements[: names.index("vertex") + 1]
     if lists := [element.name for element in before if element.has_list]:
         raise DataError(
-            f"{path}: {quote(lists[0])}, with a list, stands before the vertices; export it with vertices first"
+            f"{path}: {quote(lists[0])}, with a list, comes before the vertices; export it with vertices first"
         )
     properties = [name for name, _ in vertex.properties]
     if not properties or len(set(properties)) < len(properties):
@@ -158,7 +158,7 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
 
 
 def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Section]:
-    """Where the elements of a binary file lie, up to one whose size nobody knows; of two with one name the first."""
+    """Return the sections of a binary file, up to an element of unknown size; for equal names, the first."""
     sections: dict[str, Section] = {}
     for element in elements:
         if element.has_list:
@@ -174,11 +174,13 @@ def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Sec
 
 
 RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
-MIP = re.compile(r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE)  # of all programs
+MIP = re.compile(
+    r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE
+)  # spellings of several programs
 FILTER = "filter_3D"
-NUMBERS = ("near", "screen_variance", "compensate", "pixel_box")  # of the comment
-ROWS = 65_536  # in memory twice, as they are read and written
-MAX_NUMBER = 1e15  # as of any number in a dataset
+NUMBERS = ("near", "screen_variance", "compensate", "pixel_box")  # numbers in the comment
+ROWS = 65_536  # rows in memory at once while reading and writing
+MAX_NUMBER = 1e15  # same limit as for numbers in a dataset
 _COLUMNS = {
     "means": ("x", "y", "z"),
     "sh_base": ("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -189,14 +191,14 @@ _COLUMNS = {
 
 
 def read_ply(path: Path) -> SplatFile:
-    """Read a splat PLY; of a disc, which has no scale_2, the third axis is FLAT_LOG_SCALE.
+    """Read a splat PLY; 2DGS discs, without scale_2, get FLAT_LOG_SCALE as the third scale.
 
-    Raises DataError when it is missing, damaged or not a splat.
+    Raises DataError if it is missing, damaged, or not a splat.
     """
     with open_file(path, "a PLY file") as file:
         header = parse_ply_header(path, file.read(MAX_HEADER))
         if header.format == "ascii":
-            raise DataError(f"{path}: is an ascii PLY; expected binary_little_endian or big_endian: export it again")
+            raise DataError(f"{path}: is an ascii PLY; export it as binary")
         rendering, size = rendering_of(path, header), header.count * header.dtype.itemsize
         require_size(path, file.seek(0, os.SEEK_END), header.start + size, f"{header.count} splats")
         file.seek(header.start)
@@ -205,9 +207,9 @@ def read_ply(path: Path) -> SplatFile:
 
 
 def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> str:
-    """Write parameters in the reference's order, and filter_variance where it is given; return the SHA-256 of the file.
+    """Write parameters in the property order of 3DGS, and filter_variance if present; return the file's SHA-256.
 
-    `rendering` becomes a comment in JSON; with `compensate` in it, the file's mode is mip.  Raises OutputError.
+    `rendering` becomes a JSON comment; with `compensate`, the mode is mip.  Raises OutputError.
     """
     count = len(parameters["means"])
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -225,7 +227,7 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
 
 
 def _body(parameters: Parameters) -> bytes:
-    """The rows of a file."""
+    """Return the rows of a file as bytes."""
     count, rest = parameters["sh_rest"].shape
     blocks = [
         parameters["means"],
@@ -242,18 +244,18 @@ def _body(parameters: Parameters) -> bytes:
 
 
 def rendering_comments(rendering: dict[str, Any]) -> list[str]:
-    """Return the comments of a header that say how a model is rendered."""
+    """Return the header comments that say how to render a model."""
     mode = "mip" if rendering.get("compensate") else "default"
     return [f"{RENDERING}{json.dumps(rendering, sort_keys=True, allow_nan=False)}", f"{MODE}{mode}"]
 
 
 def render_mode(header: PlyHeader) -> str:
-    """Return `mip` where a comment of any program says so, else `default`."""
+    """Return `mip` if a comment of any program says so, else `default`."""
     return "mip" if any(MIP.match(text) for text in header.comments) else "default"
 
 
 def rendering_of(path: Path, header: PlyHeader) -> dict[str, Any]:
-    """Return the numbers of our comment; none where there is another.  Raises DataError for an invalid one."""
+    """Return the values of our JSON comment, or {}.  Raises DataError for an invalid number."""
     text = next((text.removeprefix(RENDERING) for text in header.comments if text.startswith(RENDERING)), "")
     try:
         values = json.loads(text or "{}")
@@ -263,25 +265,25 @@ def rendering_of(path: Path, header: PlyHeader) -> dict[str, Any]:
 
 
 def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Return what a file says about rendering.  Raises DataError for an invalid number."""
+    """Validate the rendering values of a file and return them.  Raises DataError for an invalid number."""
     for name in NUMBERS:
         value = values.get(name)
         if value is not None and (not isinstance(value, int | float) or not 0 <= value < MAX_NUMBER):
             raise DataError(
-                f"{path}: its comment says {name} = {quote(value)}; expected a number from 0 to {MAX_NUMBER:g}: "
+                f"{path}: its comment says {name} = {quote(value)}; expected a number from 0 to {MAX_NUMBER:g}; "
                 "export it again, or correct that line"
             )
     try:
         json.dumps(values, allow_nan=False)
     except (ValueError, RecursionError) as error:
         raise DataError(
-            f"{path}: its comment holds what no JSON holds ({quote(error)}); export it again, or correct it"
+            f"{path}: its comment is not valid JSON ({quote(error)}); export it again, or correct it"
         ) from error
     return values
 
 
 def _read(path: Path, file: BinaryIO, header: PlyHeader) -> Parameters:
-    """The tables of a file that stands at its first row, read some rows at a time."""
+    """Read the tables of a file, positioned at its first row, some rows at a time."""
     tables: Parameters = {}
     for first in range(0, max(header.count, 1), ROWS):
         rows = min(ROWS, header.count - first)
@@ -302,14 +304,14 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     if missing:
         raise DataError(
             f"{path}: not a splat file: it has no {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}; "
-            "train from a point cloud with `clsplat run`"
+            "to train from a point cloud, use `clsplat run`"
         )
     rest = sum(name.startswith("f_rest_") for name in names)
     degree = next((d for d in range(MAX_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)
     columns = tuple(f"f_rest_{i}" for i in range(rest))
     if degree is None or not set(columns) <= set(names):
         raise DataError(
-            f"{path}: has {rest} f_rest properties; expected 0, 9, 24 or 45, numbered from 0 on: export it again"
+            f"{path}: has {rest} f_rest properties; expected 0, 9, 24, or 45, numbered from 0; export it again"
         )
     parameters = {name: _columns(vertices, columns) for name, columns in columns_of.items()}
     by_channel = _columns(vertices, columns)
@@ -319,41 +321,43 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
         parameters["log_scales"] = np.pad(parameters["log_scales"], ((0, 0), (0, 1)), constant_values=FLAT_LOG_SCALE)
     parameters = {name: parameters[name] for name in PARAMETERS}
     if FILTER in names:
-        with np.errstate(over="ignore"):  # infinity is refused
+        with np.errstate(over="ignore"):  # infinity is refused later
             parameters["filter_variance"] = np.square(_columns(vertices, (FILTER,)))
-    moving = find_motion_columns(names)
-    if moving is None:
+    motion = find_motion_columns(names)
+    if motion is None:
         raise DataError(
-            f"{path}: has some properties of a motion and lacks others; expected velocity_0..2, time_center and "
-            "log_duration, and none or all of acceleration_0..2, jerk_0..2 and turn_0..3: export it again"
+            f"{path}: has only some properties of a motion; expected velocity_0..2, time_center, and log_duration, "
+            "and none or all of acceleration_0..2, jerk_0..2, and turn_0..3; export it again"
         )
-    return {**parameters, MOTION: _columns(vertices, moving)} if moving else parameters
+    return {**parameters, MOTION: _columns(vertices, motion)} if motion else parameters
 
 
 def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.float32]:
     if not columns:
         return np.zeros((len(vertices), 0), np.float32)
-    with np.errstate(over="ignore"):  # of doubles: infinity is refused
+    with np.errstate(over="ignore"):  # from doubles; infinity is refused later
         return np.stack([vertices[c].astype(np.float32) for c in columns], axis=1)
 
 
-# Several splat PLY files as one, a piece at a time: the memory is that of a piece, whatever the files hold.
+# Joining PLY files piece by piece, in little memory.
 
-PIECE_ROWS = 1 << 16  # of a piece
+PIECE_ROWS = 1 << 16  # rows per piece
 Check = Callable[[int, NDArray[np.float32]], None]
 
 
 def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
-    """Write the vertices of all parts, in their order, with the header of the first; return their number.
+    """Write the vertices of all parts in order, with the header of the first; return their number.
 
-    check: is given the number of a part and the means of some of its rows, [n, 3], and raises what is wrong.
-    Raises DataError where a part is damaged or has other properties or another comment than the first, OutputError.
+    check: called with the index of a part and the means of some of its rows, [n, 3]; it may raise an error.
+    Raises DataError if a part is damaged or its properties or comments differ from the first, and OutputError.
     """
     headers = [_header(part) for part in parts]
     first, count = headers[0], sum(header.count for header in headers)
     for part, header in zip(parts, headers, strict=True):
         if (header.dtype, header.comments) != (first.dtype, first.comments):
-            raise DataError(f"{part}: has other properties, or another comment, than {parts[0]}; train both alike")
+            raise DataError(
+                f"{part}: differs from {parts[0]} in properties or comments; train both with the same settings"
+            )
     properties = [f"float {name}" for name in first.dtype.names or ()]
     with open_hashed(path) as output:
         output.write(format_ply_header(first.comments, vertex=(count, properties)))
@@ -364,7 +368,7 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
                     size = min(PIECE_ROWS, header.count - start) * header.dtype.itemsize
                     piece = file.read(size)
                     if len(piece) < size:
-                        raise DataError(f"{part}: its end is missing; train that block again")
+                        raise DataError(f"{part}: is truncated; train that block again")
                     rows = np.frombuffer(piece, header.dtype)
                     check(number, np.stack([rows[axis].astype(np.float32) for axis in "xyz"], axis=1))
                     output.write(piece)
@@ -376,5 +380,5 @@ def _header(part: Path) -> PlyHeader:
         header = parse_ply_header(part, file.read(MAX_HEADER))
     kinds = {header.dtype[name] for name in header.dtype.names or ()}
     if header.format != "binary_little_endian" or list(header.sections) != ["vertex"] or kinds != {np.dtype("<f4")}:
-        raise DataError(f"{part}: expected a model as `export` writes it")
+        raise DataError(f"{part}: expected a PLY written by `export`; export it again")
     return header

@@ -1,7 +1,7 @@
-"""Tables rounded so that a SOG holds them in fewer bytes: to fewer different values.
+"""Round tables to fewer distinct values, so that a SOG file compresses better.
 
-A SOG has 16 bits for a position and 8 for most other numbers, more than pictures show.  What is rounded here lies on
-levels of the format, so that it is written as it is.
+SOG has 16 bits for a position and 8 for most other numbers, more than is visible.  Values are rounded to levels of the
+format, so that writing does not change them again.
 """
 
 from itertools import product
@@ -17,23 +17,23 @@ from clsplat.formats.palette import robust_max
 from clsplat.formats.splats import MAX_LOG, SH_C0, Parameters, unit
 
 Floats = NDArray[np.floating]
-LEVELS = 65535  # of a position, from 0
-TINY = 2.0**-40  # levels, in the place of a size of 0
-MOST_BITS = 8  # last bits of a position that are alike
+LEVELS = 65535  # of a position
+TINY = 2.0**-40  # levels, replaces a size of 0
+MOST_BITS = 8  # last bits of a position that may be zeroed
 _SIGNED = [turn for turn in product((0, 1, -1), repeat=4) if np.count_nonzero(turn) in (1, 2, 4)]
-# rotations of the axes onto axes, [24, 4]; a quaternion and its negative are one
+# rotations that map axes onto axes, [24, 4]; a quaternion and its negative are the same
 _TURNS = np.array([np.divide(turn, np.linalg.norm(turn)) for turn in _SIGNED if next(filter(None, turn)) > 0])
 
 
 def round_to(values: Floats, step: float) -> NDArray[np.float32]:
-    """Return values as multiples of a step."""
+    """Round values to multiples of a step."""
     return np.asarray(np.rint(values.astype(np.float64) / step) * step, np.float32)
 
 
 def round_means(
     means: Floats, log_scales: Floats, log_weights: NDArray[np.float64], share: float
 ) -> NDArray[np.float32]:
-    """Return positions [N, 3] in steps of about `share` of the size of each Gaussian, those of median weight.
+    """Round positions [N, 3] to about `share` of the size of each Gaussian, for those of median weight.
 
     The step is as 1 / sqrt(weight) (see `quantization_steps`): a power of two of the levels of a SOG.
     """
@@ -45,7 +45,7 @@ def round_means(
 
 
 def _levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Positions in levels of a SOG, [N, 3]; the least of each axis, and how much a level is, [3], of logarithms."""
+    """Return positions in SOG levels, [N, 3], and the smallest logarithm and the level size of each axis, [3]."""
     wide = means.astype(np.float64)
     t = np.sign(wide) * np.log1p(np.abs(wide))
     low, span = t.min(axis=0), np.ptp(t, axis=0)
@@ -54,7 +54,7 @@ def _levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
 
 
 def _sizes(means: Floats, log_scales: Floats) -> NDArray[np.float64]:
-    """Geometric means of standard deviations where the positions are logarithms, [N, 3]."""
+    """Return geometric means of scales in the logarithmic space of positions, [N, 3]."""
     size = np.exp(np.minimum(log_scales.astype(np.float64).mean(axis=1, keepdims=True), MAX_LOG))
     return np.asarray(size / (1 + np.abs(means.astype(np.float64))))
 
@@ -64,10 +64,10 @@ def _positions(logarithms: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return quaternions [N, 4] on every `step`-th level of a SOG, and the scales [N, 3] that go with them.
+    """Round quaternions [N, 4] to every `step`-th level of SOG; also return the scales [N, 3], permuted to match.
 
-    A Gaussian has 24 pairs of a rotation and scales, which differ in the names and signs of its axes.  That of the
-    least angle is taken: the largest component is w then, and the others are small.
+    A Gaussian has 24 equivalent pairs of rotation and scales, which permute and flip its axes.  The pair with the
+    smallest angle is chosen: w is then the largest component, and the others are small.
     """
     q, rows = unit(quats), np.arange(len(quats))
     along, taken = np.full(len(q), -1.0), np.zeros(len(q), np.intp)
@@ -81,17 +81,17 @@ def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[n
 
 
 def _axes(turns: NDArray[np.float64]) -> NDArray[np.intp]:
-    """The axis that each axis comes from, [24, 3], by rotations of axes onto axes."""
+    """Return the source axis of each axis, [24, 3], under rotations that map axes onto axes."""
     inverse = turns * [1, -1, -1, -1]
     axes = [multiply(multiply(turns, np.eye(4)[1 + axis]), inverse) for axis in range(3)]
     return np.stack([np.abs(image[:, 1:]).argmax(axis=1) for image in axes], axis=1)
 
 
-# Harmonics rounded so that little of it shows, from the model alone.
+# Rounding SH with little visible error, using only the model.
 
-ISOTROPIC = 0.02  # share of all directions alike beside those that the moments tell; 0.005 to 0.1 differ little
-USUAL = 0.028  # root of the mean square of harmonics: fox after 7 000 steps; Lego has 0.037, the kitchen 0.043
-ROWS = 1 << 15  # that are rounded at once
+ISOTROPIC = 0.02  # weight of a uniform distribution of directions added to the moments; 0.005 to 0.1 differ little
+USUAL = 0.028  # RMS of SH coefficients: fox after 7,000 steps; lego has 0.037, kitchen 0.043
+ROWS = 1 << 15  # rows rounded at once
 
 
 def quantization_steps(log_weights: NDArray[np.float64], median: float, most: float) -> NDArray[np.float32]:
@@ -101,13 +101,13 @@ def quantization_steps(log_weights: NDArray[np.float64], median: float, most: fl
 
 
 def usual_step(rest: Floats, step: float, most: float) -> float:
-    """Return a step that is chosen for harmonics of the size USUAL, and for others in proportion, up to `most`."""
+    """Scale a step that suits SH of RMS size USUAL to these SH, up to `most`."""
     size = float(np.sqrt(np.square(np.clip(rest, -1, 1), dtype=np.float64).mean())) if rest.size else 0.0
     return min(most, step * max(size / USUAL, 1e-3))
 
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:
-    """Return G for harmonics [N, 3 K], as [K, K] with a trace of K, the same bits with any number of threads."""
+    """Return the error metric G, [K, K] with trace K, of SH [N, 3 K]; the same bits for any number of threads."""
     largest = robust_max(rest)
     count = rest.shape[1] // 3
     form = np.zeros((count, count))
@@ -121,26 +121,26 @@ def visible_form(rest: Floats) -> NDArray[np.float64]:
 
 
 def compensate_base(base: Floats, errors: Floats, form: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return coefficients of band 0, [N, 3], that take up what is the same everywhere of errors of the others.
+    """Correct coefficients of band 0, [N, 3], for the mean error of the other bands over directions.
 
-    errors: what the others lack, [N, 3 K].
+    errors: exact minus rounded coefficients of the other bands, [N, 3 K].
     """
     count = len(form)
-    lacking = errors.reshape(len(errors), count, 3)
+    errors_by_band = errors.reshape(len(errors), count, 3)
     change = np.zeros(base.shape)
     for k, mean in enumerate(mean_basis(form)):
-        change += mean * lacking[:, k]
+        change += mean * errors_by_band[:, k]
     return np.asarray(base + change / SH_C0, np.float32)
 
 
 def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return harmonics [N, 3 K] as multiples of each Gaussian's step, whose errors show little by `form`, [K, K]."""
+    """Round SH [N, 3 K] to multiples of each Gaussian's step, with error feedback under the metric `form`, [K, K]."""
     count = len(form)
-    # (G^-1) reversed = U^T U: row k of U tells how the coefficients after k take up an error of k
+    # (G^-1) reversed = U^T U: row k of U says how later coefficients compensate an error of k
     inverse = np.linalg.inv(form[::-1, ::-1])
     feedback = np.linalg.cholesky(inverse).T.astype(np.float32)
     feedback /= np.diag(feedback)[:, None].copy()
-    found = np.empty(rest.shape, np.float32)
+    rounded = np.empty(rest.shape, np.float32)
     for start in range(0, len(rest), ROWS):
         part, step = rest[start : start + ROWS], steps[start : start + ROWS]
         left = np.ascontiguousarray(part.reshape(len(part), count, 3)[:, ::-1].transpose(1, 2, 0), np.float32)
@@ -150,16 +150,16 @@ def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]
             error = wanted - left[k]
             for later in range(k + 1, count):
                 left[later] -= feedback[k, later] * error
-        found[start : start + ROWS] = left[::-1].transpose(2, 0, 1).reshape(part.shape)
-    return found
+        rounded[start : start + ROWS] = left[::-1].transpose(2, 0, 1).reshape(part.shape)
+    return rounded
 
 
-# A palette of many harmonics: parts of all Gaussians, divided again and again.
+# A large SH palette: Gaussians are split into clusters recursively.
 
-LLOYD_STEPS = 3  # of each division
-AT_ONCE = 0.5  # share of the parts, at most, that are divided before their errors are computed again
-TINY_WEIGHT = 1e-300  # in the place of the weight of an empty part
-SH_LEVELS = 128  # to a coefficient of 1
+LLOYD_STEPS = 3  # per split
+AT_ONCE = 0.5  # largest fraction of clusters split before errors are recomputed
+TINY_WEIGHT = 1e-300  # replaces the weight of an empty cluster
+SH_LEVELS = 128  # per coefficient of 1
 LARGEST_STEP = 64.0  # levels
 Labels = NDArray[np.int64]
 
@@ -167,10 +167,9 @@ Labels = NDArray[np.int64]
 def tree_palette(
     rest: NDArray[np.float32], log_weights: NDArray[np.float64], entries: int, median_step: float
 ) -> tuple[NDArray[np.float64], Labels]:
-    """Return vectors [E, 3 K], E at most `entries`, for harmonics [N, 3 K], and for each Gaussian its vector, [N].
+    """Return at most `entries` vectors [E, 3 K] for SH [N, 3 K], and the label of each Gaussian, [N].
 
-    log_weights: as `log_weights` returns them; median_step: of vectors, in LEVELS, in the median, for harmonics of the
-    usual size.
+    log_weights: as returned by `log_weights`; median_step: median step of vectors, in LEVELS, for SH of typical size.
     """
     form, weights = visible_form(rest), np.exp2(log_weights)
     labels = _divided(_in_form(rest, form), weights, entries)
@@ -188,7 +187,7 @@ def tree_palette(
 
 
 def _in_form(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Harmonics so turned and stretched that the form is the square of a distance, [N, 3 K]."""
+    """Transform SH so that the metric becomes the squared Euclidean distance, [N, 3 K]."""
     count = len(form)
     root = np.linalg.cholesky(form).astype(np.float32)  # e^T G e = |root^T e|^2
     table, found = rest.reshape(len(rest), count, 3), np.zeros((len(rest), count, 3), np.float32)
@@ -199,10 +198,10 @@ def _in_form(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np
 
 
 def _divided(points: NDArray[np.float32], weights: NDArray[np.float64], entries: int) -> Labels:
-    """Parts of points [N, c], which are divided until there are so many."""
+    """Split points [N, c] into at most `entries` clusters; return the label of each point."""
     labels, parts = np.zeros(len(points), np.int64), 1
     while parts < entries:
-        held = np.maximum(np.bincount(labels, weights, minlength=parts), TINY_WEIGHT)  # a half may be empty
+        held = np.maximum(np.bincount(labels, weights, minlength=parts), TINY_WEIGHT)  # a half can be empty
         mean = _sums(labels, weights, points, parts) / held[:, None]
         away = (points - mean[labels]).astype(np.float32)
         spread = _sums(labels, weights, np.square(away), parts)
@@ -226,7 +225,7 @@ def _divided(points: NDArray[np.float32], weights: NDArray[np.float64], entries:
 def _halves(
     points: NDArray[np.float32], weights: NDArray[np.float64], own: Labels, beyond: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Lloyd's iteration with two means for each part: which points are of the second, from a first guess."""
+    """Run Lloyd's iteration with two means per cluster; return which points are in the second half."""
     parts = int(own.max()) + 1
     for _ in range(LLOYD_STEPS):
         half = 2 * own + beyond
@@ -244,26 +243,24 @@ def _halves(
 def _sums(
     labels: Labels, weights: NDArray[np.float64], points: NDArray[np.floating], parts: int
 ) -> NDArray[np.float64]:
-    """Weighted sums of the points of each label, [parts, c], in the order of the points."""
+    """Return weighted sums of the points of each label, [parts, c], summed in the order of the points."""
     columns = [np.bincount(labels, weights * column, minlength=parts) for column in points.T]
     return np.stack(columns, axis=1)
 
 
-# How much each Gaussian is estimated to contribute to pictures, from the model alone.
+# Estimating how much each Gaussian contributes to renders, using only the model.
 
-LARGEST = 10.0  # of the logarithms, on both sides of 0
-# A sky is behind a gap: a distance within which are all but a few, and behind it many.  The spheres of
-# clsplat/gaussians/conversion.py are 10 times as far as 97 % of the scene.  Their rows are found by it, not by their
-# number: models are cropped, merged to fewer Gaussians, sorted and rounded afterwards.
+LARGEST = 10.0  # limit of the absolute logarithms
+# Sky Gaussians are recognized by a gap in distance: clsplat/gaussians/conversion.py places them 10 times as far away as
+# 97 % of the scene.  Their row numbers do not help, because models are cropped, decimated, sorted, and rounded later.
 GAP, INSIDE = 5.0, 0.97
-FEWEST_INSIDE, FEWEST_BEHIND = 0.01, 0.05  # of all
+MIN_INSIDE, MIN_BEHIND = 0.01, 0.05  # fractions of all Gaussians
 
 
 def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
-    """Return the binary logarithms of the weights, [N], of which the scene's median is 0; from -LARGEST to LARGEST.
+    """Return base-2 logarithms of the weights, [N], from -LARGEST to LARGEST, with a median of 0.
 
-    Scale-free: a model that is twice as large has the same.  has_sky: whether some Gaussians are a sky, which the
-    median leaves out.
+    They do not depend on the scale of the model.  has_sky: some Gaussians are a sky, which the median excludes.
     """
     if not len(p["means"]):
         return np.zeros(0)
@@ -272,18 +269,15 @@ def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
     counted = before_gap(np.sqrt(squares)) if has_sky else np.ones(len(squares), np.bool_)
     squares += np.maximum(np.median(squares[counted]), 1e-30)
     opacity = -np.logaddexp(0, -p["logit_opacity"][:, 0].astype(np.float64))
-    found = (opacity + (scales[:, 1] + scales[:, 2] - np.log(squares)) / 2) / np.log(2)
-    return np.asarray(np.clip(found - np.median(found[counted]), -LARGEST, LARGEST))
+    logs = (opacity + (scales[:, 1] + scales[:, 2] - np.log(squares)) / 2) / np.log(2)
+    return np.asarray(np.clip(logs - np.median(logs[counted]), -LARGEST, LARGEST))
 
 
 def before_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of these distances, [N], are not behind a gap, as those of a sky are; all where there is none.
-
-    A sky lies around the scene, so that the median of all positions is in the scene's middle.
-    """
+    """Return which distances, [N], are before the gap that separates a sky; all if there is no gap."""
     ordered, count = np.sort(distances), len(distances)
     within = np.arange(1, count + 1)
     inside = np.searchsorted(ordered, ordered / GAP, side="right")
-    ends = (inside >= INSIDE * within) & (within >= FEWEST_INSIDE * count) & (count - within >= FEWEST_BEHIND * count)
+    ends = (inside >= INSIDE * within) & (within >= MIN_INSIDE * count) & (count - within >= MIN_BEHIND * count)
     ends &= ordered > 0
     return distances <= ordered[ends][-1] / 2 if ends.any() else np.ones(count, np.bool_)

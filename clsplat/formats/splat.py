@@ -1,9 +1,9 @@
-"""`.splat` of antimatter15, 32 bytes a splat, and `.ksplat` of GaussianSplats3D, which is only read.
+"""Read and write `.splat` of antimatter15, 32 bytes per splat; read `.ksplat` of GaussianSplats3D.
 
     position 3 float32 · linear scale 3 float32 · r g b a uint8: 255 (1/2 + C0 f_dc), 255 opacity
     quaternion w x y z uint8: 128 q + 128, q of unit length
 
-The largest and most opaque come first, for viewers that show a file while it arrives.
+The largest and most opaque splats come first, for viewers that show a file while it downloads.
 """
 
 import logging
@@ -35,12 +35,12 @@ from clsplat.formats.splats import (
 
 LOG = logging.getLogger("clsplat")
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
-LARGEST_SCALE = 1e6  # scene units: text, read as numbers, has larger ones
-EXPECTED = "a .splat file, 32 bytes a splat"
+LARGEST_SCALE = 1e6  # scene units; text misread as numbers has larger ones
+EXPECTED = "a .splat file with 32 bytes per splat"
 
 
 def looks_like_splat(data: bytes, size: int) -> bool:
-    """Return whether bytes that begin a file of a size can be splats: the format has no mark."""
+    """Return whether the first bytes of a file of `size` bytes can be splats; the format has no magic number."""
     count = len(data) // ROW.itemsize
     if not count or size % ROW.itemsize or data.isascii():
         return False
@@ -52,13 +52,13 @@ def looks_like_splat(data: bytes, size: int) -> bool:
 
 
 def read_splat(path: Path) -> SplatFile:
-    """Read a `.splat` file.  Raises DataError when it is missing or has another size."""
+    """Read a `.splat` file.  Raises DataError if it is missing or has another size."""
     data = read_file(path, EXPECTED, limit=MAX_FILE)
     if len(data) % ROW.itemsize:
-        raise DataError(f"{path}: has {len(data)} bytes, no multiple of 32; expected {EXPECTED}: copy it again")
+        raise DataError(f"{path}: has {len(data)} bytes, not a multiple of 32; expected {EXPECTED}; copy it again")
     rows = np.frombuffer(data, ROW)
     if (rows["scale"] < 0).any():
-        raise DataError(f"{path}: holds scales below 0; expected {EXPECTED}: it may be a file of another format")
+        raise DataError(f"{path}: has scales below 0; expected {EXPECTED}; it may be of another format")
     color = rows["color"] / 255.0
     parameters: Parameters = {
         "means": rows["position"].astype(np.float32),
@@ -87,14 +87,15 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     warn_clipped(path, "splat", "colors from 0 to 1", outside_bytes(255 * color))
     if p["sh_rest"].shape[1]:
         LOG.warning(
-            "%s: splat holds no harmonics: the colors are the same from everywhere; other formats hold them", path
+            "%s: splat stores no spherical harmonics: colors do not depend on the view; other formats do",
+            path,
         )
     rows["color"] = np.clip(np.rint(255 * color), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
     return write_bytes(path, rows[order].tobytes())
 
 
-# `.ksplat` of GaussianSplats3D, which is read only: a header, sections, and in each its buckets and its splats.
+# `.ksplat` of GaussianSplats3D, read only: a header, then sections, each with buckets and splats.
 
 HEADER, SECTION = 4096, 1024  # bytes
 MAX_DEGREE = 2
@@ -154,12 +155,10 @@ def looks_like_ksplat(data: bytes, size: int) -> bool:
 
 
 def read_ksplat(path: Path) -> SplatFile:
-    """Read a `.ksplat` file.  Raises DataError when it is missing or damaged."""
+    """Read a `.ksplat` file.  Raises DataError if it is missing or damaged."""
     data = read_file(path, "a .ksplat file", limit=MAX_FILE)
     if not looks_like_ksplat(data, len(data)):
-        raise DataError(
-            f"{path}: not a .ksplat file of version 0.1; expected its header of {HEADER} bytes: copy it again"
-        )
+        raise DataError(f"{path}: not a .ksplat file of version 0.1 with a header of {HEADER} bytes; copy it again")
     most, sections = struct.unpack_from("<2I", data, 4)
     (level,) = struct.unpack_from("<H", data, 20)
     ends = struct.unpack_from("<2f", data, 36)
@@ -180,20 +179,20 @@ def read_ksplat(path: Path) -> SplatFile:
 
 
 def _check(path: Path, section: SplatSection, number: int) -> None:
-    """Raise DataError for a section that cannot be."""
+    """Raise DataError for an invalid section."""
     if section.degree > MAX_DEGREE or section.count > section.rows:
         raise DataError(
             f"{path}: section {number} has {section.count} of {section.rows} splats with SH degree {section.degree}; "
-            f"expected no more splats than places, and degree 0 to {MAX_DEGREE}: the file is damaged, copy it again"
+            f"expected no more splats than rows, and degree 0 to {MAX_DEGREE}; the file is damaged, copy it again"
         )
     if (section.buckets and section.bucket_bytes < 12) or section.full + section.partial > section.buckets:
-        raise DataError(f"{path}: the buckets of section {number} do not fit their numbers; copy the file again")
+        raise DataError(f"{path}: the buckets of section {number} do not match their counts; copy the file again")
 
 
 def _tables(
     path: Path, data: bytes, start: int, section: SplatSection, level: int, ends: tuple[float, ...]
 ) -> dict[str, NDArray[np.float32]]:
-    """The parameters of one section."""
+    """Return the parameters of one section."""
     partial, buckets, _ = section.sizes(level)
     rows = np.frombuffer(data, section.row(level), section.count, start + partial + buckets)
     position = rows["position"].astype(np.float64)
@@ -204,7 +203,7 @@ def _tables(
     if level == 2:
         sh = ends[0] + sh / 255 * (ends[1] - ends[0])
     color = rows["color"] / 255.0
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused later
         return {
             "means": position.astype(np.float32),
             "quats": rows["rotation"].astype(np.float32),
@@ -216,11 +215,11 @@ def _tables(
 
 
 def _centers(path: Path, data: bytes, start: int, section: SplatSection) -> NDArray[np.float64]:
-    """The center of each splat's bucket, [count, 3]: full buckets come first, then partial ones."""
+    """Return the center of each splat's bucket, [count, 3]; full buckets come first, then partial ones."""
     partial = np.frombuffer(data, "<u4", section.partial, start).astype(np.int64)
     filled = section.full * section.bucket_size
     if filled + int(partial.sum()) < section.count or filled > section.rows:
-        raise DataError(f"{path}: its buckets hold fewer splats than it declares, {section.count}; copy the file again")
+        raise DataError(f"{path}: its buckets have fewer splats than the {section.count} declared; copy the file again")
     held = np.concatenate([np.full(section.full, section.bucket_size), np.minimum(partial, section.count)])
     ends = np.minimum(np.cumsum(held), section.count)
     bucket = np.repeat(np.arange(len(held)), np.diff(ends, prepend=0))
@@ -230,7 +229,7 @@ def _centers(path: Path, data: bytes, start: int, section: SplatSection) -> NDAr
 
 
 def _interleaved(sh: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each degree's red, green and blue coefficients as red, green, blue of each coefficient."""
+    """Convert channel-major coefficients of each degree to coefficient-major order."""
     bands, first = [], 0
     for size in (3, 5):
         if first < sh.shape[1]:

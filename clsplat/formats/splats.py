@@ -1,11 +1,11 @@
-"""What a model file holds, and what the formats share: names and widths of tables, activations, axes.
+"""Define what all formats share: names and widths of tables, activations, axes, and checks.
 
     means [3] scene units · quats [4] (w, x, y, z), unnormalized · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
-    filter_variance [1] scene units², the world filter; only in our own PLY, as is
-    motion [5 or more], where Gaussians move
+    filter_variance [1] scene units², the world filter; only in our own PLY
+    motion [5 or more], for moving Gaussians; only in our own PLY
 
-Axes are those of the PLY of 3DGS: x right, y down, z ahead.
+Axes are those of a 3DGS PLY: x right, y down, z forward.
 """
 
 import logging
@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 
-# The table `motion` of Gaussians that move: its columns, and their names in a PLY.
+# The columns of the table `motion` and their names in a PLY.
 
 MOTION = "motion"
 FIELDS = {"velocity": 3, "time_center": 1, "log_duration": 1, "acceleration": 3, "jerk": 3, "turn": 4}
-TURN = 4  # columns of the turn
+TURN = 4  # columns of the change of the quaternion
 MAX_DEGREE = 3
-EXPECTED_TIME = "expected a number from 0, the first moment of the scene, to 1, its last"
-STATIC_LOG_DURATION = 12.0  # log of a duration: what is there always, exp(-1/2 exp(-24)) being 1 in float32
+EXPECTED_TIME = "expected a timestamp from 0, the start of the scene, to 1, its end"
+STATIC_LOG_DURATION = 12.0  # of a Gaussian that is always visible: exp(-1/2 exp(-24)) is 1 in float32
 
 
 def is_timestamp(time: float) -> bool:
-    """Return whether a number is a moment of a scene."""
+    """Return whether a number is a valid timestamp, in [0, 1]."""
     return math.isfinite(time) and 0 <= time <= 1
 
 
@@ -46,12 +46,12 @@ WIDTHS = {
 
 
 def motion_degree(width: int) -> int:
-    """Return the degree of the polynomials of a table with so many columns."""
+    """Return the polynomial degree of a motion table with `width` columns."""
     return WIDTHS[width][0]
 
 
 def motion_fields(width: int) -> dict[str, slice]:
-    """Return the columns of each field in a table with so many columns, by name, in their order."""
+    """Return the columns of each field of a motion table with `width` columns, by name, in order."""
     degree, turns = WIDTHS[width]
     present = ["velocity", "time_center", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * turns]
     ends: dict[str, slice] = {}
@@ -63,7 +63,7 @@ def motion_fields(width: int) -> dict[str, slice]:
 
 
 def motion_columns(width: int) -> tuple[str, ...]:
-    """Return the names of the columns in a PLY."""
+    """Return the PLY property names of a motion table with `width` columns."""
     names = []
     for name in motion_fields(width):
         names += [name] if FIELDS[name] == 1 else [f"{name}_{i}" for i in range(FIELDS[name])]
@@ -71,73 +71,75 @@ def motion_columns(width: int) -> tuple[str, ...]:
 
 
 def find_motion_columns(names: Collection[str]) -> tuple[str, ...] | None:
-    """Return the columns of the motion among the properties of a file; () of none, None of some but no whole table."""
+    """Return the motion columns among a file's properties: () if there are none, None if the table is incomplete."""
     own = {column for width in WIDTHS for column in motion_columns(width)} & set(names)
     return next((motion_columns(width) for width in WIDTHS if set(motion_columns(width)) == own), None) if own else ()
 
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 SH_C0 = 0.28209479177387814  # basis function of band 0
-NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: nearest distance and screen filter of 3DGS
-MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
+NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: near plane and screen filter of 3DGS
+MIP_VARIANCE = 0.1  # px², of files that only say `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
-MAX_VALUE = 1e15  # of LIMITED: beyond it neither viewers nor codebooks hold anything
+MAX_VALUE = 1e15  # of the tables in LIMITED; viewers and codebooks fail beyond it
 LIMITED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
-MAX_EXPONENT = 700.0  # of e in float64
-MAX_LOG = 88.7  # of a scale in float32
-FLAT_LOG_SCALE = -13.815511  # log 1e-6: of the third axis of a disc
-FLIP_SH = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # y and z change sign: bands 1 to 3
-Quality = Literal["small", "balanced", "high"]  # how finely SPZ and SOG are rounded
-Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each [N, components]
+MAX_EXPONENT = 700.0  # of exp in float64
+MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
+FLAT_LOG_SCALE = -13.815511  # log 1e-6: for the third axis of a 2DGS disc
+FLIP_SH = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # signs of bands 1 to 3 when y and z change sign
+Quality = Literal["small", "balanced", "high"]  # precision of SPZ and SOG
+Parameters = dict[str, NDArray[np.float32]]  # by the names in PARAMETERS, each [N, components]
 Floats = NDArray[np.floating]
 LOG = logging.getLogger("clsplat")
 
 
 @dataclass(frozen=True)
 class SplatFile:
-    """A model file: the parameters, and the numbers of its comment for rendering them."""
+    """The content of a model file: the parameters, and the numbers in its comment for rendering."""
 
-    parameters: Parameters  # filter_variance too, where the file has it
+    parameters: Parameters  # including filter_variance and motion if the file has them
     rendering: dict[str, Any] = field(default_factory=dict)
-    mode: str = "default"  # `mip` where a screen filter reduces opacities to keep their energy
-    placement: NDArray[np.float64] | None = None  # [4, 4], by which the Gaussians are still to be moved
+    mode: str = "default"  # `mip`: a screen filter reduces opacities to conserve energy
+    placement: NDArray[np.float64] | None = None  # [4, 4], a transform still to be applied
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
     @property
     def sh_degree(self) -> int:
-        """Highest degree of the spherical harmonics."""
+        """The SH degree."""
         return sh_degree_of(self.parameters["sh_rest"].shape[1])
 
     @property
     def has_sky(self) -> bool:
-        """Whether some Gaussians are a sky, as clsplat/gaussians/conversion.py notes in the comment."""
+        """Whether some Gaussians are a sky, as clsplat/gaussians/conversion.py marks in the comment."""
         return bool(self.rendering.get("sky") == "splats")
 
     def rows(self, chosen: Any) -> "SplatFile":
-        """Return some of the Gaussians, in the order that is given."""
+        """Return the Gaussians at the given rows, in that order."""
         return replace(self, parameters={name: table[chosen] for name, table in self.parameters.items()})
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What a file does not say about itself."""
+    """Options for reading that a file does not determine itself."""
 
-    axes: Literal["spz", "ply"] = "spz"  # of an SPZ file: as its specification says, or those of a PLY, unturned
+    axes: Literal["spz", "ply"] = "spz"  # of an SPZ file: those of its specification, or those of a PLY
     not_finite: Literal["refuse", "drop", "keep"] = "refuse"  # Gaussians with NaN or infinity
-    quiet: bool = False  # no line about the axes of an SPZ file: whoever reads it wrote it
+    quiet: bool = False  # do not log about the axes of an SPZ file
 
 
 @dataclass(frozen=True)
 class Writing:
-    """How a model is written, where a format leaves a choice."""
+    """Options for writing a model."""
 
-    sh_bits: tuple[int, int] | None = None  # SPZ: bits of band 1 and of the others, from 1 to 8; None: as `quality`
-    axes: Literal["spz", "ply"] = "spz"  # SPZ: as its specification says, or those of the PLY, for readers that differ
+    sh_bits: tuple[int, int] | None = None  # SPZ: bits of band 1 and of the others, 1 to 8; None: by `quality`
+    axes: Literal["spz", "ply"] = (
+        "spz"  # SPZ: those of its specification, or those of a PLY, for readers that expect them
+    )
     quality: Quality = "balanced"  # SPZ and SOG
-    quiet: bool = False  # no line about what the format does not keep: it was said
+    quiet: bool = False  # do not warn about what the format does not store
 
 
 def sh_coefficients(degree: int) -> int:
@@ -146,13 +148,13 @@ def sh_coefficients(degree: int) -> int:
 
 
 def sh_degree_of(columns: int) -> int:
-    """Return the SH degree of a table sh_rest with so many columns."""
+    """Return the SH degree of a table sh_rest with `columns` columns."""
     degree: int = round((1 + columns / 3) ** 0.5) - 1
     return degree
 
 
 def with_degree(parameters: Parameters, degree: int) -> Parameters:
-    """Return the Gaussians with more or fewer SH bands."""
+    """Return the parameters with more or fewer SH bands."""
     columns = 3 * (sh_coefficients(degree) - 1)
     rest = parameters["sh_rest"][:, :columns]
     padding = np.zeros((len(rest), columns - rest.shape[1]), np.float32)
@@ -166,20 +168,20 @@ def logits(alpha: Floats) -> NDArray[np.float32]:
 
 
 def opacities(logit: Floats) -> NDArray[np.float64]:
-    """Return opacities in [0, 1] of logits, to 1e-16."""
+    """Return the opacities in [0, 1] of logits, exact to 1e-16."""
     return np.asarray(0.5 + 0.5 * np.tanh(0.5 * logit.astype(np.float64)))
 
 
 def inverse_opacities(logit: Floats) -> NDArray[np.float64]:
-    """Return 1 / opacity of logits, in which faint ones keep their digits; finite for all that are."""
+    """Return 1 / opacity of logits, precise for faint Gaussians and always finite."""
     return np.asarray(1 + np.exp(np.minimum(-logit.astype(np.float64), MAX_EXPONENT)))
 
 
 def logs(scales: Floats) -> NDArray[np.float32]:
     """Return the logarithms of scales; those of 0 become FLAT_LOG_SCALE."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = np.log(scales.astype(np.float64))
-    return np.where(scales == 0, FLAT_LOG_SCALE, found).astype(np.float32)
+        log_scales = np.log(scales.astype(np.float64))
+    return np.where(scales == 0, FLAT_LOG_SCALE, log_scales).astype(np.float32)
 
 
 def unit(quats: Floats) -> NDArray[np.float64]:
@@ -191,13 +193,13 @@ def unit(quats: Floats) -> NDArray[np.float64]:
 
 
 def flip_axes(parameters: Parameters) -> Parameters:
-    """Return the Gaussians in axes whose y and z point the other way: up and back for down and ahead, or back again."""
+    """Return the parameters with y and z reversed: between down and forward, and up and back."""
     signs = _signs(parameters)
     return {name: table * signs[name] if name in signs else table for name, table in parameters.items()}
 
 
 def flip_axes_in_place(parameters: Parameters) -> None:
-    """Turn the Gaussians as `flip_axes` does, in place."""
+    """Reverse y and z as `flip_axes` does, in place."""
     for name, signs in _signs(parameters).items():
         parameters[name] *= signs
 
@@ -216,7 +218,7 @@ def reorder_columns(table: NDArray[np.float32], outer: int, inner: int) -> NDArr
 
 
 def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
-    """Return which Gaussians hold NaN or infinity, [N]."""
+    """Return which Gaussians have NaN or infinity, [N]."""
     found = np.zeros(len(parameters["means"]), np.bool_)
     for table in parameters.values():
         found |= ~np.isfinite(table).all(axis=1)
@@ -224,30 +226,32 @@ def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
 
 
 def too_large(parameters: Parameters) -> NDArray[np.bool_]:
-    """Return which Gaussians hold finite logarithms of scales, coefficients or motions beyond LARGEST, [N]."""
+    """Return which Gaussians have finite log scales, SH coefficients, or motions beyond MAX_VALUE, [N]."""
     return np.asarray(np.any([_beyond(parameters[name]) for name in LIMITED if name in parameters], axis=0))
 
 
 def too_large_message(parameters: Parameters) -> str:
-    """Say how many Gaussians hold values that are too large, and of which tables; '' of none."""
+    """Return how many Gaussians have values that are too large, and in which tables; '' if none."""
     if not (count := int(too_large(parameters).sum())):
         return ""
     names = ", ".join(name for name in LIMITED if name in parameters and _beyond(parameters[name]).any())
-    return f"{count:,} of {len(parameters['means']):,} Gaussians hold {names} beyond {MAX_VALUE:g}"
+    return f"{count:,} of {len(parameters['means']):,} Gaussians have {names} beyond {MAX_VALUE:g}"
 
 
 def _beyond(table: Floats) -> NDArray[np.bool_]:
-    """Which rows hold finite values beyond LARGEST, [N]."""
+    """Return which rows have finite values beyond MAX_VALUE, [N]."""
     size = np.abs(table)
     return np.asarray(((size > MAX_VALUE) & (size < np.inf)).any(axis=1))
 
 
 def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
-    """Refuse, drop or keep Gaussians that are not finite; drop those that are too large, too.  Raises DataError."""
+    """Refuse, drop, or keep Gaussians with NaN or infinity; dropping includes values that are too large.
+
+    Raises DataError."""
     bad = not_finite(splats.parameters)
     if options.not_finite == "drop":
-        if told := too_large_message(splats.parameters):
-            LOG.warning("%s: %s; they are dropped", path, told)
+        if message := too_large_message(splats.parameters):
+            LOG.warning("%s: %s; they are dropped", path, message)
         if bad.any():
             LOG.warning("%s: dropped %s Gaussians with values that are not finite", path, f"{int(bad.sum()):,}")
         bad |= too_large(splats.parameters)
@@ -256,36 +260,36 @@ def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFi
         return splats
     names = [name for name, table in splats.parameters.items() if not_finite({"means": table}).any()]
     raise DataError(
-        f"{path}: {', '.join(names)} hold values that are not finite; export the file again, or drop those Gaussians "
+        f"{path}: {', '.join(names)} have values that are not finite; export the file again, or drop those Gaussians "
         "with `clsplat convert`"
     )
 
 
 def require_in_range(path: Path, splats: SplatFile, name: str) -> None:
-    """Raise DataError for values that the format `name` cannot hold."""
-    if told := too_large_message(splats.parameters):
-        raise DataError(f"{path}: {told}, which {name} cannot hold; `clsplat convert MODEL OTHER.ply` drops them")
+    """Raise DataError for values that the format `name` cannot store."""
+    if message := too_large_message(splats.parameters):
+        raise DataError(f"{path}: {message}; {name} cannot store that: `clsplat convert MODEL OTHER.ply` drops them")
 
 
 def require_static(path: Path, splats: SplatFile, name: str) -> None:
-    """Raise DataError for Gaussians that move, which the format `name` cannot hold."""
+    """Raise DataError for moving Gaussians, which the format `name` cannot store."""
     if MOTION in splats.parameters:
         raise DataError(
-            f"{path}: the Gaussians move, which {name} cannot hold; write a PLY, or one moment: `clsplat convert MODEL "
-            "OUT --time T`, `--frames N` for several, or `model.at(time)`"
+            f"{path}: {name} cannot store moving Gaussians; write a PLY, or a single frame: `clsplat convert "
+            "MODEL OUT --time T`, `--frames N` for several, or `model.at(time)`"
         )
 
 
 def require_size(path: Path, held: int, expected: int, what: str) -> None:
-    """Raise DataError where a file holds fewer bytes than its header declares."""
+    """Raise DataError if a file has fewer bytes than its header declares."""
     if held < expected:
         raise DataError(
-            f"{path}: holds {held} bytes, but its header declares {what}, {expected} bytes; "
+            f"{path}: has {held} bytes, but its header declares {what}, {expected} bytes; "
             "the file is truncated: copy or export it again"
         )
 
 
 def require_gaussians(path: Path, splats: SplatFile) -> None:
-    """Raise DataError for a model without Gaussians, which most formats do not know."""
+    """Raise DataError for a model without Gaussians, which most formats cannot store."""
     if not len(splats):
-        raise DataError(f"{path}: the model holds no Gaussians; a PLY can hold none")
+        raise DataError(f"{path}: the model has no Gaussians; only a PLY can be empty")

@@ -1,13 +1,13 @@
-"""SPZ of Niantic, versions 1 to 4: planes of bytes in gzip (1 to 3) or Zstandard (4).
+"""Read SPZ of Niantic, versions 1 to 4, and write version 3: planes of bytes in gzip (1 to 3) or Zstandard (4).
 
-    header     u32 magic, version, splats · u8 SH degree, fractional bits, flags, 0; of version 4 in place of the 0: u8
+    header     u32 magic, version, splats · u8 SH degree, fractional bits, flags, 0; in version 4 instead of the 0: u8
                streams, u32 offset of their table (u64 packed, u64 unpacked size each), 12 bytes of 0
     positions  int24 of x 2^bits (version 1: float16) · alphas  255 opacity · colors  255 (0.15 f_dc + 1/2)
     scales     16 (log s + 10) · rotations  index of the largest of x y z w << 30, the others as sign and 9 bits of
                511 |c| sqrt 2 (versions 1, 2: x y z as 127.5 c + 127.5, where w >= 0)
     harmonics  128 f + 128, coefficient-major, to 1/2^(bits - 1)
 
-Axes are x right, y up, z back.  Some programs leave those of the PLY, and nothing in the file tells: see `axes`.
+Axes are x right, y up, z back.  Some programs keep those of the PLY, and the file does not say which: see `axes`.
 """
 
 import io
@@ -60,32 +60,32 @@ from clsplat.formats.splats import (
     unit,
 )
 
-# The planes of an SPZ file: numbers as bytes, and bytes as numbers.
+# Encoding and decoding the planes of an SPZ file.
 
 LOG = logging.getLogger("clsplat")
 MAGIC = b"NGSP"
 MIP, EXTENSIONS = 1, 2  # flags
 HEADER = 16  # bytes
-STORED_DEGREE = 4  # which the format knows; bands beyond MAX_DEGREE are dropped
+STORED_DEGREE = 4  # of the format; bands beyond MAX_DEGREE are dropped
 COLOR = 0.15
 MAX_INT24 = 2**23 - 1
-FRACTION, FINE_FRACTION = 12, 20  # bits of positions; the second for quality high
-ROWS = 1 << 13  # that are decoded at once: what that takes beside the result is little
-WHOLE = (8, 8)  # bits of harmonics
-# steps of harmonics, in levels of 256: of the Gaussian of median weight, for the usual size and at most; of any one
+FRACTION, FINE_FRACTION = 12, 20  # fractional bits of positions; the second for quality `high`
+ROWS = 1 << 13  # rows decoded at once, to limit temporary memory
+WHOLE = (8, 8)  # bits of SH coefficients
+# steps of SH coefficients, in levels of 256: for a Gaussian of median weight, typical and at most; at most for any
 MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
 LARGEST_STEP = {"small": 128.0, "balanced": 64.0, "high": 1.0}
-# step of positions: a share of the smallest deviation, for a Gaussian of median weight
+# step of positions for a Gaussian of median weight, relative to its smallest scale
 SMALLEST_SHARE = {"small": 0.5, "balanced": 0.5, "high": 0.0}
-# steps of colors, in levels of 255: of the Gaussian of median weight, and at most
+# steps of colors, in levels of 255: for a Gaussian of median weight, and at most
 BASE_STEP = {"small": (2**0.5, 16.0), "balanced": (2**0.5, 16.0), "high": (1.0, 1.0)}
-MAX_ZEROS = 16  # last bits of a position, at most
-TURN_STEP = {"small": 4, "balanced": 4, "high": 1}  # levels of quaternions, of 511
+MAX_ZEROS = 16  # last bits of a position that may be zeroed
+TURN_STEP = {"small": 4, "balanced": 4, "high": 1}  # step of quaternions, in levels of 511
 
 
 @dataclass(frozen=True)
 class SpzHeader:
-    """The numbers that begin a file."""
+    """The header of an SPZ file."""
 
     version: int
     count: int
@@ -95,26 +95,26 @@ class SpzHeader:
 
     @classmethod
     def parse(cls, path: Path, data: bytes) -> "SpzHeader":
-        """Take them from the first bytes.  Raises DataError where they cannot be."""
+        """Parse the first bytes of a file.  Raises DataError if they are invalid."""
         if len(data) < HEADER or data[:4] != MAGIC:
-            raise DataError(f"{path}: not an SPZ file; expected its header of {HEADER} bytes: copy or export it again")
+            raise DataError(f"{path}: not an SPZ file, whose header has {HEADER} bytes; copy or export it again")
         version, count, degree, fraction, flags = struct.unpack_from("<2I3B", data, 4)
         if not 1 <= version <= 4 or degree > STORED_DEGREE or fraction > 23:
             raise DataError(
                 f"{path}: SPZ of version {version}, SH degree {degree}, {fraction} fractional bits; expected version "
-                "1 to 4, degree 0 to 4, at most 23 bits: export it again"
+                "1 to 4, degree 0 to 4, at most 23 bits; export it again"
             )
         return cls(version, count, degree, fraction, flags)
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes of each plane."""
+        """Sizes of the planes, bytes."""
         widths = (6 if self.version == 1 else 9, 1, 3, 3, 3 if self.version < 3 else 4)
         return [self.count * width for width in (*widths, 3 * (sh_coefficients(self.degree) - 1))]
 
 
 def unpacked(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
-    """Return the parameters that the bytes of the planes stand for: of each, what returns the next so many bytes."""
+    """Decode the planes to parameters; each entry of `planes` is a function that reads the next bytes of a plane."""
     byte = np.arange(256, dtype=np.float32)
     levels = {
         "logit_opacity": logits(np.arange(256) / 255.0),
@@ -124,11 +124,11 @@ def unpacked(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Par
     }
     columns = 3 * (sh_coefficients(min(header.degree, MAX_DEGREE)) - 1)
     widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": columns}
-    found = {name: np.empty((header.count, widths[name]), np.float32) for name in PARAMETERS}
+    parameters = {name: np.empty((header.count, widths[name]), np.float32) for name in PARAMETERS}
     order = ("means", "logit_opacity", "sh_base", "log_scales", "quats", "sh_rest")
-    for name, size, plane in zip(order, header.sizes, planes, strict=False):  # of degree 0 there may be no last one
+    for name, size, plane in zip(order, header.sizes, planes, strict=False):  # degree 0 may have no last plane
         for start in range(0, header.count if size else 0, ROWS):
-            part = found[name][start : start + ROWS]
+            part = parameters[name][start : start + ROWS]
             data = np.frombuffer(plane(size // header.count * len(part)), np.uint8).reshape(len(part), -1)
             if name == "means":
                 part[:] = _positions(header, data)
@@ -136,7 +136,7 @@ def unpacked(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Par
                 part[:] = _three_bytes(data) if header.version < 3 else _four_bytes(data)
             else:
                 part[:] = levels[name][data[:, : widths[name]]]
-    return found
+    return parameters
 
 
 def _positions(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -162,18 +162,18 @@ def _four_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
-    """Return bits after the point with which every position fits into 24; where they are few, say so.
+    """Return the number of fractional bits with which all positions fit into 24 bits; warn if it is small.
 
-    Raises DataError for positions that do not fit without any.
+    Raises DataError for positions that do not fit even without fractional bits.
     """
     largest = float(np.abs(means).max(initial=0))
     bits = min(FINE_FRACTION if fine else FRACTION, math.floor(math.log2(MAX_INT24 / max(largest, 1e-9))))
     if bits < 0:
-        raise DataError(f"{path}: SPZ holds positions to {MAX_INT24}; the model has {largest:g}: crop it")
+        raise DataError(f"{path}: SPZ stores positions up to {MAX_INT24}, but the model has {largest:g}; crop it")
     if bits < FRACTION:
         LOG.warning(
-            "%s: its largest coordinate is %g: SPZ keeps all positions in steps of %.3g, not %.3g, scene units; a crop "
-            "keeps them finer",
+            "%s: because of its largest coordinate, %g, SPZ rounds all positions to %.3g instead of %.3g scene units; "
+            "crop the model for more precision",
             path,
             largest,
             2.0**-bits,
@@ -183,34 +183,36 @@ def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
 
 
 def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: int, options: Writing) -> list[bytes]:
-    """Return the bytes of each plane; values beyond its range are cut.
+    """Encode the planes; values outside of their range are clipped.
 
-    weights: binary logarithms, [N], of `log_weights`.  Gaussians whose harmonics have fine steps come first, and keep
-    their order among themselves: alike bytes compress.
+    weights: base-2 logarithms, [N], of `log_weights`.  Gaussians with fine SH steps come first and otherwise keep their
+    order, because similar bytes compress better.
     """
     sh_steps = _sh_steps(p["sh_rest"], weights, options)
     order = np.argsort(sh_steps, kind="stable")
     p, weights = {name: table[order] for name, table in p.items()}, weights[order]
     harmonics, base = _rounded_sh(p, sh_steps[order], options.sh_bits)
-    cut = {
+    levels = {
         "alphas": 255 * opacities(p["logit_opacity"]),
         "colors": 255 * (COLOR * base.astype(np.float64) + 0.5),
         "scales": 16 * (p["log_scales"].astype(np.float64) + 10),
     }
-    warn_clipped(path, "SPZ", "harmonics from -1 to 1", np.abs(p["sh_rest"]) > 1)
-    warn_clipped(path, "SPZ", "colors from -0.44 to 1.44", outside_bytes(cut["colors"]))
-    warn_clipped(path, "SPZ", "scales from 4.5e-05 to 379", outside_bytes(cut["scales"]))
+    warn_clipped(path, "SPZ", "SH coefficients from -1 to 1", np.abs(p["sh_rest"]) > 1)
+    warn_clipped(path, "SPZ", "colors from -0.44 to 1.44", outside_bytes(levels["colors"]))
+    warn_clipped(path, "SPZ", "scales from 4.5e-05 to 379", outside_bytes(levels["scales"]))
     step = quantization_steps(weights, *BASE_STEP[options.quality])[:, None]
-    cut["colors"] = np.rint(cut["colors"] / step) * step
-    alphas, colors, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in cut.values())
+    levels["colors"] = np.rint(levels["colors"] / step) * step
+    alphas, colors, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in levels.values())
     positions = _fixed(p, weights, fraction, SMALLEST_SHARE[options.quality])
     rotations = _rotations(p["quats"], TURN_STEP[options.quality])
     return [positions, alphas, colors, scales, rotations, harmonics.tobytes()]
 
 
 def _fixed(p: Parameters, weights: NDArray[np.float64], fraction: int, share: float) -> bytes:
-    """Positions in 24 bits, in steps of about `share` of the smallest standard deviation, and more where weights are
-    small: powers of two."""
+    """Encode positions in 24 bits, with power-of-two steps of about `share` of the smallest scale.
+
+    Steps grow for small weights.
+    """
     size = p["log_scales"].min(axis=1, keepdims=True).astype(np.float64) / np.log(2) - weights[:, None] / 2
     step = np.exp2(np.clip(np.floor(size + np.log2(share) + fraction), 0, MAX_ZEROS)) if share else 1.0
     multiples = np.rint(p["means"].astype(np.float64) * 2**fraction / step) * step
@@ -219,7 +221,7 @@ def _fixed(p: Parameters, weights: NDArray[np.float64], fraction: int, share: fl
 
 
 def _rotations(quats: NDArray[np.float32], step: int) -> bytes:
-    """The three smallest components of quaternions in 9 bits, as multiples of `step`, their signs, and which."""
+    """Encode the three smallest components of quaternions in 9 bits each, as multiples of `step`, with signs."""
     largest, others = smallest_three(np.roll(unit(quats), -1, axis=1))
     multiples = np.rint(511 / step * np.abs(others) * 2**0.5) * step
     levels = np.minimum(multiples, 511).astype(np.uint32)
@@ -231,7 +233,7 @@ def _rotations(quats: NDArray[np.float32], step: int) -> bytes:
 
 
 def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: Writing) -> NDArray[np.float32]:
-    """The step of the harmonics of each Gaussian, [N] levels; 1 for all where bits are given, or all are kept."""
+    """Return the SH step of each Gaussian, [N] levels; 1 for all if `sh_bits` is given or nothing is rounded."""
     most = LARGEST_STEP[options.quality]
     if options.sh_bits or most == 1 or not rest.shape[1]:
         return np.ones(len(rest), np.float32)
@@ -241,28 +243,30 @@ def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: 
 def _rounded_sh(
     p: Parameters, sh_steps: NDArray[np.float32], bits: tuple[int, int] | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Harmonics as levels, 128 for 0: multiples of each Gaussian's step, or of 2^(8 - bits); and band 0, which takes up
-    the errors of the first."""
+    """Round SH to levels, 128 for 0: multiples of each Gaussian's step, or of 2^(8 - bits).
+
+    Also returns band 0, corrected for the rounding errors.
+    """
     rest = p["sh_rest"]
     levels = np.clip(rest, -1, 1) * np.float32(128)
     if bits is None and sh_steps.max(initial=1) > 1:
         form = visible_form(rest)
-        found = np.clip(round_sh(levels, sh_steps, form), -128, 128 - sh_steps[:, None])
-        base = compensate_base(p["sh_base"], rest - found / 128, form)
+        rounded = np.clip(round_sh(levels, sh_steps, form), -128, 128 - sh_steps[:, None])
+        base = compensate_base(p["sh_base"], rest - rounded / 128, form)
     else:
         columns = np.full(rest.shape[1], 2.0 ** (8 - (bits or WHOLE)[1]), np.float32)
         columns[:9] = 2.0 ** (8 - (bits or WHOLE)[0])
-        found, base = np.rint(levels / columns) * columns, p["sh_base"]
-    return np.asarray(np.clip(found + 128, 0, 255), np.uint8), base
+        rounded, base = np.rint(levels / columns) * columns, p["sh_base"]
+    return np.asarray(np.clip(rounded + 128, 0, 255), np.uint8), base
 
 
-# Zstandard, of Python from 3.14 on, else of the package zstandard, which is an extra.
+# Zstandard from Python 3.14, or else from the optional package zstandard.
 
-MAX_WINDOW = 27  # log2 of bytes: what a stream may ask the decoder to hold
+MAX_WINDOW = 27  # log2 of bytes, largest window that a stream may request
 
 
 class ZstdFrame:
-    """A frame that holds `size` bytes, read a part at a time.  Raises DataError for another size or a bad frame."""
+    """A frame of `size` bytes, read in parts.  Raises DataError for another size or a damaged frame."""
 
     def __init__(self, path: Path, data: bytes, size: int) -> None:
         module, builtin = _module()
@@ -270,20 +274,20 @@ class ZstdFrame:
         self.stream = _stream(module, builtin, data)
 
     def read(self, size: int) -> bytes:
-        """Return the next bytes, so many."""
-        found = self._some(size)
+        """Return the next `size` bytes."""
+        data = self._read(size)
         self.left -= size
-        if len(found) != size or (not self.left and self._some(1)):
-            end = "ends early" if len(found) != size else "goes on"
-            raise DataError(f"{self.path}: a stream {end}; expected {self.size} bytes: copy or export the file again")
-        return found
+        if len(data) != size or (not self.left and self._read(1)):
+            fault = "too short" if len(data) != size else "too long"
+            raise DataError(f"{self.path}: a stream is {fault}; expected {self.size} bytes; copy or export it again")
+        return data
 
-    def _some(self, size: int) -> bytes:
+    def _read(self, size: int) -> bytes:
         try:
-            found: bytes = self.stream.read(size)
+            data: bytes = self.stream.read(size)
         except (self.error, EOFError) as error:
             raise DataError(f"{self.path}: a stream is damaged ({error}); copy or export the file again") from error
-        return found
+        return data
 
 
 def _stream(module: ModuleType, builtin: bool, data: bytes) -> Any:
@@ -294,7 +298,7 @@ def _stream(module: ModuleType, builtin: bool, data: bytes) -> Any:
 
 
 def _module() -> tuple[ModuleType, bool]:
-    """The module, and whether it is that of Python itself."""
+    """Return the Zstandard module, and whether it is Python's own."""
     try:
         from compression import zstd
 
@@ -310,19 +314,19 @@ def _module() -> tuple[ModuleType, bool]:
 
 
 WRITTEN_VERSION = 3  # more programs read it than version 4
-HEADER4 = 32  # bytes, of version 4
+HEADER4 = 32  # bytes, in version 4
 LEVEL = 12  # of deflate
-GZIP_RATIO = 1032  # most bytes that one byte of deflate can stand for
-RATIO4 = 1024  # most bytes of positions that one byte of version 4 may stand for, as in Niantic's library
-ALIKE = 1 << 27  # bytes of all planes that a file of version 4 of any size may stand for: 0.6 GB in memory
-BLOCK = 1 << 16  # bytes at once
-GZIP_START = b"\x1f\x8b\x08\0\0\0\0\0\2\xff"  # without a time and a system: the same model gives the same bytes
+GZIP_RATIO = 1032  # largest compression ratio of deflate
+RATIO4 = 1024  # largest accepted compression ratio of positions in version 4, as in Niantic's library
+ALIKE = 1 << 27  # bytes of planes that any file of version 4 may decode to: 0.6 GB in memory
+BLOCK = 1 << 16  # bytes read at once
+GZIP_START = b"\x1f\x8b\x08\0\0\0\0\0\2\xff"  # without time and system, so that the same model gives the same bytes
 ADOBE_AXES = 0xADBE0003  # an extension that changes the axes
 EXPECTED = "an SPZ file"
 
 
 def read_spz(path: Path, options: Reading) -> SplatFile:
-    """Read an SPZ file.  Raises DataError when it is missing or damaged, or where its axes are not known."""
+    """Read an SPZ file.  Raises DataError if it is missing or damaged, or has custom axes."""
     data = read_file(path, EXPECTED, limit=MAX_FILE)
     header, parameters = _unpacked_4(path, data) if data[:4] == MAGIC else _unpacked(path, data)
     if header.degree > MAX_DEGREE:
@@ -330,17 +334,20 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
     if options.axes == "spz":
         flip_axes_in_place(parameters)
     if options.axes == "spz" and not options.quiet:
-        LOG.info("%s: axes as the format says (up, back); if it stands on its head, `clsplat convert --axes ply`", path)
+        LOG.info(
+            "%s: read with the axes of SPZ; if the model is upside down, use `clsplat convert --axes ply`",
+            path,
+        )
     return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default")
 
 
 def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write splats, those with finer harmonics first, else along a Morton curve.
+    """Write splats: those with finer SH steps first, each group along a Morton curve.
 
-    Raises OutputError; DataError where positions are too large.
+    Raises OutputError, and DataError if positions are too large.
     """
     require_gaussians(path, splats)
-    require_in_range(path, splats, "SPZ")  # one value that is not finite would spoil the harmonics of all
+    require_in_range(path, splats, "SPZ")  # one invalid value would spoil the SH of all Gaussians
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     weights = log_weights(p, splats.has_sky)
     fraction = fraction_of(path, p["means"], options.quality == "high")
@@ -350,77 +357,79 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
 
 
 def _gzip(data: bytes) -> bytes:
-    """Bytes as one member of gzip."""
-    import deflate  # here, as only this needs it
+    """Compress bytes as one gzip member."""
+    import deflate  # imported here because only this function needs it
 
     check = struct.pack("<2I", zlib.crc32(data), len(data) & 0xFFFFFFFF)
     return GZIP_START + deflate.deflate_compress(data, LEVEL) + check
 
 
 def _unpacked(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
-    """Header and parameters of versions 1 to 3."""
+    """Decode header and parameters of versions 1 to 3."""
     stream = _Gzip(path, data)
     header = SpzHeader.parse(path, stream.read(HEADER))
     if header.version > 3:
-        raise DataError(f"{path}: SPZ of version 4 in gzip; expected Zstandard: export it again")
+        raise DataError(f"{path}: SPZ of version 4 must use Zstandard, not gzip; export it again")
     _check_size(path, header, sum(header.sizes), len(data) * GZIP_RATIO)
 
     def read(size: int) -> bytes:
-        if len(found := stream.read(size)) < size:
+        if len(part := stream.read(size)) < size:
             expected = HEADER + sum(header.sizes)
-            raise DataError(f"{path}: ends early: {header.count} splats take {expected} bytes; copy or export it again")
-        return found
+            raise DataError(f"{path}: too short: {header.count} splats take {expected} bytes; copy or export it again")
+        return part
 
     parameters = unpacked(header, [read] * len(header.sizes))
     if header.flags & EXTENSIONS:
         _check_extensions(path, stream.read)
     if stream.read(1):
-        raise DataError(f"{path}: goes on after {header.count} splats; copy or export it again")
+        raise DataError(f"{path}: has data after its {header.count} splats; copy or export it again")
     stream.require_end()
     return header, parameters
 
 
 class _Gzip:
-    """A member of gzip, a part at a time.  Raises DataError where it is damaged."""
+    """A gzip member, read in parts.  Raises DataError if it is damaged."""
 
     def __init__(self, path: Path, data: bytes) -> None:
         self.path, self.file, self.stream = path, io.BytesIO(data), zlib.decompressobj(31)
 
     def read(self, size: int) -> bytes:
-        """Return so many bytes, or fewer at the end."""
-        found = bytearray()
-        while len(found) < size and not self.stream.eof:
-            fed = self.stream.unconsumed_tail or self.file.read(BLOCK)
+        """Return `size` bytes, or fewer at the end."""
+        data = bytearray()
+        while len(data) < size and not self.stream.eof:
+            packed = self.stream.unconsumed_tail or self.file.read(BLOCK)
             try:
-                part = self.stream.decompress(fed, size - len(found))
+                part = self.stream.decompress(packed, size - len(data))
             except zlib.error as error:
                 raise DataError(
-                    f"{self.path}: {error}; expected {EXPECTED} in gzip: copy or export it again"
+                    f"{self.path}: {error}; expected {EXPECTED} in gzip; copy or export it again"
                 ) from error
-            if not fed and not part:
+            if not packed and not part:
                 break
-            found += part
-        return bytes(found)
+            data += part
+        return bytes(data)
 
     def require_end(self) -> None:
-        """Raise DataError where the member, which is read, is not whole, or something follows it."""
+        """Raise DataError if the gzip member is incomplete or followed by other data."""
         if not self.stream.eof:
-            raise DataError(f"{self.path}: ends early, before the checksum of its gzip; copy or export it again")
+            raise DataError(f"{self.path}: is truncated before the checksum of its gzip data; copy or export it again")
         if rest := len(self.stream.unused_data) + len(self.file.read()):
-            raise DataError(f"{self.path}: goes on for {rest} bytes after its gzip; copy or export it again")
+            raise DataError(f"{self.path}: has {rest} bytes after its gzip data; copy or export it again")
 
 
 def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
-    """Header and parameters of version 4."""
+    """Decode header and parameters of version 4."""
     header = SpzHeader.parse(path, data)
     if header.version != 4 or len(data) < HEADER4:
-        raise DataError(f"{path}: SPZ of version {header.version} without gzip; expected version 4: export it again")
+        raise DataError(
+            f"{path}: SPZ of version {header.version} without gzip; only version 4 has none; export it again"
+        )
     streams, table = struct.unpack_from("<BI", data, HEADER - 1)
     present = [size for size in header.sizes if size]
     if streams != len(present) or not HEADER4 <= table <= len(data) - 16 * streams:
         raise DataError(
-            f"{path}: has {streams} streams, their table at byte {table}; expected {len(present)}, inside of its "
-            f"{len(data)} bytes: copy or export it again"
+            f"{path}: has {streams} streams and their table at byte {table}; expected {len(present)} streams within "
+            f"{len(data)} bytes; copy or export it again"
         )
     _check_size(path, header, header.sizes[0], len(data) * RATIO4)
     _check_size(path, header, sum(header.sizes), max(len(data) * RATIO4, ALIKE))
@@ -432,29 +441,31 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters]:
         if declared != size or held > len(data) - start:
             raise DataError(
                 f"{path}: stream {number} declares {held} bytes for {declared}; expected {size} for {header.count} "
-                "splats, inside of the file: copy or export it again"
+                "splats, inside the file; copy or export it again"
             )
         frames.append(ZstdFrame(path, data[start : start + held], size))
         start += held
     if start != len(data):
-        raise DataError(f"{path}: goes on after its last stream, at byte {start}; copy or export it again")
+        raise DataError(f"{path}: has data after its last stream, at byte {start}; copy or export it again")
     return header, unpacked(header, [frame.read for frame in frames])
 
 
 def _check_size(path: Path, header: SpzHeader, size: int, most: int) -> None:
-    """Raise DataError where a file cannot hold so many splats, of this size, before any is made."""
+    """Raise DataError, before allocating, if a file cannot contain as many splats as it declares."""
     if size > most:
         raise DataError(
-            f"{path}: declares {header.count} splats, {size} bytes, more than it can hold ({most}); "
+            f"{path}: declares {header.count} splats of {size} bytes, more than it can contain ({most}); "
             "the file is truncated or damaged: copy or export it again"
         )
 
 
 def _check_extensions(path: Path, read: Callable[[int], bytes]) -> None:
-    """Raise DataError for a record that changes the axes; others are skipped, as the library does."""
+    """Raise DataError for an extension that changes the axes; skip others, as Niantic's library does."""
     while len(record := read(8)) == 8:
         kind, length = struct.unpack("<2I", record)
         if kind == ADOBE_AXES:
-            raise DataError(f"{path}: has axes of its own, in the record {kind:#x}; expected none: export it without")
+            raise DataError(
+                f"{path}: uses custom axes (extension {kind:#x}), which are not supported; export it without them"
+            )
         while length and (part := read(min(length, BLOCK))):
             length -= len(part)

@@ -263,7 +263,7 @@ def test_gaussians_that_are_not_finite_are_dropped_or_kept(tmp_path, rng, caplog
     bad = splats(rng, 20)
     bad.parameters["means"][3, 1], bad.parameters["sh_rest"][7, 0] = np.nan, np.inf
     write_ply(tmp_path / "a.ply", bad.parameters, {})
-    with pytest.raises(DataError, match=r"means, sh_rest hold values that are not finite; .* `clsplat convert`"):
+    with pytest.raises(DataError, match=r"means, sh_rest have values that are not finite; .* `clsplat convert`"):
         load(tmp_path / "a.ply")
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.spz")["gaussians"] == 18
     assert "dropped 2 Gaussians" in caplog.text
@@ -277,10 +277,10 @@ def test_gaussians_beyond_any_codebook_are_refused_or_dropped(table, value, tmp_
     large = splats(rng, 20, 1)
     large.parameters[table][3:5, 1] = value
     write_ply(tmp_path / "a.ply", large.parameters, {})
-    told = f"2 of 20 Gaussians hold {table} beyond 1e+15"
+    told = f"2 of 20 Gaussians have {table} beyond 1e+15"
     (tmp_path / "out").mkdir()
     for place in ("a.sog", "meta.json"):
-        with pytest.raises(DataError, match=re.escape(f"{told}, which SOG cannot hold; `clsplat convert MODEL OTHER")):
+        with pytest.raises(DataError, match=re.escape(f"{told}; SOG cannot store that: `clsplat convert MODEL OTHER")):
             write(tmp_path / "out" / place, large)
     assert list((tmp_path / "out").iterdir()) == []
     found = clsplat.check(tmp_path / "a.ply")
@@ -298,7 +298,7 @@ def test_tables_that_are_not_finite_are_not_called_too_large(tmp_path, rng, capl
     large.parameters["log_scales"][7] = np.inf
     write_ply(tmp_path / "a.ply", large.parameters, {})
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply")["gaussians"] == 100
-    assert "1,100 of 1,200 Gaussians hold sh_base beyond 1e+15; they are dropped" in caplog.text
+    assert "1,100 of 1,200 Gaussians have sh_base beyond 1e+15; they are dropped" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["b.ply", "b.sog", "b.glb"])
@@ -314,7 +314,7 @@ def test_a_comment_of_numbers_that_are_not_finite_is_refused(number, source, tmp
     (tmp_path / "a.ply").write_bytes(
         (tmp_path / "a.ply").read_bytes().replace(b'{"note": 5}', f'{{"note": {number}}}'.encode())
     )
-    with pytest.raises(DataError, match=r"a\.ply: its comment holds what no JSON holds"):
+    with pytest.raises(DataError, match=r"a\.ply: its comment is not valid JSON"):
         clsplat.convert(tmp_path / "a.ply", tmp_path / "b.glb")
 
 
@@ -404,7 +404,7 @@ def test_check_sees_activations_that_were_applied_already(table, values, words, 
 
 @pytest.mark.parametrize("name", ["a.splat", "a.spz", "a.sog", "a.glb", "a.usda"])
 def test_a_format_that_knows_no_empty_model_refuses_one(name, tmp_path, rng):
-    with pytest.raises(DataError, match="the model holds no Gaussians; a PLY can hold none"):
+    with pytest.raises(DataError, match="the model has no Gaussians; only a PLY can be empty"):
         write(tmp_path / name, splats(rng, 0))
     write(tmp_path / "a.ply", splats(rng, 0))
     assert verdict(clsplat.check(tmp_path / "a.ply")).endswith("it holds no Gaussians; export it again")

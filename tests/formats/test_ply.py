@@ -160,7 +160,7 @@ def test_filter_whose_square_overflows_is_refused_silently(tmp_path, rng, recwar
     write_ply(tmp_path / "a.ply", parameters(rng) | {"filter_variance": np.ones((20, 1), np.float32)}, {})
     data = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(data[:-4] + np.float32(1e30).tobytes())
-    with pytest.raises(DataError, match="filter_variance hold values that are not finite"):
+    with pytest.raises(DataError, match="filter_variance have values that are not finite"):
         read_ply(tmp_path / "a.ply")
     assert not recwarn.list
 

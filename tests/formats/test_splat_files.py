@@ -55,8 +55,8 @@ def test_what_a_splat_does_not_hold_is_said(tmp_path, rng, caplog):
     source.parameters["sh_base"][:] = 0
     source.parameters["sh_base"][4:7] = -3
     write(tmp_path / "a.splat", source)
-    assert "splat holds colors from 0 to 1; those of 3 Gaussians were cut" in caplog.text
-    assert "splat holds no harmonics" in caplog.text
+    assert "splat stores colors from 0 to 1; values of 3 Gaussians were clipped" in caplog.text
+    assert "splat stores no spherical harmonics" in caplog.text
 
 
 def test_numbers_as_text_are_no_splat(tmp_path):
@@ -66,7 +66,9 @@ def test_numbers_as_text_are_no_splat(tmp_path):
         read(tmp_path / "a.txt")
 
 
-@pytest.mark.parametrize(("data", "words"), [(PUBLISHED[:-1], "31 bytes, no multiple of 32"), (b"\xff" * 64, "finite")])
+@pytest.mark.parametrize(
+    ("data", "words"), [(PUBLISHED[:-1], "31 bytes, not a multiple of 32"), (b"\xff" * 64, "finite")]
+)
 def test_a_damaged_splat_is_refused(data, words, tmp_path):
     (tmp_path / "a.splat").write_bytes(data)
     with pytest.raises(DataError, match=words):
@@ -108,8 +110,8 @@ DAMAGED = {
     "more splats than places": ({"count": 4}, "4 of 3 splats"),
     "degree": ({"degree": 3}, "SH degree 3"),
     "places": ({"rows": 3, "buckets": 10**6}, "truncated"),
-    "empty buckets": ({"held": 2}, "hold fewer splats"),
-    "full buckets": ({"full": 1}, "do not fit"),
+    "empty buckets": ({"held": 2}, "have fewer splats"),
+    "full buckets": ({"full": 1}, "do not match"),
     "no sections": ({"sections": 0}, "not a .ksplat"),
 }
 

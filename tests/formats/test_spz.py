@@ -89,7 +89,7 @@ def test_positions_get_the_bits_that_they_need(tmp_path, rng, caplog):
         away, least = np.abs(found - expected["means"]).max(axis=1), 2.0 ** -(fraction + 1)
         assert (away <= np.maximum(np.exp(-9.9) / 4 * np.exp2(-log_weights(expected) / 2), least)).all()
         lost = (
-            f"coordinate is {largest:g}: SPZ keeps all positions in steps of {2.0**-fraction:.3g}, not 0.000244, scene"
+            f"coordinate, {largest:g}, SPZ rounds all positions to {2.0**-fraction:.3g} instead of 0.000244 scene units"
         )
         warned = [record for record in caplog.records if record.levelname == "WARNING"]
         assert (lost in caplog.text) == bool(warned) == (fraction < 12)
@@ -105,7 +105,7 @@ def test_harmonics_beyond_one_are_cut_and_said(tmp_path, rng, caplog):
     source = splats(rng, 10)
     source.parameters["sh_rest"][3, 5] = 2.9
     found = there_and_back(tmp_path / "a.spz", source)
-    assert "those of 1 Gaussians were cut" in caplog.text
+    assert "values of 1 Gaussians were clipped" in caplog.text
     assert 127 / 128 <= np.abs(found.parameters["sh_rest"]).max() <= 1
 
 
@@ -114,8 +114,8 @@ def test_colors_and_scales_that_no_byte_holds_are_cut_and_said(tmp_path, rng, ca
     source.parameters["sh_base"][2:4, 1] = 9
     source.parameters["log_scales"][5, 0] = -12
     there_and_back(tmp_path / "a.spz", source)
-    assert "colors from -0.44 to 1.44; those of 2 Gaussians were cut" in caplog.text
-    assert "scales from 4.5e-05 to 379; those of 1 Gaussians were cut" in caplog.text
+    assert "colors from -0.44 to 1.44; values of 2 Gaussians were clipped" in caplog.text
+    assert "scales from 4.5e-05 to 379; values of 1 Gaussians were clipped" in caplog.text
 
 
 def legacy(version, count=2, flags=0, rest=b""):
@@ -145,9 +145,9 @@ def test_axes_and_losses_are_reported_unless_the_caller_knows(tmp_path, rng, cap
     for name in ("a.spz", "b.spz"):
         write(tmp_path / name, one)
         read(tmp_path / name)
-    assert [(text.split(":")[0], "does not store" in text, "axes as" in text) for text in caplog.messages] == [
-        (str(tmp_path / name), writes, not writes) for name in ("a.spz", "b.spz") for writes in (True, False)
-    ]
+    assert [
+        (text.split(":")[0], "does not store" in text, "read with the axes" in text) for text in caplog.messages
+    ] == [(str(tmp_path / name), writes, not writes) for name in ("a.spz", "b.spz") for writes in (True, False)]
     caplog.clear()
     write(tmp_path / "a.spz", one, Writing(quiet=True))
     read(tmp_path / "a.spz", Reading(quiet=True))
@@ -161,7 +161,7 @@ def test_extension_that_turns_axes_is_refused_others_skipped(tmp_path):
     assert len(read(path)) == 2
     long = struct.pack("<2I", 7, 200_000) + bytes(200_000)
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=long + struct.pack("<2II", 0xADBE0003, 4, 1))))
-    with pytest.raises(DataError, match="axes of its own"):
+    with pytest.raises(DataError, match="uses custom axes"):
         read(path)
     damaged = bytearray(gzip.compress(legacy(2, flags=2, rest=other)))
     damaged[-5] ^= 1  # of the checksum, which is read with the records
@@ -169,7 +169,7 @@ def test_extension_that_turns_axes_is_refused_others_skipped(tmp_path):
     with pytest.raises(DataError, match="incorrect data check"):
         read(path)
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other + struct.pack("<2II", 0xADBE0003, 4, 1))))
-    with pytest.raises(DataError, match="axes of its own, in the record 0xadbe0003"):
+    with pytest.raises(DataError, match=r"uses custom axes \(extension 0xadbe0003\)"):
         read(path)
 
 
@@ -182,18 +182,18 @@ def test_degree_four_is_cut_to_three(tmp_path, caplog):
 
 REFUSED = {
     "other version": (gzip.compress(legacy(5)), "version 5"),
-    "count": (gzip.compress(legacy(2, 2)[:8] + struct.pack("<I", 2**31) + legacy(2)[12:]), "more than it can hold"),
-    "short": (gzip.compress(legacy(2)[:-1]), "ends early"),
-    "long": (gzip.compress(legacy(2) + b"a"), "goes on after 2 splats"),
+    "count": (gzip.compress(legacy(2, 2)[:8] + struct.pack("<I", 2**31) + legacy(2)[12:]), "more than it can contain"),
+    "short": (gzip.compress(legacy(2)[:-1]), "too short"),
+    "long": (gzip.compress(legacy(2) + b"a"), "has data after its 2 splats"),
     "gzip": (gzip.compress(legacy(2))[:20], "not an SPZ|ends early"),
-    "cut by its trailer": (gzip.compress(legacy(2))[:-8], "ends early, before the checksum of its gzip; copy"),
-    "cut by three bytes": (gzip.compress(legacy(2))[:-3], "ends early, before the checksum of its gzip; copy"),
-    "cut with records": (gzip.compress(legacy(2, flags=2))[:-3], "ends early, before the checksum"),
-    "rubbish": (gzip.compress(legacy(2)) + b"rubbish", "goes on for 7 bytes after its gzip; copy"),
-    "two members": (gzip.compress(legacy(2)) * 2, "goes on for [0-9]+ bytes after its gzip"),
+    "cut by its trailer": (gzip.compress(legacy(2))[:-8], "is truncated before the checksum of its gzip data; copy"),
+    "cut by three bytes": (gzip.compress(legacy(2))[:-3], "is truncated before the checksum of its gzip data; copy"),
+    "cut with records": (gzip.compress(legacy(2, flags=2))[:-3], "is truncated before the checksum"),
+    "rubbish": (gzip.compress(legacy(2)) + b"rubbish", "has 7 bytes after its gzip data; copy"),
+    "two members": (gzip.compress(legacy(2)) * 2, "has [0-9]+ bytes after its gzip data"),
     "checksum of bytes": (b"\x1f\x8b\x08\0\0\0\0\0\0\xff\xff\xff\xff", "in gzip"),
     "version 3 without gzip": (legacy(3), "without gzip"),
-    "header": (b"NGSP\4\0\0\0", "its header of 16 bytes"),
+    "header": (b"NGSP\4\0\0\0", "whose header has 16 bytes"),
 }
 
 
@@ -210,7 +210,7 @@ def test_streams_of_other_sizes_are_refused(tmp_path, rng):
     data = version_4(path, splats(rng, 40))
     table = struct.unpack_from("<12Q", data, 32)
     cases = {
-        "goes on after its last stream": data + b"x",
+        "has data after its last stream": data + b"x",
         "has 5 streams": data[:15] + b"\5" + data[16:],
         "table at byte 4294967295": data[:16] + b"\xff" * 4 + data[20:],
         "expected 360 for 40 splats": data[:40] + struct.pack("<Q", table[1] + 1) + data[48:],
@@ -232,10 +232,10 @@ def test_a_bomb_is_refused_before_it_grows(tmp_path):
     header = struct.pack("<4s2I4BI12x", b"NGSP", 4, 2, 0, 12, 0, 5, 32)
     assert len(header) == 32
     (tmp_path / "a.spz").write_bytes(header + table + frame)
-    with pytest.raises(DataError, match="a stream goes on; expected 18"):
+    with pytest.raises(DataError, match="a stream is too long; expected 18"):
         read(tmp_path / "a.spz")
     (tmp_path / "a.spz").write_bytes(zlib.compress(legacy(2) + bytes(1 << 26), wbits=31))
-    with pytest.raises(DataError, match="goes on after 2 splats"):
+    with pytest.raises(DataError, match="has data after its 2 splats"):
         read(tmp_path / "a.spz")
 
 
@@ -280,5 +280,7 @@ def test_more_splats_than_version_4_allows_are_refused(tmp_path):
     count, path = 20_000_000, tmp_path / "a.spz"
     table = b"".join(struct.pack("<2Q", 8000, count * width) for width in (9, 1, 3, 3, 4))
     path.write_bytes(struct.pack("<4s2I4BI12x", b"NGSP", 4, count, 0, 12, 0, 5, 32) + table + bytes(5 * 8000))
-    with pytest.raises(DataError, match=r"20000000 splats, 180000000 bytes, more than it can hold \([0-9]+\); .*copy"):
+    with pytest.raises(
+        DataError, match=r"20000000 splats of 180000000 bytes, more than it can contain \([0-9]+\); .*copy"
+    ):
         read(path)

@@ -206,7 +206,7 @@ def test_folders_of_killed_processes_go_before_a_new_one_is_made(tmp_path):
 
 def test_an_empty_level_is_refused(written, tmp_path):
     _, made = written
-    with pytest.raises(DataError, match="holds no Gaussians"):
+    with pytest.raises(DataError, match="has no Gaussians"):
         write_lod(tmp_path / "b", [made[0], made[1].rows([])])
     with pytest.raises(ConfigError, match="streamed SOG is only written by `clsplat lod`"):
         write(tmp_path / "lod-meta.json", made[0])
@@ -219,7 +219,7 @@ def test_values_beyond_sog_are_refused_and_boxes_stay_finite(tmp_path, rng):
     json.loads((tmp_path / "a" / "lod-meta.json").read_text(), parse_constant=lambda text: pytest.fail(text))
     large.parameters["log_scales"][7] = 3e38
     write(tmp_path / "a.ply", large)
-    told = r"1 of 50 Gaussians hold log_scales beyond 1e\+15, which SOG cannot hold"
+    told = r"1 of 50 Gaussians have log_scales beyond 1e\+15; SOG cannot store that"
     with pytest.raises(DataError, match=told):
         write_lod(tmp_path / "b", [large])
     with pytest.raises(DataError, match=told):

@@ -269,7 +269,7 @@ def test_what_spz_loses_is_said_once_for_a_search(few_steps, tiny_scene, tmp_pat
     assert len(list((tmp_path / "out" / "trials").iterdir())) > 1
     (told,) = [text for text in caplog.messages if "does not store" in text]
     assert told.startswith(f"{tmp_path / 'out' / 'compressed.spz'}: SPZ does not store near = 0.05")
-    assert "axes as the format says" not in caplog.text
+    assert "read with the axes of SPZ" not in caplog.text
 
 
 def test_the_command_prints_a_table(searched, few_steps):
