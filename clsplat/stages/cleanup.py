@@ -1,4 +1,4 @@
-"""Stages that make a model smaller: cleanup, crop, fewer Gaussians, fewer harmonics."""
+"""Make a model smaller: remove useless Gaussians, crop, prune, reduce spherical harmonics."""
 
 import logging
 from collections.abc import Collection
@@ -28,9 +28,9 @@ LOG = logging.getLogger("clsplat")
 
 
 class Cleanup(Stage):
-    """Remove what a trained model has and the training photographs hardly show, which is seen from other places.
+    """Remove Gaussians that the training views hardly show and that would be visible from elsewhere, such as floaters.
 
-    All rules see the model as it is before.  What two of them remove counts for the first.
+    All rules see the model before the cleanup.  A Gaussian that two rules remove counts for the first.
     """
 
     stage: Literal["cleanup"] = "cleanup"
@@ -42,36 +42,35 @@ class Cleanup(Stage):
     rules: list[OneOf[Rule]] = Field(
         [PruneFaint(opacity_below=0.02), PruneFar(), PruneUseless(views_below=0)], min_length=1
     )
-    """Which Gaussians are removed, each rule with its keys; a rule that is not in the list removes none.
-    `prune_useless` with `views_below: 2` removes those that are useful in one photograph alone, too; `prune_wide` those
-    that are large on the screen."""
+    """Rules that remove Gaussians.  `prune_useless` with `views_below: 2` also removes Gaussians that are useful in
+    only one view; `prune_wide` removes those that are large on the screen."""
 
     @field_validator("rules")
     @classmethod
-    def _that_remove(cls, rules: list[Rule]) -> list[Rule]:
+    def _must_remove(cls, rules: list[Rule]) -> list[Rule]:
         for rule in rules:
             name = getattr(rule, "type", "rule")
             if rule.grows:
-                raise ValueError(f"the rule '{name}' is of growth; expected rules that remove, such as prune_faint")
+                raise ValueError(f"the rule '{name}' grows; expected rules that remove, such as prune_faint")
             if rule.rewrites:
-                raise ValueError(f"the rule '{name}' changes Gaussians that stay; use it in densify")
+                raise ValueError(f"the rule '{name}' changes the Gaussians that it keeps; use it in densify")
             if rule.start:
-                raise ValueError(f"the rule '{name}' has a start, and cleanup applies it once; expected start: 0")
+                raise ValueError(f"the rule '{name}' has a 'start', but cleanup applies it once; remove 'start'")
             if read := sorted(rule.statistics | rule.tables):
                 raise ValueError(f"the rule '{name}' reads {', '.join(read)} of training steps; use it in densify")
         return rules
 
     def run(self, run: Run) -> None:
         gaussians = run.model.gaussians
-        run.stats = SplatStats(gaussians, ())  # sums over steps are not of the Gaussians that follow
+        run.stats = SplatStats(gaussians, ())  # sums over steps do not fit the Gaussians after the cleanup
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         step = max(run.step, 1)  # rules act after step 0
         edit = Edit(gaussians, run.stats, scale, step, run.seed, run.survey())
-        edit.may_rewrite = False  # what refuses leaves the model as it was
+        edit.may_rewrite = False  # a refused cleanup leaves the model unchanged
         change = mark(edit, self.rules)
         if change.after == 0:
             raise NumericError(
-                "cleanup: its rules would remove every Gaussian; weaken them, as with a smaller "
+                "cleanup: its rules would remove all Gaussians; weaken them, such as by a smaller "
                 "prune_faint.opacity_below, or remove the stage"
             )
         with run.editing_tables():
@@ -82,38 +81,35 @@ class Cleanup(Stage):
         LOG.info("%s Gaussians kept; removed: %s", f"{change.after:,} of {change.before:,}", removed)
 
 
-# The Gaussians in a part of space, without the others.
-
-
 class Crop(Stage):
-    """Remove the Gaussians whose means lie outside a box."""
+    """Remove the Gaussians whose means are outside a box."""
 
     stage: Literal["crop"] = "crop"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
 
     inside: Box
-    """The part of space that stays."""
+    """The box to keep."""
 
     def run(self, run: Run) -> None:
         gaussians = run.model.gaussians
         kept = np.flatnonzero(self.inside.holds(gaussians.get("means")))
         if not len(kept):
-            raise EmptyRegionError(f"crop: none of {gaussians.count:,} Gaussians lies inside; expected a larger box")
+            raise EmptyRegionError(f"crop: none of {gaussians.count:,} Gaussians is inside the box; give a larger one")
         change = keep_rows(gaussians, kept, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
-        LOG.info("%s Gaussians kept, which lie inside", f"{change.after:,} of {change.before:,}")
+        LOG.info("%s Gaussians kept, which are inside", f"{change.after:,} of {change.before:,}")
 
-
-# Make a trained model smaller: fewer Gaussians, fewer harmonics, fewer values of them.
 
 Part = Annotated[float, Field(gt=0, lt=1)]
 
 
 def scores(run: Run, score: Score = "weight") -> NDArray[np.float64]:
-    """Return what each Gaussian does to the training views, [N], summed over their pixels: its blend weight, or the
-    squares of the image's derivatives by its value."""
+    """Return a score of each Gaussian, [N], summed over the pixels of the training views.
+
+    "weight": its blend weight; otherwise the squared derivatives of the image with respect to its parameters.
+    """
     views = run.scene.split("train")
     looks = run.survey().render(run.status.counted(views, "views", len(views)))
     return SCORES[score](looks, run.model.gaussians.count).astype(np.float64)
@@ -122,7 +118,7 @@ def scores(run: Run, score: Score = "weight") -> NDArray[np.float64]:
 class PruneLeast(Scheduled):
     """Remove the Gaussians that contribute least to the training views.
 
-    The score of a Gaussian is a sum over all pixels of all training views; pixels that a mask leaves out do not count.
+    The score of a Gaussian is a sum over all unmasked pixels of all training views.
     """
 
     stage: Literal["prune_least"] = "prune_least"
@@ -131,16 +127,17 @@ class PruneLeast(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"keep", "remove", "score"})
 
     keep: Part | None = None
-    """Share of the Gaussians that stays; this or `remove`."""
+    """Fraction of the Gaussians to keep; give this or `remove`."""
     remove: Part | None = None
-    """Share of the Gaussians that is removed; this or `keep`."""
+    """Fraction of the Gaussians to remove; give this or `keep`."""
     score: Score = "weight"
-    """Of its weights in the image, or of the squared derivatives of the image by its value (Hanson et al. 2025)."""
+    """Sum of blend weights, or of squared derivatives of the image with respect to the Gaussian (Hanson et al.
+    2025)."""
 
     @model_validator(mode="after")
     def _one_share(self) -> "PruneLeast":
         if (self.keep is None) == (self.remove is None):
-            raise ValueError("expected one of 'keep' and 'remove', a share of the Gaussians")
+            raise ValueError("give either 'keep' or 'remove', a fraction of the Gaussians")
         return self
 
     def stale(self, run: Run) -> Collection[str]:
@@ -160,11 +157,11 @@ class PruneLeast(Scheduled):
 
 
 class ReduceSh(Scheduled):
-    """Drop bands of spherical harmonics: those above a degree, and of the others those that matter least.
+    """Drop bands of spherical harmonics: those above a degree, and the least important others.
 
-    What a band of a Gaussian matters is the mean square of its colors over all directions, times the Gaussian's weight
-    in the training views.  Bands that are dropped by `share` are zeros, which formats store in few bytes; training that
-    follows gives them values again.
+    The importance of a Gaussian's band is the mean square of its color over all directions, times the Gaussian's weight
+    in the training views.  Bands dropped by `share` become zeros, which formats store in few bytes; later training
+    changes them again.
     """
 
     stage: Literal["reduce_sh"] = "reduce_sh"
@@ -173,9 +170,9 @@ class ReduceSh(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
 
     degree: Annotated[int, Field(ge=0, le=MAX_DEGREE)] = MAX_DEGREE
-    """Highest degree that stays, for all Gaussians."""
+    """Highest degree to keep, for all Gaussians."""
     share: Share = 0
-    """Share of all bands of all Gaussians that become zero: those that matter least."""
+    """Fraction of all bands of all Gaussians that become zero, the least important ones."""
 
     def stale(self, run: Run) -> Collection[str]:
         return ("sh_rest",)
@@ -198,7 +195,7 @@ class ReduceSh(Scheduled):
 def band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the mean square over the sphere of each band above 0, [N, degree], of coefficients [N, (K-1)*3].
 
-    The basis is orthonormal: the mean square of a function is the sum of its squared coefficients by 4 pi.
+    The basis is orthonormal: the mean square of a function is the sum of its squared coefficients divided by 4 pi.
     """
     squares = np.square(rest.astype(np.float64)) / (4 * np.pi)
     return np.stack([squares[:, first:end].sum(axis=1) for first, end in _bands(rest.shape[1])], axis=1)
@@ -211,6 +208,6 @@ def columns_of(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _bands(columns: int) -> list[tuple[int, int]]:
-    """First column and end of each band above 0."""
+    """Return the first column and the end of each band above 0."""
     ends = [3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)]
     return [(first, end) for first, end in pairwise(ends) if end <= columns]

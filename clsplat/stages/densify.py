@@ -1,4 +1,4 @@
-"""Density control at a cadence."""
+"""Apply density rules at a cadence."""
 
 import logging
 import math
@@ -35,25 +35,25 @@ class Densify(Scheduled):
     step_keys: ClassVar[frozenset[str]] = frozenset({"grow_until"})
 
     rules: list[OneOf[Rule]]
-    """Which Gaussians grow or are removed; the first growing rule decides, pruning rules override growth."""
+    """Rules that grow or remove Gaussians; the first growing rule applies, and pruning rules override growth."""
     max_gaussians: AtLeastOne | None = None
-    """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues.
-    With `inside` it is the number of those in there."""
+    """Number of Gaussians at which growth stops; pruning continues.  Default: as many as fit in memory.  With `inside`,
+    only Gaussians in the box count."""
     per_pixel: Annotated[float, Field(gt=0)] | None = None
-    """Number of Gaussians at which growth stops, for each pixel of a training photograph (the median of them); without
-    it, no such number.  Pruning continues.  `inside` as above."""
+    """Number of Gaussians per pixel of a training image (of median size) at which growth stops; pruning continues.
+    Default: no limit.  With `inside`, only Gaussians in the box count."""
     budget: OneOf[Budget] | None = None
-    """Number of Gaussians at which the growth of an edit stops, from the course of the training; needs `stop`."""
+    """Limit of the growth of each edit, which depends on the progress of training; needs `stop`."""
 
     inside: Box | None = None
-    """Part of space in which Gaussians grow; those outside train and are pruned.  Without it, all space."""
+    """Box in which Gaussians grow; Gaussians outside are trained and pruned.  Default: everywhere."""
 
     patience: Annotated[int, Field(gt=0)] | None = None
-    """Measurements of the validation views in a row without a better one after which nothing grows any more, in a
-    training with `keep: best`, whose own patience counts anew from there; pruning continues.  Without it, growth goes
-    on."""
+    """Number of consecutive measurements of the validation views without improvement after which growth ends, in a
+    training with `keep: best`, whose own patience then starts from zero; pruning continues.  Default: growth does not
+    end."""
     grow_until: Annotated[int, Field(gt=0)] | None = None
-    """Global step from which on nothing grows; pruning continues.  Without it, growth goes on."""
+    """Global step from which on nothing grows; pruning continues.  Default: growth does not end."""
 
     @property
     def statistics(self) -> set[str]:
@@ -62,7 +62,7 @@ class Densify(Scheduled):
 
     @property
     def tables(self) -> set[str]:
-        """Tables of the Gaussians that the rules read beside the parameters."""
+        """Tables of the Gaussians that the rules read in addition to the parameters."""
         return {name for rule in self.rules for name in rule.tables}
 
     @model_validator(mode="after")
@@ -79,14 +79,14 @@ class Densify(Scheduled):
     @model_validator(mode="after")
     def _with_an_end(self) -> "Densify":
         if self.budget and self.stop is None:
-            raise ValueError("'budget' needs 'stop', the step at which it is reached")
+            raise ValueError("'budget' needs 'stop', the step at which the budget is reached")
         return self
 
     @model_validator(mode="after")
     def _with_growth(self) -> "Densify":
         if self.per_pixel is not None and not any(rule.grows for rule in self.rules):
             raise ValueError(
-                "'per_pixel' ends growth, and no rule here grows; set it to null, or beside rules that clone or split"
+                "'per_pixel' limits growth, and no rule here grows; set it to null, or add a rule that clones or splits"
             )
         return self
 
@@ -98,41 +98,41 @@ class Densify(Scheduled):
             return
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
-        asked = min(self._limits(run, edit), default=math.inf)
-        fits = most_gaussians(run, asked)
-        limit = int(min(fits, asked))
+        wanted = min(self._limits(run, edit), default=math.inf)
+        fits = most_gaussians(run, wanted)
+        limit = int(min(fits, wanted))
         room = partial(make_room, run)
         change = densify(edit, self.rules, run.rasterizer.tiler, limit, self.inside, room)
         run.refresh_filter()
         if change.after == fits:
-            more = f"smaller photographs{more_room(run)}"
-            most = f"{fits:,} Gaussians, the most that fit in the device's memory; with {more} more do"
+            remedy = f"smaller photos{more_room(run)} leave room for more"
+            most = f"{fits:,} Gaussians, the most that fit in the device's memory; {remedy}"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))
         LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", pluralize(change.after, "Gaussian"))
         if change.after == 0:
-            raise NumericError(f"step {run.step}: every Gaussian was pruned; weaken the prune rules or lower the rates")
+            raise NumericError(f"step {run.step}: all Gaussians were pruned; weaken the prune rules or lower the rates")
 
     def _has_grown(self, run: Run) -> bool:
-        """Whether growth has ended, by its step or by validation; a run keeps the step."""
+        """Return whether growth has ended, by its step or by validation; the run records the step."""
         if self.grow_until is not None and run.step >= self.grow_until:
             return True
         best = run.best
-        if self.patience is None or best is None or run.is_refit:  # whose pipeline says the step
+        if self.patience is None or best is None or run.is_refit:  # a refit has the step in its pipeline
             return False
         if best.growth_ended is None and best.since_best >= self.patience:
             best = run.best = best.model_copy(update={"growth_ended": run.step, "since": 0})
-            LOG.info("step %d: growth ends: the model was best at step %d", run.step, best.measured.step)
+            LOG.info("step %d: growth ends, since the model was best at step %d", run.step, best.measured.step)
         return best.growth_ended is not None
 
     def _outside(self, edit: Edit) -> int:
-        """The Gaussians outside the part of space in which they grow."""
+        """Return the number of Gaussians outside the box in which they grow."""
         if self.inside is None:
             return 0
         return int((~self.inside.holds(edit.gaussians.get("means"))).sum())
 
     def _limits(self, run: Run, edit: Edit) -> Iterator[int]:
-        """The numbers of Gaussians at which the settings stop growth."""
+        """Yield the numbers of Gaussians at which the settings stop growth."""
         if self._has_grown(run):
             yield 0
         if self.max_gaussians is not None:

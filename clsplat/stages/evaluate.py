@@ -1,4 +1,4 @@
-"""Metrics of a split."""
+"""Measure the metrics of a split."""
 
 import logging
 from typing import Annotated, ClassVar, Literal
@@ -28,11 +28,11 @@ def _inside(text: str) -> str:
 
 
 class Evaluate(Scheduled):
-    """Render the views of a split and compare them, as 8-bit images, with the photographs.
+    """Render the views of a split and compare them, as 8-bit images, with the photos.
 
-    Each of `downscales` divides the size of the original photographs, not the training size: `downscales: [8, 4, 2, 1]`
-    zooms into a scene that was trained at `downscale: 8`.  With `file`, what is measured is a file that an earlier
-    `export` has written, as a viewer reads it.
+    Each of `downscales` divides the original image size, not the training size: `downscales: [8, 4, 2, 1]` zooms into a
+    scene that was trained at `downscale: 8`.  With `file`, the stage measures a file that an earlier `export` wrote, as
+    viewers read it.
     """
 
     stage: Literal["evaluate"] = "evaluate"
@@ -49,25 +49,25 @@ class Evaluate(Scheduled):
     }
 
     split: Literal["test", "train", "validation"] = "test"
-    """Views that are measured."""
+    """Views to measure."""
     max_views: Annotated[int, Field(gt=0)] | None = None
-    """Number of views that are measured at most, evenly spaced; without it, all."""
+    """Largest number of views to measure, evenly spaced; default: all."""
     downscales: Annotated[list[Downscale], Field(min_length=1)] | None = None
-    """Divisors of the photographs' size; without it, the smallest in training."""
+    """Divisors of the original image size; default: the smallest one of the training."""
     metrics: list[Metric] = Field(["psnr", "ssim"])
-    """Metrics beside LPIPS; psnr and ssim must be among them."""
+    """Metrics in addition to LPIPS; psnr and ssim are required."""
     lpips: InputPath | None = None
     """ONNX file of LPIPS."""
     lpips_input: InputRange = "-1..1"
-    """Range of the values for LPIPS; 0..1 as in the tables of 3DGS and Mip-Splatting."""
+    """Range of the values that LPIPS gets; the tables of 3DGS and Mip-Splatting use 0..1."""
     file: Annotated[str, AfterValidator(_inside)] | None = None
-    """Model file in the run folder, which is read and measured; without it, the model that is trained."""
+    """Model file in the run folder to measure; default: the model in training."""
 
     @field_validator("metrics")
     @classmethod
     def _with_psnr_and_ssim(cls, metrics: list[Metric]) -> list[Metric]:
         if not {"psnr", "ssim"} <= set(metrics):
-            raise ValueError("'psnr' and 'ssim' must be among the metrics: every metrics.json has them")
+            raise ValueError("'psnr' and 'ssim' are required, since every metrics.json has them; add them")
         return metrics
 
     def check(self) -> None:
@@ -83,14 +83,14 @@ class Evaluate(Scheduled):
 
     def run(self, run: Run) -> None:
         if not run.scene.split(self.split):
-            if self.split != "test" or run.pipeline["scene"]["holdout"] != 0:  # who wants none need not be told
+            if self.split != "test" or run.pipeline["scene"]["holdout"] != 0:  # no warning if the user wants none
                 key = "holdout" if self.split == "test" else "validation"
-                LOG.warning("no %s views: nothing to evaluate (scene.%s chooses them)", self.split, key)
+                LOG.warning("no %s views: nothing to evaluate; scene.%s selects them", self.split, key)
             return
         perceptual, painter = self._perceptual(), self._painter(run)
         for downscale in self.downscales or [run.downscale]:
-            found = learned_scene(run).downscaled(downscale).split(self.split)
-            views = sample_views(found, self.max_views or len(found))
+            candidates = learned_scene(run).downscaled(downscale).split(self.split)
+            views = sample_views(candidates, self.max_views or len(candidates))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
             trained, colors = run.scene.split("train"), color_model(run)

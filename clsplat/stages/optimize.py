@@ -1,4 +1,4 @@
-"""The training loop: render, compare, differentiate, update."""
+"""Train: render, compare, differentiate, update."""
 
 import itertools
 import logging
@@ -29,43 +29,40 @@ from clsplat.training.sh_offload import more_room, place_harmonics
 from clsplat.training.stage import Scheduled, Training
 from clsplat.training.trainer import StepTrainer
 
-# Which model a training leaves: that of its last step, or the best one by photographs that it did not see.
-
 LOG = logging.getLogger("clsplat")
-EVALUATIONS, SHORTEST = 20, 100  # of a training at most; steps from one to the next at least
+MAX_EVALUATIONS, MIN_INTERVAL = 20, 100  # of a training; steps from one to the next
 PSNR_AND_SSIM = ("psnr", "ssim")
-ROOMY = 8  # times the first number of Gaussians fit: growth then rarely reaches the limit
-SHOWN = 8  # training views that are measured beside the validation views, at most
+ROOMY = 8  # memory for this many times the initial Gaussians: growth rarely reaches the limit
+MAX_TRAINING_VIEWS = 8  # that are measured together with the validation views
 
 
 class Keeping(Training):
-    """A training with a number of steps, and the model that it leaves.
+    """A training that keeps its last model, or the best one at validation views.
 
-    With `keep: best` the validation views (`scene.validation`) are measured as often as an `evaluate` of them in
-    `during` says, or else every 20th part of the steps, 100 at least; some training views beside them.
+    With `keep: best`, the validation views (`scene.validation`) are measured as often as an `evaluate` of them in
+    `during` says, or else 20 times, at least 100 steps apart; together with some training views.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"patience"})
 
     keep: Literal["last", "best"] = "last"
-    """Model that the training leaves: that of its last step, or the one with the best PSNR at the validation views, in
-    the photographs' colors where all measured views have that figure."""
+    """Model to keep: the last one, or the one with the best PSNR at the validation views (the PSNR in the photographs'
+    colors if all measured views have it)."""
     patience: Annotated[int, Field(gt=0)] | None = None
-    """Measurements of the validation views without a better one after which the training ends; without it, none."""
+    """Number of measurements of the validation views without improvement after which the training ends; default: it
+    does not end early."""
     refit: bool = False
-    """With `keep: best`: train again from the beginning on all training photographs, those for validation too, for the
-    number of steps that was best."""
+    """With `keep: best`: train again from the start for the best number of steps, on the validation views too."""
 
     @model_validator(mode="after")
     def _by_validation(self) -> "Keeping":
         if self.keep != "best" and (self.patience or self.refit):
-            raise ValueError(f"'{'patience' if self.patience else 'refit'}' is for 'keep: best'; give both or neither")
-        inner = self.during
-        if self.keep != "best" and any(getattr(stage, "patience", None) for stage in inner):
-            raise ValueError("'densify.patience' is for 'keep: best'; give both or neither")
-        if self.keep == "best" and any("average" in stage.makes for stage in inner):
+            raise ValueError(f"'{'patience' if self.patience else 'refit'}' needs 'keep: best'; set both or neither")
+        if self.keep != "best" and any(getattr(stage, "patience", None) for stage in self.during):
+            raise ValueError("'densify.patience' needs 'keep: best'; set both or neither")
+        if self.keep == "best" and any("average" in stage.makes for stage in self.during):
             raise ValueError(
-                "'keep: best' leaves the model of one step, and not the average of several; choose one, or a pipeline "
+                "'keep: best' keeps the model of one step, not an average; remove one of them, or use a pipeline "
                 "without 'add_to_average' and 'take_average', such as splat_7k"
             )
         return self
@@ -74,70 +71,71 @@ class Keeping(Training):
         """Return the measurements that `keep: best` adds to `during`: of training views, then of validation views."""
         if self.keep == "last":
             return []
-        own = next((stage for stage in during if _validates(stage)), None)
-        parts = max(1, min(EVALUATIONS, self.steps // SHORTEST))  # whole ones: what is not measured cannot be the best
-        every = own.every if own else self.steps // parts
-        start, stop = (own.start, own.stop) if own else (0, None)
-        facts = {"metrics": [*PSNR_AND_SSIM], "every": every}
-        train = Evaluate.model_validate({**facts, "split": "train", "max_views": SHOWN, "start": start, "stop": stop})
-        return [train] if own else [train, Evaluate.model_validate({**facts, "split": "validation"})]
+        listed = next((stage for stage in during if _validates(stage)), None)
+        parts = max(1, min(MAX_EVALUATIONS, self.steps // MIN_INTERVAL))  # equal: the last step is measured
+        every = listed.every if listed else self.steps // parts
+        start, stop = (listed.start, listed.stop) if listed else (0, None)
+        keys = {"metrics": [*PSNR_AND_SSIM], "every": every}
+        of_train = {"split": "train", "max_views": MAX_TRAINING_VIEWS, "start": start, "stop": stop}
+        train = Evaluate.model_validate({**keys, **of_train})
+        return [train] if listed else [train, Evaluate.model_validate({**keys, "split": "validation"})]
 
     @property
     def min_steps(self) -> int:
-        """The fewest steps of the training, with those of a refit: where no measurement is better than the first."""
+        """Smallest number of steps, including a refit: if no measurement is better than the first."""
         if self.patience is None:
             return self.steps
         every = self.measuring(getattr(self, "during", ()))[-1].every or self.steps
         return min(self.steps, fire_step(every, 1 + self.patience)) + (fire_step(every, 1) if self.refit else 0)
 
     def in_turn(self, during: Sequence[Scheduled]) -> list[Scheduled]:
-        """Return all stages of `during` in the order in which they act: first the measurements of `keep: best`, since
-        they may end the training."""
+        """Return all stages of `during` in the order in which they run.
+
+        The measurements of `keep: best` come first, since they may end the training.
+        """
         first = sorted(during, key=lambda stage: not _validates(stage)) if self.keep == "best" else during
         return [*self.measuring(during), *first]
 
     def begin_to_keep(self, run: Run) -> None:
-        """Forget the best of an earlier training.  Raises ConfigError where there is nothing to choose by."""
+        """Forget the best model of an earlier training.  Raises ConfigError if there are no validation views."""
         if self.keep == "last":
             return
         if not run.scene.split("validation"):
-            raise ConfigError(
-                "optimize.keep: best chooses by validation views; expected some: set scene.validation=auto"
-            )
+            raise ConfigError("optimize.keep: best needs validation views; set scene.validation=auto")
         self.require_measured(run.step - run.stage_step)
         if run.stage_step == 0:
             run.best, run.best_tables = None, {}
 
     def check_pipeline(self, pipeline: Any) -> None:
         if self.keep == "best" and pipeline.scene.validation == 0:
-            raise ConfigError("optimize.keep: best chooses by validation views; expected scene.validation: auto")
+            raise ConfigError("optimize.keep: best needs validation views; set scene.validation: auto")
         trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
-        if self.refit and (found := sum(isinstance(one, Keeping) for one in trainings)) > 1:
-            raise ConfigError(f"optimize.refit: expected one stage that trains, found {found}")
-        before = list(itertools.takewhile(lambda one: one is not self, trainings))
-        if not any(getattr(one, "patience", None) for one in before):  # else nobody knows at which step it begins
-            self.require_measured(sum(one.steps for one in before))
+        if self.refit and (number := sum(isinstance(stage, Keeping) for stage in trainings)) > 1:
+            raise ConfigError(f"optimize.refit: expected a single stage that trains, got {number}")
+        before = list(itertools.takewhile(lambda stage: stage is not self, trainings))
+        if not any(getattr(stage, "patience", None) for stage in before):  # else the first step is unknown
+            self.require_measured(sum(stage.steps for stage in before))
 
-    def require_measured(self, begun: int) -> None:
-        """Raise ConfigError where `keep: best` measures nothing before the last step; begun: global step before it."""
+    def require_measured(self, first: int) -> None:
+        """Raise ConfigError if `keep: best` measures nothing until the last step; first: global step before it."""
         if self.keep == "last":
             return
-        last = begun + self.steps
-        found = [stage for stage in self.in_turn(self.during) if _validates(stage)]
-        if not any(stage.due(step, step == last) for stage in found for step in range(begun + 1, last + 1)):
+        last = first + self.steps
+        stages = [stage for stage in self.in_turn(self.during) if _validates(stage)]
+        if not any(stage.due(step, step == last) for stage in stages for step in range(first + 1, last + 1)):
             raise ConfigError(
-                "optimize.keep: best needs a measurement of the validation views before the last step; expected "
-                "an `evaluate: {every: …, split: validation}` in `during` that is due, or none: it is made then"
+                "optimize.keep: best needs a measurement of the validation views until the last step; lower "
+                "the `every` of `evaluate` in `during`, or remove it: one is then added"
             )
 
     def judge(self, run: Run, stage: Scheduled) -> None:
-        """After a measurement of the validation views, keep the model where it is the best so far."""
+        """After a measurement of the validation views, keep the model if it is the best so far."""
         if self.keep == "last" or not _validates(stage):
             return
         averages = {split: run.metrics.get(split, {}) for split in ("train", "validation")}
         measured = [one.get(f"{run.downscale:g}", {}) for one in averages.values()]
         train, validation = compared(measured)
-        if train is None or validation is None:  # at another size, or masks leave out all
+        if train is None or validation is None:  # measured at another size, or everything is masked
             return
         best, now = run.best, Measured(step=run.step, train=train, validation=validation)
         if best is not None and not validation > best.measured.validation:
@@ -161,13 +159,13 @@ class Keeping(Training):
         run.best_tables = tables
 
     def has_ended(self, run: Run) -> bool:
-        """Whether no step of the training is left."""
+        """Return whether the training has no step left."""
         best = run.best if self.keep == "best" and run.stage_step else None
         ended = best is not None and self.patience is not None and best.since_best >= self.patience
         return ended or run.stage_step >= self.steps
 
     def leave(self, run: Run) -> None:
-        """At the end of the training, put the best model into the place of the last one."""
+        """At the end of the training, replace the last model by the best one."""
         best = run.best
         if self.keep == "last" or best is None or best.ended is not None:
             return
@@ -183,32 +181,28 @@ class Keeping(Training):
 
 
 def compared(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
-    """Return the PSNR of averages of metrics, dB, None where there is none: in the photographs' colors where all have
-    it of all their views."""
+    """Return the PSNR of each of the averages, dB, or None: in the photographs' colors if all have it for all views."""
     whole = all(one.get("psnr_color") is not None and "psnr_color_reason" not in one for one in measured)
     return [one.get("psnr_color" if whole else "psnr") for one in measured]
 
 
 def _validates(stage: Scheduled) -> bool:
-    """Whether a stage measures validation views at the size of the training."""
+    """Return whether a stage measures validation views at the training size."""
     if not isinstance(stage, Evaluate) or stage.split != "validation":
         return False
     return stage.file is None and stage.downscales is None
 
 
-# What a training tells of itself every so many steps.
-
-
 def report(
     run: Run, forecast: Forecast, values: tuple[float, float], seconds: Sequence[float], distribution_every: int = 1
 ) -> None:
-    """Record a step and show it.
+    """Record a step and report it.
 
-    values: its loss and its PSNR, dB; seconds: of the steps since the last report; distribution_every: steps from one
-    record of the Gaussians' sizes and opacities to the next.
+    values: its loss, and its PSNR, dB.  seconds: of the steps since the last report.  distribution_every: steps between
+    records of the Gaussians' sizes and opacities.
     """
     count, (loss, psnr) = run.gaussians, values
-    stages, ms = stage_milliseconds(run.device.timings), 1e3 * median(seconds)  # the first step may load much
+    stages, ms = stage_milliseconds(run.device.timings), 1e3 * median(seconds)  # median: the first step loads files
     cost = {"ms": ms, "cpu_seconds": round(run.cpu_seconds, 3), "stages": stages}
     run.records.add(run.step, "train", loss=loss, psnr=psnr, **({} if count is None else {"gaussians": count}), **cost)
     if count is not None and (run.step % distribution_every == 0 or run.step == forecast.last_step):
@@ -226,8 +220,8 @@ DISTRIBUTION_INTERVAL, READ_AHEAD = 5, 4  # reports; photographs
 class Optimize(Keeping):
     """Train for a number of steps, one view each (Kerbl et al. 2023).
 
-    Stages in `during` that edit the model act between two steps, so that other stages see the model before the edit.
-    No edit follows the last step.  As in the reference, a parameter is not updated at the step before its edit.
+    Stages in `during` that edit the model run between two steps, so that other stages see the model before the edit.
+    No edit follows the last step.  As in the reference code, a parameter is not updated in the step before its edit.
     """
 
     stage: Literal["optimize"] = "optimize"
@@ -238,18 +232,18 @@ class Optimize(Keeping):
     rates: Rates = Rates()
     """Learning rates."""
     update: Rows = "all"
-    """Gaussians that a step changes: `all`, or `seen`: those that the view culls keep their parameters and moments.
-    `deferred`: all, with the same bits; `sh_rest` of those that are culled has its updates when a view sees them."""
+    """Gaussians that a step updates: `all`; `seen`, where culled Gaussians keep their parameters and moments; or
+    `deferred`, with the same bits as `all`, where `sh_rest` of culled Gaussians is updated when a view sees them."""
     views: ViewSettings = ViewSettings()
-    """View, size and photograph of each step."""
+    """View, image size and transforms of each step."""
     losses: list[OneOf[Loss]]
     """Losses and penalties; training minimizes their sum."""
     modules: list[OneOf[TrainingModule]] = Field([])
-    """What takes part in a step next to the Gaussians, in the order of the forward pass; each once.  `--set` addresses
-    one by its type: `optimize.modules.TYPE.KEY=…`; `optimize.modules.TYPE={}` adds it at its place, `=null` removes
-    it."""
+    """Modules that take part in a step in addition to the Gaussians, in the order of the forward pass; each at most
+    once.  `--set` addresses a module by its type: `optimize.modules.TYPE.KEY=…`; `optimize.modules.TYPE={}` adds it in
+    the right order, `=null` removes it."""
     during: list[OneOf[Scheduled]] = Field([])
-    """Stages that run every so many steps."""
+    """Stages that run at a cadence."""
     log_every: Annotated[int, Field(gt=0)] = 100
     """Steps between lines of metrics.jsonl."""
 
@@ -257,7 +251,7 @@ class Optimize(Keeping):
     @classmethod
     def _of_an_image(cls, losses: list[Loss]) -> list[Loss]:
         if not any(isinstance(loss, ImageLoss) and loss.reads_photograph for loss in losses):
-            raise ValueError("expected at least one loss that compares images, such as l1")
+            raise ValueError("at least one loss must compare images, such as l1")
         return losses
 
     @field_validator("modules")
@@ -285,13 +279,13 @@ class Optimize(Keeping):
             module.check_run(run)
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
-        """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
+        """Train step by step; yields ViewGradients unless a step is skipped, valid until the next step."""
         self.begin_to_keep(run)
         views = self.views.settled(run.training_images)
         last_step = run.step - run.stage_step + self.steps
         trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
         memory, count = run.memory_plan(), run.model.gaussians.count
-        if run.harmonics != "auto" or memory.host == 0:  # else it was looked at before they moved
+        if run.harmonics != "auto" or memory.host == 0:  # otherwise it was checked before the harmonics moved
             memory.check(count, more_room(run))
         is_tight = memory.host or memory.limit < ROOMY * count
         LOG.log(logging.INFO if is_tight else logging.DEBUG, memory.text(count))
@@ -324,7 +318,7 @@ class Optimize(Keeping):
 
     @property
     def tables(self) -> set[str]:
-        """Tables of the Gaussians that penalties and rules read beside the parameters."""
+        """Tables of the Gaussians that penalties and rules read in addition to the parameters."""
         parts: list[Penalty | Densify] = [*(loss for loss in self.losses if isinstance(loss, Penalty)), *self._density]
         return {name for part in parts for name in part.tables}
 
@@ -333,7 +327,7 @@ class Optimize(Keeping):
         return [stage for stage in self.during if isinstance(stage, Densify)]
 
     def _trainer(self, run: Run, views: ViewSettings, last: int) -> StepTrainer:
-        """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
+        """Add moments, statistics and tables to the run's Gaussians, unless a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.stats = SplatStats(gaussians, self.statistics, len(run.scene.split("train")))
         for name in sorted(self.tables - gaussians.tables.keys()):
@@ -350,7 +344,7 @@ class Optimize(Keeping):
         return StepTrainer(*parts, *trained, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
-        """Run the edits that were due at the step before."""
+        """Run the edits that were due at the previous step."""
         if run.stage_step == 0 or run.edited:
             return
         run.image_downscale = views.divisor(run.step)
@@ -360,12 +354,12 @@ class Optimize(Keeping):
             run.edited = True
 
     def _step(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> ViewLosses:
-        """Do one step; a failure before its update leaves the run at the step before."""
+        """Do one step; a failure before its update leaves the run at the previous step."""
         run.step += 1
         run.stage_step += 1
         try:
             view, stale = self._differentiate(run, trainer, sampler)
-        except BaseException:  # a second Ctrl-C too
+        except BaseException:  # also a second Ctrl-C
             run.step, run.stage_step = run.step - 1, run.stage_step - 1
             run.device.timings.sampling = False
             raise
@@ -377,7 +371,7 @@ class Optimize(Keeping):
         return view
 
     def _differentiate(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> tuple[ViewLosses, set[str]]:
-        """The losses of one view, with gradients unless it is skipped, and the parameters that they do not update."""
+        """Return the losses of a view, with gradients unless it is skipped, and the parameters not to update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)
         photograph = run.photographs.of_sizes(sample.view, sample.original, sample.number)

@@ -1,4 +1,4 @@
-"""A palette of harmonics, as a SOG holds it: drawn, and trained."""
+"""Quantize harmonics and tables as SOG stores them: build a palette, train it, round tables."""
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -29,8 +29,8 @@ from clsplat.training.stage import ALL_HARMONICS, Scheduled, Stage
 LOG = logging.getLogger("clsplat")
 FILE = "clusters.cl"
 TOGETHER = int(constants(FILE)["TOGETHER"])
-BLOCK = 1 << 16  # points on the device at once: they have many components
-AT_ONCE = 1024  # vectors of a launch: they stay in a core's cache
+BLOCK = 1 << 16  # points on the device at a time, since they have many components
+AT_ONCE = 1024  # vectors per launch, which fit in a core's cache
 Floats = NDArray[np.float64]
 Nearest = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]
 UNSEEN = 0.05  # weight of all directions together next to the observed ones; 0.01 to 0.05 give lego the same errors
@@ -39,12 +39,12 @@ ROUNDS = 4  # iterations of Lloyd's algorithm; a fifth lowers the error of lego 
 
 
 class PaletteSh(Scheduled):
-    """Give each Gaussian one of the vectors of a palette of harmonics, as a SOG holds them.
+    """Replace the harmonics of each Gaussian by a vector of a palette, as SOG stores them.
 
-    Errors count by how they show in the training views: by what a Gaussian contributes there, in the directions from
-    which it is seen, and without what the base color takes up, which is changed by it.  Training that follows with a
-    rate of 0 for `sh_rest` adapts the other tables to them, and the SOG then loses nothing of its harmonics.  Harmonics
-    that are vectors of a palette already keep it, and are rounded to the numbers that a SOG has.
+    Errors are weighted by their visibility in the training views: by the Gaussian's contribution, in the directions
+    from which it is seen, and after the base color, which the stage adapts, has absorbed part of them.  Training with a
+    rate of 0 for `sh_rest` then adapts the other tables, and the SOG stores the harmonics without loss.  Harmonics that
+    already form a palette keep it, rounded to the numbers that SOG can store.
     """
 
     stage: Literal["palette_sh"] = "palette_sh"
@@ -54,10 +54,10 @@ class PaletteSh(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"quality", "step"})
 
     quality: Quality = "balanced"
-    """Of the SOG: `small`, `balanced` or `high`, which have 1,024, 4,096 and 16,384 vectors at most."""
+    """Quality of the SOG: `small`, `balanced` or `high`, with at most 1,024, 4,096 and 16,384 vectors."""
     step: Annotated[float, Field(gt=0)] | None = None
-    """Step of the coefficients of the vectors, where that makes 256 different ones at most: a larger one makes the
-    file smaller."""
+    """Step to which the coefficients are rounded, if that leaves at most 256 values; a larger step makes the file
+    smaller."""
 
     def stale(self, run: Run) -> Collection[str]:
         return "sh_base", "sh_rest"
@@ -67,22 +67,23 @@ class PaletteSh(Scheduled):
         if not gaussians.sh_degree:
             return
         rest, error = gaussians.get("sh_rest"), visible_error(run)
-        better = partial(error.palette, rest, nearest=partial(most_alike, run.device))
-        found = Harmonics.fit(rest, self.quality, error.weights, better, self.step)
-        gaussians.set("sh_rest", found.values)
-        gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - found.values))
-        set_clusters(gaussians, found.labels, error.weights)
+        improve = partial(error.palette, rest, nearest=partial(most_alike, run.device))
+        harmonics = Harmonics.fit(rest, self.quality, error.weights, improve, self.step)
+        gaussians.set("sh_rest", harmonics.values)
+        gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - harmonics.values))
+        set_clusters(gaussians, harmonics.labels, error.weights)
         if run.adam is not None:
             run.adam.forget("sh_rest")
-        LOG.info("%s of %s", pluralize(len(found.palette), "harmonic"), pluralize(gaussians.count, "Gaussian"))
+        vectors = pluralize(len(harmonics.palette), "vector")
+        LOG.info("%s in the palette of %s", vectors, pluralize(gaussians.count, "Gaussian"))
 
 
 class SharePalette(Scheduled):
-    """Move each vector of the palette to the mean of the harmonics of its Gaussians, which get it again.
+    """Move each vector of the palette to the mean of the harmonics of its Gaussians, and assign it to them again.
 
-    The mean is by what the Gaussians contributed to the training views when `palette_sh` drew the palette.  On a
-    cadence, with a rate for `sh_rest`, the vectors are trained: each Gaussian moves its own, and those that share one
-    agree.  It belongs right behind such a training too, since no edit follows the last step.
+    The mean is weighted by the contributions to the training views when `palette_sh` built the palette.  At a cadence
+    and with a rate for `sh_rest`, this trains the vectors.  Run it right after that training too, since no edit follows
+    the last step.
     """
 
     stage: Literal["share_palette"] = "share_palette"
@@ -91,7 +92,7 @@ class SharePalette(Scheduled):
     conflicts = ALL_HARMONICS
 
     def excluded(self) -> Mapping[str, str]:
-        return self.conflicts if self.every else {}  # not after a training
+        return self.conflicts if self.every else {}  # no conflict after a training
 
     def run(self, run: Run) -> None:
         if run.model.gaussians.sh_degree:
@@ -99,7 +100,7 @@ class SharePalette(Scheduled):
 
 
 def most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the vector, of [E, c], with the largest product for each point, of [N, c], the first of equal ones."""
+    """Return the index of the vector, [E, c], with the largest dot product for each point, [N, c]; ties: the first."""
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
     return np.concatenate([_most_alike(device, block, vectors) for block in blocks])
 
@@ -232,7 +233,7 @@ def _with_squares(vectors: Floats) -> NDArray[np.float32]:
 
 
 def visible_error(run: Run) -> VisibleError:
-    """Return how errors of the harmonics show in the training views."""
+    """Return how visible errors of the harmonics are in the training views."""
     views, gaussians = run.scene.split("train"), run.model.gaussians
     looks = run.survey().render(run.status.counted(views, "views", len(views)))
     positions = (view.position for view in views)
@@ -240,13 +241,13 @@ def visible_error(run: Run) -> VisibleError:
     return VisibleError.from_views(zip(looks, positions, strict=False), gaussians.get("means"), coefficients)
 
 
-# Gaussians in clusters whose members share values; which cluster, and with which weight, is in tables next to them.
+# Clusters of Gaussians that share values: tables hold each Gaussian's cluster and weight.
 
-LABEL, CLUSTER_WEIGHT = "cluster/label", "cluster/weight"  # [1] a whole number below 2^24, [1] at least 0
+LABEL, CLUSTER_WEIGHT = "cluster/label", "cluster/weight"  # [1] an integer below 2^24, [1] at least 0
 
 
 def set_clusters(gaussians: Gaussians, labels: NDArray[np.integer], weights: NDArray[np.floating]) -> None:
-    """Note the cluster of each Gaussian, [N], and how much it counts there, [N]."""
+    """Store the cluster of each Gaussian, [N], and its weight there, [N]."""
     for name, column in ((LABEL, labels), (CLUSTER_WEIGHT, weights)):
         if name not in gaussians.tables:
             gaussians.add(name, 1)
@@ -268,16 +269,16 @@ def share(gaussians: Gaussians, name: str) -> None:
     )
 
 
-# Tables of a model in fewer different values, which a SOG holds in fewer bytes.
+# Tables with fewer distinct values, which SOG stores in fewer bytes.
 
 Step = Annotated[float, Field(gt=0)]
 Levels = Annotated[int, Field(ge=1, le=64)]
 
 
 class RoundTables(Stage):
-    """Round tables to steps, as a SOG then holds them in fewer bytes.
+    """Round tables to steps, so that SOG stores them in fewer bytes.
 
-    Tables without a step stay.  Training that follows with rates of 0 for what was rounded adapts the others to it.
+    Tables without a step do not change.  Training with rates of 0 for the rounded tables then adapts the others.
     """
 
     stage: Literal["round_tables"] = "round_tables"
@@ -286,10 +287,10 @@ class RoundTables(Stage):
     training_keys: ClassVar[frozenset[str]] = frozenset({"means", "quats", "log_scales", "sh_base"})
 
     means: Step | None = None
-    """Step of positions, as a share of the size of each Gaussian (the geometric mean of three standard deviations);
-    larger where it weighs little."""
+    """Step of positions, as a fraction of the size of each Gaussian (the geometric mean of three standard deviations);
+    larger for Gaussians of little weight."""
     quats: Levels | None = None
-    """Levels of 255 from one to the next; the axes of each Gaussian are named anew, so that it is turned least."""
+    """Step of rotations, in levels of 255; axes are permuted so that each Gaussian turns as little as possible."""
     log_scales: Step | None = None
     """Step of the logarithms of standard deviations."""
     sh_base: Step | None = None

@@ -1,4 +1,4 @@
-"""The run as one page that opens offline: pictures, cameras, figures, curves, times on the device, settings."""
+"""Write a run as one page that opens offline: renders, cameras, metrics, curves, times on the device, settings."""
 
 import logging
 import os
@@ -31,78 +31,78 @@ from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
 from clsplat.viewer.charts import COLORS, Line, camera_plans, curve
 
-# What would make a scene better, in sentences for the page of a run.
+# Advice: how to improve the scene.
 
-MOST = 24  # training views that are measured, evenly spaced
-NAMED = 3  # photographs in a sentence
-APART = 5.0  # dB below the median of the views
-GAINED = 1.0  # dB by three numbers for the colors of each photograph
-FEW = 24  # training photographs
-AIMED = 0.8  # mean cosine between a camera's axis and the direction of the middle: cameras that look at one place
-AROUND = 0.3  # of the distance to the middle, across the upward axis: cameras that stand around it
-GAP = 40.0  # degrees around the middle without a photograph
-OPEN = 120.0  # degrees; a gap from here on is the side from which nobody meant to look
+MAX_MEASURED = 24  # training views, evenly spaced
+MAX_NAMES = 3  # of photos in a sentence
+OUTLIER_DB = 5.0  # below the median of the views
+MIN_EXPOSURE_GAIN = 1.0  # dB, by a gain per channel and photo
+FEW_PHOTOS = 24  # for training
+AIMED_COSINE = 0.8  # between camera axes and the direction of the center, on average: cameras look at one point
+MIN_OFFSET = 0.3  # of the distance to the center, across the upward axis: cameras surround the center
+MIN_GAP = 40.0  # degrees around the center without a photo
+OPEN_SIDE = 120.0  # degrees; a wider gap is a side that was not meant to be seen
 UNEVEN = 3.0  # times the median gap
 
 
 def advice(run: Run) -> list[str]:
-    """Return sentences, or none where nothing stands out.  Renders at most MOST training views."""
+    """Return advice in sentences; empty if nothing stands out.  Renders at most MAX_MEASURED training views."""
     views = learned_scene(run).downscaled(run.downscale).split("train")
-    chosen = sample_views(views, MOST)
+    chosen = sample_views(views, MAX_MEASURED)
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
-    found = measure(run.painter(), chosen, run.photographs, colors=Gains(), counted=counted)
+    metrics = measure(run.painter(), chosen, run.photographs, colors=Gains(), counted=counted)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
     return [
-        *of_training_views(found, has_colors=color_model(run) is not None),
-        *of_test_views(test),
-        *of_capture(views, run.original.views),
+        *from_training_views(metrics, has_exposures=color_model(run) is not None),
+        *from_test_views(test),
+        *from_capture(views, run.original.views),
         *sky_advice(run),
     ]
 
 
-def of_training_views(found: Sequence[ViewMetrics], has_colors: bool) -> Iterator[str]:
-    """What the figures of training views tell.  has_colors: whether photographs have colors of their own."""
-    if names := far_below({one.view: one.psnr for one in found}):
+def from_training_views(metrics: Sequence[ViewMetrics], has_exposures: bool) -> Iterator[str]:
+    """Yield advice from the metrics of training views.  has_exposures: whether training learns exposures."""
+    if names := far_below({view.view: view.psnr for view in metrics}):
         yield (
-            f"{_listed(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the others: look for blur, "
-            "a wrong camera, or what has moved, and leave such photographs out, or mask what has moved"
+            f"{_list(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the other photos: look for blur, "
+            "wrong poses and moving objects; remove these photos, or mask the objects"
         )
-    gains = [one.colors["psnr_color"] - one.psnr for one in found if "psnr_color" in one.colors]
+    gains = [view.colors["psnr_color"] - view.psnr for view in metrics if "psnr_color" in view.colors]
     gained = float(np.mean(gains)) if gains else 0.0
-    if not has_colors and gained >= GAINED:
+    if not has_exposures and gained >= MIN_EXPOSURE_GAIN:
         yield (
-            f"exposures or colors differ: in their own colors photographs would be {gained:.1f} dB nearer; "
+            f"exposures or colors differ between photos: matching them would gain {gained:.1f} dB; "
             "try `--set optimize.modules.exposure={}`"
         )
 
 
-def of_test_views(psnr: Mapping[str, float]) -> Iterator[str]:
-    """What the PSNR of test views, dB by name, tells."""
+def from_test_views(psnr: Mapping[str, float]) -> Iterator[str]:
+    """Yield advice from the PSNR of test views, dB by name."""
     if names := far_below(psnr):
-        yield f"{_listed(names)}: much worse than the other test views; take more photographs of what is seen there"
+        yield f"{_list(names)}: much worse than the other test views; take more photos of what is visible there"
 
 
-def of_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
-    """What the training views, and where all views stand, tell."""
+def from_capture(train: Sequence[View], views: Sequence[View]) -> Iterator[str]:
+    """Yield advice from the number of training views and the positions of all views."""
     number = len({view.name for view in train})
-    if number < FEW:
-        yield f"{pluralize(number, 'training photograph')}: few; show every place in five, from several sides"
+    if number < FEW_PHOTOS:
+        yield f"only {pluralize(number, 'training photograph')}; show every part in at least five, from several sides"
     if gap := widest_gap(views):
-        degrees, one, other = gap
-        yield f"no photograph is from the {degrees:.0f}° between {one} and {other}; take some there"
+        degrees, first, second = gap
+        yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take some there"
 
 
 def far_below(psnr: Mapping[str, float]) -> list[str]:
-    """Return the names of views that are far below the median, the worst first; psnr: dB, by name."""
+    """Return the names of views far below the median, the worst first; psnr: dB, by name."""
     median = float(np.median(list(psnr.values()))) if psnr else 0.0
-    return [name for name in sorted(psnr, key=psnr.__getitem__) if psnr[name] < median - APART]
+    return [name for name in sorted(psnr, key=psnr.__getitem__) if psnr[name] < median - OUTLIER_DB]
 
 
 def widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
-    """Return the widest gap between views that stand around what they look at, degrees, and the views on its sides.
+    """Return the widest gap between views around the point that they look at, degrees, and the views on its sides.
 
-    None where they look elsewhere, where no gap stands out, and for the side that is open.
+    None if the views do not surround a point, if no gap stands out, and for an open side.
     """
     if len(views) < 3:
         return None
@@ -112,27 +112,27 @@ def widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
     distances = np.linalg.norm(from_middle, axis=1)
     angles, aside = _around(from_middle, up_direction(views))
     aimed = -(axes * from_middle).sum(axis=1) / np.maximum(distances, 1e-12)
-    if aimed.mean() < AIMED or np.median(aside / np.maximum(distances, 1e-12)) < AROUND:
+    if aimed.mean() < AIMED_COSINE or np.median(aside / np.maximum(distances, 1e-12)) < MIN_OFFSET:
         return None
     order = np.argsort(angles, kind="stable")
     gaps = np.degrees(np.diff(np.append(angles[order], angles[order[0]] + 2 * np.pi)))
-    inner = np.where(gaps < OPEN, gaps, 0.0)
+    inner = np.where(gaps < OPEN_SIDE, gaps, 0.0)
     widest = int(np.argmax(inner))
-    if inner[widest] < max(GAP, UNEVEN * float(np.median(gaps))):
+    if inner[widest] < max(MIN_GAP, UNEVEN * float(np.median(gaps))):
         return None
     return float(gaps[widest]), views[order[widest]].name, views[order[(widest + 1) % len(views)]].name
 
 
 def _around(offsets: NDArray[np.floating], up: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Angles around the upward axis, radians, and distances from it, of offsets, [V, 3]."""
+    """Return the angles around the upward axis, radians, and the distances from it, of offsets, [V, 3]."""
     ahead = perpendicular(up)
     x, y = offsets @ ahead, offsets @ np.cross(up, ahead)
     return np.arctan2(y, x), np.hypot(x, y)
 
 
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+def _list(names: Sequence[str]) -> str:
+    more = len(names) - MAX_NAMES
+    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def cameras(run: Run) -> list[Markup]:
@@ -141,10 +141,10 @@ def cameras(run: Run) -> list[Markup]:
     return safe_charts(camera_plans({split: run.original.split(split) for split in SPLITS}, points))
 
 
-# Curves over the steps of a run, and of its Gaussians.
+# Curves over steps, and of the Gaussians.
 
 NAMES = {"train": "training views", "test": "test views", "validation": "validation views"}
-DOTTED = 2  # place in DASHES
+DOTTED = 2  # index into DASHES
 
 
 def training_charts(run: Run) -> list[Markup]:
@@ -169,18 +169,20 @@ def training_charts(run: Run) -> list[Markup]:
 
 
 def _measured(run: Run, trial: bool = False) -> list[Line]:
-    """PSNR of each split over the steps whose model was measured, by the last measurement of each; `trial`: before a
-    refit."""
+    """Return the measured PSNR of each split over steps, the last one if a step was measured twice.
+
+    trial: of the training before a refit.
+    """
     points: dict[str, dict[int, float]] = {split: {} for split in NAMES}
     for line in run.records.read("evaluate", trial):
         if line["downscale"] == run.downscale:
             points[line["split"]][line["step"]] = line["psnr"]
     colors = dict(zip(NAMES, COLORS, strict=False))
-    return [Line(sorted(one.items()), NAMES[split], colors[split]) for split, one in points.items() if one]
+    return [Line(sorted(psnr.items()), NAMES[split], colors[split]) for split, psnr in points.items() if psnr]
 
 
 def gaussians_charts(run: Run) -> list[Markup]:
-    """Distributions of size, shape and opacity during training, effects of the density rules, PSNR by Gaussians."""
+    """Draw distributions of size, shape and opacity, effects of the density rules, and PSNR by number of Gaussians."""
     lines = run.records.read("distribution")
     if len(lines) < 2:
         return []
@@ -192,49 +194,49 @@ def gaussians_charts(run: Run) -> list[Markup]:
     return safe_charts(
         [
             curve("size (rms scale, scene units), quantiles", quantiles("size"), logarithmic=True),
-            curve("anisotropy (longest by shortest axis), quantiles", quantiles("anisotropy"), logarithmic=True),
+            curve("anisotropy (longest / shortest axis), quantiles", quantiles("anisotropy"), logarithmic=True),
             curve("opacity, quantiles", quantiles("opacity")),
-            curve("Gaussians changed by each rule, in all", _totals(run, "causes")),
-            curve("share of growth so far, by rule", _shares(_totals(run, "grown"))),
+            curve("Gaussians changed by each rule, total", _totals(run, "causes")),
+            curve("fraction of growth so far, by rule", _shares(_totals(run, "grown"))),
             curve("test PSNR, dB, over thousands of Gaussians", _psnr_by_gaussians(run)),
         ]
     )
 
 
-def _totals(run: Run, what: str) -> list[Line]:
-    """Gaussians that each rule of density control has changed so far, or added."""
+def _totals(run: Run, key: str) -> list[Line]:
+    """Return the numbers of Gaussians that each density rule has changed or added so far.  key: of the record."""
     edits = run.records.read("densify")
-    names = dict.fromkeys(name for edit in edits for name in edit.get(what, {}))
-    totals = {name: np.cumsum([edit.get(what, {}).get(name, 0) for edit in edits]) for name in names}
+    names = dict.fromkeys(name for edit in edits for name in edit.get(key, {}))
+    totals = {name: np.cumsum([edit.get(key, {}).get(name, 0) for edit in edits]) for name in names}
     steps = [edit["step"] for edit in edits]
     return [Line(list(zip(steps, map(float, total), strict=True)), name) for name, total in totals.items()]
 
 
 def _shares(lines: Sequence[Line]) -> list[Line]:
-    """The lines divided by their sum, where it is not zero; lines that are always zero are left out."""
+    """Divide lines by their sum where it is not zero; drop lines that are always zero."""
     sums = np.sum([[y for _, y in line.points] for line in lines], axis=0) if lines else []
     shares = [[(x, y / total) for (x, y), total in zip(line.points, sums, strict=True) if total > 0] for line in lines]
     return [Line(points, line.name) for points, line in zip(shares, lines, strict=True) if any(y for _, y in points)]
 
 
 def _psnr_by_gaussians(run: Run) -> list[Line]:
-    """Points in order of steps: where Gaussians are pruned, the line turns back.  No line for a single point."""
+    """Return test PSNR over the number of Gaussians, in order of steps: where Gaussians are pruned, it turns back."""
     counts = {r["step"]: r["gaussians"] for r in run.records.read("train") if "gaussians" in r}
     tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["downscale"] == run.downscale]
     points = {r["step"]: (counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts}
-    return [Line(list(points.values()))] if len(points) > 1 else []
+    return [Line(list(points.values()))]
 
 
-# Whether a model has learned its photographs by heart, in words.
+# Overfitting.
 
 REMEDY = (
-    "More photographs, from places between these, help most; `scene.validation: auto` with `optimize.keep: best`, in a "
-    "pipeline without `take_average` such as splat_7k, keeps the model that is best elsewhere."
+    "More photos, taken between the existing ones, help most; `scene.validation: auto` with `optimize.keep: best`, in "
+    "a pipeline without `take_average` such as splat_7k, keeps the model that is best at views it was not trained on."
 )
 
 
 def overfitting_note(run: Run) -> str:
-    """Return how good the model is where it was trained and elsewhere; "" where that is not known, or unremarkable."""
+    """Compare the model at training views and at others, in words; "" if that is unknown or unremarkable."""
     if run.best:
         return run.best.text()
     split, now = _psnr_elsewhere(run)
@@ -245,15 +247,15 @@ def overfitting_note(run: Run) -> str:
 
 
 def is_overfit(run: Run) -> bool:
-    """Return whether the model of a run has learned its photographs by heart, as far as that is known."""
+    """Return whether the model is known to be overfit."""
     now = run.best.measured if run.best else _psnr_elsewhere(run)[1]
     return now is not None and now.is_overfit
 
 
 def _psnr_elsewhere(run: Run) -> tuple[str, Measured | None]:
-    """The split whose views were not trained on, and the last PSNR there and at training views.
+    """Return a split that was not trained on, and the last PSNR there and at training views.
 
-    Validation views come before test views; training views that were not measured count as the reports saw them.
+    Validation views are preferred to test views; training views that were not measured count as in the log.
     """
     lines = [line for line in run.records.read("evaluate") if line["downscale"] == run.downscale]
     for split in ("validation", "test"):
@@ -265,13 +267,13 @@ def _psnr_elsewhere(run: Run) -> tuple[str, Measured | None]:
 
 
 def _training(run: Run, lines: list[dict[str, Any]], step: int) -> float | None:
-    """The PSNR at training views, dB, measured at a step, or else over the reports up to it."""
+    """Return the PSNR at training views, dB, as measured at a step, or else as logged up to it."""
     measured = [line["psnr"] for line in lines if line["split"] == "train" and line["step"] == step]
     reports = [line["psnr"] for line in run.records.read("train") if line["step"] <= step]
     return measured[-1] if measured else over_views(reports)[-1] if reports else None
 
 
-# Where the time of a training step goes on the device.
+# The time of a training step on the device.
 
 
 @dataclass(frozen=True)
@@ -293,7 +295,7 @@ class Times:
 
 
 def times(run: Run) -> Times | None:
-    """Return the times; None where no step was sampled."""
+    """Return the times, or None if no step was sampled."""
     samples = [r["stages"] for r in run.records.read("train") if r.get("stages")]
     totals: dict[str, float] = defaultdict(float)
     for sample in samples:
@@ -305,14 +307,14 @@ def times(run: Run) -> Times | None:
     return Times(len(samples), whole, [StageTime(name, ms, 100 * ms / whole) for name, ms in totals.items()])
 
 
-# Views beside their photographs: the worst and the best.
+# The best and the worst views, next to their photos.
 
-MAX_VIEWS = 3  # of the worst, and of the best
+MAX_VIEWS = 3  # of each
 
 
 @dataclass(frozen=True)
 class ViewFigure:
-    """Images of one view with a caption."""
+    """Images of a view with a caption."""
 
     caption: str
     images: dict[str, str]  # label -> data URL
@@ -396,13 +398,13 @@ class HtmlReport(Stage):
 
 
 def _addresses(run: Run, stage: str, page: Path) -> dict[str, str]:
-    """The files that stages of this name write, by their paths in the run, with their addresses beside the page."""
+    """Return the addresses, relative to the page, of the files that stages of a name write, by path in the run."""
     files = [Path(one[stage]["file"]) for one in run.pipeline["stages"] if stage in one]
     return {file.as_posix(): quote(Path(os.path.relpath(run.out / file, page.parent)).as_posix()) for file in files}
 
 
 def _main(run: Run) -> str:
-    """The figures that are looked for first."""
+    """Return the most important figures as a line of text."""
     test = run.metrics.get("test", {}).get(f"{run.downscale:g}")
     quality = [f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}"] if test else []
     quality += [f"the model of step {run.model_step:,}"] if run.model_step != run.step else []
@@ -426,11 +428,11 @@ def _figures(run: Run) -> dict[str, str]:
                     values[f"{split} {name}{suffix}{some}"] = f"{averages[key]:.2f} {unit}"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     if run.is_refit and run.best:
-        found = run.best.measured
-        values["validation PSNR before the refit"] = f"{found.validation:.2f} dB"
-        values["training PSNR before the refit"] = f"{found.train:.2f} dB"
-    number, _, what = _size(run).partition(" ")
-    values[what] = number
+        measured = run.best.measured
+        values["validation PSNR before the refit"] = f"{measured.validation:.2f} dB"
+        values["training PSNR before the refit"] = f"{measured.train:.2f} dB"
+    number, _, unit = _size(run).partition(" ")
+    values[unit] = number
     values["steps"] = f"{run.step:,}"
     values["training"] = duration_text(run.train_seconds)
     return values

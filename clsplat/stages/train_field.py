@@ -1,4 +1,4 @@
-"""The training of a field: a network in the place of Gaussians."""
+"""Train a field, a network instead of Gaussians, and export it."""
 
 import logging
 import math
@@ -25,11 +25,11 @@ LOG = logging.getLogger("clsplat")
 
 
 class TrainField(Training):
-    """Train a field of densities and colors on random rays of the photographs (Mip-NeRF, Barron et al. 2021).
+    """Train a field of densities and colors on random rays of the photos (Mip-NeRF, Barron et al. 2021).
 
-    A step draws its rays from one photograph, or from several, as many from each.  Where photographs have several
-    sizes, the loss is that of all their pixels, each counted as its area (section 4): so all sizes count alike.
-    Stages that render, measure and report take the field as they take Gaussians; `export_field` writes a file of it.
+    A step samples its rays from one photo, or the same number from each of several.  With several image sizes, pixels
+    are weighted by their area, so that all sizes contribute equally (section 4).  Stages that render, measure and
+    report work with fields as with Gaussians; `export_field` writes a file.
     """
 
     stage: Literal["train_field"] = "train_field"
@@ -37,51 +37,54 @@ class TrainField(Training):
     takes: ClassVar[frozenset[str]] = frozenset({"model"})
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "coarse_weight", "epsilon"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"warm_up"})
-    rehearsed: ClassVar[int] = 20  # all of its steps take the same time
+    rehearsed: ClassVar[int] = 20  # since all steps take the same time
 
     field: FieldShape = FieldShape()
     """Network and samples."""
     rays: Annotated[int, Field(gt=0, le=1 << 20)] = 4096
-    """Rays of a step."""
+    """Rays per step."""
     photographs: Annotated[int, Field(gt=0, le=1 << 20)] = 1
-    """Photographs that they are drawn from, as many from each."""
+    """Photos per step, with the same number of rays from each."""
     order: OneOf[Order] = Uniform()
-    """Which photographs a step trains on."""
+    """Order of the photos."""
     coarse_weight: Annotated[float, Field(ge=0)] = 0.1
-    """Weight of the coarse level's loss beside that of the fine one."""
+    """Weight of the coarse level's loss; the fine level's is 1."""
     rate: NonNegative = Decay(initial=5e-4, final=5e-6, over=1_000_000)
-    """Learning rate, by step."""
+    """Learning rate."""
     warm_up: Annotated[int, Field(ge=0)] = 2500
-    """Steps until the rate is that of `rate`, along a quarter of a sine."""
+    """Steps in which the rate rises to `rate`, along a quarter of a sine."""
     warm_up_from: Annotated[float, Field(ge=0, le=1)] = 0.01
-    """Share of the rate at the first step."""
+    """Fraction of the rate at the first step."""
     epsilon: Annotated[float, Field(gt=0)] = 1e-8
-    """Added to the root of Adam's second moment; below it gradients are too small to count: a grid has such."""
+    """Added to the root of Adam's second moment; smaller gradients, as grids have them, hardly count."""
     during: list[OneOf[Scheduled]] = Field([])
-    """Stages that run every so many steps."""
+    """Stages that run at a cadence."""
     log_every: Annotated[int, Field(gt=0)] = 100
     """Steps between lines of metrics.jsonl."""
 
     @model_validator(mode="after")
     def _same_rays(self) -> "TrainField":
         if self.rays % self.photographs:
-            raise ValueError(f"expected 'rays' in equal parts for {self.photographs} photographs; {self.rays} are not")
+            raise ValueError(f"'rays' must be a multiple of 'photographs', {self.photographs}; got {self.rays}")
         if any(stage.edits for stage in self.during):
-            raise ValueError("expected stages in 'during' that edit no Gaussians: a field has none")
+            raise ValueError("'during' has a stage that edits Gaussians, and a field has none; remove the stage")
         return self
 
     def check_run(self, run: Run) -> None:
-        """Raise ConfigError for a grid that the scene does not touch, MemoryLimitError for a field that does not fit,
-        before it is made, and what stages of `during` raise."""
+        """Check the run before the field is made.
+
+        Raises ConfigError if no camera sees the grid, MemoryLimitError if the field does not fit, and what the stages
+        in `during` raise.
+        """
         super().check_run(run)
         require_seen(self.field, run.scene)
         views = run.scene.split("train")
-        held = min(run.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
-        field_plan(self.field, held).check(run.device.info)
+        image_bytes = min(run.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
+        field_plan(self.field, image_bytes).check(run.device.info)
 
     def run(self, run: Run) -> None:
         self.check_run(run)
-        field = run.learned_field = self._begun(run)
+        field = run.learned_field = self._field(run)
         last = run.step - run.stage_step + self.steps
         pool, forecast = ViewPool(run.scene.split("train"), run.seed), Forecast.of(run.step, last, [])
         seconds: list[float] = []  # of the steps since the last report
@@ -99,12 +102,12 @@ class TrainField(Training):
             self.end_step(run)
 
     def rate_at(self, step: int) -> float:
-        """Return the learning rate of a global step (Barron et al. 2021, released code: delayed warm-up)."""
-        share = math.sin(0.5 * math.pi * min(step / self.warm_up, 1.0)) if self.warm_up else 1.0
-        return (self.warm_up_from + (1 - self.warm_up_from) * share) * at_step(self.rate, step)
+        """Return the learning rate of a global step, with the delayed warm-up of Barron et al. 2021 (released code)."""
+        progress = math.sin(0.5 * math.pi * min(step / self.warm_up, 1.0)) if self.warm_up else 1.0
+        return (self.warm_up_from + (1 - self.warm_up_from) * progress) * at_step(self.rate, step)
 
-    def _begun(self, run: Run) -> LearnedField:
-        """The field of the run, where an earlier step has trained one of this shape; else a new one."""
+    def _field(self, run: Run) -> LearnedField:
+        """Return the field of a resumed run, or a new one."""
         if isinstance(run.learned_field, LearnedField) and run.learned_field.field.shape == self.field:
             return run.learned_field
         field = LearnedField.first(self.field, run.seed, run.photographs.background)
@@ -112,32 +115,32 @@ class TrainField(Training):
         return field
 
     def _step(self, run: Run, field: LearnedField, pool: ViewPool) -> None:
-        """Do one step; a failure before its update leaves the run at the step before."""
+        """Do one step; a failure before its update leaves the run at the previous step."""
         step = run.step + 1
         run.device.timings.sampling = step % self.log_every == self.log_every // 2
-        shown = list(self._shown(run, pool, step))
+        photographs = list(self._sample(run, pool, step))
         with run.editing_tables():
             run.step, run.stage_step = step, run.stage_step + 1
-            field.step(shown, self.coarse_weight, AdamStep(self.rate_at(step), self.epsilon), run.seed, step)
-            run.device.finish()  # the one wait of a step
+            field.step(photographs, self.coarse_weight, AdamStep(self.rate_at(step), self.epsilon), run.seed, step)
+            run.device.finish()  # the only wait in a step
             run.during_index = 0
         run.device.timings.sampling = False
         run.status.note(step=run.step)
 
-    def _shown(self, run: Run, pool: ViewPool, step: int) -> Iterator[RayPhotograph]:
-        """The photographs of a step."""
+    def _sample(self, run: Run, pool: ViewPool, step: int) -> Iterator[RayPhotograph]:
+        """Yield the photos of a step."""
         for number in range(self.photographs):
             view = self.order.at(pool, (step - 1) * self.photographs + number + 1)
             photograph = run.photographs.get(view)
             if photograph.mask is not None:
-                raise ConfigError(f"train_field: {view.name} has a mask; expected photographs whose pixels all count")
-            area = view.camera.width * view.camera.height * view.downscale**2  # which its rays stand for
+                raise ConfigError(f"train_field: {view.name} has a mask, which fields do not support; remove the masks")
+            area = view.camera.width * view.camera.height * view.downscale**2  # in original pixels
             yield RayPhotograph(photograph.camera, photograph, self.rays // self.photographs, area)
 
     def _values(self, run: Run, field: LearnedField) -> tuple[float, float]:
-        """The loss of the last step and the PSNR of its fine level, dB.
+        """Return the loss of the last step, and the PSNR of its fine level, dB.
 
-        Raises NotFiniteError, with the state set aside, where the loss or the field is not finite.
+        Raises NotFiniteError, after setting the state aside, if the loss or the field is not finite.
         """
         loss, error = field.loss(self.coarse_weight)
         broken = field.not_finite()
@@ -146,13 +149,10 @@ class TrainField(Training):
         return loss, -10 * math.log10(max(error, 1e-12))
 
 
-# The field as a file.
-
-
 class ExportField(Stage):
-    """Write the field that `train_field` has trained, and read it back: a file that clsplat alone reads.
+    """Write the field that `train_field` trained, in a format that only clsplat reads, and read it back.
 
-    `clsplat render` and `clsplat evaluate` take it, or the run folder that holds it.
+    `clsplat render` and `clsplat evaluate` accept the file or its run folder.
     """
 
     stage: Literal["export_field"] = "export_field"
@@ -170,5 +170,5 @@ class ExportField(Stage):
         try:
             load_field(file)
         except DataError as error:
-            raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
+            raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
         LOG.info("a field of %s parameters written to %s", f"{field.shape.learned:,}", file)

@@ -1,4 +1,4 @@
-"""The model as a video."""
+"""Render the model as a video, or its training as a time-lapse."""
 
 import difflib
 import logging
@@ -22,17 +22,15 @@ from clsplat.viewer.video.film import FPS, FRAMES, Film, Wish, plan, shoot, stil
 from clsplat.viewer.video.paths import MAX_FRAMES, RATES, checked_size, size_of
 from clsplat.viewer.video.pictures import Canvas, letterboxed
 
-# Pictures of one camera while the model is trained, and the video that they make.
-
 LOG = logging.getLogger("clsplat")
 KIND = "snapshot"  # of lines in metrics.jsonl
 FOLDER = "timelapse"
 
 
 class Snapshot(Scheduled):
-    """Write a picture of the model from one camera, for a later stage `timelapse`.
+    """Write a render of the model from one camera, for a later stage `timelapse`.
 
-    The model has the same bits with it and without it.  A run that was killed and goes on ends with the same pictures.
+    The stage does not change the bits of the model.  A resumed run ends with the same images.
     """
 
     stage: Literal["snapshot"] = "snapshot"
@@ -41,30 +39,30 @@ class Snapshot(Scheduled):
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"view", "size", "folder"}
 
     view: str | None = None
-    """Name of the view whose camera is taken; without it, the first test view, else the first of all."""
+    """Name of the view to render; default: the first test view, or the first view if there is none."""
     size: str | None = None
-    """WIDTHxHEIGHT of the pictures, even numbers; without it, that of the photograph in training."""
+    """WIDTHxHEIGHT of the renders, even numbers; default: the training size of the view."""
     folder: Annotated[str, path_in_run()] = FOLDER
     """Path inside the run folder."""
 
     @field_validator("size")
     @classmethod
-    def _of_a_video(cls, size: str | None) -> str | None:
+    def _even(cls, size: str | None) -> str | None:
         return None if size is None else size_of(size)
 
     def check_run(self, run: Run) -> None:
         self._view(run)
 
     def _view(self, run: Run) -> View:
-        """The camera.  Raises ConfigError where the scene has no such view."""
+        """Return the view to render.  Raises ConfigError if the scene does not have it."""
         scene = run.scene.downscaled(run.downscale)
         if self.view is None:
             return (scene.split("test") or scene.views)[0]
-        found = {view.name: view for view in scene.views}
-        if self.view not in found:
-            near = difflib.get_close_matches(self.view, found, n=1, cutoff=0.0)
+        by_name = {view.name: view for view in scene.views}
+        if self.view not in by_name:
+            near = difflib.get_close_matches(self.view, by_name, n=1, cutoff=0.0)
             raise ConfigError(f"snapshot: the scene has no view {quote(self.view)}; did you mean {quote(near[0])}?")
-        return found[self.view]
+        return by_name[self.view]
 
     def run(self, run: Run) -> None:
         view = still(self._view(run), checked_size(self.size) if self.size else None)
@@ -74,31 +72,31 @@ class Snapshot(Scheduled):
 
 
 class Timelapse(Stage):
-    """Make a video of the pictures that a stage `snapshot` has written during training."""
+    """Make a video of the renders that the stage `snapshot` wrote during training."""
 
     stage: Literal["timelapse"] = "timelapse"
     needs: ClassVar[frozenset[str]] = frozenset({"painter", "snapshots"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"folder", "file", "fps"})
 
     folder: str = FOLDER
-    """That of the stage snapshot."""
+    """The `folder` of the stage `snapshot`."""
     file: Annotated[str, path_in_run(*encoding.WRITERS)] = "timelapse.webm"
     """Path inside the run folder; .webm, or .mp4 with the extra video."""
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] = 15.0
-    """Pictures a second."""
+    """Frames per second."""
 
     def check(self) -> None:
         encoding.check_encoder(Path(self.file))
 
     def _files(self, run: Run) -> list[Path]:
-        """The pictures of the run, by step: those of an earlier one may lie beside them."""
-        found = {line["step"]: line["file"] for line in run.records.read(KIND) if line.get("folder") == self.folder}
-        return [run.out / self.folder / found[step] for step in sorted(found)]
+        """Return the renders of this run, by step; the folder may also hold those of an earlier run."""
+        files = {line["step"]: line["file"] for line in run.records.read(KIND) if line.get("folder") == self.folder}
+        return [run.out / self.folder / files[step] for step in sorted(files)]
 
     def run(self, run: Run) -> None:
         files = self._files(run)
         if not files:
-            raise ConfigError(f"timelapse: no stage snapshot has written into {quote(self.folder)}; name its folder")
+            raise ConfigError(f"timelapse: {quote(self.folder)} has no snapshots; set 'folder' to that of snapshot")
         size = image_size(files[-1])
         with encoding.opened(run.out / self.file, size, self.fps) as write:
             for path in run.status.counted(run.until_interrupted(files), "frames", len(files)):
@@ -106,32 +104,32 @@ class Timelapse(Stage):
         LOG.info("time-lapse of %d frames written to %s", len(files), run.out / self.file)
 
 
-Moment = Annotated[float, Field(ge=0, le=1)]
+Timestamp = Annotated[float, Field(ge=0, le=1)]
 
 
 class Video(Stage):
-    """Film the model along a camera path: about the scene (ellipse, orbit, spiral) or along the photographs."""
+    """Render a video along a camera path: around the scene (ellipse, orbit, spiral) or along the photos."""
 
     stage: Literal["video"] = "video"
     needs: ClassVar[frozenset[str]] = frozenset({"painter"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"path", "frames", "fps", "size", "times", "file"})
 
     path: InputPath = "ellipse"
-    """One of ellipse, spiral, orbit, through, views and fixed, fixed:NAME of a view, or a file camera_path.json."""
+    """One of ellipse, spiral, orbit, through, views, fixed and fixed:VIEW, or a file camera_path.json."""
     frames: Annotated[int, Field(gt=0, le=MAX_FRAMES)] = FRAMES
     """Number of frames."""
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] = FPS
-    """Frames a second."""
+    """Frames per second."""
     size: str | None = None
-    """WIDTHxHEIGHT, even numbers; without it, that of the photographs in training."""
-    times: Moment | tuple[Moment, Moment] | None = None
-    """Of a scene that moves: one moment, or those of the first and the last frame; without it, the whole."""
+    """WIDTHxHEIGHT, even numbers; default: the training size."""
+    times: Timestamp | tuple[Timestamp, Timestamp] | None = None
+    """In a moving scene, a timestamp, or those of the first and the last frame; default: the whole duration."""
     file: Annotated[str, path_in_run(*encoding.WRITERS)] = "video.webm"
     """Path inside the run folder; .webm, or .mp4 with the extra video."""
 
     @field_validator("size")
     @classmethod
-    def _of_a_video(cls, size: str | None) -> str | None:
+    def _even(cls, size: str | None) -> str | None:
         return None if size is None else size_of(size)
 
     def input_path(self, key: str, scene: str | None) -> Path | None:
@@ -161,7 +159,7 @@ class Video(Stage):
 
 
 def _points(run: Run) -> NDArray[np.float32]:
-    """Where something is, [M, 3]: the means of the Gaussians; for a field the scene's points, if it has any."""
+    """Return points of the scene, [M, 3]: the means of the Gaussians, or, for a field, the scene's points."""
     if run.gaussians is not None:
         return run.model.gaussians.get("means")
     return run.scene.points.positions if run.scene.points else np.zeros((0, 3), np.float32)

@@ -151,5 +151,5 @@ def test_two_fourth_planes_are_refused(device, rng):
 
 
 def test_a_training_also_needs_a_loss_on_colors():
-    with pytest.raises(ValueError, match="at least one loss that compares images"):
+    with pytest.raises(ValueError, match="at least one loss must compare images"):
         Optimize(steps=3, losses=[InverseDepth()])

@@ -197,5 +197,5 @@ def test_steps_with_the_loss_alone_make_pixels_clearer(device, rng):
 
 
 def test_a_training_also_needs_a_loss_on_colors():
-    with pytest.raises(ValueError, match="at least one loss that compares images"):
+    with pytest.raises(ValueError, match="at least one loss must compare images"):
         Optimize(steps=3, losses=[WeightEntropy()])

@@ -97,7 +97,7 @@ def test_photographs_of_all_sizes_count_alike(finished, tiny_scene, pipeline):
     (stage, *_) = load(pipeline).stages
     assert isinstance(stage, TrainField)
     pool = ViewPool(run.scene.split("train"), run.seed)
-    shown = [one for step in range(1, 5) for one in stage._shown(run, pool, step)]
+    shown = [one for step in range(1, 5) for one in stage._sample(run, pool, step)]
     assert {one.camera.width for one in shown} == {40, 20}
     assert {(one.rays, one.weight) for one in shown} == {(32, 1600)}
 
@@ -272,7 +272,7 @@ def test_a_shape_that_cannot_be_is_refused(keys, complaint):
 
 
 def test_rays_are_divided_evenly():
-    with pytest.raises(ValidationError, match="in equal parts for 3 photographs"):
+    with pytest.raises(ValidationError, match="must be a multiple of 'photographs', 3"):
         TrainField(steps=1, rays=100, photographs=3)
 
 

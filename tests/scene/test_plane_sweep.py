@@ -242,7 +242,7 @@ def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, cap
     run = train(tiny_scene, tmp_path / "run", pipeline=str(file))
     log = caplog.text
     swept = bool(more) and not alpha
-    assert f"{own + joined:,} Gaussians from the scene's points{' and a sweep' if swept else ''}" in log
+    assert f"{own + joined:,} Gaussians from the scene's points{' and a plane sweep' if swept else ''}" in log
     assert run.model.gaussians.count == own + joined
 
 
@@ -252,7 +252,7 @@ def test_points_and_sweep(tiny_scene, tmp_path, caplog, detail):
     caplog.set_level("INFO", "clsplat")
     sets = ("init.source=points+sweep", f"init.detail={detail}", "init.sweep_points=60", "optimize.steps=1")
     train(tiny_scene, tmp_path / "run", *sets)
-    found = re.search(r"([\d,]+) Gaussians from the scene's points and a sweep", caplog.text)
+    found = re.search(r"([\d,]+) Gaussians from the scene's points and a plane sweep", caplog.text)
     assert found
     expected = Init(source="points+sweep", sweep_points=60).expected_count(scene)
     assert len(scene.points) < int(found[1].replace(",", "")) <= expected == len(scene.points) + 60
@@ -262,11 +262,11 @@ def test_a_sweep_that_adds_nothing_is_told(tiny_scene, tmp_path, monkeypatch, ca
     nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
     monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: nothing)
     run = train(tiny_scene, tmp_path / "run", "init.source=points+sweep", "optimize.steps=1")
-    assert "agree on no points beside the scene's" in caplog.text
+    assert "found no additional points" in caplog.text
     assert run.model.gaussians.count == len(read_scene(tiny_scene).points)
 
 
 def test_points_and_sweep_need_points(tiny_scene, tmp_path):
     shutil.copytree(tiny_scene, tmp_path / "bare", ignore=shutil.ignore_patterns("points3d.ply"))
-    with pytest.raises(DataError, match=r"no points to start from; use init: \{source: sweep\}"):
+    with pytest.raises(DataError, match=r"no points; use init: \{source: sweep\}"):
         train(tmp_path / "bare", tmp_path / "run", "init.source=points+sweep")

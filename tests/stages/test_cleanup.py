@@ -117,7 +117,7 @@ def test_one_photograph_is_enough_unless_it_is_said(tiny_scene, spoilt, tmp_path
 def test_a_model_of_which_nothing_would_be_left_is_refused(tiny_scene, spoilt, tmp_path):
     run = opened(tiny_scene, spoilt, tmp_path / "run")
     before = run.model.gaussians.get("means")
-    with pytest.raises(NumericError, match="cleanup: its rules would remove every Gaussian; weaken them"):
+    with pytest.raises(NumericError, match="cleanup: its rules would remove all Gaussians; weaken them"):
         Cleanup(stage="cleanup", rules=[PruneFaint(opacity_below=0.9)]).act(run)
     np.testing.assert_array_equal(run.model.gaussians.get("means"), before)
     assert run.is_consistent
@@ -173,7 +173,7 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tiny_scene, en
 def test_refusal_keeps_trained_state_without_earlier_checkpoint(finished, tiny_scene, tmp_path, caplog):
     out, path = tmp_path / "run", tmp_path / "ending.yaml"
     path.write_text(ENDING.replace(", {checkpoint: {every: 1}}", "").replace("{checkpoint: {every: 1}}", ""))
-    with pytest.raises(NumericError, match="would remove every Gaussian"):
+    with pytest.raises(NumericError, match="would remove all Gaussians"):
         train(tiny_scene, out, "cleanup.rules.0.opacity_below=1", pipeline=str(path))
     assert "the state of step 4 is saved in" in caplog.text
     assert [path.name for path in checkpoint.saved(out)] == ["step_000004.npz"]
@@ -185,11 +185,11 @@ def test_refusal_keeps_trained_state_without_earlier_checkpoint(finished, tiny_s
     ("rules", "complaint"),
     [
         ("[]", "expected a list of at least 1"),
-        ("[clone]", "the rule 'clone' is of growth; expected rules that remove"),
-        ("[merge_neighbors]", "the rule 'merge_neighbors' changes Gaussians that stay; use it in densify"),
+        ("[clone]", "the rule 'clone' grows; expected rules that remove"),
+        ("[merge_neighbors]", "the rule 'merge_neighbors' changes the Gaussians that it keeps; use it in densify"),
         (
             "[{type: prune_faint, start: 9}]",
-            "the rule 'prune_faint' has a start, and cleanup applies it once; expected",
+            "the rule 'prune_faint' has a 'start', but cleanup applies it once; remove",
         ),
         ("[{type: prune_scored}]", "the rule 'prune_scored' reads screen_grad of training steps; use it in densify"),
     ],

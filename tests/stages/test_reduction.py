@@ -167,8 +167,8 @@ def test_an_interruption_between_edits_changes_no_bit(finished, tiny_scene, pipe
 @pytest.mark.parametrize(
     ("fields", "complaint"),
     [
-        ("{}", "expected one of 'keep' and 'remove'"),
-        ("{keep: 0.5, remove: 0.5}", "expected one of 'keep' and 'remove'"),
+        ("{}", "give either 'keep' or 'remove'"),
+        ("{keep: 0.5, remove: 0.5}", "give either 'keep' or 'remove'"),
         ("{keep: 0.0}", "greater than 0"),
         ("{remove: 1.0}", "less than 1"),
         ("{remove: 0.5, score: weights}", "expected 'weight' or 'sensitivity'"),

@@ -10,7 +10,7 @@ from clsplat.metrics.views import ViewMetrics
 from clsplat.render.backdrops import Auto, Backdrop, EnvironmentMap
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
-from clsplat.stages.report import FEW, far_below, of_capture, of_test_views, of_training_views, widest_gap
+from clsplat.stages.report import FEW_PHOTOS, far_below, from_capture, from_test_views, from_training_views, widest_gap
 from clsplat.training.modules.sky_choice import sky_advice
 
 CAMERA = Camera(40, 30, 40.0, 40.0, 20.0, 15.0)
@@ -37,28 +37,28 @@ def test_views_far_below_the_median_are_named_the_worst_first():
 
 
 def test_training_photographs_that_disagree_are_named():
-    (text,) = of_training_views(measured([30, 31, 10, 30]), has_colors=False)
-    assert text.startswith("2.jpg disagrees with the others")
-    (text,) = of_training_views(measured([30] * 9 + [10, 11, 12, 13, 14]), has_colors=False)
+    (text,) = from_training_views(measured([30, 31, 10, 30]), has_exposures=False)
+    assert text.startswith("2.jpg disagrees with the other photos")
+    (text,) = from_training_views(measured([30] * 9 + [10, 11, 12, 13, 14]), has_exposures=False)
     assert text.startswith("9.jpg, 10.jpg, 11.jpg and 2 more disagree with")
-    assert not [*of_training_views([], has_colors=False)]
+    assert not [*from_training_views([], has_exposures=False)]
 
 
-@pytest.mark.parametrize(("gained", "has_colors", "said"), [(0.9, False, 0), (1.5, False, 1), (1.5, True, 0)])
-def test_colors_that_differ_are_said_where_none_are_trained(gained, has_colors, said):
-    texts = [*of_training_views(measured([30, 30, 31], gained), has_colors)]
+@pytest.mark.parametrize(("gained", "has_exposures", "said"), [(0.9, False, 0), (1.5, False, 1), (1.5, True, 0)])
+def test_colors_that_differ_are_said_where_none_are_trained(gained, has_exposures, said):
+    texts = [*from_training_views(measured([30, 30, 31], gained), has_exposures)]
     assert len(texts) == said
-    assert all("1.5 dB nearer" in text and "optimize.modules.exposure={}" in text for text in texts)
+    assert all("would gain 1.5 dB" in text and "optimize.modules.exposure={}" in text for text in texts)
 
 
 def test_photographs_whose_colors_cannot_be_fitted_are_ignored():
     found = [*measured([30, 30], 1.5), ViewMetrics("half.jpg", 30, 0.9, {}, {"psnr_affine": 90.0})]
-    assert "1.5 dB nearer" in "".join(of_training_views(found, has_colors=False))
-    assert not [*of_training_views(found[2:], has_colors=False)]
+    assert "would gain 1.5 dB" in "".join(from_training_views(found, has_exposures=False))
+    assert not [*from_training_views(found[2:], has_exposures=False)]
 
 
 def test_test_views_that_are_much_worse_are_named():
-    (text,) = of_test_views({"a": 22.0, "b": 16.0, "c": 26.0})
+    (text,) = from_test_views({"a": 22.0, "b": 16.0, "c": 26.0})
     assert text.startswith("b: much worse")
 
 
@@ -75,9 +75,9 @@ def test_a_sky_that_was_added_is_said_with_its_reason():
 
 
 def test_few_photographs_are_said():
-    assert "1 training photograph: few" in "".join(of_capture(around([0]), around([0])))
-    many = around([i * 360 / FEW for i in range(FEW)])
-    assert not [*of_capture(many, many)]
+    assert "only 1 training photograph" in "".join(from_capture(around([0]), around([0])))
+    many = around([i * 360 / FEW_PHOTOS for i in range(FEW_PHOTOS)])
+    assert not [*from_capture(many, many)]
 
 
 @pytest.mark.parametrize("turn", [0, 250])

@@ -207,7 +207,7 @@ def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, 
 )
 def test_measurement_never_due_is_refused_before_the_first_step(tiny_scene, tmp_path, pipeline, own):
     during = f"optimize.during=[evaluate: {own}]"
-    with pytest.raises(ConfigError, match="needs a measurement of the validation views before the last step"):
+    with pytest.raises(ConfigError, match="needs a measurement of the validation views until the last step"):
         train(tiny_scene, tmp_path / "run", during, pipeline=pipeline)
 
 
@@ -218,7 +218,7 @@ def test_measurements_of_a_later_training_count_from_its_start(tmp_path):
         (tmp_path / "x.yaml").write_text("name: x\nscene: {validation: auto}\n" + stages.format(first, 4, during))
         assert load(str(tmp_path / "x.yaml")).settings.training
         (tmp_path / "x.yaml").write_text("name: x\nscene: {validation: auto}\n" + stages.format(first, 3, during))
-        with pytest.raises(ConfigError, match="needs a measurement of the validation views before the last step"):
+        with pytest.raises(ConfigError, match="needs a measurement of the validation views until the last step"):
             load(str(tmp_path / "x.yaml"))
 
 
@@ -323,9 +323,9 @@ def test_photographs_that_are_kept_out_do_not_change_the_model(tiny_scene, tmp_p
 @pytest.mark.parametrize(
     ("settings", "fault"),
     [
-        (["scene.validation=0"], "expected scene.validation: auto"),
-        (["optimize.keep=last", "optimize.patience=3"], "'patience' is for 'keep: best'; give both or neither"),
-        (["optimize.keep=last", "optimize.refit=true"], "'refit' is for 'keep: best'"),
+        (["scene.validation=0"], "set scene.validation: auto"),
+        (["optimize.keep=last", "optimize.patience=3"], "'patience' needs 'keep: best'; set both or neither"),
+        (["optimize.keep=last", "optimize.refit=true"], "'refit' needs 'keep: best'"),
     ],
 )
 def test_what_has_nothing_to_choose_by_is_refused(pipeline, settings, fault):
@@ -337,7 +337,7 @@ def test_other_models_at_the_end_are_refused(tmp_path):
     head = "name: x\nscene: {validation: auto}\nstages:\n  - init: {}\n"
     one = "  - optimize: {steps: 9, keep: best, losses: [l1], during: [{add_to_average: {every: 2}}]}\n"
     two = "  - optimize: {steps: 9, losses: [l1]}\n  - optimize: {steps: 9, keep: best, refit: true, losses: [l1]}\n"
-    for stages, fault in ((one, "not the average of several"), (two, "expected one stage that trains, found 2")):
+    for stages, fault in ((one, "not an average"), (two, "expected a single stage that trains, got 2")):
         (tmp_path / "x.yaml").write_text(head + stages)
         with pytest.raises(ConfigError, match=fault):
             load(str(tmp_path / "x.yaml"))
@@ -361,7 +361,7 @@ def test_a_trainer_needs_a_scene_with_validation_views(tiny_scene, pipeline):
     import clsplat
 
     trainer = Trainer(clsplat.read_scene(tiny_scene), pipeline)
-    with pytest.raises(ConfigError, match="expected some: set"):
+    with pytest.raises(ConfigError, match="set scene"):
         trainer.step()
 
 

@@ -154,7 +154,7 @@ def test_a_model_without_gaussians_is_nothing_to_start_from(tiny_scene, tmp_path
     path = tmp_path / "empty.ply"
     widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 45}
     write_ply(path, {name: np.zeros((0, width), np.float32) for name, width in widths.items()}, {})
-    with pytest.raises(DataError, match=r"empty\.ply: holds no Gaussians"):
+    with pytest.raises(DataError, match=r"empty\.ply: the model has no Gaussians"):
         train(tiny_scene, tmp_path / "run", "init.source=model", f"init.file='{path}'")
 
 

@@ -42,7 +42,9 @@ def test_names_are_escaped(page):
     views = [{**view, "name": f"{HOSTILE}{i}"} for i, view in enumerate(page.views)]
     start = replace(page.viewpoint.start, name=f"{HOSTILE}0")
     models = {HOSTILE: page.models["model"], f"{HOSTILE}B": page.models["model"]}
-    text = replace(page, title=HOSTILE, models=models, views=views, stand=replace(page.viewpoint, start=start)).text()
+    text = replace(
+        page, title=HOSTILE, models=models, views=views, viewpoint=replace(page.viewpoint, start=start)
+    ).text()
     parsed = Parsed(text)
     assert parsed.elements["script"] == 4, "the scene, two models and the program"
     assert parsed.text.count(HOSTILE) == 2 + 2 + 2 * 3, "title twice, a label and three facts of each model"
