@@ -236,9 +236,6 @@ WRITERS: dict[str, Callable[[Path, list[PosedView], PointCloud | None, Tracks | 
     "nerfstudio": write_nerfstudio,
     "inria": write_inria,
 }
-CHECKS: dict[str, Callable[[list[PosedView]], None]] = {  # what a format cannot hold
-    "nerfstudio": check_nerfstudio,
-}
 PLACES = {  # that each writes
     "colmap": [MODEL / name for name in FILES],
     "nerfstudio": [Path(NERFSTUDIO_FILE), Path(POINTS)],
@@ -253,8 +250,8 @@ TRACKS = "colmap"  # what keeps which points the photographs show
 def check_cameras(scene: Scene, format_: str) -> list[PosedView]:
     """Return the views as a format names them.  Raises DataError for what it cannot hold."""
     views = posed_views(scene)
-    if format_ in CHECKS:
-        CHECKS[format_](views)
+    if format_ == "nerfstudio":
+        check_nerfstudio(views)
     return views
 
 

@@ -1,4 +1,4 @@
-"""The files of a dataset: allowed paths, bytes and images."""
+"""Read the image files of a dataset: headers, pixels, EXIF data; write images."""
 
 import json
 import logging
@@ -20,9 +20,9 @@ from clsplat.core.errors import DataError, quote, shorten
 from clsplat.core.files import open_atomic, write_text
 from clsplat.core.reading import open_file, read_file, read_json
 
-# The size, the orientation and the end of a photograph, from its bytes, without decoding it.
+# Size, orientation and completeness of an image file, without decoding it.
 
-HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes that are looked at, at either end
+HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes to read at either end
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 JPEG, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of a frame header
@@ -40,17 +40,17 @@ class Header:
 
 
 def parse_header(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None:
-    """Return the header of a PNG or JPEG file from its first and last bytes; None for anything else.
+    """Return the header of a PNG or JPEG file from its first and last bytes; None for other formats.
 
-    `whole` returns all bytes: it is called where neither end holds what is looked for.
+    `whole` returns all bytes; it is called when the end marker is in neither part.
     """
-    found = None
+    header = None
     if head.startswith(PNG) and head[12:16] == b"IHDR" and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
-        found = Header(width, height, complete=PNG_END in tail or PNG_END in whole())
+        header = Header(width, height, complete=PNG_END in tail or PNG_END in whole())
     elif head.startswith(JPEG):
-        found = _jpeg(head, tail, whole)
-    return found if found and found.width and found.height else None
+        header = _jpeg(head, tail, whole)
+    return header if header and header.width and header.height else None
 
 
 def is_truncated(data: bytes) -> bool:
@@ -65,7 +65,7 @@ def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None
     for marker, at, length in jpeg_segments(head):
         if marker in FRAMES:
             height, width = struct.unpack_from(">HH", head, at + 5)
-            # An end marker cannot be part of the pixels; that of a thumbnail lies before them.
+            # Pixels cannot contain an end marker; a thumbnail has one, but before the frame header.
             complete = JPEG_END in tail or whole().find(JPEG_END, at) >= 0
             return Header(width, height, orientation, complete)
         if _is_exif(head, marker, at):
@@ -74,12 +74,12 @@ def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None
 
 
 def find_exif_segment(head: bytes) -> tuple[int, int] | None:
-    """Return the place and the length of the Exif segment in the first bytes of a JPEG file; None without one.
+    """Return the offset and length of the Exif segment in the first bytes of a JPEG file; None without one.
 
-    Its block of tags begins 10 bytes behind the place.
+    Its TIFF block starts 10 bytes after the offset.
     """
-    found = ((at, length) for marker, at, length in jpeg_segments(head) if _is_exif(head, marker, at))
-    return next(found, None) if head.startswith(JPEG) else None
+    matches = ((at, length) for marker, at, length in jpeg_segments(head) if _is_exif(head, marker, at))
+    return next(matches, None) if head.startswith(JPEG) else None
 
 
 def _is_exif(head: bytes, marker: int, at: int) -> bool:
@@ -87,7 +87,7 @@ def _is_exif(head: bytes, marker: int, at: int) -> bool:
 
 
 def jpeg_segments(head: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield the marker, the place and the length of the segments of a JPEG file; none behind a damaged one."""
+    """Yield the marker, offset and length of each segment of a JPEG file, up to a damaged one."""
     at = 2
     while at + 9 <= len(head) and head[at] == 0xFF:
         marker = head[at + 1]
@@ -100,14 +100,14 @@ def jpeg_segments(head: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _orientation(exif: bytes) -> int:
-    """The orientation in a TIFF block, 1 to 8; 1 where there is none."""
+    """The orientation in a TIFF block, 1 to 8; 1 if missing."""
     at = find_orientation(exif)
     value = struct.unpack_from({b"II": "<", b"MM": ">"}[exif[:2]] + "H", exif, at)[0] if at else 1
     return int(value) if 1 <= value <= 8 else 1
 
 
 def find_orientation(exif: bytes) -> int | None:
-    """Return where the orientation, 2 bytes, lies in a TIFF block; None where there is none."""
+    """Return the offset of the orientation, 2 bytes, in a TIFF block; None if missing."""
     order = {b"II": "<", b"MM": ">"}.get(exif[:2])
     if order is None or len(exif) < 8:
         return None
@@ -119,20 +119,25 @@ def find_orientation(exif: bytes) -> int | None:
     return None
 
 
-# PNG files as OpenCV gets them: checked, and without what has nothing to do with pixels.
+# PNG files are checked and stripped before OpenCV reads them.
 
-SIGNATURE = b"\x89PNG\r\n\x1a\n"
-USED = {b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"}  # beside the critical ones, whose names begin with a capital
+USED = {
+    b"tRNS",
+    b"eXIf",
+    b"acTL",
+    b"fcTL",
+    b"fdAT",
+}  # besides the critical chunks, with a capital letter
 
 
 def strip_png_metadata(data: bytes) -> bytes:
-    """Return a PNG without metadata; what is no PNG is returned as it is.
+    """Return a PNG without metadata, and other files unchanged.
 
-    Raises ValueError, with the place, where the file is cut or the checksum of a chunk that matters is wrong.
+    Raises ValueError, with the offset, when the file is truncated or the checksum of a relevant chunk is wrong.
     """
-    if not data.startswith(SIGNATURE):
+    if not data.startswith(PNG):
         return data
-    view, at, kept = memoryview(data), len(SIGNATURE), [memoryview(SIGNATURE)]
+    view, at, chunks = memoryview(data), len(PNG), [memoryview(PNG)]
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)
         kind, end = data[at + 4 : at + 8], at + 12 + length
@@ -141,17 +146,17 @@ def strip_png_metadata(data: bytes) -> bytes:
         if kind in USED or not kind[0] & 0x20:
             if zlib.crc32(view[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
                 raise ValueError(f"byte {at}: the checksum of the chunk {quote(kind.decode('latin-1'))} is wrong")
-            kept.append(view[at:end])
+            chunks.append(view[at:end])
         if kind == b"IEND":
-            return b"".join(kept)
+            return b"".join(chunks)
         at = end
-    raise ValueError(f"byte {at}: expected another chunk, of which {len(data) - at} bytes are left")
+    raise ValueError(f"byte {at}: expected another chunk, but only {len(data) - at} bytes are left")
 
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines name no file; errors here do
 logger = logging.getLogger("clsplat")
-Missing = Literal["refuse", "skip"]  # what to do about photographs that a dataset names and does not have
-MAX_BYTES = (1 << 31) - 1  # of an image file: OpenCV decodes no longer ones
+Missing = Literal["refuse", "skip"]  # what to do about missing photographs
+MAX_BYTES = (1 << 31) - 1  # per image file, the limit of OpenCV
 REDUCED = {  # what OpenCV decodes to gray, by the divisor of the size
     1: cv2.IMREAD_GRAYSCALE,
     2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
@@ -182,7 +187,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def safe_join(folder: Path, name: str, where: str) -> Path:
-    """Return `folder / name`.  Raises DataError, starting with `where`, when that lies outside the folder."""
+    """Return `folder / name`.  Raises DataError, starting with `where`, when that is outside the folder."""
     path = PureWindowsPath(name)  # splits at both kinds of slash and at drives
     if path.anchor or ".." in path.parts or not path.parts or any(letter < " " for letter in name):
         raise DataError(f"{where}: the file name {quote(name)} is not a path below {folder}; rename it")
@@ -190,30 +195,33 @@ def safe_join(folder: Path, name: str, where: str) -> Path:
 
 
 def require_files(path: Path, files: Iterable[Path]) -> None:
-    """Raise DataError, naming the first few, when some of the `files` of the dataset at `path` do not exist."""
+    """Raise DataError that names the first few `files` of the dataset at `path` that do not exist, if any."""
     find_existing(path, list(files), "refuse", "")
 
 
 def find_existing(
-    path: Path, files: Sequence[Path], missing: Missing, remedy: str = ", or --set scene.missing=skip to do without"
+    path: Path,
+    files: Sequence[Path],
+    missing: Missing,
+    remedy: str = ", or --set scene.missing=skip to train without them",
 ) -> list[bool]:
     """Return which of the photographs of the dataset at `path` exist.
 
-    Raises DataError, naming the first few, where some do not, unless those are to be skipped; where none does, always.
+    Raises DataError, naming the first few, when some are missing and `missing` is not skip, or when all are missing.
     """
-    found = [os.path.exists(file) for file in files]  # unlike Path.exists, never raises
-    lost = [str(file) for file, there in zip(files, found, strict=True) if not there]
+    exists = [os.path.exists(file) for file in files]  # unlike Path.exists, never raises
+    lost = [str(file) for file, is_there in zip(files, exists, strict=True) if not is_there]
     if lost:
         names = ", ".join(map(shorten, lost[:3])) + (", ..." if len(lost) > 3 else "")
         fault = f"{path}: {len(lost)} of {len(files)} image files are missing: {names}"
         if missing == "refuse" or len(lost) == len(files):
             raise DataError(f"{fault}; put them back{remedy if len(lost) < len(files) else ''}")
         logger.warning("%s; the scene is read without them", fault)
-    return found
+    return exists
 
 
 def read_header(path: Path) -> Header:
-    """Return the header of an image file; formats but PNG and JPEG are decoded.  Raises DataError."""
+    """Return the header of an image file, decoding formats other than PNG and JPEG.  Raises DataError."""
     with open_file(path, "an image", limit=MAX_BYTES) as file:
         head = file.read(HEAD_SIZE)
         file.seek(max(0, file.seek(0, 2) - TAIL_SIZE))
@@ -227,9 +235,10 @@ def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
 
 
 def read_gray(path: Path, long_side: int) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """Return a photograph as stored in gray, [H, W], no side longer than `long_side` px, and the stored px of one px.
+    """Return a photograph in gray as stored, [H, W], with no side longer than `long_side` px, and its scale factors.
 
-    A JPEG decoder makes half, a quarter or an eighth of the size for less.  Raises DataError as decode_image does.
+    The factors, in x and y, are stored pixels per returned pixel.  JPEG files are decoded at 1/2, 1/4 or 1/8 of their
+    size, which is faster.  Raises DataError as decode_image does.
     """
     data = read_file(path, "an image", limit=MAX_BYTES)
     header = parse_header(data[:HEAD_SIZE], data[-TAIL_SIZE:], lambda: data) if data.startswith(JPEG) else None
@@ -271,20 +280,20 @@ def _decoded(data: bytes, path: Path, flags: int) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-# What a camera noted of a photograph's exposure: Exif 2.3 in JPEG files, or a file beside images that lost it.
+# Camera settings of a photograph: Exif 2.3 in JPEG files, or a file next to images without it.
 
 EXPOSURES_FILE = "exposures.json"  # in a folder of images
-SUB_FOLDER = 0x8769  # tags: where those of the exposure are
+EXIF_IFD = 0x8769  # tag with the offset of the exposure tags
 SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
-MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm on film of 35 mm
-TEXT, SHORT, LONG, RATIONAL = 2, 3, 4, 5  # kinds of values
+MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm equivalent for 35 mm film
+TEXT, SHORT, LONG, RATIONAL = 2, 3, 4, 5  # types of values
 POSSIBLE = ((1e-7, 1e5), (0.1, 1e3), (0.1, 1e8))  # seconds, f-number, ISO
 Value = float | str
 
 
 @dataclass(frozen=True)
 class CameraExposure:
-    """The settings that decide how bright a photograph of the same light is."""
+    """The camera settings that determine how bright a photograph is."""
 
     seconds: float
     aperture: float  # f-number
@@ -292,110 +301,102 @@ class CameraExposure:
 
     @property
     def value(self) -> float:
-        """The logarithm to base 2 of the light that makes a photograph, by its sensitivity."""
+        """The exposure in stops: the base-2 logarithm of seconds x ISO / f-number²."""
         return math.log2(self.seconds * self.iso / self.aperture**2)
 
 
 def read_exif_exposure(path: Path) -> CameraExposure | None:
-    """Return the exposure that a JPEG file tells; None where it does not.  Raises DataError when it cannot be read."""
+    """Return the exposure in the EXIF data of a JPEG file, or None.  Raises DataError when it cannot be read."""
     with open_file(path, "an image") as file:
-        return parse_exif_exposure(file.read(HEAD_SIZE))
-
-
-def parse_exif_exposure(head: bytes) -> CameraExposure | None:
-    """Return the exposure in the first bytes of a JPEG file, or None."""
-    tags = _tags(head)
+        tags = _read_tags(file.read(HEAD_SIZE))
     return make_exposure(tags.get(SECONDS), tags.get(APERTURE), tags.get(ISO))
 
 
 def read_exif_optics(path: Path) -> tuple[Value, ...] | None:
-    """Return make, model and focal lengths of the camera that took a JPEG file; None where it does not tell them.
+    """Return make, model and focal lengths of the camera of a JPEG file; None without focal lengths.
 
     Raises DataError when it cannot be read.
     """
     with open_file(path, "an image") as file:
-        tags = _tags(file.read(HEAD_SIZE))
-    told = [tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL, FOCAL_35)]
-    return tuple(told) if any(told[2:]) else None
+        tags = _read_tags(file.read(HEAD_SIZE))
+    values = [tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL, FOCAL_35)]
+    return tuple(values) if any(values[2:]) else None
 
 
 def copy_exif(head: bytes, jpeg: bytes) -> bytes:
-    """Return a JPEG file of upright pixels with the EXIF data in the first bytes of another, but for the rotation."""
-    found = find_exif_segment(head)
-    if found is None:
+    """Return the upright `jpeg` with the EXIF data in the first bytes of another file, without its rotation."""
+    segment = find_exif_segment(head)
+    if segment is None:
         return jpeg
-    at, length = found
+    at, length = segment
     block = bytearray(head[at : at + 2 + length])
-    if place := find_orientation(bytes(block[10:])):
-        block[10 + place : 12 + place] = struct.pack({b"II": "<H", b"MM": ">H"}[bytes(block[10:12])], 1)
+    if offset := find_orientation(bytes(block[10:])):
+        block[10 + offset : 12 + offset] = struct.pack({b"II": "<H", b"MM": ">H"}[bytes(block[10:12])], 1)
     return jpeg[:2] + bytes(block) + jpeg[2:]
 
 
-def _tags(head: bytes) -> dict[int, Value]:
-    """What the first bytes of a JPEG file tell by tag, as far as it can be read."""
-    found = find_exif_segment(head)
+def _read_tags(head: bytes) -> dict[int, Value]:
+    """The readable EXIF values in the first bytes of a JPEG file, by tag."""
+    segment = find_exif_segment(head)
     tags: dict[int, Value] = {}
-    if found is None:
+    if segment is None:
         return tags
-    at, length = found
+    at, length = segment
     block = head[at + 10 : at + 2 + length]
-    with suppress(struct.error, KeyError, ValueError):  # cut, without such a folder, or with no number for its place
+    with suppress(struct.error, KeyError, ValueError):  # truncated, or without EXIF tags
         order = {b"II": "<", b"MM": ">"}[block[:2]]
         (start,) = struct.unpack_from(order + "I", block, 4)
         tags.update(_values(block, order, int(start)))
-        tags.update(_values(block, order, int(tags[SUB_FOLDER])))
+        tags.update(_values(block, order, int(tags[EXIF_IFD])))
     return tags
 
 
 def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
-    """The numbers and texts of a folder of tags; of several numbers the first."""
-    found: dict[int, Value] = {}
+    """The values of an IFD by tag; of several numbers the first."""
+    values: dict[int, Value] = {}
     (entries,) = struct.unpack_from(order + "H", block, start)
     for at in range(start + 2, start + 2 + 12 * entries, 12):
         tag, kind, count, value = struct.unpack_from(order + "HHII", block, at)
         if kind == RATIONAL:
             above, below = struct.unpack_from(order + "II", block, value)
             if below:
-                found[tag] = above / below
+                values[tag] = above / below
         elif kind in (SHORT, LONG):
-            (found[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, at + 8)
+            (values[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, at + 8)
         elif kind == TEXT:
             place = value if count > 4 else at + 8
-            found[tag] = block[place : place + count].split(b"\0")[0].decode("ascii", "replace").strip()
-    return found
+            values[tag] = block[place : place + count].split(b"\0")[0].decode("ascii", "replace").strip()
+    return values
 
 
 def make_exposure(seconds: object, aperture: object, iso: object) -> CameraExposure | None:
-    """Return an exposure, or None where a value is no number that a camera can have."""
-    numbers = [float(one) for one in (seconds, aperture, iso) if isinstance(one, int | float)]
-    possible = len(numbers) == 3 and all(low < one < high for one, (low, high) in zip(numbers, POSSIBLE, strict=True))
-    return CameraExposure(*numbers) if possible else None
+    """Return an exposure, or None when a value is not a number that a camera can have."""
+    numbers = [float(value) for value in (seconds, aperture, iso) if isinstance(value, int | float)]
+    is_valid = len(numbers) == 3 and all(low < n < high for n, (low, high) in zip(numbers, POSSIBLE, strict=True))
+    return CameraExposure(*numbers) if is_valid else None
 
 
 def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]) -> None:
-    """Write the exposures of the images of a folder, by name, where any is known.  Raises OutputError."""
+    """Write the known exposures of the images in a folder, by name, if there are any.  Raises OutputError."""
     known = {name: asdict(exposure) for name, exposure in exposures.items() if exposure}
     if known:
         write_text(folder / EXPOSURES_FILE, json.dumps(known, indent=1) + "\n")
 
 
 def read_exposures(folder: Path) -> dict[str, CameraExposure]:
-    """Return the exposures that lie beside the images of a folder; none where there is no such file.
+    """Return the exposures in the file of a folder of images; none without the file.
 
-    Raises DataError where it is damaged.
+    Raises DataError when it is damaged.
     """
     path = folder / EXPOSURES_FILE
     if not path.is_file():
         return {}
-    data, expected = (
-        read_json(path, "exposures of images"),
-        "expected {name: {seconds, aperture, iso}}: remove it",
-    )
+    data, expected = read_json(path, "exposures of images"), "expected {name: {seconds, aperture, iso}}: remove it"
     if not isinstance(data, dict):
         raise DataError(f"{path}: {expected}")
-    found = {}
+    exposures = {}
     for name, row in data.items():
         if not isinstance(row, dict) or not (exposure := make_exposure(*map(row.get, ("seconds", "aperture", "iso")))):
             raise DataError(f"{path}: the exposure of one image is not three positive numbers; {expected}")
-        found[name] = exposure
-    return found
+        exposures[name] = exposure
+    return exposures

@@ -1,4 +1,4 @@
-"""The base class of all dataset readers."""
+"""Define the base class of dataset readers, and datasets in pieces."""
 
 import inspect
 from abc import ABC, abstractmethod
@@ -15,14 +15,12 @@ from clsplat.scene.points import PointTable
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 
-# A dataset in pieces: a damaged piece becomes a fault, and the other pieces stay readable.
-
 Result = TypeVar("Result")
 
 
 @dataclass
 class Parts:
-    """A dataset in pieces.
+    """A dataset in pieces: a damaged piece becomes a fault, and the others stay readable.
 
     `scene` is None when the dataset cannot be read as a whole; `refusal` is the reason why training does not start.
     """
@@ -30,26 +28,24 @@ class Parts:
     path: Path
     kind: str = "none"
     views: list[View] = field(default_factory=list)  # whether or not their files exist
-    models: dict[str, str] = field(default_factory=dict)  # camera models by view, where the dataset names them
-    observed: dict[str, int] = field(default_factory=dict)  # points seen, by view, where the dataset has them
-    submodels: dict[str, int] = field(default_factory=dict)  # images of each COLMAP model, the one that is used first
+    models: dict[str, str] = field(default_factory=dict)  # camera model of each view, if the dataset names it
+    observed: dict[str, int] = field(default_factory=dict)  # number of points seen by each view, if known
+    submodels: dict[str, int] = field(default_factory=dict)  # images of each COLMAP model, the one in use first
     points: PointTable | None = None
-    image_folder: Path | None = None  # holds all images of the dataset; None: the folders of `expected`
-    on_disk: list[Path] = field(default_factory=list)  # image files where the views' files are looked for
+    image_folder: Path | None = None  # contains all images; None: those in `expected`
+    on_disk: list[Path] = field(default_factory=list)  # image files in the folders of the views
     expected: list[Path] = field(default_factory=list)  # files that the dataset names
     faults: list[str] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)  # what is told of files that are no photographs for `prepare`
+    left_out: list[str] = field(default_factory=list)  # warnings about files that `prepare` cannot read
     scene: Scene | None = None
     refusal: str = ""
-    _said: set[str] = field(default_factory=set)  # of `faults`
 
     def attempt(self, read: Callable[..., Result], *arguments: Any) -> Result | None:
-        """Return what a function reads; where it raises DataError, note the fault and return None."""
+        """Call a function and return its result; when it raises DataError, record the fault and return None."""
         try:
             return read(*arguments)
         except DataError as error:
-            if str(error) not in self._said:
-                self._said.add(str(error))
+            if str(error) not in self.faults:
                 self.faults.append(str(error))
             return None
 
@@ -57,13 +53,13 @@ class Parts:
 class Reader(ABC):
     """A dataset format.
 
-    All commands use a subclass as soon as it is defined; they do not use a class that has subclasses of its own.  A
-    class that is defined again, as in a notebook, replaces the one before.
+    All commands use a subclass as soon as it is defined, unless it has subclasses itself.  A class that is defined
+    again, as in a notebook, replaces the earlier one.
     """
 
     name: ClassVar[str]  # of the format
     expects: ClassVar[str]  # the files that mark the format, in a few words
-    missing: Missing = "refuse"  # what to do about photographs that the dataset names and does not have
+    missing: Missing = "refuse"  # what to do about missing photographs
     defined: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -83,13 +79,13 @@ class Reader(ABC):
 
     @abstractmethod
     def read(self, path: Path, holdout: int) -> Scene:
-        """Read the dataset in a folder; every `holdout`-th view is for testing where the dataset has no split.
+        """Read the dataset in a folder; every `holdout`-th view is a test view if the dataset has no split.
 
         Raises DataError when a file is missing, damaged or not supported.
         """
 
     def list_parts(self, parts: Parts) -> None:
-        """Add the readable pieces of a dataset, which may be damaged; by default those that `read` returned."""
+        """Add the readable pieces of a dataset, which may be damaged; by default, those of the scene."""
         scene = parts.scene
         if scene is not None:
             parts.views = list(scene.views)

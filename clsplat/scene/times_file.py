@@ -1,4 +1,4 @@
-"""times.json in a folder of photographs: at which moment each of them was taken, in any unit."""
+"""Read and write times.json, the timestamp of each photograph in a folder, in any unit."""
 
 import json
 import os
@@ -18,16 +18,16 @@ LARGEST = 1 << 26  # bytes
 
 
 def write_times(folder: Path, times: Mapping[str, float]) -> None:
-    """Write the moments of photographs by their names below `folder`.  Raises OutputError."""
+    """Write the timestamps of photographs by their names below `folder`.  Raises OutputError."""
     write_text(folder / FILE, json.dumps(dict(times), indent=1) + "\n")
 
 
 def read_times(folder: Path) -> dict[str, float] | None:
-    """Return the moments of the photographs below `folder` by name, None without a file.  Raises DataError."""
+    """Return the timestamps of the photographs below `folder` by name; None without a file.  Raises DataError."""
     path = folder / FILE
-    if not os.path.lexists(path):  # what is there and is no file is refused when it is read
+    if not os.path.lexists(path):  # reading reports a path that is not a file
         return None
-    table = read_json(path, "moments of photographs in JSON", limit=LARGEST)
+    table = read_json(path, "timestamps of photographs in JSON", limit=LARGEST)
     if not isinstance(table, dict):
         raise DataError(f"{path}: expected a table with a number for each photograph, by name")
     for name, value in table.items():
@@ -49,5 +49,5 @@ def add_times(views: list[View], folder: Path) -> list[View]:
         return views
     clock = make_clock(folder / FILE, [(view.name, times.get(view.name)) for view in views])
     if clock is None:
-        raise DataError(f"{folder / FILE}: names none of the {len(views)} photographs; write their names as below it")
+        raise DataError(f"{folder / FILE}: names none of the {len(views)} photographs; write their relative paths")
     return [replace(view, time=float(clock(times[view.name]))) for view in views]

@@ -144,10 +144,8 @@ def color_of(background: ArrayLike) -> Floats:
     try:
         color = np.asarray(background, np.float64)
     except (ValueError, TypeError):
-        raise ValueError(f"the background is {quote(background)}; expected one number or three in [0, 1]") from None
-    if color.shape not in ((), (3,)):
-        raise ValueError(f"the background has shape {color.shape}; expected one number or three")
-    if not ((color >= 0) & (color <= 1)).all():
+        color = np.empty(0)
+    if color.shape not in ((), (3,)) or not ((color >= 0) & (color <= 1)).all():
         raise ValueError(f"the background is {quote(background)}; expected one number or three in [0, 1]")
     return np.broadcast_to(color, (3,))
 

@@ -1,4 +1,4 @@
-"""A choice of a scene's views by their names: every n-th, a list, or the lines of a file."""
+"""Select views of a scene by name: every n-th, a list, or the lines of a file; split a scene with them."""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,7 +18,7 @@ from clsplat.scene.scene import HOLDOUT, Scene, camera_extent, every_nth, other_
 LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
 TakenBy = Literal["holdout", "train", "missing"]
-Taken = Mapping[TakenBy, Sequence[str]]  # names that are no training views, by the key that says so, or their files
+Taken = Mapping[TakenBy, Sequence[str]]  # names that cannot be selected, by the setting that excludes them
 NONE: Taken = {}
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
@@ -32,38 +32,38 @@ def _text(value: Any) -> Any:
 
 
 class MissingViewError(DataError):
-    """A fault of a choice that follows from which photographs are there: fewer of them may not have it."""
+    """A selection that does not fit the photographs at hand; it may fit once they are prepared."""
 
 
 class ViewSelection(Settings):
-    """Views by name: every n-th from one on, or those of a list, or of a file with a name a line.
+    """Views by name: every n-th, those of a list, or those of a file with one name per line.
 
-    A listed name is that of the view, or its end: `0042`, `0042.jpg` and `images/0042.jpg` name the same photograph.
-    It has this name, too, where it was prepared as `0042.png`.
+    A listed name may be the end of a view's name: `0042`, `0042.jpg` and `images/0042.jpg` name the same photograph,
+    also when it was prepared as `0042.png`.
     """
 
     every: Annotated[int, Field(gt=0)] | None = None
     """Every n-th view, in order of name."""
     offset: Annotated[int, Field(ge=0)] = 0
-    """Place of the first of them, counted from 0."""
+    """Index of the first view, counted from 0."""
     names: Annotated[list[Annotated[str, BeforeValidator(_text)]], Field(min_length=1)] | None = None
     """Names of the views."""
     file: InputPath | None = None
-    """Text file with a name a line; a relative path is one in the folder of the dataset."""
+    """Text file with one name per line; a relative path is relative to the folder of the dataset."""
 
     @model_validator(mode="before")
     @classmethod
     def _as_meant(cls, value: Any) -> Any:
-        """Say what is wrong with tables that are nearly right."""
+        """Explain what is wrong with tables that are nearly right."""
         if not isinstance(value, dict):
             return value
         if any(isinstance(key, str) and ":" in key and given is None for key, given in value.items()):
-            raise ValueError(f"{NOTATIONS} (YAML needs a blank after each colon)")
+            raise ValueError(f"{NOTATIONS} (YAML needs a space after each colon)")
         offset = value.get("offset")
         if isinstance(offset, int) and offset < 0:
             raise ValueError(f"expected an offset of 0 or more, not {quote(offset)}")
         if "offset" in value and len(value) == 1:
-            raise ValueError("expected every beside offset, as in {every: 8, offset: 4}")
+            raise ValueError("expected every next to offset, as in {every: 8, offset: 4}")
         return value
 
     @model_validator(mode="after")
@@ -72,7 +72,7 @@ class ViewSelection(Settings):
         if sum(value is not None for value in given) != 1 or (self.offset and self.every is None):
             raise ValueError(NOTATIONS)
         if self.every is not None and self.offset >= self.every:
-            raise ValueError(f"expected an offset below every, {self.every}")
+            raise ValueError(f"expected an offset less than every, {self.every}")
         return self
 
     def input_path(self, key: str, scene: str | None) -> Path | None:
@@ -80,55 +80,52 @@ class ViewSelection(Settings):
         return place and Path(scene or "") / place
 
     def select(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> set[int]:
-        """Return the indices of the chosen ones of `names`.
+        """Return the indices of the selected `names`.
 
-        folders: where a relative file is looked for, in order; others: names that may not be chosen, and those whose
-        photographs are missing, which are skipped.  Raises DataError for a name that no view has, or several have.
+        folders: where to look for a relative file, in order; others: names that must not be selected, and names with
+        missing photographs, which are skipped.  Raises DataError for names that match no view or several.
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
         place, listed = self._listed(folders)
-        own, of_others = _Ends(names), {key: _Ends(taken) for key, taken in others.items()}
-        found_at = {name: own.indices_of(name) for name in listed}
-        for name in [name for name, found in found_at.items() if not found]:
-            for key in (key for key, taken in of_others.items() if taken.indices_of(name)):
+        index, excluded = _NameIndex(names), {key: _NameIndex(taken) for key, taken in others.items()}
+        found_at = {name: index.indices_of(name) for name in listed}
+        for name in [name for name, matches in found_at.items() if not matches]:
+            for key in (key for key, taken in excluded.items() if taken.indices_of(name)):
                 if key != "missing":
                     raise _taken(place, name, key)
                 del found_at[name]
         if lost := len({*listed}) - len(found_at):
             LOG.info("%s: skipped %s whose photograph is missing", place, pluralize(lost, "name"))
-        chosen = {name: _only(name, found, names, place) for name, found in found_at.items()}
-        for name, i in chosen.items():
-            _tell_of_another(name, names[i], place)
-        return set(chosen.values())
+        return {_only(name, matches, names, place) for name, matches in found_at.items()}
 
     def check(self, names: Sequence[str], folders: Sequence[Path], others: Taken = NONE) -> list[str]:
-        """Return those of `names` that are listed, some of which may be left out later; none of every n-th.
+        """Return the listed names, some of which may be left out later; none for every n-th.
 
-        others: names that may not be chosen.  Raises DataError for a name that means none, or only such.
+        others: names that must not be selected.  Raises DataError for a name that matches none, or only such names.
         """
         if self.every is not None:
             return []
         place, listed = self._listed(folders)
-        own, of_others = _Ends(names), {key: {*taken} for key, taken in others.items()}
-        found = {name: own.indices_of(name) for name in listed}
-        for name, indices in found.items():
+        index, excluded = _NameIndex(names), {key: {*taken} for key, taken in others.items()}
+        matches = {name: index.indices_of(name) for name in listed}
+        for name, indices in matches.items():
             if not indices:
                 raise _unknown(name, names, place)
-            for key in (key for key, taken in of_others.items() if {names[i] for i in indices} <= taken):
+            for key in (key for key, taken in excluded.items() if {names[i] for i in indices} <= taken):
                 raise _taken(place, name, key)
-        return [names[i] for indices in found.values() for i in indices]
+        return [names[i] for indices in matches.values() for i in indices]
 
     def _listed(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
-        """Where the names are listed, and these.  Raises DataError where the file cannot be read, or has none."""
+        """The source of the listed names, for messages, and the names.  Raises DataError for a bad or an empty file."""
         if self.file is None:
             return "the list of names", self.names or []
         files = [folder / self.file for folder in folders]
-        found = next((file for file in files if file.is_file()), files[-1])
-        lines = (line.strip() for line in read_text(found, limit=LARGEST).splitlines())
+        path = next((file for file in files if file.is_file()), files[-1])
+        lines = (line.strip() for line in read_text(path, limit=LARGEST).splitlines())
         if listed := [line for line in lines if line and not line.startswith("#")]:
-            return str(found), listed
-        raise DataError(f"{found}: is empty; expected the name of a photograph in each line")
+            return str(path), listed
+        raise DataError(f"{path}: is empty; expected the name of a photograph in each line")
 
 
 Number = Annotated[int, Field(ge=0)]
@@ -137,10 +134,10 @@ ChosenOrAuto = Annotated[Number | ViewSelection | Literal["auto"], in_one_senten
 
 
 def _taken(place: str, name: str, key: TakenBy) -> DataError:
-    """The error of a name that cannot be chosen, since a key of the scene's settings leaves it to another use."""
+    """The error for a name that cannot be selected, since another setting of the scene excludes it."""
     why, remedy = {
-        "holdout": ("is held out for testing", "out of scene.holdout"),
-        "train": ("is left out by scene.train", "put it into scene.train"),
+        "holdout": ("is a test view", "from scene.holdout"),
+        "train": ("is left out by scene.train", "add it to scene.train"),
     }[key]
     told = f"{quote(name)} {why}; expected training photographs: take it out of this list, or {remedy}"
     return MissingViewError(f"{place}: {told}")
@@ -156,8 +153,8 @@ def choose(
     return choice.select(names, folders, others) if isinstance(choice, ViewSelection) else every_nth(names, choice)
 
 
-class _Ends:
-    """Names of views by their ends: `a/b.png`, `b.png` and `b` mean the same one."""
+class _NameIndex:
+    """Find views by the ends of their names: `a/b.png`, `b.png` and `b` are the same view."""
 
     def __init__(self, names: Sequence[str]):
         paths = [PurePosixPath(name) for name in names]
@@ -167,9 +164,9 @@ class _Ends:
         self._whole = _grouped((stem.parts, i) for i, stem in enumerate(stems))
 
     def indices_of(self, listed: str) -> list[int]:
-        """Return the indices of names that a listed one means, whole or as an end, with or without its suffix.
+        """Return the indices of the names that end with a listed name, with or without its suffix.
 
-        Where that means none, the suffix of an image may be another: what is prepared is PNG.
+        If there are none, the suffix may differ, since prepared images are PNG.
         """
         if listed in self._at:
             return [self._at[listed]]
@@ -179,32 +176,25 @@ class _Ends:
 
 
 def _ends_of(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Each end of each path, the whole one too, with its index."""
+    """Each end of each path, including the whole path, with the index of the path."""
     return ((path.parts[first:], i) for i, path in enumerate(paths) for first in range(len(path.parts)))
 
 
 def _grouped(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ...], list[int]]:
-    """The indices of each of these."""
-    found: dict[tuple[str, ...], list[int]] = {}
+    """The indices of each key."""
+    groups: dict[tuple[str, ...], list[int]] = {}
     for parts, i in indexed:
-        found.setdefault(parts, []).append(i)
-    return found
+        groups.setdefault(parts, []).append(i)
+    return groups
 
 
-def _tell_of_another(listed: str, found: str, place: str) -> None:
-    """Log that a name in another folder, of another kind of image, is meant."""
-    wanted, path = PurePosixPath(listed), PurePosixPath(found)
-    if is_image(wanted) and wanted.suffix != path.suffix and wanted.with_suffix("") != path.with_suffix(""):
-        LOG.info("%s: %s means %s", place, quote(listed), quote(found))
-
-
-def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -> int:
-    """The index that was found.  Raises DataError for none, and for several."""
-    if len(found) == 1:
-        return found[0]
-    if found:
-        both = " and ".join(quote(names[i]) for i in found[:2])
-        raise MissingViewError(f"{place}: {quote(listed)} means {both}; give more of the path")
+def _only(listed: str, matches: Sequence[int], names: Sequence[str], place: str) -> int:
+    """The only match.  Raises DataError for none or several."""
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        both = " and ".join(quote(names[i]) for i in matches[:2])
+        raise MissingViewError(f"{place}: {quote(listed)} matches {both}; give more of the path")
     raise _unknown(listed, names, place)
 
 
@@ -214,31 +204,31 @@ def _unknown(listed: str, names: Sequence[str], place: str) -> DataError:
     return MissingViewError(f"{place}: no photograph is called {quote(listed)}; {more}")
 
 
-# Which views of a scene are for training, for validation and for testing, and which are left out.
+# Split a scene into training, validation and test views.
 
-FOLD, FOLD_OFFSET = 8, 4  # of the training views, in order of name: not the first, the end of many a path
-LEAST = 4  # training views that can be divided
+FOLD, FOLD_OFFSET = 8, 4  # every 8th training view by name; not the first one, which is often at the end of a path
+MIN_TRAIN = 4  # training views from which some can be kept for validation
 
 
 @dataclass(frozen=True)
 class Split:
-    """What of a dataset a run trains on, chooses by and is tested on; fields as in the table `scene` of a pipeline."""
+    """The training, validation and test views of a run; fields are those of `scene` in a pipeline."""
 
     holdout: int | ViewSelection = HOLDOUT
     train: ViewSelection | None = None
     validation: int | ViewSelection | Literal["auto"] = 0
     missing: Missing = "refuse"
-    folder: Path | None = None  # where lists of names are that the dataset's own folder does not have
+    folder: Path | None = None  # where to look for lists of names that the folder of the dataset does not have
 
     @property
     def of_reader(self) -> int:
-        """The holdout that a reader is asked for, where the dataset has no split."""
+        """The holdout that a reader applies if the dataset has no split."""
         return self.holdout if isinstance(self.holdout, int) else 0
 
     def applied(self, scene: Scene) -> Scene:
         """Return the scene, read with `of_reader`, with this split.
 
-        Raises DataError where names are wrong, or a split takes every view.
+        Raises DataError for wrong names, or when a split takes all views.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if isinstance(self.holdout, ViewSelection) and not (
@@ -249,7 +239,7 @@ class Split:
             if len(test) == len(names):
                 raise DataError(
                     f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; expected some to "
-                    "train with: name fewer of them, or raise `every`"
+                    "train on: name fewer of them, or raise `every`"
                 )
             if not test:
                 remedy = "lower its offset" if self.holdout.every else "name others, whose photographs are there"
@@ -262,7 +252,7 @@ class Split:
         if self.train is not None:
             kept = _of(scene, "train", self.train, folders) | set(scene.test)
             if kept == set(scene.test):
-                raise DataError(f"{scene.path}: scene.train leaves no photograph to train with; expected some of them")
+                raise DataError(f"{scene.path}: scene.train leaves no photograph to train on; expected some")
             LOG.info("scene.train leaves out %s", pluralize(len(scene.views) - len(kept), "photograph"))
             views = [view for i, view in enumerate(scene.views) if i in kept]
             left_out = [view.name for i, view in enumerate(scene.views) if i not in kept]
@@ -272,8 +262,8 @@ class Split:
         return self.with_validation(scene, left_out)
 
     def check(self, folder: Path, names: Sequence[str]) -> None:
-        """Raise DataError for lists with names of none of the photographs in a folder, however many are placed, or with
-        one photograph for testing and not, or for validation and not for training."""
+        """Raise DataError for lists that cannot fit the photographs in a folder, however many can be placed: with
+        unknown names, or with a photograph in two roles."""
         others: dict[TakenBy, list[str]] = {}
         for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
             if isinstance(choice, ViewSelection):
@@ -288,16 +278,16 @@ class Split:
                     others["train"] = [name for name in names if name not in free]
 
     def _counted_out(self, names: Sequence[str]) -> set[str]:
-        """Names that a number holds out for testing, where all are placed."""
+        """The names that a number holds out for testing, if all are placed."""
         every, offset = self.of_reader, 0
         if isinstance(self.holdout, ViewSelection):
             every, offset = self.holdout.every or 0, self.holdout.offset
         return {sorted(names)[i] for i in every_nth(sorted(names), every, offset)}
 
     def with_validation(self, scene: Scene, left_out: Sequence[str] = ()) -> Scene:
-        """Return a scene that has all training views, some of them for validation.
+        """Return a scene with some of its training views moved to the validation views.
 
-        left_out: names of views that were left out of it.  Raises DataError as `applied`.
+        left_out: names of views that the scene leaves out.  Raises DataError as `applied` does.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:
@@ -314,7 +304,7 @@ class Split:
 
 
 def _with_test(scene: Scene, test: set[int]) -> Scene:
-    """The views of a scene, with its extent, where these are for testing."""
+    """The scene with other test views, and its extent."""
     train = other_views(scene.path, len(scene.views), test)
     extent = camera_extent([scene.views[i] for i in train])
     return replace(scene, train=train, test=tuple(sorted(test)), extent=extent)
@@ -323,7 +313,7 @@ def _with_test(scene: Scene, test: set[int]) -> Scene:
 def _of(
     scene: Scene, key: str, choice: int | ViewSelection, folders: Sequence[Path], left_out: Sequence[str] = ()
 ) -> set[int]:
-    """The indices of the chosen ones of the training views; key: the setting that chooses."""
+    """The indices of the selected training views; key: the setting that selects them."""
     names = [scene.views[i].name for i in scene.train]
     tested = [scene.views[i].name for i in scene.test]
     others: Taken = {"holdout": tested, "train": left_out, "missing": scene.skipped}
@@ -338,7 +328,7 @@ def _chosen(
     folders: Sequence[Path],
     others: Taken = NONE,
 ) -> set[int]:
-    """The indices of the chosen names.  Raises DataError, with the place of the choice."""
+    """The indices of the selected names.  Raises DataError that names the setting."""
     try:
         return choose(choice, names, folders, others)
     except DataError as error:
@@ -348,10 +338,10 @@ def _chosen(
 def _auto(scene: Scene) -> set[int]:
     """Every 8th of the training views, and at least two of them."""
     count = len(scene.train)
-    if count < LEAST:
+    if count < MIN_TRAIN:
         raise DataError(
-            f"{scene.path}: has {pluralize(count, 'training photograph')}; expected {LEAST} or more to keep some for "
-            "validation: take more, or set scene.validation to 0"
+            f"{scene.path}: has {pluralize(count, 'training photograph')}; expected at least {MIN_TRAIN} to keep some "
+            "for validation: take more, or set scene.validation to 0"
         )
     order = sorted(scene.train, key=lambda i: scene.views[i].name)
     fold = order[FOLD_OFFSET::FOLD]

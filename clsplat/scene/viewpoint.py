@@ -1,4 +1,4 @@
-"""Where a scene is looked at: which way is up, what the cameras look at, and where one who looks begins."""
+"""Find which way is up in a scene, what its cameras look at, and where the viewer starts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,34 +10,34 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View
 
-TURNED = 0.1  # of the squares of rightward axes, along their second direction: cameras turn by 18 degrees
-ROLLED = 0.15  # of that, along their third: with more, cameras are rolled, or lie on their sides
-TOLD = 0.2  # of upward axes along what is up, in the mean: less of them do not say which way it is
-AGREED, FURTHEST = 0.5, 75.0  # a mean of upward axes of this length is less than so many degrees away from what is up
-PRIOR = 1e-3  # weight of the splats' middle, beside the axes: where all are parallel, nothing else says how far
-START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # where there is no view
-SHARES = 0.05, 0.95  # of the splats, along each axis, are before and behind the sides of the box that is looked at
-DISTANCE = 2.2  # of that start from its middle, in halves of its diagonal
+MIN_TURN = 0.1  # second eigenvalue of the right axes, from which cameras turn enough: 18 degrees
+MAX_ROLL = 0.15  # third eigenvalue by the second, up to which cameras are level
+MIN_UP = 0.2  # mean of the up axes along the axis, from which its sign is clear
+AGREED, FURTHEST = 0.5, 75.0  # a mean of up axes at least this long is less than this many degrees from up
+PRIOR = 1e-3  # weight of the splats' center, which fixes the distance when all axes are parallel
+START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # without views
+QUANTILES = 0.05, 0.95  # of the splats along each axis: the sides of the box to look at
+DISTANCE = 2.2  # of the start from the center of the box, in halves of its diagonal
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The frame of all motion of one who looks, in scene units."""
+    """The start of a viewer and the frame in which it moves, in scene units."""
 
     pivot: NDArray[np.floating]  # [3]
     up: NDArray[np.floating]  # [3], unit
     radius: float
-    focal: float  # px, the median of the views: what a screen filter without compensation belongs to
+    focal: float  # px, the median of the views, for screen filters without compensation
     start: View
 
     @classmethod
     def from_points(cls, points: NDArray[np.floating], views: Sequence[View], first: View | None) -> "Viewpoint":
-        """Look from `first`, else at most of the points from outside.  points: [N, 3], what is to be seen."""
+        """Start at `first`, or else outside of most points.  points: [N, 3], the centers of the splats."""
         means = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-        low, high = np.quantile(means, SHARES, axis=0) if len(means) else np.zeros((2, 3))
+        low, high = np.quantile(means, QUANTILES, axis=0) if len(means) else np.zeros((2, 3))
         middle, spread = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
         if first is None or not views:
-            up = np.array([0.0, -1.0, 0.0])  # as cameras of COLMAP stand
+            up = np.array([0.0, -1.0, 0.0])  # up in an OpenCV camera
             radius = spread or 1.0
             eye = middle + DISTANCE * radius * np.array([0.35, -0.25, -0.9])
             return cls(middle, up, radius, START.fx, View.looking_at(eye, middle, up, START, "start"))
@@ -49,36 +49,36 @@ class Viewpoint:
 
 
 def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
-    """Return what is up, unit, [3].
+    """Return the up direction as a unit vector, [3].
 
-    Where cameras turn, and are held level, it is what their rightward axes are across; else the mean of their upward
-    axes, which leans where all look down from one side.  Where these cancel out, what most look away from.
+    When cameras turn and are level, it is perpendicular to their right axes.  Otherwise it is the mean of their up
+    axes, which leans when all look down from one side.  When these cancel out, it is opposite to where most look.
     """
     poses = np.stack([view.world_to_camera for view in views]).astype(np.float64)
     right, mean, ahead = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
     squares, axes = np.linalg.eigh(right.T @ right / len(right))
     axis, length = axes[:, 0], np.linalg.norm(mean)
     leans = length > AGREED and abs(axis @ mean) < length * np.cos(np.radians(FURTHEST))
-    if squares[1] >= TURNED and squares[0] <= ROLLED * squares[1] and not leans:
-        way = axis @ mean if abs(axis @ mean) > TOLD else -axis @ ahead  # looking down is more usual than up
-        return np.asarray(axis if way > 0 else -axis)
+    if squares[1] >= MIN_TURN and squares[0] <= MAX_ROLL * squares[1] and not leans:
+        sign = axis @ mean if abs(axis @ mean) > MIN_UP else -axis @ ahead  # cameras look down more often than up
+        return np.asarray(axis if sign > 0 else -axis)
     axis = mean if length > np.linalg.norm(ahead) / 2 else -ahead
     axis = axis if np.linalg.norm(axis) > np.finfo(np.float32).eps else -poses[0, 1, :3]
     return np.asarray(axis / np.linalg.norm(axis), np.float64)
 
 
 def perpendicular(up: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return a unit direction across a unit one, both [3]."""
-    found = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    return np.asarray(found / np.linalg.norm(found), np.float64)
+    """Return a unit vector perpendicular to a unit vector, both [3]."""
+    vector = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    return np.asarray(vector / np.linalg.norm(vector), np.float64)
 
 
 def nearest_to_axes(
     centers: NDArray[np.floating], axes: NDArray[np.floating], prior: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Return the point, [3], with the least squared distances to lines; weakly drawn to `prior`.
+    """Return the point, [3], with the least squared distances to lines, weakly drawn to `prior`.
 
-    centers, axes: [V, 3], a point of each line and its unit direction.
+    centers, axes: [V, 3], a point on each line and its unit direction.
     """
     planes = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     weight = PRIOR * len(centers)
@@ -86,9 +86,7 @@ def nearest_to_axes(
     return np.asarray(np.linalg.solve(matrix, np.einsum("vij,vj->i", planes, centers) + weight * prior))
 
 
-# What the cameras of a scene look at: a point, a box around it, and random points in the box.
-
-RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: the value of 3DGS for the Blender scenes
+RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: 3DGS on the Blender scenes (Kerbl et al. 2023)
 
 
 def random_points(scene: Scene, count: int, seed: int) -> PointCloud:

@@ -264,7 +264,7 @@ def test_arrays_of_a_picture_are_the_callers_own(device, rng):
 def test_impossible_backgrounds_and_cameras_are_refused(device, rng):
     case = random_case(rng, 3, *SIZE)
     renderer = Renderer(model_of(case), device)
-    with pytest.raises(ValueError, match=r"the background has shape \(2,\); expected one number or three"):
+    with pytest.raises(ValueError, match="expected one number or three in"):
         renderer.render(case.view, (0, 1))
     with pytest.raises(ValueError, match="expected a positive size, positive focal lengths"):
         renderer.render(replace(case.view, camera=replace(case.view.camera, fx=-1.0)))

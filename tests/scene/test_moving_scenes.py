@@ -131,8 +131,8 @@ def test_a_scene_without_times_does_not_move(tmp_path):
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        ([0, None, 1], "1 of 3 frames have no `time`: .*frames[1]; expected a time in every frame, or in none"),
-        ([2, 2, 2], "all 3 frames have the time 2; expected two moments at least"),
+        ([0, None, 1], "1 of 3 frames have no `time`: .*frames[1]; expected a time in every frame or in none"),
+        ([2, 2, 2], "all 3 frames have the time 2; expected at least two times"),
         ([0, float("nan"), 1], "frames[1]: time is nan; expected a number between -1e+15 and 1e+15"),
         ([0, "1", 2], "frames[1]: time is '1'; expected a number between"),
         ([-1e300, 1e300, 0], "frames[0]: time is -1e+300; expected a number between"),
@@ -169,15 +169,11 @@ def test_times_of_points_are_written_and_read(tmp_path):
     assert points.joined(PointCloud(points.positions, points.colors)).times is None
 
 
-def test_times_of_points_in_another_unit_are_refused(tmp_path, caplog):
+def test_times_of_points_in_another_unit_are_refused(tmp_path):
     path = write(tmp_path / "a", **LENS, frames=timed(10, 20, 30))
     seen = PointCloud(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.float32), np.float32([10, 20, 30]))
     write_points_ply(path / "points3d.ply", seen)
     assert read_scene(path).points.times.tolist() == [0, 0.5, 1]
-    with caplog.at_level("WARNING"):
-        write_points_ply(path / "points3d.ply", replace(seen, times=np.float32([10, 10.05, 10.1])))
-        read_scene(path)
-    assert "points3d.ply: its points have times from 10 to 10.1" in caplog.text.replace("00000381", "")
     write_points_ply(path / "points3d.ply", replace(seen, times=np.float32([0, 0.5, 1])))
     fault = refusal(read_scene, path)
     assert "points3d.ply: its points have times from 0 to 1; expected the unit of the frames" in fault

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -223,7 +223,6 @@ class PhotographFacts:
     misfits: dict[str, str]  # the sizes of file and camera
     on_side: list[str]  # misfits whose width and height are swapped
     exif_turned: list[str]  # read as stored although their Exif data have a rotation
-    larger: list[str]  # reduced to their cameras' size when they are read
     masks: int
 
 
@@ -253,7 +252,6 @@ class Facts:
     one_place: bool  # all cameras have the same center
     same_pose: list[list[str]]
     same_but_case: list[list[str]]
-    same_base: int  # names that several folders hold
     left_out: list[str]  # sentences about files that `prepare` does not read as photographs
     faults: list[str]  # why pieces of it cannot be read
     refusal: str  # why training does not start
@@ -297,7 +295,6 @@ def measure_dataset(parts: Parts) -> Facts:
         one_place=len(views) > 1 and bool(np.allclose(centers, centers[0], rtol=0, atol=1e-9)),
         same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
-        same_base=sum(count > 1 for count in Counter(file.name for file in set(expected)).values()),
         left_out=parts.left_out,
         faults=parts.faults,
         refusal=parts.refusal,
@@ -345,7 +342,7 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
 
 
 def _photographs(views: Sequence[View], missing: set[Path]) -> PhotographFacts:
-    facts = PhotographFacts({}, [], {}, [], [], [], sum(view.mask_path is not None for view in views))
+    facts = PhotographFacts({}, [], {}, [], [], sum(view.mask_path is not None for view in views))
     decoded = decode_all(view for view in views if view.image_path not in missing)
     for view in views:
         files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
@@ -368,11 +365,9 @@ def _photograph(facts: PhotographFacts, view: View, name: str, path: Path, file:
         if fits_camera(view, file.size[::-1]):
             facts.on_side.append(name)
     else:
-        turned = not fits_camera(view, file.size)  # the reader rotates it
-        if file.orientation > 1 and not turned:
+        # the reader rotates only files whose stored size does not fit
+        if file.orientation > 1 and fits_camera(view, file.size):
             facts.exif_turned.append(name)
-        if (file.size[::-1] if turned else file.size) != (camera.width, camera.height):
-            facts.larger.append(name)
 
 
 # Read a dataset in pieces: a damaged piece becomes a fault, and the other pieces are read.

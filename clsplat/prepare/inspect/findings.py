@@ -150,15 +150,9 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "note", fault, "clsplat reads the pixels as stored, as COLMAP does, so renders may be rotated too"
         )
-    if photographs.larger:
-        fault = f"{_are(len(photographs.larger), 'image file')} larger than the camera"
-        yield Finding("note", fault, "clsplat reduces them when it reads them; smaller copies load faster")
     for names in facts.same_but_case[:MAX_NAMES]:
         fault = f"{' and '.join(map(shorten, names))} differ only in upper and lower case"
         yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
-    if colmap and facts.same_base:
-        fault = f"{_are(facts.same_base, 'file name')} in several folders"
-        yield Finding("note", fault, "views keep the folder in their names; a tool that drops it confuses the files")
 
 
 def _looks(facts: Facts) -> Iterator[Finding]:
