@@ -19,9 +19,6 @@ DATASET = f"The folder of a dataset: {format_names()}."
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
 Out = Annotated[Path, typer.Argument(help="Folder to make.")]
-Size = Annotated[int, typer.Option(min=8, help="Width and height of the images, pixels.")]
-Train = Annotated[int, typer.Option(min=1, help="Number of training views.")]
-Test = Annotated[int, typer.Option(min=1, help="Number of held-out views.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")]
 
 
@@ -58,21 +55,6 @@ def synthetic(
     if times is not None and not moving:
         raise ConfigError("--times is for a scene that moves; give --moving, too")
     print(write_dataset(out, Moving(seed=seed, **found) if moving else SyntheticOptions(seed=seed, **found)))
-
-
-@app.command()
-def city(
-    out: Out,
-    size: Size = 256,
-    train: Train = 300,
-    test: Test = 30,
-    lots: Annotated[int, typer.Option(min=1, max=64, help="Houses and parks along each side.")] = 12,
-    seed: Seed = 0,
-) -> None:
-    """Ray-cast a city from the air: streets, houses, roofs; with exact cameras, in the Blender layout."""
-    from clsplat.data_tools.city import City
-
-    print(write_dataset(out, City(size=size, train=train, test=test, seed=seed, lots=lots)))
 
 
 @app.command()
@@ -144,21 +126,6 @@ def undistort(
     from clsplat.prepare.undistort import undistort_scene
 
     print(f"{undistort_scene(scene, out, long_side, undefined_pixels)} images in {out}")
-
-
-@app.command()
-def masks(
-    scene: Annotated[Path, typer.Argument(help=DATASET)],
-    folder: Annotated[Path | None, typer.Option(help="Folder of existing masks; default: the images' alpha.")] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the masks; default: masks beside COLMAP's images.")
-    ] = None,
-    threshold: Annotated[float, typer.Option(min=0, max=1, help="Smallest alpha of a pixel that counts.")] = 0.5,
-) -> None:
-    """Write masks, white in pixels that count, from alpha or from a folder."""
-    from clsplat.data_tools.masks import write_masks
-
-    print(f"{write_masks(scene, folder, out, threshold)} masks written")
 
 
 @app.command()

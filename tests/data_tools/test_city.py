@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import DataError
-from clsplat.data_tools.city import FLIGHT, City
 from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.scene.detect import read_scene
+from tests.support.city import FLIGHT, City
 
 TINY = City(size=16, train=4, test=1, lots=3)
 

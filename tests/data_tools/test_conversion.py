@@ -1,7 +1,6 @@
-"""The small tools: frames of a video, image pyramids, masks."""
+"""The small tools: frames of a video, image pyramids."""
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -12,11 +11,8 @@ from typer.testing import CliRunner
 from clsplat import cli
 from clsplat.core.errors import DataError
 from clsplat.data_tools import video as video_tool
-from clsplat.data_tools.masks import write_masks
 from clsplat.data_tools.video import sharpest, write_frames
-from clsplat.scene.detect import read_scene
 from clsplat.scene.images import read_image
-from tests.support.colmap_writer import CameraEntry, ColmapModel, ImageEntry, write_scene
 from tests.support.pictures import contents
 from tests.support.refusals import refusal
 
@@ -172,90 +168,10 @@ def test_sharpest(values, parts, chosen):
     assert sharpest(values, [0.0] * len(values), parts) == chosen
 
 
-# ---- masks
-
-
-def store_photos(folder: Path, channels: int) -> None:
-    """Two photographs, of whose alpha the first three columns are 100."""
-    (folder / "train").mkdir(parents=True, exist_ok=True)
-    for i in range(2):
-        pixels = np.full((6, 8, channels), 250, np.uint8)
-        pixels[:, :3, 3:] = 100
-        cv2.imwrite(str(folder / "train" / f"{i}.png"), pixels)
-
-
-def colmap_scene(path: Path, channels: int) -> Path:
-    camera = CameraEntry(1, "PINHOLE", 8, 6, (8.0, 8.0, 4.0, 3.0))
-    write_scene(path, ColmapModel([camera], [ImageEntry(f"train/{i}.png") for i in range(2)]))
-    store_photos(path / "images", channels)
-    return path
-
-
-def blender_scene(path: Path, name: str) -> Path:
-    store_photos(path, 4)
-    frames = [{"file_path": f"./train/{i}", "transform_matrix": np.eye(4).tolist()} for i in range(2)]
-    (path / name).write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
-    return path
-
-
-@pytest.mark.parametrize("name", ["transforms_train.json", "transforms.json"])
-def test_masks_that_nothing_would_read_are_refused(name, tmp_path):
-    scene = blender_scene(tmp_path / "scene", name)
-    told = refusal(write_masks, scene)
-    assert "scenes have no folder of masks" in told
-    assert "scene.alpha=mask" in told
-    assert not (scene / "masks").exists()
-    assert write_masks(scene, out=tmp_path / "masks") == 2
-
-
-def test_masks_lie_where_the_reader_looks_for_them(tmp_path):
-    scene = colmap_scene(tmp_path / "scene", 4)
-    assert write_masks(scene / "sparse" / "0") == 2
-    assert all(view.mask_path is not None for view in read_scene(scene).views)
-
-
-def test_masks_from_alpha(tmp_path):
-    scene = colmap_scene(tmp_path / "scene", 4)
-    assert write_masks(scene) == 2
-    mask = read_image(scene / "masks" / "train" / "0.png")[:, :, 0]
-    np.testing.assert_array_equal(mask, [[0] * 3 + [255] * 5] * 6)
-    assert write_masks(scene) == 0
-    assert write_masks(scene, out=tmp_path / "others", threshold=0.3) == 2
-    assert read_image(tmp_path / "others" / "train" / "0.png").min() == 255
-    assert "has no alpha" in refusal(write_masks, colmap_scene(tmp_path / "opaque", 3))
-
-
-def test_masks_follow_their_source_but_not_over_those_of_others(tmp_path):
-    scene = colmap_scene(tmp_path / "scene", 4)
-    (scene / "masks" / "train").mkdir(parents=True)
-    cv2.imwrite(str(scene / "masks" / "train" / "1.png"), np.zeros((6, 8), np.uint8))
-    assert write_masks(scene) == 1
-    assert write_masks(scene) == 0
-    assert write_masks(scene, threshold=0.3) == 1
-    assert read_image(scene / "masks" / "train" / "0.png").min() == 255
-    assert read_image(scene / "masks" / "train" / "1.png").max() == 0
-
-
-def test_masks_from_a_folder(tmp_path):
-    scene, folder = colmap_scene(tmp_path / "scene", 3), tmp_path / "made" / "train"
-    folder.mkdir(parents=True)
-    cv2.imwrite(str(folder / "0.png"), np.full((6, 8), 255, np.uint8))
-    assert "no masks for 1 of 2 photographs: train/1" in refusal(write_masks, scene, tmp_path / "made")
-    cv2.imwrite(str(folder / "1.png"), np.zeros((5, 8), np.uint8))
-    assert "1.png: the image is 8x5 pixels, its camera 8x6" in refusal(write_masks, scene, tmp_path / "made")
-    cv2.imwrite(str(folder / "1.png"), np.zeros((6, 8), np.uint8))
-    shutil.rmtree(scene / "masks", ignore_errors=True)
-    assert write_masks(scene, tmp_path / "made") == 2
-    assert read_image(scene / "masks" / "train" / "1.png").max() == 0
-
-
 # ---- on the command line
 
 
-def test_data_tools_are_commands(tmp_path):
-    scene = colmap_scene(tmp_path / "scene", 4)
-    result = CliRunner().invoke(cli.app, ["data", "masks", str(scene)])
-    assert result.output.endswith("2 masks written\n")
+def test_data_tools_are_commands():
     listing = CliRunner().invoke(cli.app, ["data", "--help"]).output
-    for name in ("photos", "video", "undistort", "masks", "multiscale", "synthetic", "fetch"):
+    for name in ("photos", "video", "undistort", "multiscale", "synthetic", "fetch"):
         assert name in listing

@@ -31,8 +31,12 @@ from typing import Any
 import numpy as np
 import yaml  # type: ignore[import-untyped]
 
+from clsplat.data_tools.synthetic import write_dataset
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.yaml_file import read_pipeline
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import read_image, write_image
+from tests.support.city import City
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
@@ -284,19 +288,26 @@ class Place:
             )
             thin(self.folder / "moving" / "points3d.ply")
         if "city" in scenes:
-            self.clsplat("data", "city", "city", "--size", "40", "--train", "8", "--test", "2", "--lots", "2")
+            write_dataset(self.folder / "city", City(size=40, train=8, test=2, lots=2), workers=1)
             thin(self.folder / "city" / "points3d.ply")
         if "multiscale" in scenes:
             self.clsplat("data", "multiscale", "still", "multiscale", "--levels", "2")
         for name, lens in {"lens": LENS, "fisheye": FISHEYE}.items():
             self._write_lens(name, lens)
-        self.clsplat("data", "masks", "still", "--out", "masks")
+        self._write_masks()
         for path in shipped().values():
             short = shorten(yaml.safe_load(read_pipeline(path)))
             (self.folder / path.name).write_text(yaml.safe_dump(short, sort_keys=False))
         if "model" in str(list(chosen.values())):
             self.clsplat("run", "splat_7k.yaml", "--scene", "still", "--out", "first")
             shutil.copy(self.folder / "first" / "point_cloud.ply", self.folder / "model.ply")
+
+    def _write_masks(self) -> None:
+        """Write the alpha of the photographs of `still` as masks."""
+        for view in read_scene(self.folder / "still", holdout=0).views:
+            white = read_image(view.image_path)[:, :, 3:] >= 0.5 * 255
+            mask = np.where(white, 255, 0).astype(np.uint8).repeat(3, axis=2)
+            write_image((self.folder / "masks" / view.name).with_suffix(".png"), mask)
 
     def _write_lens(self, name: str, lens: dict[str, Any]) -> None:
         """Write the photographs of `still` in nerfstudio's layout, as if a lens had taken them."""

@@ -13,11 +13,11 @@ from clsplat.conformance.checks.appearance import check_response
 from clsplat.conformance.reference.appearance import taken, taken_backward
 from clsplat.core.errors import DataError
 from clsplat.core.resources import resource_dir
-from clsplat.data_tools.city import City
 from clsplat.data_tools.synthetic import write_dataset
 from clsplat.runs.model_file import evaluate
 from clsplat.training.modules import camera_response
 from clsplat.training.run import Run
+from tests.support.city import City
 from tests.support.deviations import assert_within_bounds
 from tests.support.devices import on_devices
 from tests.support.runs import FEW, digest, killed, train

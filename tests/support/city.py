@@ -5,10 +5,10 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from .casting import World, camera_pose
-from .shapes import GOLDEN_ANGLE, Array, Cuboid, Shape, Vector, unit
-from .still_life import PRIMES, mix, noise, scramble
-from .synthetic import SyntheticOptions
+from clsplat.data_tools.casting import World, camera_pose
+from clsplat.data_tools.shapes import GOLDEN_ANGLE, Array, Cuboid, Shape, Vector, unit
+from clsplat.data_tools.still_life import PRIMES, mix, noise, scramble
+from clsplat.data_tools.synthetic import SyntheticOptions
 
 PITCH, LOT = 1.0, 0.72  # scene units: from one street to the next, and the side of what is between two
 HEIGHTS = (0.18, 1.1)  # of houses
