@@ -142,6 +142,18 @@ def test_how_to_pages_are_short_and_have_no_measurements():
         assert not re.findall(r"^\|.*\d dB.*$", text, re.M), f"{name}: measurements belong in docs/results"
 
 
+def test_reasons_for_photos_left_out_are_those_of_the_program():
+    section = (
+        text_of(ROOT / "docs" / "photographs.md").partition("## When photos are left out")[2].partition("\n## ")[0]
+    )
+    reasons = re.findall(r"^\| (.+?) \|", section, re.M)[1:]
+    source = text_of(ROOT / "clsplat" / "prepare" / "diagnosis.py")
+    assert len(reasons) == 7
+    for reason in reasons:
+        part = max(re.split(r"\bN features\b|\bN\b|b\.jpg", reason), key=len)
+        assert part.strip() in source, reason
+
+
 def test_the_navigation_has_at_most_seven_groups():
     assert len(re.findall(r"^  - (.+):$", text_of(ROOT / "mkdocs.yml").partition("\nnav:")[2], re.M)) <= 7
 
