@@ -58,16 +58,14 @@ class RunScene:
         """
         original, background = settings.applied(scene)
         downscaled = original.downscaled(*settings.downscales)
-        camera = downscaled.views[0].camera
         LOG.info(
-            "scene: %s, %d training%s and %d test views, %d x %d px, %s background, extent %.3g",
+            "scene: %s, %d training%s and %d test views, %s px, %s background, extent %.3g",
             *(
                 scene.path,
                 len(downscaled.train),
                 f", {len(downscaled.validation)} validation" if downscaled.validation else "",
                 len(downscaled.test),
-                camera.width,
-                camera.height,
+                downscaled.image_sizes,
                 background,
                 downscaled.extent,
             ),

@@ -10,6 +10,7 @@ Conventions of the whole project
 
 import logging
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -153,6 +154,13 @@ class Scene:
         return replace(self, views=tuple(views), train=train, test=test, validation=validation)
 
     @property
+    def image_sizes(self) -> str:
+        """The width x height of the images in pixels, the three most frequent first: `800x600 and 600x800`."""
+        sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in self.views)
+        *others, last = [size for size, _ in sizes.most_common(3)] + (["others"] if len(sizes) > 3 else [])
+        return f"{', '.join(others)} and {last}" if others else last
+
+    @property
     def cameras(self) -> dict[str, str]:
         """The camera of each view, by name: the name of the first view with an equal lens, or pinhole camera."""
         first: dict[object, str] = {}
@@ -165,11 +173,11 @@ class Scene:
     def _repr_html_(self) -> str:
         from clsplat.core.page import summary
 
-        camera, count = self.views[0].camera, len(self.points) if self.points else 0
+        count = len(self.points) if self.points else 0
         rows = {
             "scene": str(self.path),
             "views": f"{len(self.train)} for training, {len(self.test)} for testing",
-            "photographs": f"{camera.width} x {camera.height} px, the first",
+            "photographs": f"{self.image_sizes} px",
             "points": f"{count:,}" if count else "none",
             "extent": f"{self.extent:.3g} scene units",
         }
