@@ -101,7 +101,7 @@ class Trainer:
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
         self.out = Path(out)
         before = RunState.read(self.out)
-        outputs.check_places(self.pipeline, before)
+        outputs.check_output_paths(self.pipeline, before)
         rasterizer = self.pipeline.settings.rasterizer
         opened = proved(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:

@@ -1,4 +1,4 @@
-"""What a run would do, before it does it."""
+"""Describe what a run would do, without running it."""
 
 import logging
 from collections.abc import Sequence
@@ -8,9 +8,9 @@ from clsplat.core import lock
 from clsplat.core.errors import DataError, pluralize
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.estimate import expected
+from clsplat.runs.estimate import estimate_time
 from clsplat.runs.opening import ReadScene, check_start, known, listed, open_run, read_run_scene, settle
-from clsplat.runs.outputs import check_places
+from clsplat.runs.outputs import check_output_paths
 from clsplat.runs.run_folder import Start, check_run_folder, start_of
 from clsplat.runs.runner import check_run, restore
 from clsplat.runs.state import RunState
@@ -35,17 +35,17 @@ def describe(
 ) -> str:
     """Return a line for each stage of a run in a folder, which is left as it is.
 
-    read: reads the scene; with_time: whether lines follow that say how long a new run takes.
-    Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
+    read: reads the scene; with_time: whether to add an estimate of the time of a new run.
+    Raises what the run would raise before its first stage, but errors of its photos only if they are prepared.
     """
     out = state.out
     begun = start_of(pipeline, state, start)
     if begun is None:
         return f"{out}: up to date"
     start = begun
-    check_places(pipeline, state)
+    check_output_paths(pipeline, state)
     check_run_folder(state, start)
-    tell_of_waiting(out)
+    check_unused(out)
     planned = pipeline.preparation(out)
     lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
     run, verdict = None, "would run"
@@ -57,36 +57,38 @@ def describe(
         pipeline = settle(pipeline, run, log_reasons=False)  # the description has them
         if start == "resume":
             resumed = restore(pipeline, run)
-            verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
+            verdict = f"would continue from step {run.step}" if resumed else "nothing to resume; would run"
         check_run(pipeline, run)
     names = listed(pipeline, planned, out) if run is None else []
     measures, refusal = _known(pipeline, names)
     lines += [*refusal, *(f"  adapt          {reason}" for reason in pipeline.reasons)]
     if undecided := pipeline.undecided:
-        lines.append(f"  adapt          follow from the photographs: {', '.join(undecided)}")
-    lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages if _does(stage, run)]
+        lines.append(f"  adapt          the photos decide {', '.join(undecided)}")
+    lines += [
+        f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages if _has_work(stage, run)
+    ]
     lines += _on_host(pipeline, run) if run else []
     if with_time and start != "resume":
-        lines += expected(pipeline, planned, names, measures, opened, run)
+        lines += estimate_time(pipeline, planned, names, measures, opened, run)
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 
 
 def _known(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures | None, list[str]]:
-    """What is known of named photographs that are to be prepared; a line where the run will be refused."""
+    """Return the measures of photos to prepare, or a line that says why the run will be refused."""
     try:
         return known(pipeline, names), []
     except DataError as error:
-        return None, [f"  photographs    if all {len(names)} photographs are placed, the run is refused: {error}"]
+        return None, [f"  photos         if all {len(names)} photos get a camera, the run is refused: {error}"]
 
 
-def tell_of_waiting(out: Path) -> None:
-    """Raise OutputError where a run in `out` would be refused as it is in use; say where it would wait to know."""
+def check_unused(out: Path) -> None:
+    """Raise OutputError if `out` is in use; log if a run would have to wait to find out."""
     if not lock.check_free(out):
-        LOG.info("%s: was in use elsewhere just now; the run would wait for its heartbeat, a minute at most", out)
+        LOG.info("%s: was in use on another machine; the run would wait up to a minute for its heartbeat", out)
 
 
 def _on_host(pipeline: Pipeline, run: Run) -> list[str]:
-    """The plan of memory, where the harmonics will lie on the host."""
+    """Return the memory plan if spherical harmonics will be in host memory."""
     first = next((stage for stage in pipeline.stages if isinstance(stage, Init)), None)
     if first is None:
         return []
@@ -98,8 +100,8 @@ def _on_host(pipeline: Pipeline, run: Run) -> list[str]:
     return [f"  {planned.text(count)}"] if planned.host else []
 
 
-def _does(stage: Stage, run: Run | None) -> bool:
-    """Whether a stage does something: those of the views of a split do not where there are none."""
+def _has_work(stage: Stage, run: Run | None) -> bool:
+    """Whether a stage does anything: it does not if its split has no views."""
     return not (isinstance(stage, Evaluate | Render) and run) or bool(run.original.split(stage.split))
 
 
@@ -114,7 +116,7 @@ def _detail(stage: Stage, run: Run | None) -> str:
 
 
 def _cadence(stage: Scheduled) -> str:
-    """How often a stage acts, and what else must hold."""
+    """Return when a stage acts."""
     limits = {name: getattr(stage, name, None) for name in ("start", "stop", "when_background")}
-    given = ", ".join(f"{name} {value}" for name, value in limits.items() if value)
-    return f"{stage.stage} every {stage.every}" + (f" ({given})" if given else "")
+    text = ", ".join(f"{name} {value}" for name, value in limits.items() if value)
+    return f"{stage.stage} every {stage.every}" + (f" ({text})" if text else "")

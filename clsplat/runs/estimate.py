@@ -1,8 +1,8 @@
-"""A rough range of the time that a run takes, by the numbers of its work alone: nothing is tried on the device.
+"""Estimate the time of a run as a rough range, without running anything on the device.
 
-The time of a step is in proportion to pixels and Gaussians, or to the samples and weights of a field, and divided by
-the compute units of the device.  What only the work itself tells widens the range: how many Gaussians grow, and at
-which step photographs for validation end the training.
+The time of a step is proportional to pixels and Gaussians, or to the samples and weights of a field, divided by the
+compute units of the device.  Unknowns widen the range: how many Gaussians grow, and at which step validation ends the
+training.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,17 +23,17 @@ from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
 from clsplat.training.run import Run
 
-PIXEL, GAUSSIAN = 1.0e-7, 4.0e-7  # s of a compute unit, for each of a training step: of an AVX-512 core
-WEIGHT, LEVEL = 2.0e-11, 2.0e-8  # s of a compute unit, for each weight of a field and level of its grid, of a sample
+PIXEL, GAUSSIAN = 1.0e-7, 4.0e-7  # s per pixel and Gaussian of a training step, of one AVX-512 core
+WEIGHT, LEVEL = 2.0e-11, 2.0e-8  # s per weight of a field and per level of its grid, for each sample
 LAUNCHES = 1.0e-3  # s of any step
-SLOWER = 6.0  # times as long, on older processors and with larger Gaussians than those of the benchmark
-FEWEST = 5000  # Gaussians, where the points are not known yet: those of a small capture
-DENSEST = 1.0  # Gaussians for each pixel of a photograph, where no setting says the most; captures end at 0.1 to 1
+SLOWER = 6.0  # factor for older processors and larger Gaussians than in the benchmark
+MIN_GAUSSIANS = 5000  # of a small capture, while the points are unknown
+MAX_PER_PIXEL = 1.0  # Gaussians per pixel of an image, if no setting limits them; captures end at 0.1 to 1
 
 
 @dataclass(frozen=True)
-class Expected:
-    """What a part of a run takes, s: at least, at most, and from what that follows."""
+class Estimate:
+    """The estimated time of a part of a run, s, as a minimum and a maximum, and why."""
 
     name: str
     seconds: tuple[float, float]
@@ -41,11 +41,11 @@ class Expected:
 
     @property
     def text(self) -> str:
-        """The part in one line."""
+        """The estimate in one line."""
         return f"  {self.name:<14} {minutes_text(self.seconds)}: {self.why}"
 
 
-def expected(
+def estimate_time(
     pipeline: Pipeline,
     planned: Sequence[PlannedStep],
     names: Sequence[str],
@@ -53,9 +53,9 @@ def expected(
     device: Device,
     run: Run | None,
 ) -> list[str]:
-    """Return a line for each part of a run, and one for all.
+    """Return a line for the whole run, and one for each part.
 
-    names, measures: of the photographs that are to be prepared; run: with its scene, where that is prepared.
+    names, measures: of the photos to prepare; run: with its scene, if that is prepared.
     """
     parts = list(_of_preparation(planned, len(names))) if names else []
     if (capture := _capture(pipeline, planned, names, run)) is not None:
@@ -66,79 +66,79 @@ def expected(
     parts += [_of_field(training, device.info.units) for training in fields]
     if not parts:
         return []
-    low, high = (sum(one.seconds[end] for one in parts) for end in (0, 1))
-    total = f"expected: {minutes_text((low, high))}, roughly, without measurements, pictures and pages"
-    return [total, *(one.text for one in parts)]
+    low, high = (sum(part.seconds[end] for part in parts) for end in (0, 1))
+    total = f"expected: {minutes_text((low, high))}, roughly, without evaluation, renders and pages"
+    return [total, *(part.text for part in parts)]
 
 
-def _of_preparation(planned: Sequence[PlannedStep], photographs: int) -> Iterator[Expected]:
-    """The steps that are to be done."""
-    for one in planned:
-        if one.why and (each := one.step.seconds) is not None:
-            count, name = one.step.pieces(photographs)
-            yield Expected(one.step.stage, (each[0] * count, each[1] * count), f"{count:,} {name}")
+def _of_preparation(planned: Sequence[PlannedStep], photographs: int) -> Iterator[Estimate]:
+    """Estimate the preparation steps that are due."""
+    for due in planned:
+        if due.why and (each := due.step.seconds) is not None:
+            count, name = due.step.pieces(photographs)
+            yield Estimate(due.step.stage, (each[0] * count, each[1] * count), f"{count:,} {name}")
 
 
 def _capture(
     pipeline: Pipeline, planned: Sequence[PlannedStep], names: Sequence[str], run: Run | None
 ) -> tuple[tuple[int, int], int] | None:
-    """The size of a photograph that is trained on, px, and the Gaussians at the beginning; None: not known."""
+    """Return the image size in training, px, and the initial number of Gaussians; None if unknown."""
     if run is not None:
         views = run.scene.merge_validation().split("train")
-        cameras = sorted(((one.camera.width, one.camera.height) for one in views), key=lambda size: size[0] * size[1])
-        begins = [one.expected_count(run.scene) for one in pipeline.settings.stages if isinstance(one, Init)]
-        return cameras[len(cameras) // 2], begins[0] if begins else FEWEST
+        sizes = sorted(((view.camera.width, view.camera.height) for view in views), key=lambda size: size[0] * size[1])
+        counts = [stage.expected_count(run.scene) for stage in pipeline.settings.stages if isinstance(stage, Init)]
+        return sizes[len(sizes) // 2], counts[0] if counts else MIN_GAUSSIANS
     scene = pipeline.settings.scene
-    if (found := _size(scene.folder, names)) is None:
+    if (size := _size(scene.folder, names)) is None:
         return None
-    longest = getattr(planned[-1].step, "long_side", None) or max(found)
-    shrink = min(1.0, longest / max(found)) / scene.downscale
-    return (max(1, round(shrink * found[0])), max(1, round(shrink * found[1]))), FEWEST
+    longest = getattr(planned[-1].step, "long_side", None) or max(size)
+    scale = min(1.0, longest / max(size)) / scene.downscale
+    return (max(1, round(scale * size[0])), max(1, round(scale * size[1]))), MIN_GAUSSIANS
 
 
 def _size(folder: Path, names: Sequence[str]) -> tuple[int, int] | None:
-    """The size of the first photograph, px; None where none of the first ones can be read."""
+    """Return the size of the first photo that can be read, px; None if none of the first three can."""
     for name in names[:3]:
         with suppress(DataError):
             return image_size(folder / name)
     return None
 
 
-def _of_training(training: Optimize, size: tuple[int, int], first: int, units: int) -> Expected:
-    """A training: between its fewest steps with the Gaussians of its start, and its most with the most of them."""
+def _of_training(training: Optimize, size: tuple[int, int], first: int, units: int) -> Estimate:
+    """Estimate a training, from the fewest steps and Gaussians to the most."""
     pixels = size[0] * size[1]
-    most = max(first, int(most_of(training, pixels) or DENSEST * pixels))
+    most = max(first, int(max_gaussians(training, pixels) or MAX_PER_PIXEL * pixels))
     low, high = step_seconds(units, size, first)[0], step_seconds(units, size, most)[1]
     steps = training.min_steps, training.steps * (2 if training.refit else 1)
     of_steps, of_counts = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (first, most)))
     why = f"{of_steps} steps of {_ms(low, high)}, with {of_counts} Gaussians at {size[0]}x{size[1]} px"
-    return Expected(training.stage, (steps[0] * low, steps[1] * high), why)
+    return Estimate(training.stage, (steps[0] * low, steps[1] * high), why)
 
 
-def _of_field(training: TrainField, units: int) -> Expected:
-    """A training of a field, whose steps all take the same time."""
+def _of_field(training: TrainField, units: int) -> Estimate:
+    """Estimate a training of a field, whose steps all take the same time."""
     shape = training.field
     samples = training.rays * (shape.coarse_samples + shape.fine_samples)
     of_sample = WEIGHT * shape.of_network + LEVEL * (shape.grid.levels if shape.grid else 0)
     low = LAUNCHES + samples * of_sample / units
     why = f"{training.steps:,} steps of {_ms(low, SLOWER * low)}, of {training.rays:,} rays"
-    return Expected(training.stage, (training.steps * low, training.steps * SLOWER * low), why)
+    return Estimate(training.stage, (training.steps * low, training.steps * SLOWER * low), why)
 
 
-def most_of(training: Optimize, pixels: int) -> float | None:
-    """Return the number of Gaussians at which a training ends growth, by its settings; None where they do not say it.
+def max_gaussians(training: Optimize, pixels: int) -> float | None:
+    """Return the limit of the number of Gaussians by the settings of a training; None without one.
 
-    pixels: of a photograph.
+    pixels: of an image.
     """
     growing = [stage for stage in training.during if isinstance(stage, Densify)]
-    limits = [max(schedule_values(one.max_gaussians)) for one in growing if one.max_gaussians is not None]
-    return min([*limits, *(one.per_pixel * pixels for one in growing if one.per_pixel)], default=None)
+    limits = [max(schedule_values(stage.max_gaussians)) for stage in growing if stage.max_gaussians is not None]
+    return min([*limits, *(stage.per_pixel * pixels for stage in growing if stage.per_pixel)], default=None)
 
 
 def step_seconds(units: int, size: tuple[int, int], count: int) -> tuple[float, float]:
-    """Return the time of a training step, s, at least and at most.
+    """Return the minimum and maximum time of a training step, s.
 
-    units: compute units of the device; size: of a photograph, px; count: of Gaussians.
+    units: compute units of the device; size: of an image, px; count: of Gaussians.
     """
     least = LAUNCHES + (PIXEL * size[0] * size[1] + GAUSSIAN * count) / units
     return least, SLOWER * least
@@ -146,12 +146,12 @@ def step_seconds(units: int, size: tuple[int, int], count: int) -> tuple[float, 
 
 def minutes_text(seconds: Sequence[float]) -> str:
     """Return two times, s, as a range of minutes."""
-    ends = [max(0.1, one / 60) for one in seconds]
-    return _range(*(f"{one:.0f}" if one >= 10 else f"{one:.1f}" for one in ends)) + " min"
+    minutes = [max(0.1, end / 60) for end in seconds]
+    return _range(*(f"{end:.0f}" if end >= 10 else f"{end:.1f}" for end in minutes)) + " min"
 
 
 def _ms(low: float, high: float) -> str:
-    return _range(*(f"{1e3 * one:.0f}" for one in (low, high))) + " ms"
+    return _range(f"{1e3 * low:.0f}", f"{1e3 * high:.0f}") + " ms"
 
 
 def _range(low: str, high: str) -> str:

@@ -1,4 +1,4 @@
-"""Failures of a run, as its status.json tells them, and of the parts of a whole, which goes on without them."""
+"""Record failures: of a run, in its status.json, and of parts, such as cells, without which the rest continues."""
 
 import logging
 from collections.abc import Iterator
@@ -15,13 +15,13 @@ class Failures(dict[str, ClsplatError]):
     """The parts that failed, by their names."""
 
     def __init__(self, parts: str) -> None:
-        """parts: what they are, such as cells."""
+        """parts: their name in messages, such as cells."""
         super().__init__()
         self._parts = parts
 
     @contextmanager
     def kept(self, name: str) -> Iterator[None]:
-        """Note a failure of the block as that of a part, and go on.  Raises Interrupted."""
+        """Record a failure of the block as that of a part, without raising it.  Raises Interrupted."""
         try:
             yield
         except Interrupted:
@@ -30,16 +30,16 @@ class Failures(dict[str, ClsplatError]):
             self.note(name, as_clsplat_error(error))
 
     def note(self, name: str, error: ClsplatError) -> None:
-        """Note that a part failed, and say so."""
+        """Record and log that a part failed."""
         self[name] = error
         LOG.warning("%s failed: %s", name, one_line(error))
 
     def texts(self) -> dict[str, str]:
-        """Return why each failed, in a line."""
+        """Return the error of each part in one line."""
         return {name: one_line(error) for name, error in self.items()}
 
     def whole(self, count: int, what: str = "failed") -> ClsplatError:
-        """Return the error that stands for all, with the exit code of the first.  count: of all parts."""
+        """Return one error for all, with the exit code of the first.  count: number of all parts."""
         name, first = next(iter(self.items()))
         whole = ClsplatError(f"{len(self)} of {count} {self._parts} {what}; the first, {name}: {first}")
         whole.exit_code = first.exit_code
@@ -48,9 +48,9 @@ class Failures(dict[str, ClsplatError]):
 
 @contextmanager
 def failures_recorded(status: StatusFile, as_raised: bool = False) -> Iterator[None]:
-    """Turn every failure of the block into a ClsplatError, and write it to status.json.
+    """Turn any failure of the block into a ClsplatError, and write it to status.json.
 
-    With `as_raised` the failure itself is raised.
+    as_raised: raise the failure itself instead.
     """
     try:
         yield
@@ -66,10 +66,10 @@ def failures_recorded(status: StatusFile, as_raised: bool = False) -> Iterator[N
 
 
 def _stopped(status: StatusFile) -> Interrupted:
-    """What to tell of a run that a signal ended at once, and how it goes on."""
+    """Return the error of a run that a signal ended at once, with how to continue it."""
     now, resume = status.now, f"`clsplat resume {shell_quote(status.out)}`"
     if not (status.has_run and now.step):  # its folder is as it was before
-        return Interrupted("stopped at once; to go on, run the same command again")
+        return Interrupted("stopped at once; run the same command again to continue")
     if now.checkpoint:
-        return Interrupted(f"stopped at once; {resume} goes on from {now.checkpoint}")
-    return Interrupted(f"stopped at once, and no checkpoint was saved; {resume} begins it again")
+        return Interrupted(f"stopped at once; {resume} continues from {now.checkpoint}")
+    return Interrupted(f"stopped at once, and no checkpoint was saved; {resume} starts it over")

@@ -1,4 +1,4 @@
-"""Open what a run needs: the device, the photographs' preparation, the scene."""
+"""Open a run: check its device, prepare its photos, read its scene."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -35,10 +35,10 @@ from clsplat.training.modules.sky_choice import choose_sky, sky_share
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
-# The scene of a run as it is trained on, with every photograph decoded.
+# The scene of a run, with all photos decoded.
 
 LOG = logging.getLogger("clsplat")
-FEWEST = 3  # training photographs without a warning at the start
+MIN_VIEWS = 3  # training photos; fewer get a warning
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,9 @@ class RunScene:
 
     @classmethod
     def of(cls, settings: SceneSettings, scene: Scene) -> "RunScene":
-        """Apply the settings to a scene, and decode its photographs.
+        """Apply the settings to a scene, and decode its photos.
 
-        Raises DataError, naming the files, when some of the training or test photographs and masks cannot be used.
+        Raises DataError with the files if some photos or masks cannot be used.
         """
         original, background = settings.applied(scene)
         downscaled = original.downscaled(*settings.downscales)
@@ -70,11 +70,10 @@ class RunScene:
                 downscaled.extent,
             ),
         )
-        if len(original.train) < FEWEST:
+        if len(original.train) < MIN_VIEWS:
             LOG.warning(
-                "%s: is trained on %s: a model of fewer than %d fits these and shows little else; add photographs, or "
-                "put back those that are missing",
-                *(scene.path, pluralize(len(original.train), "photograph"), FEWEST),
+                "%s: only %s for training: the model will fit these and little else; add photos",
+                *(scene.path, pluralize(len(original.train), "photo")),
             )
         files = decode_all(view for one in (original, downscaled) for split in SPLITS for view in one.split(split))
         require_decodable(scene.path, files)
@@ -100,9 +99,9 @@ def open_run(
     status: StatusFile | None = None,
     read: ReadScene = read_run_scene,
 ) -> Run:
-    """Open the device, prepare and read the scene, decode its photographs, and tell `status` how far that is.
+    """Open the device, prepare and read the scene, and decode its photos, with the progress in `status`.
 
-    start: "restart" lets others take the place of the photographs that the run in `out` was started with.
+    start: "restart" allows other photos than those that the run in `out` was started with.
     Raises the errors of these steps.
     """
     opened, planned = check_start(pipeline, out, device, start)
@@ -119,9 +118,9 @@ def open_run(
 
 
 def counts_of(status: StatusFile) -> Listener:
-    """Return what notes counts of the preparation, and the time left in its last stage alone.
+    """Return a listener that writes counts of the preparation to `status`, with the time left in its last stage only.
 
-    Before that the time of later steps is not known, such as that of finding the cameras while pairs are matched.
+    Earlier, the time of the following steps is unknown, such as that of mapping while pairs are matched.
     """
 
     def note_count(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
@@ -133,7 +132,7 @@ def counts_of(status: StatusFile) -> Listener:
 def check_start(
     pipeline: Pipeline, out: Path, device: str | Device | None, start: Start
 ) -> tuple[Device, list[PlannedStep]]:
-    """Check all that can be checked before photographs are prepared; return the device and the steps of `prepare`.
+    """Check everything that can be checked before photos are prepared; return the device and the steps of `prepare`.
 
     Nothing is written.  Raises the errors of a run.
     """
@@ -143,16 +142,14 @@ def check_start(
     opened = open_correct(device, settings.rasterizer.schedule, settings.rasterizer.sort)
     planned = check_preparation(pipeline, out)
     if planned and start != "restart" and read_note(out) not in (None, make_note(planned)):
-        raise ConfigError(
-            f"{out}: was started with other photographs, or other settings of `prepare`; give another folder"
-        )
+        raise ConfigError(f"{out}: was started with other photos or other settings of `prepare`; use another folder")
     return opened, planned
 
 
 def listed(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> list[str]:
-    """Return the names of what is to be prepared; none where `prepare` finds no photographs by itself.
+    """Return the names of the photos to prepare; empty if `prepare` has no photos to find.
 
-    The log says which files are left out.
+    The log names the files that are skipped.
     """
     try:
         return (
@@ -163,39 +160,39 @@ def listed(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> lis
 
 
 def check_preparation(pipeline: Pipeline, out: Path) -> list[PlannedStep]:
-    """Return the steps that prepare the photographs of a run in `out`; nothing is written.
+    """Return the steps that prepare the photos of a run in `out`; nothing is written.
 
-    Raises what is known before the first of them: ConfigError or DataError.
+    Raises ConfigError or DataError for faults that are known before the first step.
     """
     planned = pipeline.preparation(out)
     if planned and planned[0].why:
         planned[0].step.check(pipeline.settings.scene.folder.resolve(), prepared_folder(out).parent)
-    if any(one.why for one in planned):
+    if any(step.why for step in planned):
         _check_split(pipeline, planned, out)
     return planned
 
 
 def _check_split(pipeline: Pipeline, planned: Sequence[PlannedStep], out: Path) -> None:
-    """Raise DataError where the photographs that are to be prepared do not have the split, however many are placed."""
+    """Raise DataError if the photos to prepare cannot have the split, even if all get a camera."""
     with log_level(logging.ERROR):
         names = listed(pipeline, planned, out)
     if not names:
         return
     pipeline.settings.scene.split.check(pipeline.settings.scene.folder, names)
-    with suppress(MissingViewError):  # a dry run says it
+    with suppress(MissingViewError):  # a dry run reports it
         _applied(pipeline, names)
 
 
 def known(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
-    """Return the measures that named photographs have if all are placed: how many train, for validation too.
+    """Return the measures of named photos, if all get a camera: the number for training and validation.
 
-    None without names.  Raises DataError where the split does not fit all of them.
+    None without names.  Raises DataError if the split does not fit them.
     """
     return Measures(len(_applied(pipeline, names).merge_validation().train)) if names else None
 
 
 def _applied(pipeline: Pipeline, names: Sequence[str]) -> Scene:
-    """The scene of named photographs, all placed, with the split.  Raises DataError."""
+    """Return a scene of named photos, all with a camera, with the split.  Raises DataError."""
     folder, split = pipeline.settings.scene.folder, pipeline.settings.scene.split
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
@@ -204,10 +201,10 @@ def _applied(pipeline: Pipeline, names: Sequence[str]) -> Scene:
 
 
 def undistorted_folder(out: Path) -> Path:
-    """Return the folder of undistorted photographs: in the run folder, or where a link beside it leads.
+    """Return the folder of undistorted photos: in the run folder, or behind a link next to it.
 
-    A store puts the link there, so that its cells share them.  Each host has its own, for the names of temporary files
-    tell processes of one host apart.
+    A store creates the link so that its cells share the photos.  Each host has its own folder, as the names of
+    temporary files are unique only within a host.
     """
     shared = out.absolute().parent / UNDISTORTED
     return shared / Owner.current().host_slug if shared.is_symlink() and shared.is_dir() else out / UNDISTORTED

@@ -1,4 +1,4 @@
-"""The files that a run has at its end."""
+"""Write and check the files of a run at its end."""
 
 import json
 from collections.abc import Collection, Mapping, Sequence
@@ -28,9 +28,12 @@ from clsplat.training.stage import Training
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
-    """Write what the run has come to, and where its files are: of each kind of stage that of the last."""
+    """Write the results of a run and the paths of its files, for the last stage of each name."""
     trained = next((stage.stage for stage in reversed(pipeline.stages) if isinstance(stage, Training)), "optimize")
-    spent = {**run.status.seconds, trained: run.train_seconds}  # of this process, but training of all
+    spent = {
+        **run.status.seconds,
+        trained: run.train_seconds,
+    }  # of this process; training time includes earlier processes
     files = {stage.stage: path for stage in pipeline.stages for path in stage.outputs(run.out)[:1]}
     metrics = {
         "test": run.metrics.get("test", {}),
@@ -57,12 +60,12 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
 
 
 def sums_before(pipeline: Pipeline, run: Run) -> dict[str, str]:
-    """Return the SHA-256 of files that an earlier end of the run has written and that its coming stages do not, by
-    path in the folder: while the run goes on, and at its end, these are never taken for whole with other bytes.
+    """Return the SHA-256, by path in the folder, of files that the finished run had and that no later stage rewrites.
 
-    Of what a training that goes on writes, and of the records, only those that are lost are among them.
+    Until the run ends again, other bytes in these files count as damage.  Records, and files of a training that
+    continues, are included only if they are lost.
     """
-    sums = read_sums(run.out)
+    sums = read_sums(run.out)  # read again: with --minutes this process may have changed them
     if sums is None:
         sums = run.model_hashes if run.status.was_done else {}
     stages = pipeline.stages[run.stage_index :]
@@ -75,19 +78,19 @@ def sums_before(pipeline: Pipeline, run: Run) -> dict[str, str]:
 
 
 def write_checksums(pipeline: Pipeline, run: Run, before: Mapping[str, str]) -> None:
-    """Write the SHA-256 of every file that the run has at its end, by its path in the run folder.
+    """Write the SHA-256 of each file of the finished run, by path in the run folder.
 
-    Those that were written `before` keep theirs.
+    Files that were written `before` keep theirs.
     """
-    found = [run.out / name for name in (PIPELINE, METRICS, RECORDS, TRIAL)]
-    for place in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
-        found += sorted(place.rglob("*")) if place.is_dir() else [place]
-    new = [path for path in dict.fromkeys(found) if path.is_file() and _name(path, run) not in before]
+    files = [run.out / name for name in (PIPELINE, METRICS, RECORDS, TRIAL)]
+    for output in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
+        files += sorted(output.rglob("*")) if output.is_dir() else [output]
+    new = [path for path in dict.fromkeys(files) if path.is_file() and _name(path, run) not in before]
     keep_checksums(run, {**{_name(path, run): sha256(path, kind=OutputError) for path in new}, **before})
 
 
 def keep_checksums(run: Run, sums: Mapping[str, str]) -> None:
-    """Write the list of checksums, or remove it where there are none."""
+    """Write the list of checksums, or remove it if there are none."""
     if sums:
         write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
     else:
@@ -98,55 +101,57 @@ def _name(path: Path, run: Run) -> str:
     return path.relative_to(run.out).as_posix()
 
 
-def check_places(pipeline: Pipeline, state: RunState) -> None:
-    """Raise ConfigError where a run in a folder would write elsewhere, or over files that no run there has made.
+def check_output_paths(pipeline: Pipeline, state: RunState) -> None:
+    """Raise ConfigError if a run would write outside of its folder, or over files that are not from a run.
 
-    Raises OutputError where there can be no such folder.
+    Raises OutputError if the folder cannot exist.
     """
     out = state.out
     path_exists(out)
     folder, scene = out.resolve(), pipeline.settings.scene
     if folder == folder.parent:
-        raise ConfigError(f"{out}: is the root of a file system; give another folder for the run")
-    taken = [folder, folder.parent] if pipeline.settings.prepare else [folder]  # the photographs' folder is hashed
-    if scene.path is not None and scene.folder.resolve() in taken:
-        raise ConfigError(f"{out}: is the folder of the photographs, or right in it; give another folder for the run")
+        raise ConfigError(f"{out}: is the root of a file system; use another folder for the run")
+    forbidden = (
+        [folder, folder.parent] if pipeline.settings.prepare else [folder]
+    )  # `prepare` hashes the photos' folder
+    if scene.path is not None and scene.folder.resolve() in forbidden:
+        raise ConfigError(f"{out}: is the folder of the photos, or in it; use another folder for the run")
     check_names(state, RUN_FILES, [path for stage in pipeline.stages for path in stage.outputs(out)])
 
 
 def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path] = ()) -> None:
-    """Raise ConfigError where what a run or a matrix writes leads outside, or is a file that none there has made."""
+    """Raise ConfigError if a file that a run or a matrix writes is outside of its folder, or is not from a run."""
     out, files = state.out, [*(state.out / name for name in sorted(names)), *outputs]
     folder = out.resolve()
     if outside := [path for path in files if not path.resolve().is_relative_to(folder)]:
-        raise ConfigError(f"{outside[0]}: a link leads outside of the run folder; remove it, or choose another name")
+        raise ConfigError(f"{outside[0]}: is a link to outside of the run folder; remove it, or choose another name")
     own = EARLY_RUN_FILES if Owner.from_record(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
-    left = {out / name for name in own}  # by a run that has not begun
+    leftovers = {out / name for name in own}  # of a run that has not started
     for path in files if state.phase < Phase.BEGUN else ():
-        if path not in left and (path.is_file() or (path.is_dir() and any(path.iterdir()))):
-            raise ConfigError(f"{path}: exists, and is not of this run; give another folder for the run")
+        if path not in leftovers and (path.is_file() or (path.is_dir() and any(path.iterdir()))):
+            raise ConfigError(f"{path}: exists, and is not from a run; use another folder for the run")
 
 
 def _is_lock(file: Path) -> bool:
-    """Whether a file is run.lock as a process that was killed leaves it, also before it has written all of it."""
+    """Whether a file is a run.lock, even if its process was killed before it had written all of it."""
     begin = b'{"process": '
     return file.is_file() and begin.startswith(read_file(file)[: len(begin)])
 
 
 def check_outputs(pipeline: Pipeline, run: Run, lost: Collection[str] = ()) -> None:
-    """Look for the files that a run has declared, but for those that were `lost` before, which a warning names.
+    """Check that the files of a run exist, except those that were `lost` before.
 
-    Raises OutputError where one is missing, or a model is not as it was written.
+    Raises OutputError if one is missing, or a model has changed since it was written.
     """
-    places = [path for stage in pipeline.stages for path in stage.outputs(run.out)]
-    models = {name: value for name, value in run.model_hashes.items() if is_below(run.out / name, places)}
+    outputs = [path for stage in pipeline.stages for path in stage.outputs(run.out)]
+    models = {name: value for name, value in run.model_hashes.items() if is_below(run.out / name, outputs)}
     faults = {name for name in (METRICS, PIPELINE, *declared(pipeline)) if not (run.out / name).is_file()}
     if faults := (faults | {*not_whole(run.out, models)}) - {*lost}:
-        what = "is missing or differs from what was written"
-        raise OutputError(f"{run.out / min(faults)}: {what}, at the end of the run; see {run.out / LOG_FILE}")
+        fault = "is missing, or changed after the run wrote it"
+        raise OutputError(f"{run.out / min(faults)}: {fault}; see {run.out / LOG_FILE}")
 
 
 def declared(pipeline: Pipeline) -> list[str]:
-    """Return the files that the stages of a pipeline name, by path in the run folder."""
+    """Return the files that the stages of a pipeline name, as paths in the run folder."""
     fields = [(stage, *named) for stage in pipeline.stages for named in stage.named_outputs().items()]
     return [name for stage, key, endings in fields if endings and (name := getattr(stage, key)) is not None]

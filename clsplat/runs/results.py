@@ -1,4 +1,4 @@
-"""A finished run, read from its folder: settings, metrics, records, renders."""
+"""Read a finished run from its folder: settings, metrics, records, renders."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +23,7 @@ Points = list[tuple[float, float]]
 
 
 class Averages(BaseModel):
-    """Metrics of a split at one size; perceptual metrics and remarks on them are extra fields."""
+    """Metrics of a split at one image size; perceptual metrics and remarks on them are extra fields."""
 
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
@@ -35,11 +35,11 @@ class Averages(BaseModel):
 
     @property
     def color_views(self) -> int:
-        """The number of views that `psnr_color` is the mean of."""
+        """The number of views over which `psnr_color` is averaged."""
         return self.views if self.psnr_color_views is None else self.psnr_color_views
 
     def figure(self, metric: str) -> float | None:
-        """Return a metric by name; None when it was not measured."""
+        """Return a metric by name; None if it was not measured."""
         value = getattr(self, metric, None)
         return float(value) if isinstance(value, int | float) else None
 
@@ -48,7 +48,7 @@ AveragesByDownscale = dict[Annotated[str, Field(pattern=r"^\d+(\.\d+)?$")], Aver
 
 
 class RunMetrics(BaseModel):
-    """The contents of metrics.json; figures of stages and of photographs are extra fields."""
+    """The content of metrics.json; values of stages and of the preparation are extra fields."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -85,7 +85,7 @@ class RunFolder:
         if PIPELINE not in state.names:
             raise DataError(f"{path}: has no {PIPELINE}; expected the folder of a finished run")
         if METRICS not in state.names:
-            raise DataError(f"{path}: has no {METRICS}, for the run is {state.state_name}; finish it with --resume")
+            raise DataError(f"{path}: has no {METRICS}, as the run is {state.state_name}; finish it with --resume")
         settings = read_settings(path)
         return cls(path, settings, _scene(path, settings), read_metrics(path / METRICS))
 
@@ -98,27 +98,27 @@ class RunFolder:
 
     @property
     def photographs(self) -> Path:
-        """The folder with the photographs that the run trained on.  Raises ConfigError when no scene is named."""
+        """The folder of the photos that the run trained on.  Raises ConfigError if no scene is named."""
         prepared = read_note(self.path)
         return Path(prepared["folder"]) if prepared else self.scene.folder
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
-        """The lines of metrics.jsonl; none where it is missing.  Raises DataError when it is damaged."""
+        """The lines of metrics.jsonl; empty if it is missing.  Raises DataError if it is damaged."""
         return Records(self.path).read()
 
     def points(self, kind: str, figure: str, **where: Any) -> Points:
-        """Return (step, figure) of all records of a kind, such as `train`, whose values are those of `where`."""
+        """Return (step, figure) of all records of a kind, such as `train`, that have the values `where`."""
         lines = (line for line in self.records if line["kind"] == kind)
         chosen = (line for line in lines if all(line.get(key) == value for key, value in where.items()))
         return [(line["step"], line[figure]) for line in chosen if isinstance(line.get(figure), int | float)]
 
     def by_cpu_seconds(self, points: Points) -> Points:
-        """Return points (step, figure) by the CPU seconds of training at their step; none where no record has them."""
-        spent = [(0.0, 0.0), *self.points("train", "cpu_seconds")]
-        if len(spent) == 1:
+        """Return points (CPU seconds of training, figure) for points (step, figure); empty without CPU times."""
+        times = [(0.0, 0.0), *self.points("train", "cpu_seconds")]
+        if len(times) == 1:
             return []
-        steps, seconds = zip(*spent, strict=True)
+        steps, seconds = zip(*times, strict=True)
         return [(float(np.interp(step, steps, seconds)), figure) for step, figure in points]
 
     @property
@@ -129,7 +129,7 @@ class RunFolder:
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return a run folder's pipeline.yaml as plain data.  Raises ConfigError when it holds anything else."""
+    """Return a run folder's pipeline.yaml as plain data.  Raises ConfigError if it is not a pipeline."""
     data = read_yaml(path / PIPELINE).data
     if not isinstance(data, dict) or not isinstance(data.get("stages", []), list):
         raise ConfigError(f"{path / PIPELINE}: damaged; expected keys such as name and stages")

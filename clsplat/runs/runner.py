@@ -229,7 +229,7 @@ def run_stages(pipeline: Pipeline, run: Run) -> None:
         if run.interrupted:
             path = checkpoint.save(run)
             raise Interrupted(
-                f"stopped in {stage.stage}, saved in {path}; `clsplat resume {shell_quote(run.out)}` goes on from it"
+                f"stopped in {stage.stage}, saved in {path}; `clsplat resume {shell_quote(run.out)}` continues from it"
             )
         if is_due(run):
             run_stages(pipeline, run)

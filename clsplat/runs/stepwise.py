@@ -1,4 +1,4 @@
-"""The stages of a pipeline that train, one step at a time."""
+"""Run the training of a pipeline step by step."""
 
 from collections.abc import Iterator
 from itertools import takewhile
@@ -11,7 +11,7 @@ from clsplat.training.run import Run
 
 
 def run_until_training(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages before the first that trains, from where the run is."""
+    """Run the stages before the first training, starting at the run's stage."""
     for cursor, stage in enumerate(pipeline.stages):
         if isinstance(stage, Optimize):
             return
@@ -21,9 +21,9 @@ def run_until_training(pipeline: Pipeline, run: Run) -> None:
 
 
 def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
-    """Run all stages that train, those between them, and the edits right behind them; yield after each step.
+    """Run all stages from the first training to the last, and the edits that follow it; yield after each step.
 
-    A refit runs the stages from the beginning on.
+    A refit runs the stages from the start.
     """
     whole, begins = pipeline, is_due(run)
     begin_if_due(run)
@@ -51,14 +51,14 @@ def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
 
 
 def _edit_behind(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages that change the model right behind the training, as part of its last step."""
+    """Run the stages that edit the model after the training, as part of its last step."""
     for stage in takewhile(lambda stage: stage.edits, pipeline.stages[run.stage_index + 1 :]):
         run.next_stage(run.stage_index + 1)
         stage.act(run)
 
 
 def is_trained(pipeline: Pipeline, run: Run) -> bool:
-    """Return whether no step of the training is left."""
+    """Return whether the training has no steps left."""
     _, last = _training_stages(pipeline)
     stage = as_trained(pipeline, run).stages[last]
     in_its_end = isinstance(stage, Optimize) and run.stage_index == last and stage.has_ended(run)
@@ -66,6 +66,6 @@ def is_trained(pipeline: Pipeline, run: Run) -> bool:
 
 
 def _training_stages(pipeline: Pipeline) -> tuple[int, int]:
-    """The first stage that trains, and the last."""
-    places = [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
-    return places[0], places[-1]
+    """Return the indices of the first and the last training."""
+    indices = [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
+    return indices[0], indices[-1]

@@ -1,4 +1,4 @@
-"""Verify a run folder from its files alone: which it must have, and whether each is whole."""
+"""Verify the files of a run folder: which must exist, and whether each is intact."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -40,7 +40,7 @@ from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
 from clsplat.training.status import status_of
 
-# How each file of a run is looked at: what it is, or the DataError of what is wrong with it.
+# Checks of each kind of file: they return a description, or raise DataError.
 
 
 def require_sum(expected: str | None, path: Path) -> None:
@@ -77,14 +77,14 @@ def checkpoint_file(path: Path) -> str:
 
 def note_file(path: Path) -> None:
     if read_note(path.parent) is None:
-        raise DataError("expected the hash and the folder of prepared photographs")
+        raise DataError("expected the hash and the folder of the prepared photos")
 
 
 def sums_file(expected: list[str], path: Path) -> str:
     sums = read_json(path)
     if not isinstance(sums, dict) or not all(isinstance(value, str) for value in sums.values()):
         raise DataError("expected the SHA-256 of each file")
-    faults = [f"'{shorten(name)}' is no file of the run" for name in sums if not is_inside(name)]
+    faults = [f"'{shorten(name)}' is not a file of the run" for name in sums if not is_inside(name)]
     if absent := [f"'{name}'" for name in expected if name not in sums]:
         faults.append(f"lacks {', '.join(absent)}")
     if faults:
@@ -93,7 +93,7 @@ def sums_file(expected: list[str], path: Path) -> str:
 
 
 def output(expected: str | None, path: Path) -> str:
-    """Look at one output; return what it is.  Raises the errors of its reader, DataError where its bytes changed."""
+    """Check one output; return a description.  Raises errors of its reader, or DataError if its bytes changed."""
     require_sum(expected, path)
     if path.name == METRICS:
         metrics = read_metrics(path)
@@ -108,20 +108,18 @@ def output(expected: str | None, path: Path) -> str:
     return ""
 
 
-NO_SUMS = "is missing, as in runs of a Trainer; without it the outputs are not verified"
+NO_SUMS = "is missing, as in runs of a Trainer; without it, outputs cannot be verified"
 
 
 def verify(state: RunState) -> dict[str, Any]:
-    """Return `whole`, the `state` of the run, and for each file in `objects` whether it is whole, and a detail.
+    """Return `whole`, the `state` of the run, and in `objects` for each file whether it is whole, and a detail.
 
-    Where a file is damaged, `remedy` says how to get it back.
-
-    Files that a run declares and does not have yet are no fault while it is not done.  Raises DataError where the
-    folder holds no run.
+    If a file is damaged, `remedy` says how to get it back.  Files of later stages may be missing while a run is
+    unfinished.  Raises DataError if the folder has no run.
     """
     out = state.out
     if state.phase is Phase.EMPTY:
-        raise DataError(f"{out}: holds neither pipeline.yaml nor status.json; expected the folder of a run")
+        raise DataError(f"{out}: has neither pipeline.yaml nor status.json; expected the folder of a run")
     cells: dict[str, RunState] = {}
     objects = list(_objects(state, cells))
     damaged = [one["file"] for one in objects if not one["whole"]]
@@ -133,15 +131,15 @@ def verify(state: RunState) -> dict[str, Any]:
 
 
 def _objects(state: RunState, cells: dict[str, RunState], whole: bool = False) -> Iterator[dict[str, Any]]:
-    """What is found of each file of a run, or of the cells of a matrix; `whole` expects those of one that is done.
+    """Yield the result for each file of a run, or of the cells of a matrix.
 
-    cells: takes the folders of the cells, by name.
+    cells: receives the folders of the cells, by name; whole: expect the files of a finished run.
     """
     out, names, status, sums = state.out, state.names, state.status, state.sums or {}
     settings: dict[str, Any] = {}
-    ended = CHECKSUMS in names and (PIPELINE in sums or not sums)  # while a run goes on it lists other files
+    ended = CHECKSUMS in names and (PIPELINE in sums or not sums)  # while a run continues, it lists other files
     done = whole or state.phase is Phase.DONE or (not status and ended)
-    one = partial(look_at, out)
+    one = partial(check_file, out)
     yield one(PIPELINE, partial(settings_file, state, settings))
     yield one(STATUS, status_file)
     if "matrix" in settings or "cells" in status:
@@ -156,7 +154,7 @@ def _objects(state: RunState, cells: dict[str, RunState], whole: bool = False) -
     for name in filter(is_inside, dict.fromkeys(saved)):
         yield one(f"{CHECKPOINTS}/{name}", checkpoint_file)
     files = [RECORDS, METRICS] if done else []
-    with suppress(ConfigError):  # told already
+    with suppress(ConfigError):  # reported for its own file
         files += declared(state.pipeline) if done else []
     if CHECKSUMS in names:
         yield one(CHECKSUMS, partial(sums_file, [PIPELINE, *files] if done else []))
@@ -171,15 +169,15 @@ def _objects(state: RunState, cells: dict[str, RunState], whole: bool = False) -
             yield one(name, partial(output, sums.get(name)))
 
 
-def look_at(out: Path, name: str, look: Callable[[Path], Any]) -> dict[str, Any]:
-    """Return what is found of one file of a folder."""
+def check_file(out: Path, name: str, check: Callable[[Path], Any]) -> dict[str, Any]:
+    """Return the result of a check of one file."""
     path = out / name
     try:
         if not path.exists():
-            raise DataError("is a link that leads to nothing" if path.is_symlink() else "is missing")
-        detail = look(path)
+            raise DataError("is a broken link" if path.is_symlink() else "is missing")
+        detail = check(path)
         return {"file": name, "whole": True, "detail": detail if isinstance(detail, str) else ""}
-    except Exception as error:  # whatever is wrong with a file, the others are looked at too
+    except Exception as error:  # whatever the fault of one file is, check the others too
         reason = one_line(error).removeprefix(f"{path}: ") or type(error).__name__
         return {"file": name, "whole": False, "detail": reason}
 
@@ -195,11 +193,11 @@ def _cells(out: Path, done: bool) -> dict[str, RunState]:
     return cells
 
 
-# What `clsplat check RUN` says of a run folder.
+# The verdict of `clsplat check RUN`.
 
 
 def verdict(found: dict[str, Any]) -> str:
-    """Return a sentence about what `verify` found."""
+    """Return the result of `verify` in one sentence."""
     damaged = [one["file"] for one in found["objects"] if not one["whole"]]
     if not damaged:
         return f"{found['run']}: {found['state']}; all {len(found['objects'])} files are whole"
@@ -215,32 +213,31 @@ def verdict(found: dict[str, Any]) -> str:
 def _remedy(state: RunState, verified: dict[str, Any]) -> str:
     """How to get the files of a run back: from a checkpoint that is whole, or from the beginning."""
     if state.phase is Phase.DONE and "cells" not in state.status and not state.lost and PIPELINE in state.names:
-        return "go without them: all outputs are whole, and only training for longer needs these files"
+        return "ignore them: all outputs are whole, and only longer training needs these files"
     whole = {Path(verified["run"], one["file"]) for one in verified["objects"] if one["whole"]}
-    goes_on = "cells" in state.status or any(path in whole for path in state.checkpoints)
-    goes_on |= state.phase < Phase.STATELESS and not (state.checkpoints or state.status.get("checkpoint"))
+    can_continue = "cells" in state.status or any(path in whole for path in state.checkpoints)
+    can_continue |= state.phase < Phase.STATELESS and not (state.checkpoints or state.status.get("checkpoint"))
     if state.out / PIPELINE not in whole:
-        how = "--resume" if goes_on else "--restart"
-        return f"give its `clsplat run … --out {shell_quote(state.out)}` again, with {how}"
-    if goes_on:
+        how = "--resume" if can_continue else "--restart"
+        return f"run its `clsplat run … --out {shell_quote(state.out)}` again, with {how}"
+    if can_continue:
         return f"`clsplat resume {shell_quote(state.out)}` runs the stages after its newest checkpoint again"
-    return f"begin again: {state.restart}"
+    return f"start over: {state.restart}"
 
 
 def lines(found: dict[str, Any]) -> str:
-    """Return what `verify` found, a line for each file."""
+    """Return the result of `verify`, a line for each file."""
     rows = ((f"{'whole  ' if one['whole'] else 'DAMAGED'}  {one['file']}", one["detail"]) for one in found["objects"])
     return "\n".join(", ".join(filter(None, row)) for row in rows)
 
 
-# What `clsplat check` was given: a pipeline, a matrix, the folder of a run, or a model.
+# `clsplat check` of a pipeline, a matrix, a run folder, or a model.
 
 
 def check(pipeline: str) -> dict[str, Any]:
-    """Check a pipeline file, or a shipped one by name: its path, its name, its stages or cells, and the keys
-    that its photographs will decide.
+    """Check a pipeline, by file or name; return its path, name, stages or cells, and the keys that the photos decide.
 
-    Of a run folder and of a model file return what `verify` and `examine` say, of the file of a field its parameters.
+    For a run folder return the result of `verify`, for a model file that of `examine`, for a field its parameters.
     Raises ConfigError; DataError for a folder without a run.
     """
     if is_field(Path(pipeline)) and path_exists(Path(pipeline)):

@@ -49,7 +49,7 @@ def run_pipeline(
 
     state: the folder before the run; minutes: as for `Job.run`.
     """
-    outputs.check_places(pipeline, state)
+    outputs.check_output_paths(pipeline, state)
     out = state.out
     with (
         run_folder.opened(state, start, step=0) as status,
@@ -290,7 +290,7 @@ def describe_matrix(experiment: Experiment, state: RunState, device: str | Devic
     """
     check_matrix_folder(state)
     run_folder.check_run_folder(state, start)
-    describe.tell_of_waiting(state.out)
+    describe.check_unused(state.out)
     cells, done = read_cells(experiment, state.out, start)
     lines, refusals = [], Failures("cells")
     read = cache(read_run_scene)  # each distinct scene once

@@ -39,7 +39,7 @@ from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.input_files import with_content_hashes
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell as MatrixCell
-from clsplat.runs.estimate import DENSEST, minutes_text, most_of, step_seconds
+from clsplat.runs.estimate import MAX_PER_PIXEL, max_gaussians, minutes_text, step_seconds
 from clsplat.runs.failures import Failures
 from clsplat.runs.model_file import as_setting, photographs_of, require_model
 from clsplat.runs.opening import read_run_scene
@@ -80,7 +80,7 @@ def block_seconds(
 def _counts(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:
     """The Gaussians that a block starts from, and the most that it may come to; without a setting that is a guess."""
     first, pixels = int(block.start.sum()), size[0] * size[1]
-    own = [most_of(training, pixels) or block.pairs * DENSEST * pixels for training in _trainings(pipeline)]
+    own = [max_gaussians(training, pixels) or block.pairs * MAX_PER_PIXEL * pixels for training in _trainings(pipeline)]
     return first, max(first, int(max(own)) + first - block.gaussians)
 
 

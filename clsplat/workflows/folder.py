@@ -60,7 +60,7 @@ def verify_blocks(out: Path) -> dict[str, Any]:
         "state": state,
         "whole": all(one["whole"] for one in objects),
         "objects": objects,
-        "remedy": f"give its `clsplat blocks … --out {shell_quote(out)}` again, which makes again what is lost",
+        "remedy": f"run its `clsplat blocks … --out {shell_quote(out)}` again, which makes again what is lost",
     }
 
 
@@ -93,7 +93,7 @@ def _objects(out: Path, done: bool) -> Iterator[dict[str, Any]]:
     looks |= {f"{name}.ply": partial(verify.output, None) for name in parts if name != COARSE}
     for name, look in looks.items():
         if done or (out / name).exists():
-            yield verify.look_at(out, name, look)
+            yield verify.check_file(out, name, look)
     for part in parts:
         if (state := RunState.read(out / part)).phase:
             yield from ({**one, "file": f"{part}/{one['file']}"} for one in verify.verify(state)["objects"])

@@ -52,9 +52,9 @@ def test_trainer_closed_or_released_early_was_interrupted(tiny_scene, tmp_path):
 
 def test_a_trainer_writes_over_no_file_of_others(tiny_scene, tmp_path):
     (tmp_path / "report.html").write_text("mine")
-    with pytest.raises(ConfigError, match=r"report.html: exists, and is not of this run"):
+    with pytest.raises(ConfigError, match=r"report.html: exists, and is not from a run"):
         clsplat.Trainer(tiny_scene, "smoke", out=tmp_path)
-    with pytest.raises(ConfigError, match="is the folder of the photographs"):
+    with pytest.raises(ConfigError, match="is the folder of the photos"):
         clsplat.Trainer(tiny_scene, "smoke", out=tiny_scene)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 

@@ -133,9 +133,9 @@ def test_list_is_not_refused_for_what_cameras_will_tell(photos, caplog):
     assert "is refused: " in (described := describe(left_out, RunState.read(out), None, "new"))
     assert "'02' is left out by scene.train" in described
     told = describe(asked, RunState.read(out), None, "new")
-    assert "if all 23 photographs are placed, the run is refused:" in told
+    assert "if all 23 photos get a camera, the run is refused:" in told
     assert "'00.png' is held out for testing" in told
-    assert "follow from the photographs: init.transparent, " in told, "what they will decide"
+    assert "the photos decide init.transparent, " in told, "what they will decide"
 
 
 def test_files_that_are_left_out_are_told_once(photos, caplog):
@@ -150,7 +150,7 @@ def test_dry_run_says_what_photographs_will_decide(photos):
         line.strip() for line in describe(asked, RunState.read(photos.parent / "runs" / "a"), None, "new").splitlines()
     ]
     (found,) = [line for line in lines if line.startswith("adapt ")]
-    assert "follow from the photographs: init.transparent, init.count, " in found
+    assert "the photos decide init.transparent, init.count, " in found
     assert "dropout" not in found
 
 

@@ -90,7 +90,7 @@ def test_a_signal_that_a_library_catches_stops_the_run(tiny_scene: Path, tmp_pat
 
     monkeypatch.setattr(opening, "check_start", catching)
     for _ in range(2):
-        with pytest.raises(Interrupted, match="stopped at once; to go on, run the same command again"):
+        with pytest.raises(Interrupted, match="stopped at once; run the same command again to continue"):
             Job.open("smoke", tiny_scene, tmp_path / "run").run()
         assert not (tmp_path / "run").exists()
     monkeypatch.setattr(opening, "check_start", check)

@@ -366,7 +366,7 @@ def test_a_dry_run_of_a_resumed_run_says_from_where(scene, tmp_path):
     train(scene, out, *FEW)
     assert f"{out}: up to date" in command(*words, "--resume").stdout
     (out / "point_cloud.ply").unlink()
-    assert f"would go on from step 12 in {out}" in command(*words, "--resume").stdout
+    assert f"would continue from step 12 in {out}" in command(*words, "--resume").stdout
     assert "already has a run" in command(*words, expect=2).stderr
     done = command(*words, "--resume", "--set", "seed=7", expect=2)
     assert "made with other settings: seed was 0, is 7" in done.stderr

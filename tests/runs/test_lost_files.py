@@ -178,7 +178,7 @@ def test_without_a_checkpoint_the_remedy_is_to_restart(copy):
     shutil.rmtree(copy / "checkpoints")
     (copy / "point_cloud.ply").unlink()
     for _ in ("done", "its status is lost too"):
-        advice = f"begin again: `clsplat run {copy}/pipeline.yaml --out {copy} --restart`\n"
+        advice = f"start over: `clsplat run {copy}/pipeline.yaml --out {copy} --restart`\n"
         assert command("check", copy, expect=7).stderr.endswith(advice)
         assert "--restart`" in command("resume", copy, expect=2 if (copy / "status.json").exists() else 7).stderr
         (copy / "status.json").unlink(missing_ok=True)
@@ -234,6 +234,6 @@ def test_run_killed_before_it_began_says_how_to_begin(tmp_path):
     (tmp_path / "run" / "status.json").write_text('{"state": "preparing", "process": 4194305}')
     again = f"run its `clsplat run … --out {tmp_path / 'run'} --resume` again"
     assert again in command("resume", tmp_path / "run", expect=3).stderr
-    assert f"give its `clsplat run … --out {tmp_path / 'run'}` again, with --resume" in (
+    assert f"run its `clsplat run … --out {tmp_path / 'run'}` again, with --resume" in (
         command("check", tmp_path / "run", expect=7).stderr
     )

@@ -39,7 +39,7 @@ ENDINGS = {
     "a defect without words": (AssertionError(), InternalError, f"internal error (a bug): AssertionError; {HINT}"),
     "several lines": (RuntimeError("a\n  b"), InternalError, "RuntimeError: a b; "),
     "no memory": (MemoryError(), MemoryLimitError, "out of memory"),
-    "a second Ctrl-C": (KeyboardInterrupt(), Interrupted, "stopped at once; to go on, run the same command again"),
+    "a second Ctrl-C": (KeyboardInterrupt(), Interrupted, "stopped at once; run the same command again to continue"),
     "the end of a file": (EOFError(), InternalError, "EOFError"),
     "a full disk": (OSError(28, "No space left on device", "/x/y"), OutputError, "/x/y: No space left on device"),
     "bad data": (DataError("no photograph"), DataError, "no photograph"),
@@ -169,4 +169,4 @@ def test_a_command_without_stdout_says_so():
 
 
 def test_running_out_of_memory_names_gaussians_and_images():
-    assert "use fewer Gaussians, smaller images" in str(as_clsplat_error(MemoryError()))
+    assert "use fewer Gaussians, or fewer or smaller images" in str(as_clsplat_error(MemoryError()))

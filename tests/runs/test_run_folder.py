@@ -19,22 +19,24 @@ from clsplat.sweeps.experiment import Job
 
 
 def opened(scene: Path, out: Path, *changes: str) -> None:
-    outputs.check_places(load("smoke", [f"scene.path={str(scene)!r}", *changes]), RunState.read(out))
+    outputs.check_output_paths(load("smoke", [f"scene.path={str(scene)!r}", *changes]), RunState.read(out))
 
 
 def test_photograph_folder_and_root_are_no_run_folders(tiny_scene, monkeypatch):
     for out in (tiny_scene, tiny_scene / "train" / ".."):
-        with pytest.raises(ConfigError, match="is the folder of the photographs"):
+        with pytest.raises(ConfigError, match="is the folder of the photos"):
             opened(tiny_scene, out)
     monkeypatch.chdir(tiny_scene)
-    with pytest.raises(ConfigError, match="is the folder of the photographs"):
+    with pytest.raises(ConfigError, match="is the folder of the photos"):
         opened(tiny_scene, Path())
     with pytest.raises(ConfigError, match="is the root of a file system"):
         opened(tiny_scene, Path(Path.cwd().anchor))
     opened(tiny_scene, tiny_scene / "runs" / "a")
     photographs = tiny_scene / "train"
-    with pytest.raises(ConfigError, match="is the folder of the photographs, or right in it"):
-        outputs.check_places(load("photos", [f"scene.path={str(photographs)!r}"]), RunState.read(photographs / "run"))
+    with pytest.raises(ConfigError, match="is the folder of the photos, or in it"):
+        outputs.check_output_paths(
+            load("photos", [f"scene.path={str(photographs)!r}"]), RunState.read(photographs / "run")
+        )
 
 
 def test_a_link_that_leads_outside_is_not_followed(tiny_scene, tmp_path):
@@ -43,7 +45,7 @@ def test_a_link_that_leads_outside_is_not_followed(tiny_scene, tmp_path):
         out.mkdir()
         (out / name).symlink_to(tmp_path / "elsewhere")
         for _ in ("new", "with a run"):
-            with pytest.raises(ConfigError, match=f"{name}: a link leads outside of the run folder"):
+            with pytest.raises(ConfigError, match=f"{name}: is a link to outside of the run folder"):
                 opened(tiny_scene, out)
             (out / "pipeline.yaml").touch()
         (out / name).unlink()
@@ -55,12 +57,12 @@ def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path
     (tmp_path / "holiday").mkdir()
     (tmp_path / "holiday" / "r_1.png").write_text("mine")
     (tmp_path / "report.html").write_text("mine")
-    with pytest.raises(ConfigError, match=r"report.html: exists, and is not of this run"):
+    with pytest.raises(ConfigError, match=r"report.html: exists, and is not from a run"):
         opened(tiny_scene, tmp_path)
-    with pytest.raises(ConfigError, match=r"holiday: exists, and is not of this run"):
+    with pytest.raises(ConfigError, match=r"holiday: exists, and is not from a run"):
         opened(tiny_scene, tmp_path, "render.folder=holiday", "report.file=other.html")
     for start in ("new", "resume", "restart"):
-        with pytest.raises(ConfigError, match="is not of this run"):
+        with pytest.raises(ConfigError, match="is not from a run"):
             Job.open("smoke", tiny_scene, tmp_path, start=start).run()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["holiday", "report.html"]
     (tmp_path / "pipeline.yaml").touch()
@@ -73,7 +75,7 @@ def test_foreign_files_with_names_of_a_run_are_not_replaced(tiny_scene, tmp_path
         out.mkdir()
         (out / name).write_text('{"state": "mine"}')
         for start in ("new", "resume", "restart"):
-            with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
+            with pytest.raises(ConfigError, match=f"{name}: exists, and is not from a run"):
                 Job.open("smoke", tiny_scene, out, start=start).run()
         assert [path.name for path in out.iterdir()] == [name]
         assert (out / name).read_text() == '{"state": "mine"}'
@@ -82,7 +84,7 @@ def test_foreign_files_with_names_of_a_run_are_not_replaced(tiny_scene, tmp_path
 def test_foreign_files_with_names_of_a_matrix_are_not_replaced(tmp_path):
     for name in files.MATRIX_FILES - {files.PIPELINE}:
         (tmp_path / name).write_text("mine")
-        with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
+        with pytest.raises(ConfigError, match=f"{name}: exists, and is not from a run"):
             experiment.check_matrix_folder(RunState.read(tmp_path))
         (tmp_path / name).unlink()
 
@@ -101,7 +103,7 @@ UNWRITABLE = {  # --out -> the exit code, and what the sentence says
     "FILE/run": (7, "cannot be written (Not a directory)"),
     "FILE": (7, "cannot be written (File exists)"),
     "x" * 300: (7, "File name too long"),
-    "SCENE": (2, "is the folder of the photographs"),
+    "SCENE": (2, "is the folder of the photos"),
     "ROOT": (2, "is the root of a file system"),
     "not \udcff text": (0, ""),
 }

@@ -95,7 +95,7 @@ def test_long_stage_ends_early_with_saved_state_and_is_repeated(
 
 def test_the_second_signal_stops_at_once(pipeline, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(render, "render_view", signalled(render.render_view, 1, times=2))
-    words = f"stopped at once, and no checkpoint was saved; `clsplat resume {tmp_path}` begins it again"
+    words = f"stopped at once, and no checkpoint was saved; `clsplat resume {tmp_path}` starts it over"
     with pytest.raises(Interrupted, match=re.escape(words)):
         Job.open(pipeline, tiny_scene, tmp_path).run()
     assert read_status(tmp_path)["state"] == "interrupted"

@@ -161,14 +161,14 @@ def test_a_list_without_a_declared_output_is_damaged(copy):
     assert damaged(copy) == {"checksums.json": f"lacks {', '.join(map(repr, names))}"}
     (copy / "checksums.json").write_text('{"../a": "", "/b": ""}')
     assert damaged(copy)["checksums.json"].startswith(
-        "'../a' is no file of the run; '/b' is no file of the run; lacks "
+        "'../a' is not a file of the run; '/b' is not a file of the run; lacks "
     )
 
 
 KINDS = {
     "is a folder": Path.mkdir,
     "is a pipe": getattr(os, "mkfifo", None),
-    "is a link that leads to nothing": lambda path: path.symlink_to("nowhere"),
+    "is a broken link": lambda path: path.symlink_to("nowhere"),
 }
 
 
@@ -296,7 +296,7 @@ def test_a_matrix_is_checked_with_its_cells(tiny_scene, tmp_path):
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(DataError, match=r"holds neither pipeline.yaml nor status.json"):
+    with pytest.raises(DataError, match=r"has neither pipeline.yaml nor status.json"):
         verify(RunState.read(tmp_path))
     assert "expected the folder of a run" in command("check", tmp_path, expect=3).stderr
 
