@@ -67,7 +67,6 @@ def render_path(
     side: PathLike | None = None,
     depth: bool = False,
     alpha: bool = False,
-    save_path: PathLike | None = None,
     downscale: float | None = None,
     kind: Literal["png", "npy"] = "png",
     device: "str | Device | None" = None,
@@ -82,8 +81,7 @@ def render_path(
     fixed, fixed:NAME of a view, or a file camera_path.json; frames: by default 120; fps: by default 30; size: even
     numbers, by default that of the photographs by `downscale`; times: of a model that moves, one moment in [0, 1],
     or those of the first and the last frame, such as (0, 1) or "0..1", by default the whole or the views' own;
-    side: "photograph", of the nearest camera, or another model, on the right; depth, alpha: files of these beside;
-    save_path: a camera_path.json to write.
+    side: "photograph", of the nearest camera, or another model, on the right; depth, alpha: files of these beside.
 
     Raises ConfigError for values out of bounds, without a scene that the path needs, and where other files would be
     replaced; DataError for files that cannot be read, and where the scene's cameras give no such path; NumericError for
@@ -94,7 +92,7 @@ def render_path(
 
     load_plugins()
     wish, place = Wish.of(str(path), frames, fps, size, times), film.FilmTarget(path_of(video), Path(out), kind)
-    extras = film.Extras(None if side is None else str(side), layer_names(depth, alpha), path_of(save_path))
+    extras = film.Extras(None if side is None else str(side), layer_names(depth, alpha))
     return film.film(Path(model), path_of(scene), place, wish, extras, downscale=downscale, device=device)
 
 

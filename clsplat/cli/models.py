@@ -294,9 +294,6 @@ TimeOption = Annotated[
 TimesOption = Annotated[
     str | None, typer.Option(metavar="A..B", help="Video: times of the first and last frame; default: 0..1.")
 ]
-SavePathOption = Annotated[
-    Path | None, typer.Option(metavar="FILE.json", help="Video: write the camera path, for nerfstudio or --path.")
-]
 
 
 @command(
@@ -324,7 +321,6 @@ def render(
     side: SideOption = None,
     time: TimeOption = None,
     times: TimesOption = None,
-    save_path: SavePathOption = None,
     device: DeviceOption = None,
 ) -> None:
     """Render a model at the views of a scene, one image per view, or make a video along a camera path."""
@@ -337,12 +333,11 @@ def render(
             raise ConfigError("--split is for images of views; for a video of all views, use --path views")
         options: dict[str, Any] = {"path": path or "ellipse", "frames": frames, "fps": fps, "size": size, "side": side}
         options["times"] = times if time is None else time
-        options |= {"depth": depth, "alpha": alpha, "save_path": save_path, "downscale": scale, "kind": format_}
+        options |= {"depth": depth, "alpha": alpha, "downscale": scale, "kind": format_}
         found = pictures.render_path(model, scene, file, out=out, device=device, **options)
         terminal.print_message(_video_text(found, pictures_wide=1 if side is None else 2))
         return
     video_options: dict[str, Any] = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--times": times}
-    video_options["--save-path"] = save_path
     if used := [name for name, value in video_options.items() if value is not None]:
         raise ConfigError(f"{used[0]} is for videos; add --path or --video")
     count = pictures.render_views(

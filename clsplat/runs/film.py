@@ -42,8 +42,7 @@ from clsplat.scene.view import NO_FILE, View
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import BUDGET, Page, Which, described, is_viewer
-from clsplat.viewer.video import camera_path
-from clsplat.viewer.video.film import Film, Side, Wish, check_path_file, files, plan, shoot
+from clsplat.viewer.video.film import Film, Side, Wish, files, plan, shoot
 from clsplat.viewer.video.paths import nearest
 from clsplat.viewer.video.pictures import Canvas, Image, letterboxed
 
@@ -66,7 +65,6 @@ class Extras:
 
     side: str | None = None  # PHOTOGRAPH, or a model file or run folder
     layers: tuple[str, ...] = ("color",)
-    save_path: Path | None = None  # a camera_path.json to write
 
 
 def film(
@@ -89,15 +87,11 @@ def film(
         raise ConfigError(f"no kind '{place.kind}'; there are {', '.join(KINDS)}")
     if videos and place.kind != KINDS[0]:
         raise ConfigError(f"--format {place.kind} is for pictures; a video has 8 bits: leave --video out")
-    if extras.save_path:
-        check_path_file(extras.save_path)
     if extras.side and not videos:
         raise ConfigError("--side needs --video: pictures of a folder stand alone")
     loaded = _read(model)
     found = _scene(model, scene, loaded, downscale, needed=not wish.of_a_file or extras.side == PHOTOGRAPH)
     made = plan(wish, found, points_of(loaded, found), moves=moves(loaded))
-    if extras.save_path:
-        camera_path.write(extras.save_path, made.views, made.fps)
     background = loaded.rendering.background or (found.background if found else "black")
     opened = open_correct(device)
     canvas = Canvas(painter_of(loaded, opened, background))

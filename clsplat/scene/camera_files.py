@@ -64,23 +64,13 @@ LOG = logging.getLogger("clsplat")
 TOLERANCE = 0.5  # px: less is no more than a convention about the middle of a pixel
 
 
-def warn_center_lost(path: Path, cameras: Sequence[Camera], readers: str) -> None:
+def warn_center_lost(path: Path, cameras: Sequence[Camera]) -> None:
     """Warn where readers of a file look for the principal point elsewhere than it is."""
     off = max(max(abs(c.cx - c.width / 2), abs(c.cy - c.height / 2)) for c in cameras)
     if off > TOLERANCE:
         LOG.warning(
-            "%s: %s take the middle of the image for the principal point, which is up to %.1f px away",
-            *(path, readers, off),
-        )
-
-
-def warn_width_lost(path: Path, cameras: Sequence[Camera], readers: str) -> None:
-    """Warn where readers of a file that holds the vertical field of view take a wrong horizontal one."""
-    off = max(c.width / 2 * abs(c.fy / c.fx - 1) for c in cameras)
-    if off > TOLERANCE:
-        LOG.warning(
-            "%s: %s take the vertical focal length for the horizontal one, which moves the sides by up to %.1f px",
-            *(path, readers, off),
+            "%s: other programs take the middle of the image for the principal point, which is up to %.1f px away",
+            *(path, off),
         )
 
 
@@ -94,7 +84,7 @@ MAX_VIEWS = 100_000
 def write_inria(out: Path, views: list[PosedView], points: PointCloud | None, tracks: Tracks | None) -> list[Path]:
     """Write out/cameras.json; return it.  Points and tracks have no place in it.  Raises OutputError."""
     write_text(out / INRIA_FILE, json.dumps([_camera(one, i) for i, one in enumerate(views)], indent=1) + "\n")
-    warn_center_lost(out / INRIA_FILE, [one.view.camera for one in views], "other programs")
+    warn_center_lost(out / INRIA_FILE, [one.view.camera for one in views])
     return [out / INRIA_FILE]
 
 

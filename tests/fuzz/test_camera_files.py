@@ -12,6 +12,7 @@ from clsplat.viewer.video import camera_path
 from clsplat.viewer.video.paths import MAX_FRAMES, SIDES
 from tests.fuzz.mutation import damaged, fuzzed
 from tests.fuzz.outcome import outcome
+from tests.support.camera_paths import write_camera_path
 from tests.support.camera_rings import ring
 
 VIEWS = ring(np.linspace(0, 2, 3))
@@ -21,10 +22,10 @@ WORDS = ['"camera_path"', '"camera_to_world"', '"fov"', '"fisheye"', "179.9", '"
 
 @pytest.fixture(scope="module")
 def seeds(folder):
-    camera_path.write(folder / "a.json", VIEWS, 24)
+    write_camera_path(folder / "a.json", VIEWS, 24)
     camera_files.write_inria(folder, posed_views(make_scene(folder, VIEWS, set(), None)), None, None)
     moved = json.loads((folder / "a.json").read_text())
-    del moved["world"], moved["keyframes"]
+    del moved["seconds"]
     return [(folder / "a.json").read_bytes(), (folder / "cameras.json").read_bytes(), json.dumps(moved).encode()]
 
 

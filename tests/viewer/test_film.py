@@ -10,7 +10,9 @@ import pytest
 import clsplat
 from clsplat.core.errors import ConfigError, DataError, NumericError
 from clsplat.scene.images import read_image
+from clsplat.viewer.video.film import Wish, plan
 from clsplat.viewer.video.pictures import Canvas, depth_picture, letterboxed
+from tests.support.camera_paths import write_camera_path
 from tests.support.commands import clsplat as command
 from tests.support.pictures import decoded
 
@@ -23,7 +25,7 @@ def pictures(folder):
 
 def test_a_film_is_the_pictures_of_its_path(few_steps, tiny_scene, tmp_path):
     options = {"path": "orbit", "frames": 6, "size": (64, 48), "fps": 5}
-    told = clsplat.render_path(few_steps, video=tmp_path / "a.webm", save_path=tmp_path / "p.json", **options)
+    told = clsplat.render_path(few_steps, video=tmp_path / "a.webm", **options)
     assert (told["frames"], told["seconds"], told["size"]) == (6, 1.2, [64, 48])
     assert clsplat.render_path(few_steps, video=None, out=tmp_path / "out", **options)["frames"] == 6
     found, fps = decoded(tmp_path / "a.webm")
@@ -38,13 +40,15 @@ def test_a_film_is_the_pictures_of_its_path(few_steps, tiny_scene, tmp_path):
     images = [renderer.render(view).image for view in views]
     assert np.mean([clsplat.metrics.psnr(a, b) for a, b in zip(images, single.values(), strict=True)]) > 30
 
+    made = plan(Wish.of("orbit", 6, 5, "64x48"), clsplat.read_scene(tiny_scene), model.means)
+    write_camera_path(tmp_path / "p.json", made.views, 5)
     again = clsplat.render_path(few_steps, video=tmp_path / "b.webm", path=str(tmp_path / "p.json"))
     assert (again["frames"], again["fps"]) == (6, 5)
     assert (tmp_path / "a.webm").read_bytes() == (tmp_path / "b.webm").read_bytes()
 
 
-def test_a_path_of_a_file_needs_no_scene(few_steps, tmp_path):
-    clsplat.render_path(few_steps, video=None, out=tmp_path / "o", frames=2, save_path=tmp_path / "p.json")
+def test_a_path_of_a_file_needs_no_scene(few_steps, tiny_scene, tmp_path):
+    write_camera_path(tmp_path / "p.json", clsplat.camera_path(clsplat.read_scene(tiny_scene), frames=2), 30)
     model = shutil.copy(few_steps / "point_cloud.ply", tmp_path)
     told = clsplat.render_path(model, video=tmp_path / "a.webm", path=str(tmp_path / "p.json"), frames=5, size="32x32")
     assert (told["frames"], told["size"]) == (5, [32, 32])
@@ -53,7 +57,7 @@ def test_a_path_of_a_file_needs_no_scene(few_steps, tmp_path):
 
 
 def test_a_path_of_a_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_path, caplog):
-    clsplat.render_path(few_steps, video=None, out=tmp_path / "o", frames=2, save_path=tmp_path / "p.json")
+    write_camera_path(tmp_path / "p.json", clsplat.camera_path(clsplat.read_scene(tiny_scene), frames=2), 30)
     shutil.copytree(few_steps, tmp_path / "run")
     pipeline = tmp_path / "run" / "pipeline.yaml"
     pipeline.write_text(pipeline.read_text().replace(str(tiny_scene), str(tmp_path / "gone")))
@@ -107,8 +111,8 @@ def test_a_record_that_is_not_ours_removes_nothing(record, few_steps, tmp_path):
     assert (tmp_path / "out" / "sub" / "b.png").is_file()
 
 
-def test_a_folder_of_sog_needs_no_scene_for_a_path_of_a_file(few_steps, tmp_path):
-    clsplat.render_path(few_steps, video=None, out=tmp_path / "o", frames=2, save_path=tmp_path / "p.json")
+def test_a_folder_of_sog_needs_no_scene_for_a_path_of_a_file(few_steps, tiny_scene, tmp_path):
+    write_camera_path(tmp_path / "p.json", clsplat.camera_path(clsplat.read_scene(tiny_scene), frames=2), 30)
     clsplat.load(few_steps).save(tmp_path / "m.sog")
     with zipfile.ZipFile(tmp_path / "m.sog") as archive:
         archive.extractall(tmp_path / "m")
@@ -207,7 +211,6 @@ def test_a_command_that_makes_no_film_ends_in_a_line(options, message, few_steps
         ({"size": "8192x32", "side": "photograph"}, "size \\(16384, 32\\)"),
         ({"fps": float("nan")}, "expected frames a second"),
         ({"video": None, "side": "photograph"}, "--side needs --video"),
-        ({"save_path": "x.txt"}, "ends in .json"),
         ({"kind": "gif", "video": None}, "no kind 'gif'"),
         ({"kind": "npy"}, "--format npy is for pictures"),
         ({"side": "no.ply"}, "no.ply"),
@@ -218,8 +221,3 @@ def test_what_makes_no_film_is_refused_before_any_work(options, message, few_ste
     with pytest.raises((ConfigError, DataError), match=message):
         clsplat.render_path(few_steps, **options)
     assert not list(tmp_path.iterdir())
-
-
-def test_files_of_a_run_are_not_replaced(few_steps):
-    with pytest.raises(ConfigError, match="is a file of a run"):
-        clsplat.render_path(few_steps, video=None, save_path=few_steps / "metrics.json")

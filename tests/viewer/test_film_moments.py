@@ -12,6 +12,7 @@ from clsplat.scene.view import View
 from clsplat.viewer.video import camera_path
 from clsplat.viewer.video.film import Wish, plan, times_of
 from clsplat.viewer.video.paths import nearest
+from tests.support.camera_paths import write_camera_path
 from tests.support.refusals import refusal
 
 CAMERA = Camera(40, 30, 50.0, 50.0, 20.0, 15.0)
@@ -86,7 +87,7 @@ def test_the_nearest_photograph_is_that_of_the_nearest_moment(scene):
 
 def test_a_path_in_a_file_keeps_its_moments(scene, tmp_path):
     views = film(scene, times="0..0.5")
-    camera_path.write(tmp_path / "path.json", views, 30)
+    write_camera_path(tmp_path / "path.json", views, 30)
     again = camera_path.read(tmp_path / "path.json").views
     assert [view.time for view in again] == pytest.approx([view.time for view in views])
     assert film(scene, str(tmp_path / "path.json"), frames=None)[2].time == pytest.approx(0.25)

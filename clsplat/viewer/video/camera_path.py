@@ -1,11 +1,10 @@
-"""Camera paths in files: nerfstudio's camera_path.json, read and written, and the list of cameras of 3DGS, read.
+"""Camera paths in files: nerfstudio's camera_path.json, and the list of cameras of 3DGS.
 
 render_width, render_height  px       fps, seconds      camera_type  perspective
 camera_path  a frame each: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical), aspect,
              render_time (0 to 1, of a scene that moves)
 """
 
-import json
 import logging
 import math
 from collections.abc import Sequence
@@ -17,21 +16,18 @@ import numpy as np
 import scipy
 
 from clsplat.core.errors import ConfigError, DataError, quote
-from clsplat.core.files import write_text
 from clsplat.core.reading import read_json
 from clsplat.formats.splats import is_timestamp
 from clsplat.scene import camera_files
 from clsplat.scene.camera import Camera
-from clsplat.scene.camera_files import warn_center_lost, warn_width_lost
 from clsplat.scene.transforms_json import TRANSFORMS_FILE as TRANSFORMS
-from clsplat.scene.transforms_json import JsonFrame, camera_to_world_of, opengl_matrix
+from clsplat.scene.transforms_json import JsonFrame, camera_to_world_of
 from clsplat.scene.view import View
 from clsplat.viewer.video.paths import MAX_FRAMES, Floats, Size, around, checked_rate, checked_size, even_size, placed
 
 LOG = logging.getLogger("clsplat")
 WORLD = "dataparser_transforms.json"  # beside a path: how nerfstudio moved the scene
 MAX_BYTES = 1 << 27
-KEYS = 24  # frames that nerfstudio's viewer shows as handles, at most
 
 
 @dataclass(frozen=True)
@@ -52,7 +48,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
     """Read a camera_path.json, with its poses in the world of the scene in a folder.
 
     nerfstudio moves and scales a scene, and says how in a file WORLD, which is looked for beside the path; without it
-    the poses are taken as they are, with a warning unless clsplat has written them.
+    the poses are taken as they are, with a warning.
     Raises DataError for another file, for damaged numbers and for a camera that is not perspective.
     """
     table = read_json(path, "a camera_path.json of nerfstudio, or a cameras.json of 3DGS", limit=MAX_BYTES)
@@ -66,7 +62,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
     if (kind := table.get("camera_type", "perspective")) != "perspective":
         raise DataError(f"{path}: camera_type is {quote(kind)}; expected perspective: export the path again")
     size, rate = _size_and_rate(JsonFrame(path.parent, str(path), table))
-    move = _world(path, scene, known=table.get("world") == "scene")
+    move = _world(path, scene)
     views = []
     for i, own in enumerate(frames):
         frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", own)
@@ -88,42 +84,6 @@ def _of_cameras(path: Path) -> CameraPath:
     size = even_size(views[0].camera)
     frames = [replace(view, name=f"frame_{i:05d}", camera=around(view.camera, size)) for i, view in enumerate(views, 1)]
     return CameraPath(frames, 30.0, size)
-
-
-def write(path: Path, views: Sequence[View], fps: float) -> None:
-    """Write views as a camera_path.json, for nerfstudio's viewer and for `read`; of a lens it holds `fov` alone.
-
-    Raises OutputError.
-    """
-    camera = views[0].camera
-    frames = [_frame(view) for view in views]
-    keys = np.unique(np.linspace(0, len(frames) - 1, min(KEYS, len(frames))).round().astype(int))
-    table = {
-        "world": "scene",  # ours: not moved as nerfstudio would
-        "camera_type": "perspective",
-        "render_width": camera.width,
-        "render_height": camera.height,
-        "fps": fps,
-        "seconds": len(views) / fps,
-        "is_cycle": False,
-        "smoothness_value": 0.0,
-        "default_fov": frames[0]["fov"],
-        "default_transition_sec": len(views) / fps / max(1, len(keys) - 1),
-        "keyframes": [
-            {
-                "matrix": frames[i]["camera_to_world"],
-                "fov": frames[i]["fov"],
-                "aspect": frames[i]["aspect"],
-                "override_transition_enabled": False,
-                "override_transition_sec": None,
-            }
-            for i in keys
-        ],
-        "camera_path": frames,
-    }
-    write_text(path, json.dumps(table, indent=1) + "\n")
-    for warn in (warn_center_lost, warn_width_lost):
-        warn(path, [view.camera for view in views], "its readers")
 
 
 def spread(views: Sequence[View], frames: int) -> list[View]:
@@ -160,13 +120,6 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
     ]
 
 
-def _frame(view: View) -> dict[str, Any]:
-    camera, matrix = view.camera, opengl_matrix(view.world_to_camera)
-    fov = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
-    moment = {} if view.time is None else {"render_time": view.time}
-    return {"camera_to_world": matrix.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height, **moment}
-
-
 def _camera(size: Size, fov: float) -> Camera:
     """A camera with a vertical field of view in rad."""
     focal = size[1] / 2 / math.tan(fov / 2)
@@ -190,15 +143,14 @@ def _rows(numbers: Any) -> Any:
     return [numbers[i : i + 4] for i in range(0, 16, 4)]
 
 
-def _world(path: Path, scene: Path | None, known: bool) -> Any:
+def _world(path: Path, scene: Path | None) -> Any:
     """A function that takes poses, [3, 4] world to camera, to the world of the scene."""
     file = path.parent / WORLD
     if not file.is_file():
-        if not known:
-            LOG.warning(
-                "%s: its poses are taken as those of the scene; where nerfstudio has moved it, put %s beside the path",
-                *(path, WORLD),
-            )
+        LOG.warning(
+            "%s: its poses are taken as those of the scene; where nerfstudio has moved it, put %s beside the path",
+            *(path, WORLD),
+        )
         return lambda pose: pose
     matrix, scale = _affine(file)
     rotation, shift = matrix[:, :3], matrix[:, 3]

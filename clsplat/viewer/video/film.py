@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.core.errors import ConfigError, quote
-from clsplat.core.files import check_result_path
 from clsplat.formats.splats import is_timestamp
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
@@ -202,8 +201,3 @@ def still(view: View, size: Size | None = None) -> View:
     if wanted == (view.camera.width, view.camera.height):
         return view
     return View(view.name, like(view.camera, wanted), view.world_to_camera, view.image_path, time=view.time)
-
-
-def check_path_file(path: Path) -> None:
-    """Raise ConfigError where no camera path can be written."""
-    check_result_path(path, ".json")
