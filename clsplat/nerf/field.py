@@ -1,5 +1,5 @@
-"""The two levels of a field: coarse samples of cones, fine ones where the coarse weights are, and their gradients
-(Barron et al. 2021)."""
+"""Render the two levels of a field, coarse samples of cones and fine samples where the coarse weights are, and
+compute their gradients (Mip-NeRF, Barron et al. 2021)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,28 +16,28 @@ from clsplat.render.painter import Layers
 from clsplat.render.workspace import Workspace
 
 RAY_VALUES = int(constants("rays.cl")["RAY_VALUES"])
-PASS_SAMPLES = 8192  # that are computed at a time: their features stay in the caches of a CPU
-RAYS = SAMPLES // LANES_MAX  # a multiple of it fills tiles, whatever the samples of a ray
+PASS_SAMPLES = 8192  # samples per pass: their features stay in a CPU's caches
+RAYS = SAMPLES // LANES_MAX  # a multiple of this fills whole tiles, for any number of samples per ray
 assert RAYS == BLOCK
 
 
 @dataclass(frozen=True)
 class Draw:
-    """Random numbers of rays of a step; without one, samples are even."""
+    """The key of the random numbers for rays of a step; without it, samples are evenly spaced."""
 
     seed: int
     step: int
-    first: int  # ray of the step
+    first: int  # index of the first ray in the step
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Pixels of a camera with their cones."""
+    """Pixels of a camera, with their cones."""
 
     camera: DeviceCamera
     pixels: Array  # [counted] row * width + column
     cones: Array  # [count, RAY_VALUES]
-    count: int  # with those that fill tiles
+    count: int  # including padding to whole tiles
     draw: Draw | None
 
     @property
@@ -47,7 +47,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class SampleLevel:
-    """The samples of rays in one level, and what they give; valid until the same level of other rays."""
+    """The samples of rays in one level, and the results; valid until this level of other rays is rendered."""
 
     rays: Rays
     samples: int
@@ -55,21 +55,21 @@ class SampleLevel:
     raw_colors: Array  # [tiles, COLOR_ROWS, SAMPLES]
     raw_densities: Array  # [tiles, COLOR_ROWS, SAMPLES]
     weights: Array  # [count, samples]
-    left: Array  # [count, samples]
+    left: Array  # [count, samples] transmittance behind each sample
     colors: Array  # [count, 3]
 
 
 @dataclass(frozen=True)
 class RayTarget:
-    """What the colors of rays are compared with."""
+    """The photograph that rays are compared with."""
 
     photograph: Array  # [3, rows, stride]
-    scale: float  # of a ray's squared difference in the loss
-    errors: Array  # [rays of the step], squared differences
+    scale: float  # factor on a ray's squared difference in the loss
+    errors: Array  # [rays of the step] squared differences
 
 
 class Levels:
-    """Renders rays of a field, level by level; each level can be differentiated until the next is rendered."""
+    """Render rays of a field, level by level; each level can be differentiated until the next one is rendered."""
 
     def __init__(self, workspace: Workspace, shape: FieldShape, background: Array) -> None:
         """background: [3] in [0, 1]."""
@@ -79,13 +79,8 @@ class Levels:
         self.encoding = Encoding(workspace, shape, self.network)
         self._rays, self._composite = device.program("rays.cl"), device.program("composite.cl")
 
-    @property
-    def rays_at_a_time(self) -> int:
-        """Rays of one pass."""
-        return rays_at_a_time(self.shape)
-
-    def drawn(self, camera: DeviceCamera, draw: Draw, count: int) -> Rays:
-        """Return rays of random pixels."""
+    def sample_rays(self, camera: DeviceCamera, draw: Draw, count: int) -> Rays:
+        """Return rays through random pixels."""
         pixels = self.workspace.array("field pixels", count, np.uint32)
         pixel_count = camera.width * camera.height
         self._rays.draw_pixels(
@@ -100,7 +95,7 @@ class Levels:
         return self.cast(camera, pixels, draw)
 
     def cast(self, camera: DeviceCamera, pixels: Array, draw: Draw | None = None) -> Rays:
-        """Return the rays of pixels, [n] of row * width + column."""
+        """Return the rays through pixels, [n] of row * width + column."""
         count = -(-pixels.shape[0] // RAYS) * RAYS
         cones = self.workspace.array("field cones", (count, RAY_VALUES))
         self._rays.cast_rays(
@@ -115,8 +110,8 @@ class Levels:
         yield self._level(parameters, rays, self._fine_edges(coarse), "fine")
 
     def differentiate(self, parameters: Array, level: SampleLevel, target: RayTarget, gradient: Array) -> None:
-        """Add the derivatives of the loss of a level, the last one that was rendered, to `gradient`, [P]; write the
-        squared differences of its rays."""
+        """Add the gradient of the loss of the level that was rendered last to `gradient`, [P], and write the squared
+        differences of its rays."""
         rays, tiles = level.rays, level.raw_colors.shape[0]
         by_colors, by_densities = (
             self.workspace.array(f"field by {name}", (tiles, COLOR_ROWS, SAMPLES)) for name in ("colors", "densities")
@@ -149,8 +144,8 @@ class Levels:
         by_grid = self.network.backward(parameters, by_colors, by_densities, gradient)
         self.encoding.backward(by_grid, gradient)
 
-    def place(self, level: SampleLevel, image: Array) -> None:
-        """Put the colors of a level's rays into a picture, [3, rows, stride]."""
+    def write_colors(self, level: SampleLevel, image: Array) -> None:
+        """Write the colors of a level's rays to their pixels in an image, [3, rows, stride]."""
         camera = level.rays.camera
         self._composite.place_colors(
             items=level.rays.counted,
@@ -166,16 +161,24 @@ class Levels:
     def _coarse_edges(self, rays: Rays) -> Array:
         samples = self.shape.coarse_samples
         edges = self.workspace.array("field coarse edges", (rays.count, samples + 1))
-        own: dict[str, Any] = {"samples": samples, "near": self.shape.near, "far": self.shape.far, **_random(rays.draw)}
-        self._rays.spread_edges(items=rays.count, edges=edges, count=rays.count, **own)
+        limits: dict[str, Any] = {"near": self.shape.near, "far": self.shape.far}
+        self._rays.spread_edges(
+            items=rays.count, edges=edges, samples=samples, count=rays.count, **limits, **_random_arguments(rays.draw)
+        )
         return edges
 
     def _fine_edges(self, coarse: SampleLevel) -> Array:
         samples, count = self.shape.fine_samples, coarse.rays.count
         edges = self.workspace.array("field fine edges", (count, samples + 1))
-        own = {"samples": coarse.samples, "fine_samples": samples, **_random(coarse.rays.draw)}
         self._rays.resample_edges(
-            items=count, weights=coarse.weights, edges=coarse.edges, fine=edges, count=count, **own
+            items=count,
+            weights=coarse.weights,
+            edges=coarse.edges,
+            fine=edges,
+            samples=coarse.samples,
+            fine_samples=samples,
+            count=count,
+            **_random_arguments(coarse.rays.draw),
         )
         return edges
 
@@ -204,22 +207,19 @@ class Levels:
         return SampleLevel(rays, samples, edges, raw_colors, raw_densities, weights, left, colors)
 
 
-def rays_at_a_time(shape: FieldShape) -> int:
-    """Return the rays of one pass."""
+def rays_per_pass(shape: FieldShape) -> int:
+    """Return how many rays one pass renders."""
     return max(RAYS, PASS_SAMPLES // max(shape.coarse_samples, shape.fine_samples) // RAYS * RAYS)
 
 
-def _random(draw: Draw | None) -> dict[str, int]:
-    """The arguments of kernels that draw edges."""
-    own = draw or Draw(0, 0, 0)
-    return {"drawn": int(draw is not None), "seed": own.seed, "step": own.step, "first_ray": own.first}
-
-
-# A field on the device: the parameters of its network, and its pictures.
+def _random_arguments(draw: Draw | None) -> dict[str, int]:
+    """Return the arguments for random edges."""
+    key = draw or Draw(0, 0, 0)
+    return {"drawn": int(draw is not None), "seed": key.seed, "step": key.step, "first_ray": key.first}
 
 
 class Field:
-    """The parameters of a shape; paints views as Gaussians do (clsplat.render.painter)."""
+    """A field on the device: a shape with its parameters; it renders views as Gaussians do (clsplat.render.painter)."""
 
     def __init__(self, shape: FieldShape, parameters: Array, background: Array) -> None:
         """parameters: [P], changed in place by training; background: [3] in [0, 1]."""
@@ -227,33 +227,33 @@ class Field:
         self.levels = Levels(Workspace(parameters.device), shape, background)
 
     @classmethod
-    def first(cls, shape: FieldShape, seed: int, background: Array) -> "Field":
-        """Return a field with the first parameters of a seed."""
-        return cls(shape, background.device.upload(shape.first_parameters(seed)), background)
+    def initial(cls, shape: FieldShape, seed: int, background: Array) -> "Field":
+        """Return a field with the initial parameters for a seed."""
+        return cls(shape, background.device.upload(shape.initial_parameters(seed)), background)
 
     @property
     def workspace(self) -> Workspace:
         return self.levels.workspace
 
     def paint(self, camera: DeviceCamera) -> Array:
-        """Return the picture of the fine level, [3, rows, stride], zero outside the camera's pixels."""
+        """Return the image of the fine level, [3, rows, stride], zero outside the camera's pixels."""
         image = self._empty(camera)
         for _, fine in self._passes(camera):
-            self.levels.place(fine, image)
+            self.levels.write_colors(fine, image)
         return image
 
     def layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
-        """Return the picture of the fine level on the host, what its samples cover, and their mean depth.
+        """Return the image of the fine level on the host, its alpha, and the mean depth.
 
-        A ray has depth 1 in the camera where its distance is 1, so that distances are depths, in scene units.
+        The direction of a ray has depth 1, so that distances along it are depths, in scene units.
         """
         image, size = self._empty(camera), (camera.height, camera.width)
         alpha, depths = (np.zeros(camera.height * camera.width, np.float32) for _ in range(2))
         for pixels, fine in self._passes(camera):
-            self.levels.place(fine, image)
+            self.levels.write_colors(fine, image)
             weights, edges = (array.get()[: len(pixels)].astype(np.float64) for array in (fine.weights, fine.edges))
             covered, summed = weights.sum(axis=1), (weights * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1)
-            alpha[pixels] = np.minimum(covered, 1)  # a sum of rounded weights
+            alpha[pixels] = np.minimum(covered, 1)  # rounding may exceed 1
             depths[pixels] = np.divide(summed, covered, out=np.zeros_like(covered), where=covered > 0)
         shown = np.ascontiguousarray(image.get()[:, : camera.height, : camera.width].transpose(1, 2, 0))
         return Layers(shown, alpha.reshape(size), depths.reshape(size) if depth else None)
@@ -264,10 +264,10 @@ class Field:
         return image
 
     def _passes(self, camera: DeviceCamera) -> Iterator[tuple[NDArray[np.uint32], SampleLevel]]:
-        """Pixels, [n] of row * width + column, and their fine level, valid until the next."""
-        pixels, at_a_time = np.arange(camera.width * camera.height, dtype=np.uint32), self.levels.rays_at_a_time
-        for first in range(0, len(pixels), at_a_time):
-            own = pixels[first : first + at_a_time]
-            rays = self.levels.cast(camera, self.workspace.device.upload(own))
+        """Yield pixels, [n] of row * width + column, and their fine level, valid until the next."""
+        pixels, count = np.arange(camera.width * camera.height, dtype=np.uint32), rays_per_pass(self.shape)
+        for first in range(0, len(pixels), count):
+            batch = pixels[first : first + count]
+            rays = self.levels.cast(camera, self.workspace.device.upload(batch))
             *_, fine = self.levels.render(self.parameters, rays)
-            yield own, fine
+            yield batch, fine

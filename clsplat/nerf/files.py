@@ -1,8 +1,8 @@
-"""A field on the host, and its file: an .npz that notices damage (clsplat.training.archive), and holds no pickle.
+"""Read and write the file of a field: an .npz with checksums (clsplat.training.archive) and without pickle.
 
-parameters.npy    [P, 1] float32, the network's parameters; clsplat.nerf.shape says where each layer's lie
+parameters.npy    [P, 1] float32, the parameters in the layout of clsplat.nerf.shape
 meta.npy          JSON: `format`, the `version` that wrote it, `shape` with the keys of `train_field.field`, the
-                  `background` and the `alpha` of the photographs
+                  `background`, and the `alpha` of the photographs
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ ENDING, FILE, PARAMETERS = ".npz", "field.npz", "parameters"
 
 
 class Notes(BaseModel):
-    """What a file says beside its parameters."""
+    """The metadata of a file."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
@@ -43,21 +43,21 @@ class Notes(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class FieldModel:
-    """A field on the host, as `train_field` leaves it.
+    """A field on the host, as `train_field` trains it.
 
-    Raises ValueError where the parameters are not those of the shape.
+    Raises ValueError if the parameters do not fit the shape.
     """
 
     shape: FieldShape
     parameters: NDArray[np.float32]  # [P]
-    rendering: Rendering  # background, and what the fourth channel of its photographs was
+    rendering: Rendering  # background, and the meaning of the photographs' fourth channel
 
     def __post_init__(self) -> None:
         if self.parameters.shape != (self.shape.parameters,):
             raise ValueError(f"its parameters are {self.parameters.shape}; expected ({self.shape.parameters},)")
 
     def upload(self, device: Device) -> Field:
-        """Copy the field to a device, before its background."""
+        """Copy the field and its background to a device."""
         background = device.upload(np.array(BACKGROUNDS[self.rendering.background or "black"], np.float32))
         return Field(self.shape, device.upload(self.parameters), background)
 
@@ -80,19 +80,19 @@ class FieldModel:
 
 
 def is_field(path: Path) -> bool:
-    """Whether a path names a file of a field."""
+    """Return whether a path has the extension of a field's file."""
     return path.suffix.lower() == ENDING
 
 
 def field_of_run(folder: Path) -> Path:
-    """Return the file of the field of a run folder: the last that `export_field` has written."""
+    """Return the field's file in a run folder: the last one that `export_field` wrote."""
     return run_output(folder, "export_field", FILE)
 
 
 def load_field(path: str | Path) -> FieldModel:
-    """Read the file of a field, or that of a run folder.
+    """Read a field from its file or from a run folder.
 
-    Raises DataError when it is missing, damaged or of something else.
+    Raises DataError if the file is missing or damaged, or contains something else.
     """
     path = field_of_run(Path(path)) if Path(path).is_dir() else Path(path)
     if not path_exists(path):
@@ -101,23 +101,23 @@ def load_field(path: str | Path) -> FieldModel:
         return _checked(*archive.read(path))
     except (DataError, ValueError) as error:
         reason = shorten(one_line(error))
-        raise DataError(f"{path}: {reason}; expected a file of the stage export_field, whole") from error
+        raise DataError(f"{path}: {reason}; expected an intact file of the stage export_field") from error
 
 
 def _checked(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel:
-    """A field of what a file holds.  Raises DataError or ValueError."""
+    """Return the field that a file contains.  Raises DataError or ValueError."""
     if notes.get("format") != FORMAT or "shape" not in notes:
-        raise DataError(f"is of format {quote(str(notes.get('format')))}, or of something else than a field")
+        raise DataError(f"has the format {quote(str(notes.get('format')))}, or is not a field")
     try:
-        found = Notes.model_validate(dict(notes))
+        meta = Notes.model_validate(dict(notes))
     except ValidationError as error:
         first = error.errors()[0]
-        raise DataError(f"{'.'.join(map(str, first['loc']))} of its notes: {first['msg']}") from error
+        raise DataError(f"metadata {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     if arrays.keys() != {PARAMETERS}:
-        raise DataError(f"expected the array {PARAMETERS} alone")
+        raise DataError(f"expected only the array {PARAMETERS}")
     table = arrays[PARAMETERS]
-    if table.dtype != np.float32 or table.shape != (found.shape.parameters, 1):
-        raise DataError(f"{PARAMETERS} are not [{found.shape.parameters}, 1] of float32")
+    if table.dtype != np.float32 or table.shape != (meta.shape.parameters, 1):
+        raise DataError(f"{PARAMETERS} are not [{meta.shape.parameters}, 1] float32")
     if not np.isfinite(table).all():
-        raise DataError(f"{PARAMETERS} hold values that are not finite")
-    return FieldModel(found.shape, np.array(table[:, 0]), Rendering(background=found.background, alpha=found.alpha))
+        raise DataError(f"{PARAMETERS} contain values that are not finite")
+    return FieldModel(meta.shape, np.array(table[:, 0]), Rendering(background=meta.background, alpha=meta.alpha))

@@ -1,6 +1,6 @@
-"""A network on the device: the outputs of samples, and derivatives of a loss by its parameters.
+"""Run a network on the device: compute its outputs, and the gradients of its parameters.
 
-Arrays of features are in tiles of samples: cl_kernels/layers.h.
+Arrays of features are in tiles of samples (cl_kernels/layers.h).
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.render.workspace import Workspace
 
 BLOCK, CHUNK = int(LAYERS["BLOCK"]), int(LAYERS["CHUNK"])
-NO_LIMIT = -float(np.finfo(np.float32).max)  # of outputs that are not cut
+NO_LIMIT = -float(np.finfo(np.float32).max)  # lower bound of outputs without an activation
 RELU = 0.0
 
 
@@ -41,20 +41,20 @@ class Network:
         self._density, self._bottleneck, self._condition, self._color = self._layers[shape.depth :]
 
     def position(self, tiles: int) -> tuple[Array, int]:
-        """Return the table that the encoded position is in, [tiles, rows, SAMPLES], and its first row there."""
+        """Return the table with the encoded position, [tiles, rows, SAMPLES], and its first row there."""
         skip, width = self.shape.skip, self.shape.width
         if skip is None:
             return self._table("position", tiles, self.shape.position_rows), 0
         return self._hidden(skip, tiles), width
 
     def seen(self, tiles: int) -> tuple[Array, int]:
-        """Return the table that the encoded direction is in, as `position`."""
+        """Return the table with the encoded direction, as `position` does."""
         rows = self.shape.width + self.shape.direction_rows
         return self._table("seen", tiles, rows), self.shape.width
 
     def forward(self, parameters: Array, tiles: int) -> tuple[Array, Array]:
-        """Return raw colors and raw densities of samples whose encodings are in place, each [tiles, COLOR_ROWS,
-        SAMPLES], valid until the next call."""
+        """Return raw colors and raw densities for the encodings in the tables, each [tiles, COLOR_ROWS, SAMPLES], valid
+        until the next call."""
         x = _Table(*self.position(tiles))
         for i, layer in enumerate([self._first, *self._trunk]):
             after = self._hidden(i, tiles)
@@ -70,9 +70,9 @@ class Network:
         return colors, densities
 
     def backward(self, parameters: Array, by_colors: Array, by_densities: Array, gradient: Array) -> Array:
-        """Add the derivatives by the parameters to `gradient`, [P], from those by the outputs of the last `forward`.
+        """Add the gradient of the parameters to `gradient`, [P], from the gradients of the last outputs.
 
-        Returns those by the features of the grid, [tiles, grid_rows, SAMPLES], valid until the next call.
+        Returns the gradient of the grid's features, [tiles, grid_rows, SAMPLES], valid until the next call.
         """
         tiles, width = by_colors.shape[0], self.shape.width
         last, seen = _Table(self._hidden(self.shape.depth - 1, tiles)), _Table(self.seen(tiles)[0])
@@ -97,7 +97,7 @@ class Network:
             by_x = by_before
         self._sum(self._first, _Table(*self.position(tiles)), by_x)
         by_grid = self._derive_grid(self._first, parameters, by_x, 0, kept=int(self.shape.skip is not None))
-        count = self.shape.of_network
+        count = self.shape.network_parameters
         self._program.dense_sums(
             items=count // int(self.workspace.device.tuning["LANES"]),
             partials=self._partials(tiles),
@@ -108,14 +108,14 @@ class Network:
         return by_grid
 
     def _derive_grid(self, layer: DenseLayer, parameters: Array, by_outputs: Array, row: int, kept: int) -> Array:
-        """Derive by the features of the grid, which a layer reads from a row on."""
+        """Compute the gradient of the grid's features, which a layer reads starting at a row."""
         tiles = by_outputs.shape[0]
         position, by_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
         self._derive(layer, parameters, by_outputs, position, by_grid, NO_LIMIT, kept, row)
         return by_grid
 
     def _hidden(self, i: int, tiles: int) -> Array:
-        """The outputs of layer i of the trunk, with room for the encoded position where that joins them."""
+        """Return the outputs of layer i of the trunk, with room for the encoded position if it is appended there."""
         more = self.shape.position_rows if i == self.shape.skip else 0
         return self._table(f"hidden {i}", tiles, self.shape.width + more)
 
@@ -123,8 +123,8 @@ class Network:
         return self.workspace.array(f"field {name}", (tiles, rows, SAMPLES))
 
     def _partials(self, tiles: int) -> Array:
-        """Sums of chunks, [chunks, of_network]; what no layer writes is zero, as new arrays are."""
-        return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.of_network))
+        """Return the sums of chunks, [chunks, network_parameters]; padding stays zero, as in new arrays."""
+        return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.network_parameters))
 
     def _apply(self, layer: DenseLayer, parameters: Array, inputs: _Table, outputs: Array, lowest: float) -> None:
         tiles = outputs.shape[0]
@@ -155,7 +155,7 @@ class Network:
         kept: int = 0,
         row: int = 0,
     ) -> None:
-        """Derive by inputs of a layer, whose weights begin at a row."""
+        """Compute the gradient of the inputs of a layer that use its weights from a row on."""
         tiles, derived, output_rows = *by_inputs.shape[:2], by_outputs.shape[1]
         count = tiles * self._columns * (derived // BLOCK)
         self._program.dense_backward(
@@ -176,14 +176,14 @@ class Network:
         )
 
     def _sum(self, layer: DenseLayer, inputs: _Table, by_outputs: Array) -> None:
-        """Write the partial sums of the derivatives by a layer's parameters."""
+        """Write the partial sums of the gradient of a layer's parameters."""
         tiles, output_rows = by_outputs.shape[:2]
         chunks = -(-tiles // CHUNK)
         count = chunks * (layer.rows // BLOCK) * (layer.columns // BLOCK)
         shared: dict[str, Any] = {
             "by_outputs": by_outputs,
             "partials": self._partials(tiles),
-            "parameter_count": self.shape.of_network,
+            "parameter_count": self.shape.network_parameters,
             "output_rows": output_rows,
             "output_count": layer.columns,
             "tiles": tiles,
@@ -202,15 +202,15 @@ class Network:
         self._program.dense_biases(items=biases, first_parameter=layer.first_bias, count=biases, **shared)
 
 
-# What the network of a field reads of samples, and derivatives by the numbers of its grid, on the device.
+# The encodings of samples that the network reads, and the gradient of the grid.
 
 PLACE_ROWS = int(GRID["PLACE_ROWS"])
-PARTS = 64  # of all levels together, for each unit of a GPU
+PARTS = 64  # parts of all levels together, per compute unit of a GPU
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Rays, cut into samples."""
+    """The samples along rays."""
 
     cones: Array  # [rays, RAY_VALUES]
     edges: Array  # [rays, samples + 1]
@@ -229,7 +229,7 @@ class Samples:
 
 
 class Encoding:
-    """Puts the encodings of samples where the network reads them."""
+    """Write the encodings of samples to the tables that the network reads."""
 
     def __init__(self, workspace: Workspace, shape: FieldShape, network: Network) -> None:
         self.workspace, self.shape, self.network = workspace, shape, network
@@ -272,9 +272,9 @@ class Encoding:
         )
 
     def backward(self, by_position: Array, gradient: Array) -> None:
-        """Add the derivatives by the grid's numbers to `gradient`, [P].
+        """Add the gradient of the grid's entries to `gradient`, [P].
 
-        by_position: those by its features of the samples of the last `forward`, [tiles, grid_rows, SAMPLES].
+        by_position: gradient of the grid's features for the samples of the last `forward`, [tiles, grid_rows, SAMPLES].
         """
         if not self.shape.grid:
             return
@@ -286,7 +286,7 @@ class Encoding:
             levels=self._levels,
             by_features=by_position,
             gradient=gradient,
-            first_parameter=self.shape.of_network,
+            first_parameter=self.shape.network_parameters,
             rows=rows,
             parts=self.parts,
             samples=tiles * SAMPLES,
@@ -294,11 +294,11 @@ class Encoding:
         )
 
     def places(self, tiles: int) -> Array:
-        """Return the places of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES], until the next `forward`."""
+        """Return the positions of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES]; `forward` sets them."""
         return self.workspace.array("field places", (tiles, PLACE_ROWS, SAMPLES))
 
     def read_grid(self, parameters: Array, tiles: int) -> None:
-        """Write the features of the grid at the places of samples."""
+        """Write the features of the grid at the positions of samples."""
         grid, (features, first) = self.shape.grid, self.network.position(tiles)
         assert grid is not None
         count = grid.levels * tiles * SAMPLES // self._lanes
@@ -308,7 +308,7 @@ class Encoding:
             levels=self._levels,
             parameters=parameters,
             features=features,
-            first_parameter=self.shape.of_network,
+            first_parameter=self.shape.network_parameters,
             rows=features.shape[1],
             first_row=first,
             samples=tiles * SAMPLES,
@@ -316,7 +316,7 @@ class Encoding:
         )
 
     def _place(self, samples: Samples) -> None:
-        """Write the places of samples."""
+        """Write the positions of samples in the grid's cube."""
         grid = self.shape.grid
         assert grid is not None
         x, y, z = grid.corner
@@ -335,9 +335,9 @@ class Encoding:
 
 
 def parts_of_levels(device: Device, levels: int) -> int:
-    """Return in how many parts the entries of each level are summed: their sums do not depend on it.
+    """Return in how many parts the entries of each level are summed; the sums do not depend on it.
 
-    Each part looks through all samples: so on a CPU they are as few as keep its cores busy.
+    Each part reads all samples, so that a CPU uses only enough parts to keep its cores busy.
     """
-    wanted = 2 * device.info.units if int(device.tuning["TEAM"]) == 1 else PARTS * device.info.units
-    return max(1, wanted // levels)
+    parts = 2 * device.info.units if int(device.tuning["TEAM"]) == 1 else PARTS * device.info.units
+    return max(1, parts // levels)

@@ -1,4 +1,4 @@
-"""A field while it is trained: the losses of a step's rays, Adam, and its tables in a checkpoint."""
+"""Train a field: the losses of a step's rays, Adam, the tables of a checkpoint, and the memory plan."""
 
 import itertools
 import json
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
-from clsplat.nerf.field import Draw, Field, RayTarget, rays_at_a_time
+from clsplat.nerf.field import Draw, Field, RayTarget, rays_per_pass
 from clsplat.nerf.network import CHUNK, PLACE_ROWS
 from clsplat.nerf.shape import COLOR_ROWS, SAMPLES, FieldShape, GridShape, WrittenShape
 from clsplat.opencl.device import Array, constants
@@ -30,24 +30,24 @@ _WRITTEN: TypeAdapter[FieldShape] = TypeAdapter(WrittenShape)
 
 @dataclass(frozen=True)
 class RayPhotograph:
-    """A photograph of a step, on the device, and the rays that are drawn from it."""
+    """A photograph of a step, on the device, and the number of rays to sample from it."""
 
     camera: DeviceCamera
     photograph: Photograph
     rays: int
-    weight: float  # of each ray: the area of what it stands for, px^2 of the full size
+    weight: float  # weight of each ray: the area of its pixel, px^2 at full resolution
 
 
 @dataclass(frozen=True)
 class AdamStep:
-    """How far an update by Adam goes."""
+    """The settings of an update by Adam."""
 
     rate: float
-    epsilon: float = 1e-8  # added to the root of the second moment: the default of Adam's paper, which Mip-NeRF keeps
+    epsilon: float = 1e-8  # added to the root of the second moment; the default of Adam's paper, also in Mip-NeRF
 
 
 class LearnedField(TrainedField):
-    """A field with Adam's moments, in tables that a checkpoint holds."""
+    """A field with Adam's moments, as tables for a checkpoint."""
 
     kind = "nerf"
 
@@ -58,50 +58,52 @@ class LearnedField(TrainedField):
         self._gradient = device.zeros(count)
         self._program = device.program("dense.cl")
         self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
-        self.updates = 0  # which count for the bias of the moments
-        self.rate = 0.0  # of the last step
-        self._scales: list[tuple[int, float]] = []  # of the last step: rays, and what a squared difference counts
+        self.updates = 0  # number of updates so far, for the bias correction of the moments
+        self.rate = 0.0  # rate of the last step
+        self._scales: list[tuple[int, float]] = []  # rays and factor on squared differences, by photograph of last step
 
     @classmethod
-    def first(cls, shape: FieldShape, seed: int, background: Array) -> "LearnedField":
+    def initial(cls, shape: FieldShape, seed: int, background: Array) -> "LearnedField":
         """Return a field before its first step."""
-        return cls(Field.first(shape, seed, background))
+        return cls(Field.initial(shape, seed, background))
 
     @classmethod
-    def of_tables(cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array) -> Self:
-        """Return the field of a checkpoint, by what `tables` has returned."""
-        own = _shape_of(shape)
-        found = cls(Field(own, background.device.zeros(own.parameters), background))
-        for name, array in found._arrays.items():
+    def from_tables(
+        cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array
+    ) -> Self:
+        """Return the field of a checkpoint, from what `tables` returned."""
+        checked = _shape_of(shape)
+        field = cls(Field(checked, background.device.zeros(checked.parameters), background))
+        for name, array in field._arrays.items():
             array.set(tables[name][:, 0])
-        return found
+        return field
 
     @classmethod
     def check_tables(cls, shape: Mapping[str, Any], tables: Tables, others: Tables) -> None:
-        """Raise DataError for tables that are not those of a field of a shape."""
+        """Raise DataError for tables that do not fit a shape."""
         if others:
-            raise DataError(f"it holds {next(iter(others))} beside a field")
+            raise DataError(f"it contains {next(iter(others))} in addition to a field")
         if tables.keys() != set(TABLES):
-            raise DataError(f"its field has not the tables {', '.join(TABLES)}")
+            raise DataError(f"its field does not have the tables {', '.join(TABLES)}")
         parameters = _shape_of(shape).parameters
         for name, table in tables.items():
             if table.dtype != np.float32 or table.shape != (parameters, 1):
-                raise DataError(f"{name} of its field is not [{parameters}, 1] of float32")
+                raise DataError(f"{name} of its field is not [{parameters}, 1] float32")
             if not np.isfinite(table).all():
-                raise DataError(f"{name} of its field holds values that are not finite")
+                raise DataError(f"{name} of its field contains values that are not finite")
 
     @property
     def painter(self) -> Field:
-        """What renders views of it."""
+        """The field, which renders its views."""
         return self.field
 
     @property
     def parameters(self) -> int:
-        """The number of parameters that are learned."""
+        """The number of trained parameters."""
         return self.field.shape.learned
 
     def shape_as_data(self) -> dict[str, Any]:
-        """Return its shape as JSON holds it."""
+        """Return its shape as data for JSON."""
         return self.field.shape.model_dump()
 
     def tables(self) -> Tables:
@@ -109,7 +111,7 @@ class LearnedField(TrainedField):
         return {name: array.get()[:, None] for name, array in self._arrays.items()}
 
     def not_finite(self) -> list[str]:
-        """Return the names of the tables that hold NaN or infinity."""
+        """Return the names of the tables that contain NaN or infinity."""
         device, count = self._gradient.device, self.field.shape.parameters
         counters = {name: device.zeros(1, np.uint32) for name in self._arrays}
         for name, array in self._arrays.items():
@@ -121,22 +123,22 @@ class LearnedField(TrainedField):
     def step(self, shown: Sequence[RayPhotograph], coarse_weight: float, adam: AdamStep, seed: int, step: int) -> None:
         """Do one update (Barron et al. 2021, section 3.3).
 
-        The loss is that of the fine level and `coarse_weight` of that of the coarse one; each is the mean squared
-        difference of the rays, weighted by what they stand for.
+        The loss is the loss of the fine level plus `coarse_weight` times the loss of the coarse level.  Each is the
+        mean squared difference of the rays, weighted by the areas of their pixels.
         """
-        whole = CHANNELS * sum(one.rays * one.weight for one in shown)
+        total = CHANNELS * sum(photo.rays * photo.weight for photo in shown)
         self.rate = adam.rate
         self._gradient.fill(0)
-        errors = self._errors(sum(one.rays for one in shown))
-        self._scales, first = [(one.rays, one.weight / whole) for one in shown], 0
-        for one in shown:
-            self._differentiate(one, one.weight / whole, coarse_weight, Draw(seed, step, first), errors)
-            first += one.rays
+        errors = self._errors(sum(photo.rays for photo in shown))
+        self._scales, first = [(photo.rays, photo.weight / total) for photo in shown], 0
+        for photo in shown:
+            self._differentiate(photo, photo.weight / total, coarse_weight, Draw(seed, step, first), errors)
+            first += photo.rays
         self.updates += 1
         self.update(self._gradient, adam, self.updates)
 
     def update(self, gradient: Array, adam: AdamStep, number: int) -> None:
-        """Change the parameters by Adam, for the update `number`, from a gradient, [P]."""
+        """Update the parameters by Adam with a gradient, [P].  number: of the update, counted from 1."""
         self._program.dense_update(
             items=self.field.shape.parameters // int(self._gradient.device.tuning["LANES"]),
             parameters=self.field.parameters,
@@ -150,7 +152,7 @@ class LearnedField(TrainedField):
         )
 
     def loss(self, coarse_weight: float) -> tuple[float, float]:
-        """Read the loss of the last step, and the mean squared difference of its fine level."""
+        """Return the loss of the last step, and the mean squared difference of its fine level."""
         coarse, fine = (
             sum(
                 scale * float(part.sum(dtype=np.float64))
@@ -164,19 +166,19 @@ class LearnedField(TrainedField):
         return np.split(errors, np.cumsum([rays for rays, _ in self._scales])[:-1])
 
     def _errors(self, rays: int) -> list[Array]:
-        """Squared differences of the rays of a step, coarse and fine."""
+        """Return the squared differences of the rays of a step, coarse and fine."""
         return [self.field.workspace.array(f"field {name} errors", rays) for name in ("coarse", "fine")]
 
     def _differentiate(
         self, shown: RayPhotograph, scale: float, coarse_weight: float, draw: Draw, errors: list[Array]
     ) -> None:
-        """Add the derivatives by the rays of one photograph, in passes."""
-        levels = self.field.levels
+        """Add the gradient for the rays of one photograph, in passes."""
+        levels, count = self.field.levels, rays_per_pass(self.field.shape)
         colors = shown.photograph.planes(self.field.workspace).colors
         scales = coarse_weight * scale, scale
-        for first in range(0, shown.rays, levels.rays_at_a_time):
-            own = Draw(draw.seed, draw.step, draw.first + first)
-            rays = levels.drawn(shown.camera, own, min(levels.rays_at_a_time, shown.rays - first))
+        for first in range(0, shown.rays, count):
+            key = Draw(draw.seed, draw.step, draw.first + first)
+            rays = levels.sample_rays(shown.camera, key, min(count, shown.rays - first))
             rendered = levels.render(self.field.parameters, rays)
             for level, of_level, squares in zip(rendered, scales, errors, strict=True):
                 target = RayTarget(colors, of_level, squares)
@@ -184,35 +186,35 @@ class LearnedField(TrainedField):
 
 
 def _shape_of(written: Mapping[str, Any]) -> FieldShape:
-    """The shape of a field in a checkpoint.  Raises DataError where it is none."""
+    """Return the shape of a field in a checkpoint.  Raises DataError if it is invalid."""
     try:
         return _WRITTEN.validate_json(json.dumps(written))
     except ValidationError as error:
         raise DataError(f"the shape of its field: {error.errors()[0]['msg']}") from None
 
 
-# The memory that the training of a field needs on the device, computed before it is allocated.
+# The device memory that training a field needs, computed before it is allocated.
 
-TABLES_HELD = 4  # of the length of the parameters: these, Adam's moments, and the gradient
+TABLES_HELD = 4  # parameters, two moments of Adam, gradient
 MIB = 2**20
 
 
 @dataclass(frozen=True)
 class FieldPlan:
-    """Bytes on the device."""
+    """The memory that training a field needs on the device, bytes."""
 
-    parameters: int  # one table of them
-    features: int  # of the samples that are computed at a time, with derivatives
+    parameters: int  # one table of parameters
+    features: int  # features and gradients of the samples of one pass
     partials: int  # sums of chunks of samples, for each parameter of the network
     photographs: int
 
     @property
     def needed(self) -> int:
-        """Bytes in all."""
+        """Bytes in total."""
         return TABLES_HELD * self.parameters + self.features + self.partials + self.photographs
 
     def text(self, limits: DeviceLimits) -> str:
-        """Return one line: the memory needed, and that of the device."""
+        """Return one line of text: the memory needed, and the memory of the device."""
         return (
             f"memory: {self.needed / MIB:,.0f} MiB for a field ({TABLES_HELD} tables of "
             f"{self.parameters / MIB:,.0f} MiB, "
@@ -221,33 +223,33 @@ class FieldPlan:
         )
 
     def check(self, limits: DeviceLimits) -> None:
-        """Raise MemoryLimitError where it does not fit."""
+        """Raise MemoryLimitError if it does not fit."""
         if self.needed > limits.memory or max(self.parameters, self.partials) > limits.allocation:
             raise MemoryLimitError(
-                f"{self.text(limits)}: take fewer levels or entries of the grid (train_field.field.grid), a smaller "
+                f"{self.text(limits)}: use fewer levels or entries of the grid (train_field.field.grid), a smaller "
                 "train_field.field.width, or fewer samples"
             )
 
 
 def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
     """Return the plan for a field.  photographs: their bytes on the device."""
-    samples = rays_at_a_time(shape) * max(shape.coarse_samples, shape.fine_samples)
-    hidden = (shape.depth + 3) * shape.width  # outputs of the trunk, and derivatives by three layers
+    samples = rays_per_pass(shape) * max(shape.coarse_samples, shape.fine_samples)
+    hidden = (shape.depth + 3) * shape.width  # outputs of the trunk, and gradients of three layers
     encoded = shape.position_rows + shape.grid_rows + PLACE_ROWS + shape.direction_rows
     rows = hidden + encoded + shape.width + 2 * shape.color_width + 4 * COLOR_ROWS
     chunks = -(-samples // (SAMPLES * CHUNK))
-    return FieldPlan(4 * shape.parameters, 4 * rows * samples, 4 * chunks * shape.of_network, photographs)
+    return FieldPlan(4 * shape.parameters, 4 * rows * samples, 4 * chunks * shape.network_parameters, photographs)
 
 
-# Where the cube of a field's grid lies beside what photographs show: outside of that nothing is learned.
+# Check that photographs show the cube of a field's grid: elsewhere nothing is trained.
 
 Floats = NDArray[np.float64]
 UNIT = np.array(list(itertools.product((0.0, 1.0), repeat=3)))  # the corners of a cube, [8, 3]
 
 
 def require_seen(shape: FieldShape, scene: Scene) -> None:
-    """Raise ConfigError for a cube that no training view sees between near and far, or that holds no point of a scene
-    with points."""
+    """Raise ConfigError if no training view sees the grid's cube between near and far, or if the scene has points and
+    none is in the cube."""
     cube, views, points = shape.grid, scene.split("train"), scene.points
     if cube is None or not views:
         return
@@ -255,24 +257,23 @@ def require_seen(shape: FieldShape, scene: Scene) -> None:
     if not any(_meet(corner + side * UNIT, _corners(view, shape.near, shape.far)) for view in views):
         fault = f"no training view sees it at depths from {shape.near:g} to {shape.far:g}"
     elif points and len(points) and not _inside(cube, np.asarray(points.positions, np.float64)).any():
-        fault = f"none of the scene's {len(points):,} points lies in it"
+        fault = f"none of the scene's {len(points):,} points is in it"
     else:
         return
-    least, most, seen = (_told(point) for point in (corner, corner + side, scene_center(views)))
+    low, high, center = (_point_text(point) for point in (corner, corner + side, scene_center(views)))
     raise ConfigError(
-        f"train_field.field.grid: its cube is from {least} to {most}, scene units, and {fault} ({scene.path}); "
-        f"expected one about what the cameras look at, near {seen}: set `corner` and `side`, and `near` and `far` "
-        "beside `grid`"
+        f"train_field.field.grid: its cube is from {low} to {high}, scene units, and {fault} ({scene.path}); the "
+        f"cameras look at {center}: set `grid.corner` and `grid.side` around it, and `near` and `far`"
     )
 
 
 def _inside(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
-    """Which points, [M, 3], lie in a cube."""
+    """Return which points, [M, 3], are in a cube."""
     return np.asarray((np.abs(positions - (np.array(cube.corner) + cube.side / 2)) <= cube.side / 2).all(axis=1))
 
 
 def _corners(view: View, near: float, far: float) -> Floats:
-    """The corners of what a view sees between two depths, [8, 3]: UNIT over the columns, the rows and the depth."""
+    """Return the corners of a view's frustum between two depths, [8, 3], ordered as UNIT: columns, rows, depth."""
     camera = view.camera
     across = (UNIT[:, :2] * [camera.width, camera.height] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     places = np.column_stack([across, np.ones(8)]) * (near + UNIT[:, 2:] * (far - near))
@@ -281,8 +282,8 @@ def _corners(view: View, near: float, far: float) -> Floats:
 
 
 def _meet(cube: Floats, frustum: Floats) -> bool:
-    """Whether two bodies, by their corners as UNIT has them, have a point in common: no axis parts them (Gottschalk,
-    Lin and Manocha 1996)."""
+    """Return whether two bodies, given by corners ordered as UNIT, intersect: no axis separates them (Gottschalk, Lin
+    and Manocha 1996)."""
     axes, edges = np.eye(3), frustum[[1, 5, 3, 7, 4, 2]] - frustum[[0, 4, 2, 6, 0, 0]]  # along the depth, row, column
     faces = np.cross(edges[[4, 4, 4, 5, 5]], edges[[5, 0, 2, 0, 1]])
     candidates = np.vstack([axes, faces, np.cross(axes[:, None], edges[None]).reshape(-1, 3)])
@@ -291,5 +292,5 @@ def _meet(cube: Floats, frustum: Floats) -> bool:
     return not bool(apart.any())
 
 
-def _told(point: NDArray[np.floating]) -> str:
+def _point_text(point: NDArray[np.floating]) -> str:
     return f"({', '.join(f'{round(float(value), 6) + 0.0:.4g}' for value in point)})"

@@ -119,7 +119,7 @@ def _of_field(training: TrainField, units: int) -> Estimate:
     """Estimate a training of a field, whose steps all take the same time."""
     shape = training.field
     samples = training.rays * (shape.coarse_samples + shape.fine_samples)
-    of_sample = WEIGHT * shape.of_network + LEVEL * (shape.grid.levels if shape.grid else 0)
+    of_sample = WEIGHT * shape.network_parameters + LEVEL * (shape.grid.levels if shape.grid else 0)
     low = LAUNCHES + samples * of_sample / units
     why = f"{training.steps:,} steps of {_ms(low, SLOWER * low)}, of {training.rays:,} rays"
     return Estimate(training.stage, (training.steps * low, training.steps * SLOWER * low), why)

@@ -110,7 +110,7 @@ class TrainField(Training):
         """Return the field of a resumed run, or a new one."""
         if isinstance(run.learned_field, LearnedField) and run.learned_field.field.shape == self.field:
             return run.learned_field
-        field = LearnedField.first(self.field, run.seed, run.photographs.background)
+        field = LearnedField.initial(self.field, run.seed, run.photographs.background)
         LOG.info("a field of %s parameters", f"{self.field.learned:,}")
         return field
 

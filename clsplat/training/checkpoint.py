@@ -206,7 +206,7 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
     if state.field:
         own, _ = split(tables, field.FOLDER)
         kind = field.class_of(state.field)
-        run.learned_field = kind.of_tables(state.field["shape"], own, run.photographs.background)
+        run.learned_field = kind.from_tables(state.field["shape"], own, run.photographs.background)
         run.learned_field.updates = state.updates[UPDATES]
         return
     run.best_tables, tables = split(tables, best_model.FOLDER)

@@ -38,7 +38,7 @@ class TrainedField(ABC):
 
     @abstractmethod
     def shape_as_data(self) -> dict[str, Any]:
-        """Return the `shape` for `check_tables` and `of_tables`, as JSON."""
+        """Return the `shape` for `check_tables` and `from_tables`, as JSON."""
 
     @abstractmethod
     def tables(self) -> Tables:
@@ -55,7 +55,9 @@ class TrainedField(ABC):
 
     @classmethod
     @abstractmethod
-    def of_tables(cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array) -> Self:
+    def from_tables(
+        cls, shape: Mapping[str, Any], tables: Mapping[str, NDArray[np.float32]], background: Array
+    ) -> Self:
         """Return the field of a checkpoint from its tables."""
 
 

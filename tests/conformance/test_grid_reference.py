@@ -84,8 +84,8 @@ def test_levels_are_dense_while_corners_fit_and_are_contiguous():
 def test_grid_parameters_follow_the_networks_and_start_near_zero():
     plain, gridded = (FieldShape(degrees=2, grid=one) for one in (None, GridShape(levels=2, entries=16)))
     assert gridded.position_rows == plain.position_rows + 2 * FEATURES
-    first = gridded.first_parameters(3)
-    own = first[gridded.of_network : gridded.of_network + gridded.grid.learned]
+    first = gridded.initial_parameters(3)
+    own = first[gridded.network_parameters : gridded.network_parameters + gridded.grid.learned]
     assert 0 < np.abs(own).min() < np.abs(own).max() < 1e-4
     assert FieldShape.model_validate(gridded.model_dump()) == gridded
 
@@ -94,7 +94,7 @@ def test_grid_parameters_follow_the_networks_and_start_near_zero():
     ("keys", "complaint"),
     [
         ({"entries": 100}, "power of 2"),
-        ({"coarsest": 16, "finest": 8}, "expected 'finest' from 16 on"),
+        ({"coarsest": 16, "finest": 8}, "must be at least .coarsest., 16; got 8"),
         ({"corner": [0.0, 1.0]}, "at least 3 items"),
     ],
 )
@@ -104,5 +104,5 @@ def test_a_grid_that_cannot_be_is_refused(keys, complaint):
 
 
 def test_a_network_without_any_position_is_refused():
-    with pytest.raises(ValidationError, match="reads no position"):
+    with pytest.raises(ValidationError, match="read no position"):
         FieldShape(degrees=0)

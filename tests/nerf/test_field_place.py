@@ -64,7 +64,9 @@ def test_the_message_says_where_the_scene_is(tmp_path):
     ]
     scene = scene_of(tmp_path, *views)
     shape = FieldShape(near=NEAR, far=FAR, grid=GridShape(corner=[20.0, 0.0, 0.0], side=1.0))
-    with pytest.raises(ConfigError, match=r"train_field\.field\.grid: .* at depths from 1 to 3 .* near \(1, 2, 3\)"):
+    with pytest.raises(
+        ConfigError, match=r"train_field\.field\.grid: .* at depths from 1 to 3 .* the cameras look at \(1, 2, 3\)"
+    ):
         require_seen(shape, scene)
     require_seen(shape.model_copy(update={"grid": None}), scene)
     require_seen(replace_grid(shape, corner=[-3.0, -3.0, -3.0], side=6.0), replace(scene, points=None))

@@ -203,11 +203,11 @@ def test_field_on_another_background_is_lighter_where_uncovered(finished, tiny_s
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"format": 2}, "is of format '2'"),
-        ({"shape": {"width": 64}}, r"parameters are not \[\d+, 1\] of float32"),
-        ({"background": "pink"}, "background of its notes: "),
-        ({"shape": {"width": None}}, "shape.width of its notes: "),
-        ({"shape": {"width": 63}}, r"shape\.width of its notes: .*multiple of 4"),
+        ({"format": 2}, "has the format '2'"),
+        ({"shape": {"width": 64}}, r"parameters are not \[\d+, 1\] float32"),
+        ({"background": "pink"}, "metadata background: "),
+        ({"shape": {"width": None}}, "metadata shape.width: "),
+        ({"shape": {"width": 63}}, r"metadata shape\.width: .*multiple of 4"),
     ],
 )
 def test_a_file_that_holds_no_such_field_is_refused_in_one_line(finished, tmp_path, change, complaint):
@@ -215,7 +215,7 @@ def test_a_file_that_holds_no_such_field_is_refused_in_one_line(finished, tmp_pa
     changed = {key: {**notes[key], **value} if isinstance(value, dict) else value for key, value in change.items()}
     with (tmp_path / "field.npz").open("wb") as file:
         archive.write(file, {**notes, **changed}, arrays.items())
-    with pytest.raises(DataError, match=f"field.npz: {complaint}.*; expected a file of the stage export_field, whole"):
+    with pytest.raises(DataError, match=f"field.npz: {complaint}.*; expected an intact file of the stage export_field"):
         clsplat.load_field(tmp_path / "field.npz")
 
 
@@ -225,7 +225,7 @@ def test_missing_or_nonfinite_field_file_is_refused(finished, tmp_path):
     field = clsplat.load_field(finished)
     field.parameters[3] = np.inf
     field.save(tmp_path / "field.npz")
-    with pytest.raises(DataError, match="hold values that are not finite"):
+    with pytest.raises(DataError, match="contain values that are not finite"):
         clsplat.load_field(tmp_path / "field.npz")
 
 
@@ -242,10 +242,10 @@ def test_a_checkpoint_of_another_shape_is_refused(finished):
     other = state.model_copy(update={"field": state.field | {"shape": state.field["shape"] | {"width": 64}}})
     with pytest.raises(DataError, match="parameters of its field is not"):
         checkpoint.check_run_tables(other, tables)
-    with pytest.raises(DataError, match="has not the tables"):
+    with pytest.raises(DataError, match="does not have the tables"):
         checkpoint.check_run_tables(state, {"field/parameters": tables["field/parameters"]})
     tables["field/moment1"] = np.full_like(tables["field/moment1"], np.nan)
-    with pytest.raises(DataError, match="moment1 of its field holds values that are not finite"):
+    with pytest.raises(DataError, match="moment1 of its field contains values that are not finite"):
         checkpoint.check_run_tables(state, tables)
 
 
@@ -260,8 +260,8 @@ def test_stages_of_gaussians_are_refused_after_a_field(tmp_path, stage):
 @pytest.mark.parametrize(
     ("keys", "complaint"),
     [
-        ({"near": 3.0, "far": 2.0}, "expected 'far' beyond 'near'"),
-        ({"skip": 7}, "expected 'skip' below 7"),
+        ({"near": 3.0, "far": 2.0}, "'far' must be larger than 'near'"),
+        ({"skip": 7}, "'skip' must be less than 7"),
         ({"width": 30}, "multiple of 4"),
         ({"coarse_samples": 20}, "multiple of 16"),
     ],
@@ -296,7 +296,7 @@ def paint(field: Field, view: View) -> np.ndarray:
 def small_field() -> Field:
     device = open_device()
     shape = FieldShape(coarse_samples=16, fine_samples=16, depth=1, skip=None, width=4, color_width=4, degrees=2)
-    return Field.first(shape, 1, device.upload(np.array([1.0, 0.5, 0.0], np.float32)))
+    return Field.initial(shape, 1, device.upload(np.array([1.0, 0.5, 0.0], np.float32)))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (64, 1), (65, 1), (97, 11)])

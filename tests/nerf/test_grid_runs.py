@@ -39,8 +39,8 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory, pipelin
 
 def test_the_numbers_of_a_grid_are_trained(finished):
     field = clsplat.load_field(finished)
-    own = slice(field.shape.of_network, field.shape.of_network + field.shape.grid.learned)
-    moved = np.abs(field.parameters - field.shape.first_parameters(0))[own]
+    own = slice(field.shape.network_parameters, field.shape.network_parameters + field.shape.grid.learned)
+    moved = np.abs(field.parameters - field.shape.initial_parameters(0))[own]
     assert 0.05 < (moved > 1e-3).mean() < 0.95  # some lie where no sample is
     assert json.loads((finished / "metrics.json").read_text())["parameters"] == field.shape.learned
 
@@ -76,7 +76,7 @@ def test_a_file_without_a_key_of_its_shape_is_refused(finished, tmp_path, missin
     del (notes["shape"][own] if own else notes["shape"])[key]
     with (tmp_path / "field.npz").open("wb") as file:
         archive.write(file, notes, arrays.items())
-    with pytest.raises(DataError, match=rf"it lacks {missing}; expected a file of the stage export_field"):
+    with pytest.raises(DataError, match=rf"lacks {missing}; expected an intact file of the stage export_field"):
         clsplat.load_field(tmp_path / "field.npz")
 
 
@@ -98,7 +98,7 @@ def test_a_field_that_does_not_fit_is_refused_before_it_is_made(tiny_scene, pipe
         photographs=SimpleNamespace(budget=1 << 30),
         device=SimpleNamespace(info=limits),
     )
-    with pytest.raises(MemoryLimitError, match=r"4 tables of 1,024 MiB.*take fewer levels or entries of the grid"):
+    with pytest.raises(MemoryLimitError, match=r"4 tables of 1,024 MiB.*use fewer levels or entries of the grid"):
         load(pipeline, changes).stages[0].check_run(run)
     load(pipeline).stages[0].check_run(run)
 
@@ -113,7 +113,8 @@ def test_cube_no_photograph_shows_is_refused_before_allocation(tiny_scene, pipel
         (["corner=[1.5, 1.5, 1.5]", "side=0.1"], r"none of the scene's [\d,]+ points lies in it"),
     ):
         stage = load(pipeline, [f"train_field.field.grid.{change}" for change in changes]).stages[0]
-        with pytest.raises(ConfigError, match=rf"{fault} \(.*tiny\); expected one about .*: set `corner` and `side`"):
+        match = rf"{fault} \(.*tiny\); the cameras look at .*: set `grid.corner` and `grid.side`"
+        with pytest.raises(ConfigError, match=match):
             stage.check_run(SimpleNamespace(scene=scene))
 
 

@@ -65,16 +65,16 @@ class FieldCase:
     def sample(cls, device: Device, rng: np.random.Generator, rays: int, draw: Draw, **keys: Any) -> "FieldCase":
         """Return a case with random rays.  keys: changes of SHAPE."""
         shape = FieldShape.model_validate({**SHAPE.model_dump(), **keys})
-        parameters = shape.first_parameters(int(rng.integers(100)))
+        parameters = shape.initial_parameters(int(rng.integers(100)))
         for layer in shape.layers:
             parameters[layer.first_bias : layer.first_bias + layer.outputs] = rng.normal(0, 0.3, layer.outputs)
         if shape.grid:
-            entries = parameters[shape.of_network : shape.of_network + shape.grid.learned]
+            entries = parameters[shape.network_parameters : shape.network_parameters + shape.grid.learned]
             entries[:] = rng.normal(0, 0.5, len(entries))
         scene = random_case(rng, 1, WIDTH, HEIGHT)
         camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)
         field = Field(shape, device.upload(parameters), device.upload(BACKGROUND))
-        cast, levels = field.levels.drawn(camera, draw, rays), field.levels
+        cast, levels = field.levels.sample_rays(camera, draw, rays), field.levels
         pixels = ref.drawn_pixels(WIDTH * HEIGHT, rays, draw.first, draw.seed, draw.step)
         filled = np.concatenate([pixels, np.repeat(pixels[-1:], cast.count - rays)])
         planes = planes_of(device, camera, photograph)
@@ -114,7 +114,7 @@ class FieldCase:
 
     def grid_levels(self) -> list[GridLevel]:
         """Return the levels of the grid; an empty list without a grid."""
-        table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.of_network
+        table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.network_parameters
         return [
             GridLevel(ref.HashLevel(cells, entries), first + FEATURES * before) for cells, before, entries, _ in table
         ]
@@ -245,7 +245,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, place
         yield by_norm("grid_backward", f"level {number}, {what}", by_entries, expected, GRADIENT)
         untouched = np.all(expected == 0, axis=1)
         yield equal("grid_backward", f"entries without samples, level {number}, {what}", by_entries[untouched], 0.0)
-    yield equal("grid_backward", f"parameters of the network, {what}", found[: shape.of_network], 0.0)
+    yield equal("grid_backward", f"parameters of the network, {what}", found[: shape.network_parameters], 0.0)
 
 
 # A field: its network, colors of rays, all gradients, images and updates.
@@ -288,8 +288,8 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
 
 
 def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[ref.Weights], what: str) -> Results:
-    gradient = gradient[: shape.of_network]
-    used = np.zeros(shape.of_network, bool)
+    gradient = gradient[: shape.network_parameters]
+    used = np.zeros(shape.network_parameters, bool)
     for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
         of_weights, of_biases = (sum(level[number][part] for level in expected) for part in (0, 1))
         kernel = "composite_backward" if layer.name in ("density", "color") else "dense_backward"
@@ -362,9 +362,9 @@ def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("dense_update")
 def updates_of_fields(device: Device, rng: np.random.Generator) -> Results:
     """Compare three updates by Adam from gradients of all magnitudes."""
-    learned = LearnedField.first(SHAPE, 0, device.upload(BACKGROUND))
+    learned = LearnedField.initial(SHAPE, 0, device.upload(BACKGROUND))
     count = SHAPE.parameters
-    values, moment1, moment2 = SHAPE.first_parameters(0).astype(np.float64), np.zeros(count), np.zeros(count)
+    values, moment1, moment2 = SHAPE.initial_parameters(0).astype(np.float64), np.zeros(count), np.zeros(count)
     for number, epsilon in enumerate((1e-8, 1e-8, 1e-15), 1):
         gradient = (rng.normal(size=count) * 10.0 ** rng.uniform(-10, 1, count)).astype(np.float32)
         learned.update(device.upload(gradient), AdamStep(0.01, epsilon), number)
