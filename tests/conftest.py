@@ -30,7 +30,7 @@ from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.pipeline import loading, plugins, yaml_file
 from clsplat.scene.reader import Reader
 from clsplat.sweeps.store import Store
-from clsplat.sweeps.task import Terms
+from clsplat.sweeps.task import CellOptions
 from tests.support.devices import NAMES, TUNINGS
 from tests.support.runs import FEW, killed, train
 
@@ -296,6 +296,6 @@ def store(tmp_path: Path) -> Store:
 
 
 @pytest.fixture
-def terms(store: Store) -> Terms:
+def options(store: Store) -> CellOptions:
     """How a cell is run in it now."""
-    return Terms(store.now())
+    return CellOptions(store.now())

@@ -345,7 +345,7 @@ def cancel(store: PathLike, cell: str | None = None) -> str:
     """
     from clsplat.sweeps.store import Store
 
-    return Store.opened(Path(store)).cancel(cell)
+    return Store.open(Path(store)).cancel(cell)
 
 
 def run_worker(

@@ -1,4 +1,4 @@
-"""Cells by their names, run through a store by an engine, with their results in folders of these names."""
+"""Run cells through a store, with an engine, and put their results into folders with their names."""
 
 import logging
 import threading
@@ -26,67 +26,62 @@ from clsplat.runs.run_folder import Start
 from clsplat.runs.state import Phase, RunState, read_sums, sum_of
 from clsplat.sweeps.cell import CellRun, Scenes
 from clsplat.sweeps.child import plugin_files, run_command
-from clsplat.sweeps.devices import places
-from clsplat.sweeps.engines import Drive, Engine, InlineEngine, Wanted
-from clsplat.sweeps.experiment import matrix_opened
+from clsplat.sweeps.devices import find_slots
+from clsplat.sweeps.engines import Dispatcher, Engine, InlineEngine, PendingCell
+from clsplat.sweeps.experiment import open_matrix
 from clsplat.sweeps.store import ERRORS, LEASE, MANIFEST, Store, copy_files, link_or_copy
-from clsplat.sweeps.task import Outcome, Terms, run_cell
+from clsplat.sweeps.task import CellOptions, Outcome, run_cell
 from clsplat.training import checkpoint
 from clsplat.training.stage import Training
 from clsplat.training.status import StatusFile, read_status
 
-# The result of a cell in the folder of its matrix.
 
-
-def place_copy(source: Path, target: Path) -> None:
-    """Let a folder hold the files of a result, linked where nothing changes them in place; the manifest comes last.
+def copy_result(source: Path, target: Path) -> None:
+    """Copy a result to a folder, by links where nothing changes files in place; the manifest comes last.
 
     Raises OutputError.
     """
     with raising_output_error(target):
-        for old in (target / MANIFEST, *checkpoint.saved(target)):  # later checkpoints are of another run
+        for old in (target / MANIFEST, *checkpoint.saved(target)):  # the checkpoints may belong to another run
             old.unlink(missing_ok=True)
         copy_files(source, target, {LEASE, ERRORS, MANIFEST})
         link_or_copy(source / MANIFEST, target / MANIFEST)
 
 
-def is_placed(source: Path, target: Path) -> bool:
-    """Whether a folder holds the files of a result, as `place_copy` leaves them.
+def has_result(source: Path, target: Path) -> bool:
+    """Return whether a folder holds the files of a result, as `copy_result` leaves them.
 
-    Raises ConfigError where a run has gone on in it, with settings of its own.
+    Raises ConfigError if the run in it was continued with other settings.
     """
-    placed = None
+    copied = None
     with suppress(DataError, KeyError, TypeError):
-        placed = read_json(target / MANIFEST)["files"][PIPELINE]
-    if placed and sum_of(target / PIPELINE) not in (None, placed):
+        copied = read_json(target / MANIFEST)["files"][PIPELINE]
+    if copied and sum_of(target / PIPELINE) not in (None, copied):
         raise ConfigError(
-            f"{target}: was trained on with other settings since the sweep had put its result there; move that folder, "
+            f"{target}: the run was continued with other settings after the sweep; move that folder away, "
             "and run the sweep again with --resume"
         )
     here = RunState.read(target)
     return here.phase is Phase.DONE and here.sums == read_sums(source) and not here.lost
 
 
-# How far the cells of a sweep are: a line of the log now and then, a bar in the terminal.
-
-EVERY = 2.0  # seconds between two looks at the files
-SHOWN = 4  # cells that are named
-
+PROGRESS_INTERVAL_S = 2.0  # between two reads of the cells' status files
+MAX_NAMES = 4  # of cells in the progress line
 
 LOG = logging.getLogger("clsplat")
 
 
 @dataclass
 class Batch:
-    """Cells that are run together, and how far they are."""
+    """Cells that are run together, and their progress."""
 
     name: str
-    text: str  # what tells it from others of its name
+    text: str  # distinguishes batches with the same name
     cells: Sequence[matrix.Cell]
     out: Path  # of the folders of results
     store: Store
     failures: Failures
-    is_anew: bool = False  # whether what is in those folders is replaced
+    overwrites: bool = False  # whether the contents of those folders are replaced
     running: dict[str, CellRun] = field(default_factory=dict)
     outcomes: dict[str, Outcome] = field(default_factory=dict)
     _keys: dict[str, str] = field(default_factory=dict)
@@ -97,65 +92,65 @@ class Batch:
         self._count, self._looked = Count("steps", sum(self._steps.values())), time.monotonic()
 
     def ready(self) -> None:
-        """Called once, before the first cell begins."""
+        """Called once, before the first cell starts."""
 
-    def tell(self, stage: str | None) -> None:
-        """Called when a cell has begun, which is the stage, or has ended."""
+    def on_change(self, started: str | None) -> None:
+        """Called when a cell has started, with its name, or has ended, with None."""
 
     def require_held(self) -> None:
-        """Raise OutputError where its folder belongs to another process now."""
+        """Raise OutputError if the folder now belongs to another process."""
 
     def run(self, execution: Execution, device: str | None) -> None:
-        """Run every cell, unless its result is in the store; `failures` has those that failed.
+        """Run every cell whose result is not in the store; `failures` collects those that failed.
 
-        device: the one of the engine inline.  Raises Interrupted, Different.
+        device: for the engine inline.  Raises Interrupted, BitsMismatch.
         """
         driving = threading.Event()
         with stopping_on_signals(lambda: ask_to_stop(self._stop, driving)), terminal.counts_on_terminal():
-            wanted = self._wanted()
+            wanted = self._pending_cells()
             with _engine(execution, self.store, device, self._is_stopped) as engine:
-                terms = Terms(self.store.now(), execution.retries)
-                drive = Drive(self.store, engine, execution.placement.bits == "same", terms, self._stop.is_set)
+                options = CellOptions(self.store.now(), execution.retries)
+                drive = Dispatcher(self.store, engine, execution.placement.bits == "same", options, self._stop.is_set)
                 driving.set()
                 self._go(drive, wanted)
 
     def _look(self) -> None:
-        """Show how far the cells are, from the files of those that run, where it is time to."""
-        if time.monotonic() - self._looked < EVERY:
+        """Report the progress of running cells from their files, if it is time to."""
+        if time.monotonic() - self._looked < PROGRESS_INTERVAL_S:
             return
         self._looked = time.monotonic()
-        done, told = sum(self._steps[name] for name in self.outcomes), []
+        done, progress = sum(self._steps[name] for name in self.outcomes), []
         for name, cell in self.running.items():
-            newest = max(self.store.folder(cell.key).attempts(), key=lambda attempt: attempt.beaten, default=None)
+            newest = max(self.store.folder(cell.key).attempts(), key=lambda attempt: attempt.last_beat, default=None)
             step = read_status(newest.path).get("step") if newest else 0
             if isinstance(step, int):
                 done += step
-                told.append(f"{name} {step}/{self._steps[name]}")
-        named = ", ".join([*told[:SHOWN], *(["…"] if len(told) > SHOWN else [])])
-        self._count.what = f"steps ({named})" if told else "steps"
+                progress.append(f"{name} {step}/{self._steps[name]}")
+        named = ", ".join([*progress[:MAX_NAMES], *(["…"] if len(progress) > MAX_NAMES else [])])
+        self._count.what = f"steps ({named})" if progress else "steps"
         self._count.reach(min(done, self._count.total))
 
     def _is_stopped(self) -> bool:
-        """Whether a signal came; an engine in this process asks again and again."""
+        """Return whether a signal arrived; the engine inline calls this regularly, so it also reports progress."""
         self._look()
         return self._stop.is_set()
 
-    def _wanted(self) -> list[Wanted]:
-        """The cells whose scenes can be read; the others have failed."""
-        scenes, found = Scenes(self.store.prepared), []
+    def _pending_cells(self) -> list[PendingCell]:
+        """Return the cells whose scenes can be read; the others fail."""
+        scenes, pending = Scenes(self.store.prepared), []
         for cell in self.cells:
             with self.failures.kept(cell.name):
-                found.append(wanted_cell(cell, scenes, self.store))
-        return found
+                pending.append(pending_cell(cell, scenes, self.store))
+        return pending
 
-    def _go(self, drive: Drive, wanted: Sequence[Wanted]) -> None:
+    def _go(self, drive: Dispatcher, wanted: Sequence[PendingCell]) -> None:
         drive.ended, drive.look = self._ended, self._look
 
         def began(cell: CellRun) -> None:
-            if drive.is_same and not self.running and not self.outcomes:  # so that its waiting cells are seen
+            if drive.is_same and not self.running and not self.outcomes:  # so that `clsplat status` shows waiting cells
                 for one in wanted:
                     self._keys[one.cell.name] = one.on(cell.spec["bits"]).key
-                    with suppress(ClsplatError):  # told when that cell runs
+                    with suppress(ClsplatError):  # reported when that cell runs
                         self.store.add(one.on(cell.spec["bits"]))
             self._began(cell)
 
@@ -168,7 +163,7 @@ class Batch:
             self._keys[cell.name] = cell.key
             self.store.note_sweep(self.name, self._keys, self.text)
         self.running[cell.name] = cell
-        self.tell(cell.name)
+        self.on_change(cell.name)
         number = len(self.outcomes) + len(self.running)
         LOG.info("cell %d of %d: %s", number, len(self.cells), cell.name)
 
@@ -177,25 +172,25 @@ class Batch:
         if outcome.state == "stopped" and self._stop.is_set():
             return
         if outcome.state == "published":
-            self._place(cell)
+            self._copy(cell)
         else:
             error = Interrupted(outcome.message) if outcome.state == "stopped" else ClsplatError(outcome.message)
             error.exit_code = outcome.exit_code
             self.failures.note(cell.name, error)
         self.outcomes[cell.name] = outcome
-        self.tell(None)
+        self.on_change(None)
 
-    def _place(self, cell: CellRun) -> None:
-        """Put a result into the folder of its name, unless it is there."""
-        result, here = self.store.folder(cell.key).result, self.out / cell.name
+    def _copy(self, cell: CellRun) -> None:
+        """Copy a result to the folder with its name, unless it is there."""
+        result, target = self.store.folder(cell.key).result, self.out / cell.name
         with self.failures.kept(cell.name):
-            if self.is_anew or not is_placed(result, here):
+            if self.overwrites or not has_result(result, target):
                 self.require_held()
-                place_copy(result, here)
+                copy_result(result, target)
 
 
 def ask_to_stop(stop: threading.Event, driving: threading.Event) -> None:
-    """Let the cells that run save their state and stop; before they run, and at the second signal, stop at once."""
+    """Let running cells save their state and stop; before any runs, and at the second signal, stop at once."""
     if stop.is_set() or not driving.is_set():
         stop_at_once()
     stop.set()
@@ -206,9 +201,9 @@ def _engine(execution: Execution, store: Store, device: str | None, is_stopped: 
     names = None if execution.devices == "auto" else execution.devices
     if execution.engine == "inline":
         chosen = [device] if device else names[:1] if names else [""]
-        engine: Engine = InlineEngine(store, places("inline", chosen)[0], is_stopped)
+        engine: Engine = InlineEngine(store, find_slots("inline", chosen)[0], is_stopped)
     else:
-        from clsplat.sweeps import dask  # where Dask is installed
+        from clsplat.sweeps import dask  # Dask may not be installed
 
         engine = dask.engine(execution, store, [device] if device else names)
     try:
@@ -217,16 +212,16 @@ def _engine(execution: Execution, store: Store, device: str | None, is_stopped: 
         engine.close()
 
 
-def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
-    """Return the cell of a matrix; what `prepare` makes for it is made now, before its runs.
+def pending_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> PendingCell:
+    """Return the cell of a matrix, after running its `prepare` steps.
 
     Raises ConfigError, DataError and the errors of the steps.
     """
     if planned := check_preparation(cell.pipeline, store.prepared.parent / cell.name):
         prepare(planned, cell.pipeline.settings.scene.folder, store.prepared)
     known = scenes.known(cell.pipeline)
-    own = CellRun.of(cell.name, cell.pipeline, known.digest, bits="")
-    return Wanted(own, steps_of(cell.pipeline) * known.pixels)
+    without_class = CellRun.of(cell.name, cell.pipeline, known.digest, bits="")
+    return PendingCell(without_class, steps_of(cell.pipeline) * known.pixels)
 
 
 def steps_of(pipeline: Pipeline) -> int:
@@ -234,7 +229,7 @@ def steps_of(pipeline: Pipeline) -> int:
     return sum(stage.steps for stage in pipeline.stages if isinstance(stage, Training))
 
 
-# One cell by itself: what `sbatch --array` calls, and any other queue.
+# A single cell, for `sbatch --array` and other queues.
 
 
 def run_one(
@@ -245,32 +240,32 @@ def run_one(
     device: str | None = None,
     retries: int = 3,
 ) -> Path:
-    """Run one cell of a matrix, or a pipeline as a cell, unless its result is in the store; return its folder.
+    """Run a cell of a matrix, or a pipeline as a cell, unless its result is in the store; return its folder.
 
-    index: of the cell in the matrix, from 0.  Raises ClsplatError with the exit code of its run.
+    index: of the cell in the matrix, from 0.  Raises ClsplatError with the exit code of the run.
     """
     experiment = load_experiment(pipeline, overrides)
     if experiment is None:
         if index:
-            raise ConfigError(f"{pipeline}: is a single pipeline, which has no cell {index}; leave --index out")
+            raise ConfigError(f"{pipeline}: is a single pipeline without cell {index}; remove --index")
         checked = load(pipeline, list(overrides))
         cells = [MatrixCell(checked.settings.name, checked)]
         experiment = Experiment(checked.path, checked.settings.name, "", cells)
     elif index is None or not 0 <= index < len(experiment.cells):
         last = len(experiment.cells) - 1
-        raise ConfigError(f"{pipeline}: is a matrix; expected --index from 0 to {last}, the number of a cell")
+        raise ConfigError(f"{pipeline}: is a matrix; give the number of a cell, --index 0 to {last}")
     chosen = experiment.cells[index or 0]
     store, stop, driving = Store(root), threading.Event(), threading.Event()
     with stopping_on_signals(lambda: ask_to_stop(stop, driving)):
-        terms = Terms(store.now(), retries, "cell")
-        wanted = wanted_cell(chosen, Scenes(store.prepared), store)
-        (place,) = places("cell", [device or ""])
-        cell = wanted.on(place.bits)
+        options = CellOptions(store.now(), retries, "cell")
+        wanted = pending_cell(chosen, Scenes(store.prepared), store)
+        (slot,) = find_slots("cell", [device or ""])
+        cell = wanted.on(slot.bits)
         store.note_sweep(f"{experiment.name}-{cell.name}", {cell.name: cell.key}, cell.key)
         driving.set()
-        outcome = run_cell(cell, store, run_command(place.device, plugin_files()), terms, stop.is_set)
+        outcome = run_cell(cell, store, run_command(slot.device, plugin_files()), options, stop.is_set)
     if outcome.state == "stopped":
-        raise Interrupted(f"cell {cell.name}: {outcome.message}; the same command goes on with it")
+        raise Interrupted(f"cell {cell.name}: {outcome.message}; continue with the same command")
     if outcome.state != "published":
         error = ClsplatError(f"cell {cell.name}: {outcome.message}")
         error.exit_code = outcome.exit_code
@@ -280,9 +275,6 @@ def run_one(
     return result
 
 
-# Run the cells of a matrix through a store, and put their results into the folder of the matrix.
-
-
 def run_sweep(
     experiment: Experiment,
     state: RunState,
@@ -290,13 +282,13 @@ def run_sweep(
     device: str | None,
     start: Start,
 ) -> None:
-    """Run every cell, unless its result is in the store, and write compare.html, as a run without a store does.
+    """Run every cell of a matrix whose result is not in the store, and write compare.html.
 
-    device: the one of the engine inline.  A cell that fails does not stop the others; at the end a ClsplatError is
-    raised with the exit code of the first one.  Raises Interrupted, Different.
+    device: for the engine inline.  A failed cell does not stop the others; at the end a ClsplatError is raised with
+    the exit code of the first one.  Raises Interrupted, BitsMismatch.
     """
     store = Store(execution.store_folder or Path())
-    with matrix_opened(experiment, state, start) as (status, failures):
+    with open_matrix(experiment, state, start) as (status, failures):
         sweep = _Sweep(
             experiment.name, experiment.text, experiment.cells, state.out, store, failures, start == "restart"
         )
@@ -305,16 +297,16 @@ def run_sweep(
 
 
 class _Sweep(Batch):
-    """A batch whose folder is that of a matrix, with its status."""
+    """A batch in the folder of a matrix, with its status."""
 
     status: StatusFile
 
     def ready(self) -> None:
         self.status.enter("running")
 
-    def tell(self, stage: str | None) -> None:
-        if stage is not None:
-            self.status.note(stage=stage)
+    def on_change(self, started: str | None) -> None:
+        if started is not None:
+            self.status.note(stage=started)
             return
         self.status.note(done=len({*self.outcomes, *self.failures}), failed=self.failures.texts())
         self.status.refresh()

@@ -1,4 +1,4 @@
-"""A cell: one run of a sweep, named by the content of all that decides its bits, and by no place."""
+"""Identify cells, the runs of a sweep, by the content of everything that determines their bits, not by paths."""
 
 import hashlib
 import json
@@ -23,31 +23,31 @@ from clsplat.scene.identity import Identity, ImageFile
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE
 
-# Fingerprints of what a cell depends on: the content of its scene, and the program.
+# Fingerprints of the content of a scene, and of the program.
 
-KEPT = 16  # hexadecimal digits of a hash
-# decode photographs, place Gaussians, and compress models: OpenCV has libwebp
+HASH_DIGITS = 16  # hexadecimal
+# these decode photos, initialize Gaussians and compress models (OpenCV includes libwebp)
 LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "zstandard", "deflate")
 
 
 @dataclass(frozen=True)
-class Known:
-    """What is known of a scene before any run."""
+class SceneFacts:
+    """Facts of a scene before any run."""
 
     digest: str
-    pixels: float  # of all training photographs, for the order of cells
+    pixels: float  # of all training images, for the order of cells
 
 
 @cache
 def code_digest() -> str:
-    """Return a hash of the program: the package, its kernels, and the libraries that decide over bits."""
+    """Return a hash of the program: the package, its kernels, and the libraries that affect the bits."""
     libraries = [*_versions(*LIBRARIES), f"zlib {zlib.ZLIB_RUNTIME_VERSION}", _builtin_zstd()]
     return _digest([__version__, *list_sources(), *libraries])
 
 
 @cache
 def tools_digest() -> str:
-    """Return a hash of what else decides over the bits of scenes that `prepare` makes."""
+    """Return a hash of the other libraries that affect the output of `prepare`."""
     return _digest(_versions("pycolmap"))
 
 
@@ -58,7 +58,7 @@ def _versions(*names: str) -> Iterator[str]:
 
 
 def _builtin_zstd() -> str:
-    """The Zstandard of Python itself, from 3.14 on."""
+    """Return the version of Python's own Zstandard, which exists since 3.14."""
     with suppress(ImportError):
         from compression import zstd
 
@@ -67,11 +67,11 @@ def _builtin_zstd() -> str:
 
 
 def _digest(parts: Iterable[str]) -> str:
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:KEPT]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:HASH_DIGITS]
 
 
 def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple[Scene, Identity]:
-    """Read a scene, and hash its files with a function; photographs are not decoded.  Raises DataError."""
+    """Read a scene, and hash its files with a function; photos are not decoded.  Raises DataError."""
     scene, _ = settings.applied(read_scene(settings.folder, settings.split))
     paths = dict.fromkeys(path for view in scene.views for path in (view.image_path, view.mask_path))
     files = {path: ImageFile(digest=digest_of(path)) for path in paths if path is not None and path != NO_FILE}
@@ -79,19 +79,19 @@ def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple
 
 
 class Scenes:
-    """Fingerprints of scenes, each of whose files is hashed once."""
+    """Fingerprints of scenes; each file is hashed once."""
 
     def __init__(self, prepared: Path) -> None:
-        """prepared: the folder of what `prepare` makes."""
+        """prepared: the folder of the output of `prepare`."""
         self._prepared = prepared
-        self._known: dict[str, Known] = {}
+        self._known: dict[str, SceneFacts] = {}
         self._digest_of = cache(_digest_of)
 
-    def known(self, pipeline: Pipeline) -> Known:
-        """Return what is known of a pipeline's scene.
+    def known(self, pipeline: Pipeline) -> SceneFacts:
+        """Return the facts of a pipeline's scene.
 
-        It is the identity that a run writes into inputs.json; where `prepare` makes the scene, that of prepared.json.
-        Raises DataError when the scene cannot be read, ConfigError when none is named.
+        The digest is the one that a run writes to inputs.json, or to prepared.json if `prepare` makes the scene.
+        Raises DataError if the scene cannot be read, and ConfigError if the pipeline has none.
         """
         settings = pipeline.settings
         steps = [step.model_dump(mode="json") for step in settings.prepare]
@@ -100,17 +100,17 @@ class Scenes:
             self._known[key] = self._read(pipeline)
         return self._known[key]
 
-    def _read(self, pipeline: Pipeline) -> Known:
+    def _read(self, pipeline: Pipeline) -> SceneFacts:
         settings = pipeline.settings.scene
         if steps := pipeline.settings.prepare:
-            return Known(plan(steps, settings.folder, self._prepared)[-1].key, 0.0)
+            return SceneFacts(plan(steps, settings.folder, self._prepared)[-1].key, 0.0)
         original, identity = identify(settings, self._digest_of)
         pixels = sum(view.camera.width * view.camera.height for view in original.split("train")) / settings.downscale**2
-        return Known(identity.digest, float(pixels))
+        return SceneFacts(identity.digest, float(pixels))
 
 
 def _digest_of(path: Path) -> str:
-    with suppress(DataError):  # the run will say what is wrong with it
+    with suppress(DataError):  # the run will report the error
         return sha256(path)
     return ""
 
@@ -120,18 +120,18 @@ KEY = 20  # hexadecimal digits of the hash that names a cell
 
 @dataclass(frozen=True)
 class CellRun:
-    """One run, and the pipeline file that runs it on this machine."""
+    """A run, and the pipeline file that runs it on this machine."""
 
     name: str  # in its sweep
-    spec: dict[str, Any]  # what its key is made of: pipeline, scene, code, bits
+    spec: dict[str, Any]  # the values that the key is a hash of: pipeline, scene, code, bits
     text: str  # the resolved pipeline, with absolute paths
-    files: dict[str, str] = field(default_factory=dict)  # hashes of the files that it names, by path
+    files: dict[str, str] = field(default_factory=dict)  # hashes of the input files of the pipeline, by path
 
     @classmethod
     def of(cls, name: str, pipeline: Pipeline, scene: str, bits: str) -> "CellRun":
         """Return the cell of a pipeline.  scene: the fingerprint of its scene; bits: the bits class of its device.
 
-        Raises DataError when a file that it names cannot be read.
+        Raises DataError if an input file of the pipeline cannot be read.
         """
         placed = with_absolute_paths(pipeline)
         spec = {"pipeline": with_content_hashes(placed), "scene": scene, "code": code_digest(), "bits": bits}
@@ -141,7 +141,7 @@ class CellRun:
 
     @classmethod
     def from_json(cls, text: str) -> "CellRun":
-        """Return what `json` returned."""
+        """Return the cell from the text that `json` returned."""
         return cls(**json.loads(text))
 
     def json(self) -> str:
@@ -149,15 +149,15 @@ class CellRun:
         return json.dumps(asdict(self))
 
     def require_files(self) -> None:
-        """Raise DataError where a file that it names does not hold here what its key was made of."""
+        """Raise DataError if an input file differs on this machine from the one that the key was made from."""
         for path, digest in self.files.items():
             if content_of(Path(path)) != digest:
                 raise DataError(
-                    f"cell {self.name}: {path} is not what it was where the sweep began; put that file there, or run "
-                    "the sweep again"
+                    f"cell {self.name}: {path} differs from the file with which the sweep started; copy that file, "
+                    "or run the sweep again"
                 )
 
     @property
     def key(self) -> str:
-        """The name of its folder in a store."""
+        """Name of the cell's folder in a store."""
         return hashlib.sha256(json.dumps(self.spec, sort_keys=True).encode()).hexdigest()[:KEY]

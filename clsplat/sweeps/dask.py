@@ -1,7 +1,7 @@
-"""Engines on Dask: a cluster of this machine, or a scheduler elsewhere.
+"""Run cells with Dask: on a cluster of this machine, or through a scheduler elsewhere.
 
-Dask gives membership, liveness and a queue.  What it does not give is in the store: going on inside of a cell, once in
-effect, stopping.  At most one cell a device is in flight, for a worker that dies takes all cells on its list with it.
+Dask provides membership, liveness and a queue.  The store provides the rest: continuing a cell, counting it once,
+stopping it.  At most one cell per device is in flight, since a worker that dies loses all cells in its queue.
 """
 
 import asyncio
@@ -24,13 +24,13 @@ from clsplat.core.reading import read_file
 from clsplat.core.signals import stopping_on_signals
 from clsplat.pipeline.execution import Execution, Tls
 from clsplat.sweeps.cell import CellRun, code_digest
-from clsplat.sweeps.child import PATIENCE, plugin_files, run_command
-from clsplat.sweeps.devices import TOLD, DeviceSlot, place_of, places
-from clsplat.sweeps.engines import ALONE, CellLost, Ticket
+from clsplat.sweeps.child import STOP_TIMEOUT_S, plugin_files, run_command
+from clsplat.sweeps.devices import METRIC_KEY, DeviceSlot, find_slots, slot_from_worker
+from clsplat.sweeps.engines import NO_DEVICE_TIMEOUT_S, CellLost, Ticket
 from clsplat.sweeps.store import Store
-from clsplat.sweeps.task import Outcome, Terms, run_cell
+from clsplat.sweeps.task import CellOptions, Outcome, run_cell
 
-# Dask, where it is installed, and how it is set.  Nothing else imports it.
+# Dask and its settings.  No other module imports it.
 
 try:
     import dask
@@ -43,9 +43,9 @@ LOOPBACK = "127.0.0.1"
 SIDES = ("client", "worker", "scheduler")
 SETTINGS = {
     "distributed.scheduler.allowed-failures": 1000,  # attempts are counted in the store
-    "distributed.scheduler.worker-ttl": "60s",  # of one that is frozen: its cell goes on elsewhere
+    "distributed.scheduler.worker-ttl": "60s",  # a frozen worker is given up, and its cell continues elsewhere
     "distributed.worker.preload": ["clsplat.sweeps.preload"],
-    "distributed.worker.memory.target": False,  # of a worker's share of memory, which its child does not take from
+    "distributed.worker.memory.target": False,  # the run is a child process, which these limits do not see
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
@@ -54,7 +54,7 @@ SETTINGS = {
 
 
 def require_certificates(tls: Tls) -> None:
-    """Raise ConfigError where one cannot be read, or they do not belong together.  Dask would name no file."""
+    """Raise ConfigError if a file cannot be read, or key and certificate do not match.  Dask would name no file."""
     for key in ("ca", "cert", "key"):
         try:
             read_file(Path(getattr(tls, key)))
@@ -66,7 +66,7 @@ def require_certificates(tls: Tls) -> None:
     except ssl.SSLError as error:
         raise ConfigError(f"tls.ca (--tls-ca): {tls.ca}: expected a certificate in PEM ({error.reason})") from error
     try:
-        context.load_cert_chain(tls.cert, tls.key, password=lambda: "")  # else it would ask in the terminal
+        context.load_cert_chain(tls.cert, tls.key, password=lambda: "")  # otherwise it asks in the terminal
     except (ssl.SSLError, ValueError) as error:
         reason = getattr(error, "reason", None) or error
         raise ConfigError(
@@ -76,7 +76,7 @@ def require_certificates(tls: Tls) -> None:
 
 
 def security(tls: Tls | None) -> Any:
-    """Return the certificates as distributed takes them; None without.  Raises ConfigError."""
+    """Return certificates for distributed, or None.  Raises ConfigError."""
     if tls is None:
         return None
     require_certificates(tls)
@@ -85,45 +85,45 @@ def security(tls: Tls | None) -> Any:
 
 
 def warn_of_open_port(execution: Execution) -> None:
-    """Say so where a scheduler elsewhere is reached without TLS."""
+    """Warn if a scheduler elsewhere is used without TLS."""
     if execution.insecure:
-        LOG.warning("%s: is not encrypted; whoever reaches the scheduler's port can run code", execution.engine)
+        LOG.warning("%s: not encrypted; anyone who can reach the scheduler's port can run code", execution.engine)
 
 
-def unanswered(execution: Execution, error: BaseException) -> DeviceError:
-    """Return the error of a scheduler that cannot be reached."""
+def scheduler_error(execution: Execution, error: BaseException) -> DeviceError:
+    """Return the error for a scheduler that cannot be reached."""
     reason = one_line(error.__cause__ or error) or "no answer"
     remedy = "start it with `dask scheduler`"
     if execution.tls:
         remedy += " and certificates of the authority that tls.ca (--tls-ca) names"
-    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); {remedy}")
+    return DeviceError(f"{execution.engine}: cannot be reached ({reason}); {remedy}")
 
 
 LOG = logging.getLogger("clsplat")
-LOOK = 5.0  # seconds between two looks at the workers
-ANSWER = 20.0  # seconds that a scheduler may take to answer
+WORKERS_INTERVAL_S = 5.0  # between two checks of the workers
+CONNECT_TIMEOUT_S = 20.0  # of a scheduler
 
 
-def work(cell: str, store: str, command: list[str], terms: str) -> str:
-    """Run a cell on a worker: text in, text out."""
-    outcome = run_cell(CellRun.from_json(cell), Store(Path(store)), command, Terms(**json.loads(terms)))
+def work(cell: str, store: str, command: list[str], options: str) -> str:
+    """Run a cell on a worker; arguments and result are text."""
+    outcome = run_cell(CellRun.from_json(cell), Store(Path(store)), command, CellOptions(**json.loads(options)))
     return json.dumps(asdict(outcome))
 
 
 def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
-    """Return the engine that `execution` names.  Raises DeviceError where there are no devices."""
-    with ExitStack() as held:
-        held.enter_context(dask.config.set(SETTINGS))  # until the engine is closed
+    """Return the engine that `execution` selects.  Raises DeviceError if there are no devices."""
+    with ExitStack() as settings:
+        settings.enter_context(dask.config.set(SETTINGS))  # until the engine is closed
         cluster = _engine(execution, store, devices)
-        cluster.settings = held.pop_all()
+        cluster.settings = settings.pop_all()
         return cluster
 
 
 def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
     if execution.engine == "local":
-        found = places("local", devices, execution.packing)
+        slots = find_slots("local", devices, execution.packing)
         cluster = distributed.LocalCluster(
-            n_workers=len(found),
+            n_workers=len(slots),
             threads_per_worker=1,
             processes=True,
             host=LOOPBACK,
@@ -131,21 +131,21 @@ def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "C
             memory_limit=0,
             silence_logs=logging.CRITICAL,
         )
-        return Cluster(distributed.Client(cluster, set_as_default=False), store, cluster, found)
+        return Cluster(distributed.Client(cluster, set_as_default=False), store, cluster, slots)
     warn_of_open_port(execution)
     try:
         client = distributed.Client(
-            execution.address, security=security(execution.tls), set_as_default=False, timeout=ANSWER
+            execution.address, security=security(execution.tls), set_as_default=False, timeout=CONNECT_TIMEOUT_S
         )
     except OSError as error:
-        raise unanswered(execution, error) from None
+        raise scheduler_error(execution, error) from None
     return Cluster(client, store)
 
 
 class _Future:
     def __init__(self, cluster: "Cluster", future: Any, address: str | None) -> None:
         self._cluster, self.future, self._address = cluster, future, address
-        self.is_over = False  # a future that was released has no state
+        self.is_over = False  # a released future has no state
 
     def outcome(self) -> Outcome | None:
         state = self.future.status
@@ -168,67 +168,70 @@ class _Future:
 class Cluster:
     """The devices of a Dask cluster."""
 
-    def __init__(self, client: Any, store: Store, cluster: Any = None, found: list[DeviceSlot] | None = None) -> None:
-        """cluster: what starts workers of this machine, and starts them again; found: its devices, on any of which they
-        run cells.  Of a scheduler elsewhere both are None, and each worker has its own device.
+    def __init__(
+        self, client: Any, store: Store, cluster: Any = None, local_slots: list[DeviceSlot] | None = None
+    ) -> None:
+        """cluster: starts and restarts workers on this machine.  local_slots: its devices; any worker can use any.
+
+        With a scheduler elsewhere both are None, and each worker has its own device.
         """
-        self._client, self._store, self._cluster, self._found = client, store, cluster, found
+        self._client, self._store, self._cluster, self._local_slots = client, store, cluster, local_slots
         self._sweep = uuid.uuid4().hex
-        self._looked, self._seen = -LOOK, time.monotonic()
-        self._places: list[DeviceSlot] = []
+        self._looked, self._seen = -WORKERS_INTERVAL_S, time.monotonic()
+        self._slots: list[DeviceSlot] = []
         self._tickets: list[_Future] = []
         self.addresses: set[str] = set()
         self.settings = ExitStack()  # of Dask, which end with the cluster
         self.command_of = lambda device: run_command(device, plugin_files())
 
-    def places(self) -> list[DeviceSlot]:
-        """Return the devices whose workers live.
+    def slots(self) -> list[DeviceSlot]:
+        """Return the devices with a live worker.
 
-        Raises DeviceError where the scheduler ended, or no worker of this version was there for a minute.
+        Raises DeviceError if the scheduler ended, or there was no worker of this version for a minute.
         """
         now = time.monotonic()
-        if now - self._looked >= LOOK or (not self._places and now - self._looked >= 0.5):
+        if now - self._looked >= WORKERS_INTERVAL_S or (not self._slots and now - self._looked >= 0.5):
             self._looked = now
             self._look(now)
-        return self._places
+        return self._slots
 
     def _look(self, now: float) -> None:
-        with self._needs_scheduler():
+        with self._requires_scheduler():
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
         self.addresses = set(workers)
-        if self._cluster and len(workers) < (count := len(self._found or ())):
-            self._cluster.scale(count)  # a worker that dies while it starts is not started again by itself
-        known = [one for address, worker in workers.items() if (one := place_of(address, worker))]
-        self._places = known if self._found is None else self._found if workers else []
-        if self._places:
+        if self._cluster and len(workers) < (count := len(self._local_slots or ())):
+            self._cluster.scale(count)  # Dask does not restart a worker that dies while it starts
+        known = [one for address, worker in workers.items() if (one := slot_from_worker(address, worker))]
+        self._slots = known if self._local_slots is None else self._local_slots if workers else []
+        if self._slots:
             self._seen = now
-        elif now - self._seen > ALONE:
+        elif now - self._seen > NO_DEVICE_TIMEOUT_S:
             others = f" ({len(workers)} of another version get no cells)" if workers else ""
             raise DeviceError(
-                f"no worker of this version for {ALONE:.0f} s{others}; start some with `clsplat worker --scheduler "
-                "ADDRESS`; what was done is in the store"
+                f"no worker of this version for {NO_DEVICE_TIMEOUT_S:.0f} s{others}; start some with "
+                "`clsplat worker --scheduler ADDRESS`; the store keeps all progress"
             )
 
     @contextmanager
-    def _needs_scheduler(self) -> Iterator[None]:
-        """Raise DeviceError where the block fails, for the scheduler is gone: its client has given up."""
+    def _requires_scheduler(self) -> Iterator[None]:
+        """Raise DeviceError if the block fails because the scheduler ended."""
         try:
             yield
-        except Exception as error:  # of which type depends on the moment
+        except Exception as error:  # its type depends on when the scheduler ended
             if isinstance(error, OSError) or self._client.status in ("closing", "closed"):
                 raise DeviceError("the scheduler ended; start it, and run the sweep again with --resume") from error
             raise
 
-    def start(self, cell: CellRun, place: DeviceSlot, terms: Terms) -> Ticket:
-        own = replace(terms, worker=place.worker, sweep=self._sweep, cores=place.cores)
-        address = place.worker if self._found is None else None
-        with self._needs_scheduler():
+    def start(self, cell: CellRun, slot: DeviceSlot, options: CellOptions) -> Ticket:
+        own_options = replace(options, worker=slot.worker, sweep=self._sweep, cores=slot.cores)
+        address = slot.worker if self._local_slots is None else None
+        with self._requires_scheduler():
             future = self._client.submit(
                 work,
                 cell.json(),
                 str(self._store.root),
-                list(self.command_of(place.device)),
-                json.dumps(asdict(own)),
+                list(self.command_of(slot.device)),
+                json.dumps(asdict(own_options)),
                 key=f"{cell.name}-{uuid.uuid4().hex[:8]}",
                 workers=[address] if address else None,
                 pure=False,
@@ -238,14 +241,14 @@ class Cluster:
         return ticket
 
     def close(self) -> None:
-        """Let the cells that run save their state and end, then the workers of this machine."""
+        """Let running cells save their state and end, then end the workers of this machine."""
         if self._pending:
             self._store.stop(self._sweep)
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + STOP_TIMEOUT_S
         while self._pending and time.monotonic() < end:
             time.sleep(0.1)
         if self._pending:
-            LOG.warning("some cells did not end in %.0f s", PATIENCE)
+            LOG.warning("some cells did not end in %.0f s", STOP_TIMEOUT_S)
         with self.settings:
             self._client.close()
             if self._cluster:
@@ -256,43 +259,43 @@ class Cluster:
         return [one for one in self._tickets if not one.is_over and one.future.status == "pending"]
 
 
-# Worker processes of this machine, one a device, for a scheduler elsewhere.
+# Worker processes of this machine, one per device, for a scheduler elsewhere.
 
 
 def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
-    """Prove each device by a short run, and work for a scheduler until it ends or a signal comes: `clsplat worker`.
+    """Test each device by a short run, and work for a scheduler until it ends or a signal arrives (`clsplat worker`).
 
-    execution: its engine is the scheduler; devices: names, default every device that works.  Raises DeviceError where
-    there is none or no scheduler answers.
+    execution: its engine is the scheduler.  devices: names; default: all devices that work.  Raises DeviceError if
+    there is no device, or the scheduler does not answer.
     """
     if execution.tls:
-        require_certificates(execution.tls)  # before a device is proved, which takes a while
-    found = places(Owner.current().host, list(devices) if devices is not None else None)
-    for place in found:
-        LOG.info("offers %s, bits:%s", place.text, place.bits)
+        require_certificates(execution.tls)  # before the devices are tested, which takes a while
+    slots = find_slots(Owner.current().host, list(devices) if devices is not None else None)
+    for slot in slots:
+        LOG.info("offering %s, bits:%s", slot.text, slot.bits)
     warn_of_open_port(execution)
     stop = threading.Event()
     with dask.config.set(SETTINGS), stopping_on_signals(stop.set):
-        asyncio.run(_serve(execution, found, stop))
+        asyncio.run(_serve(execution, slots, stop))
     if stop.is_set():
-        raise Interrupted("stopped; cells that ran here go on elsewhere")
+        raise Interrupted("stopped; cells that ran here continue elsewhere")
 
 
-def _told(text: str, worker: object) -> str:
-    """What a worker says of itself among its figures."""
+def _constant_metric(text: str, worker: object) -> str:
+    """Return a worker's description of its device, as one of its metrics."""
     return text
 
 
-async def _serve(execution: Execution, found: Sequence[DeviceSlot], stop: threading.Event) -> None:
-    told = [
+async def _serve(execution: Execution, slots: Sequence[DeviceSlot], stop: threading.Event) -> None:
+    descriptions = [
         {
-            "host": place.worker,
-            "device": place.device,
-            "bits": place.bits,
-            "memory": place.memory,
+            "host": slot.worker,
+            "device": slot.device,
+            "bits": slot.bits,
+            "memory": slot.memory,
             "code": code_digest(),
         }
-        for place in found
+        for slot in slots
     ]
     nannies = [
         distributed.Nanny(
@@ -301,16 +304,16 @@ async def _serve(execution: Execution, found: Sequence[DeviceSlot], stop: thread
             memory_limit=0,
             security=security(execution.tls),
             host=LOOPBACK if execution.is_local else None,
-            metrics={TOLD: partial(_told, json.dumps(one))},
+            metrics={METRIC_KEY: partial(_constant_metric, json.dumps(description))},
             dashboard_address=f"{LOOPBACK}:0",
             silence_logs=logging.CRITICAL,
         )
-        for one in told
+        for description in descriptions
     ]
     try:
-        await asyncio.wait_for(asyncio.gather(*nannies), ANSWER)
+        await asyncio.wait_for(asyncio.gather(*nannies), CONNECT_TIMEOUT_S)
     except (OSError, TimeoutError, RuntimeError) as error:
-        raise unanswered(execution, error) from None
+        raise scheduler_error(execution, error) from None
     while not stop.is_set() and any(nanny.status is distributed.Status.running for nanny in nannies):
         await asyncio.sleep(0.2)
     await asyncio.gather(*(nanny.close(timeout=5) for nanny in nannies))

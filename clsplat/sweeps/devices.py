@@ -1,7 +1,7 @@
-"""The bits class of a device: the hash of what a fixed run gives on it.
+"""Find devices and their bits classes: a class is the hash of the result of a fixed run.
 
-A name is not enough, and too much: other runtimes may give the same bits, and the same runtime others on another
-processor.  Devices of one class may go on with each other's cells.
+Names of devices do not serve: different runtimes may give the same bits, and the same runtime other bits on another
+processor.  Devices of one class can continue each other's cells.
 """
 
 import json
@@ -24,33 +24,31 @@ from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
 from clsplat.pipeline.files import shipped
 from clsplat.sweeps.cell import code_digest
-from clsplat.sweeps.child import filled, run_command
-
-# How many runs share a CPU, and which cores each has.
+from clsplat.sweeps.child import fill_command, run_command
 
 LOG = logging.getLogger("clsplat")
-Parts = list[tuple[int, ...]]  # the cores of each run; one without cores has all, and is not kept to any
+Parts = list[tuple[int, ...]]  # the cores of each run; (): all cores, without pinning
 
 
-def shares_of(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
-    """Return the cores of the runs of each device; a device that is no CPU has one run.
+def split_device_cores(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
+    """Return the cores of the runs of each device: `packing` runs on a CPU, one on other devices.
 
     Raises ConfigError for more runs than cores.
     """
-    own = machine.usable_cores()
-    if packing > len(own):
+    cores = machine.usable_cores()
+    if packing > len(cores):
         raise ConfigError(
-            f"execution.packing: {packing} runs cannot share {pluralize(len(own), 'core')}; expected fewer"
+            f"execution.packing: {packing} runs cannot share {pluralize(len(cores), 'core')}; set at most {len(cores)}"
         )
-    parts: Parts = machine.split_cores(own, packing) if packing > 1 else [()]
+    parts: Parts = machine.split_cores(cores, packing) if packing > 1 else [()]
     return [parts if info.kind == "CPU" else [()] for info in devices]
 
 
-TOLD = "clsplat"  # name of what a worker tells of its device, among the figures that Dask keeps of it
-CLASS = 8  # hexadecimal digits of a bits class
-SECONDS = 600.0  # that the fixed run may take: a runtime may build its kernels for minutes
+METRIC_KEY = "clsplat"  # of the Dask metric in which a worker describes its device
+CLASS_DIGITS = 8  # hexadecimal digits of a bits class
+RUN_TIMEOUT_S = 600.0  # of the fixed run: some runtimes build kernels for minutes
 SCENE_OPTIONS = ("--size", "48", "--train", "8", "--test", "2", "--seed", "0")
-PIPELINE = "smoke"  # it grows, and resets opacity; with all bands, and both filters:
+PIPELINE = "smoke"  # it grows and resets opacity; the settings add all SH bands and both filters
 SETTINGS = (
     "model.sh_degree=3",
     "model.world_filter={type: smoothing, variance: 0.2}",
@@ -60,20 +58,20 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class DeviceSlot:
-    """A device that runs cells, one at a time."""
+    """A device, or a part of a CPU, that runs one cell at a time."""
 
-    worker: str  # who offers it
+    worker: str  # that offers it
     device: str  # as `--device` takes it
     bits: str  # its class
-    text: str = ""  # what it is
-    cores: tuple[int, ...] = ()  # of a CPU that several runs share; none: all
-    memory: int = sys.maxsize  # bytes that a run may take
+    text: str = ""  # description
+    cores: tuple[int, ...] = ()  # of a CPU that several runs share; (): all
+    memory: int = sys.maxsize  # available to a run, bytes
 
 
-def place_of(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
-    """Return the device that a worker tells; None for a worker of another program, or version."""
+def slot_from_worker(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
+    """Return the device that a worker describes, or None for a worker of another program or version."""
     try:
-        values = json.loads(str(worker["metrics"][TOLD]))
+        values = json.loads(str(worker["metrics"][METRIC_KEY]))
         if values["code"] != code_digest():
             return None
         device, bits, text = (str(values[name]) for name in ("device", "bits", "host"))
@@ -82,44 +80,44 @@ def place_of(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
         return None
 
 
-def places(worker: str, devices: list[str] | None = None, packing: int = 1) -> list[DeviceSlot]:
-    """Return the devices of this machine that work, or those of a list of names, with their classes.
+def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) -> list[DeviceSlot]:
+    """Return the working devices of this machine, or those of a list of names, with their bits classes.
 
-    packing: the runs that share a CPU, each of which has a place.
-    Raises DeviceError where there is none, or one of the list does not work, ConfigError for more runs than cores.
+    packing: runs that share a CPU, each with its own slot.
+    Raises DeviceError if no device works, or one in the list does not, and ConfigError for more runs than cores.
     """
     infos = list_devices()
     chosen = [choose(name) for name in devices] if devices is not None else [one for one in infos if not one.fault()]
     if not chosen:
-        raise DeviceError("no OpenCL device works; `clsplat devices` tells why")
-    found = []
-    for info, parts in zip(chosen, shares_of(chosen, packing), strict=True):
+        raise DeviceError("no OpenCL device works; `clsplat devices` shows why")
+    slots = []
+    for info, parts in zip(chosen, split_device_cores(chosen, packing), strict=True):
         bits, memory = bits_class(info, infos), info.memory // len(parts)
-        own = DeviceSlot(worker, word_of(info, infos), bits, info.text, memory=memory)
-        found += [replace(own, cores=part) for part in parts]
-    return found
+        slot = DeviceSlot(worker, device_words(info, infos), bits, info.text, memory=memory)
+        slots += [replace(slot, cores=part) for part in parts]
+    return slots
 
 
-def word_of(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
-    """Return the words that name one device of several for `--device`."""
+def device_words(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
+    """Return the words that identify a device for `--device`."""
     words = f"{info.platform} {info.name} {info.kind}"
     same = [one.index for one in infos if one.matches(words)]
     return f"{words}:{same.index(info.index)}"
 
 
 def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
-    """Return the class of a device; the fixed run is run once for a device, its driver and the program.
+    """Return the bits class of a device; the fixed run is done once per device, driver and program version.
 
-    Raises DeviceError where it fails.
+    Raises DeviceError if the run fails.
     """
     key = hash_values(Owner.current().host, info.text, info.driver, code_digest(), shipped()[PIPELINE])
     note = cache_folder() / "bits" / f"{key[:16]}.json"
     with suppress(DataError):
-        found = read_json(note)
-        if isinstance(found, dict) and isinstance(found.get("bits"), str):
-            return str(found["bits"])
-    LOG.info("%s: a short run tells which devices give the same bits", info.text)
-    bits = _run(word_of(info, infos))
+        values = read_json(note)
+        if isinstance(values, dict) and isinstance(values.get("bits"), str):
+            return str(values["bits"])
+    LOG.info("%s: running a short test that shows which devices give the same bits", info.text)
+    bits = _run(device_words(info, infos))
     with suppress(OutputError):
         write_text(note, json.dumps({"bits": bits, "device": info.text}) + "\n")
     return bits
@@ -130,19 +128,19 @@ def _run(device: str) -> str:
         folder = Path(name)
         scene = str(folder / "scene")
         _call(device, [sys.executable, "-P", "-m", "clsplat", "data", "synthetic", scene, *SCENE_OPTIONS], folder)
-        words = filled(run_command(device), shipped()[PIPELINE], folder / "run")
+        words = fill_command(run_command(device), shipped()[PIPELINE], folder / "run")
         _call(device, [*words, "--scene", scene, *(word for one in SETTINGS for word in ("--set", one))], folder)
-        return sha256(folder / "run" / "point_cloud.ply")[:CLASS]
+        return sha256(folder / "run" / "point_cloud.ply")[:CLASS_DIGITS]
 
 
 def _call(device: str, command: list[str], folder: Path) -> None:
-    """Run a command of the test, whose input stays open.  Raises DeviceError where it fails."""
+    """Run a command of the test, with its standard input open.  Raises DeviceError if it fails."""
     with (folder / "errors.txt").open("wb") as errors:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)
         try:
-            process.wait(SECONDS)
+            process.wait(RUN_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            raise DeviceError(f"{device}: the run of its test did not end in {SECONDS:.0f} s") from None
+            raise DeviceError(f"{device}: the test run did not end within {RUN_TIMEOUT_S:.0f} s") from None
         finally:
             process.kill()
             process.wait()
@@ -150,4 +148,4 @@ def _call(device: str, command: list[str], folder: Path) -> None:
             process.stdin.close()
     if process.returncode:
         lines = read_file(folder / "errors.txt").decode(errors="replace").strip().splitlines()
-        raise DeviceError(f"{device}: the run of its test failed: {lines[-1] if lines else process.returncode}")
+        raise DeviceError(f"{device}: the test run failed: {lines[-1] if lines else process.returncode}")

@@ -1,4 +1,4 @@
-"""Hand the cells of a sweep to the devices of an engine: the longest first, one a device, those of one bits class."""
+"""Assign the cells of a sweep to the devices of an engine: longest first, one per device, in one bits class."""
 
 import logging
 import time
@@ -11,37 +11,35 @@ from clsplat.core.errors import DeviceError, Interrupted, MemoryLimitError
 from clsplat.sweeps.cell import CellRun
 from clsplat.sweeps.child import plugin_files, run_command
 from clsplat.sweeps.devices import DeviceSlot
-from clsplat.sweeps.store import Different, Store
-from clsplat.sweeps.task import Outcome, Terms, run_cell
-
-# What an engine is for a sweep, and the one that runs cells in this process.
+from clsplat.sweeps.store import BitsMismatch, Store
+from clsplat.sweeps.task import CellOptions, Outcome, run_cell
 
 
 class Ticket(Protocol):
-    """A cell that was handed to an engine."""
+    """A cell that an engine runs."""
 
     def outcome(self) -> Outcome | None:
-        """Return how it ended; None while it runs.  Raises CellLost where nobody runs it any more, and its errors."""
+        """Return how the cell ended, or None while it runs.  Raises CellLost if its process is gone, and its errors."""
 
 
 class CellLost(Exception):
-    """The process that ran a cell is gone; the cell goes on from its checkpoint elsewhere."""
+    """The process that ran a cell is gone; the cell continues from its checkpoint elsewhere."""
 
 
 class Engine(Protocol):
-    """Devices, and a way to run a cell on one of them."""
+    """Devices, and a way to run cells on them."""
 
-    def places(self) -> list[DeviceSlot]:
-        """Return the devices that are there now.  Raises ClsplatError where there will be none."""
+    def slots(self) -> list[DeviceSlot]:
+        """Return the devices that are available now.  Raises ClsplatError if there will be none."""
 
-    def start(self, cell: CellRun, place: DeviceSlot, terms: Terms) -> Ticket:
-        """Begin to run a cell on a device that is free."""
+    def start(self, cell: CellRun, slot: DeviceSlot, options: CellOptions) -> Ticket:
+        """Start a cell on a free device."""
 
     def close(self) -> None:
-        """End what was started."""
+        """End everything that was started."""
 
 
-class _Ended:
+class _FinishedTicket:
     def __init__(self, outcome: Outcome) -> None:
         self._outcome = outcome
 
@@ -50,34 +48,34 @@ class _Ended:
 
 
 class InlineEngine:
-    """Runs a cell at a time, each as a child of this process."""
+    """Run one cell at a time, as a child of this process."""
 
-    def __init__(self, store: Store, place: DeviceSlot, is_stopped: Callable[[], bool]) -> None:
-        self._store, self._place, self._is_stopped = store, place, is_stopped
+    def __init__(self, store: Store, slot: DeviceSlot, is_stopped: Callable[[], bool]) -> None:
+        self._store, self._slot, self._is_stopped = store, slot, is_stopped
 
-    def places(self) -> list[DeviceSlot]:
-        return [self._place]
+    def slots(self) -> list[DeviceSlot]:
+        return [self._slot]
 
-    def start(self, cell: CellRun, place: DeviceSlot, terms: Terms) -> Ticket:
-        command = run_command(place.device, plugin_files())
-        return _Ended(run_cell(cell, self._store, command, terms, self._is_stopped))
+    def start(self, cell: CellRun, slot: DeviceSlot, options: CellOptions) -> Ticket:
+        command = run_command(slot.device, plugin_files())
+        return _FinishedTicket(run_cell(cell, self._store, command, options, self._is_stopped))
 
     def close(self) -> None:
         pass
 
 
 LOG = logging.getLogger("clsplat")
-LOOK = 0.05  # seconds between two looks at what runs
-ALONE = 60.0  # seconds without a device that may run a cell, after which a sweep ends
+POLL_INTERVAL_S = 0.05  # between two checks of running cells
+NO_DEVICE_TIMEOUT_S = 60.0  # without a suitable device, after which a sweep ends
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """A cell before a device is chosen."""
+class PendingCell:
+    """A cell without a device."""
 
-    cell: CellRun  # of no class
-    cost: float  # steps times pixels, to compare
-    above: int = 0  # bytes of the largest device that did not hold it
+    cell: CellRun  # without a bits class
+    cost: float  # steps times pixels, for the order of cells
+    above: int = 0  # memory of the largest device that was too small, bytes
 
     def on(self, bits: str) -> CellRun:
         """Return the cell in a bits class."""
@@ -85,116 +83,116 @@ class Wanted:
 
 
 @dataclass
-class Drive:
+class Dispatcher:
     """A sweep in progress."""
 
     store: Store
     engine: Engine
-    is_same: bool  # all cells in one bits class
-    terms: Terms
+    is_same: bool  # whether all cells run in one bits class
+    options: CellOptions
     is_stopped: Callable[[], bool] = lambda: False
     began: Callable[[CellRun], None] = lambda cell: None
     ended: Callable[[CellRun, Outcome], None] = lambda cell, outcome: None
-    look: Callable[[], None] = lambda: None  # called again and again
-    bits: str | None = None  # the class of all cells, once it is chosen
-    _seen: float = field(default_factory=time.monotonic)  # when a device of that class was there last
-    _unsuited: tuple[list[DeviceSlot], set[DeviceSlot]] = field(default_factory=lambda: ([], set()))
-    """All devices, and those that suit no cell that waits."""
-    _running: dict[DeviceSlot, tuple[Wanted, CellRun, Ticket]] = field(default_factory=dict)
+    look: Callable[[], None] = lambda: None  # called regularly
+    bits: str | None = None  # bits class of all cells, once chosen
+    _seen: float = field(default_factory=time.monotonic)  # when a device of that class was last available
+    _unsuitable: tuple[list[DeviceSlot], set[DeviceSlot]] = field(default_factory=lambda: ([], set()))
+    """All devices, and those on which no waiting cell can run."""
+    _running: dict[DeviceSlot, tuple[PendingCell, CellRun, Ticket]] = field(default_factory=dict)
 
-    def run(self, wanted: Sequence[Wanted]) -> None:
-        """Run all cells, and tell `ended` how each did.
+    def run(self, wanted: Sequence[PendingCell]) -> None:
+        """Run all cells, and call `ended` for each.
 
-        Raises Different where two runs of a cell have other bits, Interrupted, and what the engine raises; then the
-        cells that run are left to `close` of the engine.
+        Raises BitsMismatch if two runs of a cell differ, Interrupted, and what the engine raises; `close` of the engine
+        then ends the running cells.
         """
         waiting = sorted(wanted, key=lambda one: -one.cost)
         while waiting or self._running:
             if self.is_stopped():
-                raise Interrupted("stopped; the same command with --resume goes on")
-            self._hand_out(waiting)
+                raise Interrupted("stopped; continue with the same command and --resume")
+            self._assign(waiting)
             before = len(self._running)
-            for place in list(self._running):
-                self._take_in(place, waiting)
+            for slot in list(self._running):
+                self._collect(slot, waiting)
             self.look()
             if (self._running and len(self._running) == before) or (waiting and not self._running):
-                time.sleep(LOOK)
+                time.sleep(POLL_INTERVAL_S)
 
-    def _hand_out(self, waiting: list[Wanted]) -> None:
-        places = sorted(self.engine.places(), key=lambda place: -place.memory)  # for the longest cell the largest
-        classes = [place.bits for place in places]
+    def _assign(self, waiting: list[PendingCell]) -> None:
+        slots = sorted(self.engine.slots(), key=lambda slot: -slot.memory)  # the longest cell gets the largest device
+        classes = [slot.bits for slot in slots]
         if self.is_same and self.bits is None and classes:
-            self.bits = self._chosen(classes, waiting)
+            self.bits = self._choose_class(classes, waiting)
         self._require_class(classes)
-        if self._unsuited[0] != places:
-            self._unsuited = (places, set())
-        for place in places:
-            if place in self._running or place in self._unsuited[1]:
+        if self._unsuitable[0] != slots:
+            self._unsuitable = (slots, set())
+        for slot in slots:
+            if slot in self._running or slot in self._unsuitable[1]:
                 continue
-            suited = next((i for i, one in enumerate(waiting) if self._suits(one, place, places)), None)
+            suited = next((i for i, one in enumerate(waiting) if self._fits(one, slot, slots)), None)
             if suited is None:
-                self._unsuited[1].add(place)  # looking again and again would read the store each time
+                self._unsuitable[1].add(slot)  # each check reads the store, so do not repeat it
                 continue
             one = waiting.pop(suited)
-            cell = one.on(place.bits)
+            cell = one.on(slot.bits)
             self.began(cell)
-            self._running[place] = (one, cell, self.engine.start(cell, place, self.terms))
+            self._running[slot] = (one, cell, self.engine.start(cell, slot, self.options))
 
-    def _chosen(self, classes: Sequence[str], wanted: Sequence[Wanted]) -> str:
-        """Return the class of most devices; of several that in which most cells are published, then by name."""
+    def _choose_class(self, classes: Sequence[str], wanted: Sequence[PendingCell]) -> str:
+        """Return the class of most devices; ties: the one in which most cells are published, then by name."""
         counts = Counter(classes)
-        most = sorted(own for own in counts if counts[own] == max(counts.values()))
-        return max(most, key=lambda own: sum(self.store.folder(one.on(own).key).result.is_dir() for one in wanted))
+        most = sorted(bits for bits in counts if counts[bits] == max(counts.values()))
+        return max(most, key=lambda bits: sum(self.store.folder(one.on(bits).key).result.is_dir() for one in wanted))
 
     def _require_class(self, classes: Sequence[str]) -> None:
-        """Raise DeviceError where devices are there, but for `ALONE` seconds none of the chosen class."""
+        """Raise DeviceError if there are devices, but none of the chosen class for NO_DEVICE_TIMEOUT_S seconds."""
         now = time.monotonic()
         if not self.is_same or not classes or self.bits in classes or self._running:
             self._seen = now
-        elif now - self._seen > ALONE:
+        elif now - self._seen > NO_DEVICE_TIMEOUT_S:
             others = ", ".join(sorted({*classes}))
             raise DeviceError(
-                f"no device of bits class {self.bits} for {ALONE:.0f} s; there are devices of {others}; "
-                "offer one of that class, or set placement: {bits: any}; what was done is in the store"
+                f"no device of bits class {self.bits} for {NO_DEVICE_TIMEOUT_S:.0f} s, only of {others}; offer one of "
+                "that class, or set placement: {bits: any}; the store keeps all progress"
             )
 
-    def _suits(self, one: Wanted, place: DeviceSlot, places: Sequence[DeviceSlot]) -> bool:
-        """Whether a cell may run on a device: of its class, and larger than those that did not hold it, if one is."""
-        allowed = self._allowed(one, places)
-        return place in ([other for other in allowed if other.memory > one.above] or allowed)
+    def _fits(self, one: PendingCell, slot: DeviceSlot, slots: Sequence[DeviceSlot]) -> bool:
+        """Return whether a cell may run on a device: in its class, and larger than devices that were too small."""
+        allowed = self._allowed(one, slots)
+        return slot in ([other for other in allowed if other.memory > one.above] or allowed)
 
-    def _allowed(self, one: Wanted, places: Sequence[DeviceSlot]) -> list[DeviceSlot]:
-        """The devices in whose class a cell may run: one that has begun stays in its own, where that is there now."""
+    def _allowed(self, one: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
+        """Return the devices on which a cell may run; a started cell stays in its class while that has devices."""
         if self.is_same:
-            return [place for place in places if place.bits == self.bits]
-        own = {place.bits for place in places if not one.above}
-        begun = [bits for bits in own if self.store.folder(one.on(bits).key).path.is_dir()]
-        return [place for place in places if not begun or place.bits in begun]
+            return [slot for slot in slots if slot.bits == self.bits]
+        classes = {slot.bits for slot in slots if not one.above}
+        started = [bits for bits in classes if self.store.folder(one.on(bits).key).path.is_dir()]
+        return [slot for slot in slots if not started or slot.bits in started]
 
-    def _take_in(self, place: DeviceSlot, waiting: list[Wanted]) -> None:
-        one, cell, ticket = self._running[place]
+    def _collect(self, slot: DeviceSlot, waiting: list[PendingCell]) -> None:
+        one, cell, ticket = self._running[slot]
         try:
             outcome = ticket.outcome()
         except CellLost:
-            self.store.tell("lost", cell=cell.key, worker=place.worker)
-            self._again(one, place, waiting)
+            self.store.log_event("lost", cell=cell.key, worker=slot.worker)
+            self._requeue(one, slot, waiting)
             return
         if outcome is None:
             return
         if outcome.state == "different":
-            raise Different(outcome.message)
-        larger = replace(one, above=place.memory)
+            raise BitsMismatch(outcome.message)
+        larger = replace(one, above=slot.memory)
         if outcome.exit_code == MemoryLimitError.exit_code and any(
-            other.memory > place.memory for other in self._allowed(larger, self.engine.places())
+            other.memory > slot.memory for other in self._allowed(larger, self.engine.slots())
         ):
-            LOG.warning("cell %s: %s; it goes to a larger device", cell.name, outcome.message)
-            self._again(larger, place, waiting)
+            LOG.warning("cell %s: %s; trying a larger device", cell.name, outcome.message)
+            self._requeue(larger, slot, waiting)
             return
-        del self._running[place]
+        del self._running[slot]
         self.ended(cell, outcome)
 
-    def _again(self, one: Wanted, place: DeviceSlot, waiting: list[Wanted]) -> None:
-        """Let a cell wait, and others take its device."""
-        del self._running[place]
+    def _requeue(self, one: PendingCell, slot: DeviceSlot, waiting: list[PendingCell]) -> None:
+        """Return a cell to the queue, and free its device."""
+        del self._running[slot]
         waiting.insert(0, one)
-        self._unsuited[1].clear()
+        self._unsuitable[1].clear()

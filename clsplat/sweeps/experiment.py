@@ -182,7 +182,7 @@ class Job:
             )
         if minutes is not None and self.start == "resume" and self.state.phase >= Phase.BEGUN:
             raise ConfigError("--minutes is for a new run, whose steps it chooses; leave it out to go on with this one")
-        with previewed(live) as preview:
+        with live_preview(live) as preview:
             if isinstance(self.work, Experiment):
                 run_matrix(self.work, self.state, device, self.start, preview)
             elif start := start_of(self.work, self.state, self.start):
@@ -205,7 +205,7 @@ def _require_same_photographs(pipeline: Pipeline, out: Path) -> None:
 
 
 @contextmanager
-def previewed(port: int | None) -> Iterator[Live | None]:
+def live_preview(port: int | None) -> Iterator[Live | None]:
     """Serve a live preview for the block, and say where; None: without one.  Raises ConfigError."""
     if port is None:
         yield None
@@ -227,7 +227,7 @@ def run_matrix(
     """
     out = state.out
     before, done = read_cells(experiment, out, start)
-    with matrix_opened(experiment, state, start) as (status, failures):
+    with open_matrix(experiment, state, start) as (status, failures):
         status.enter("running")
         for number, cell in enumerate(status.counted(experiment.cells, "cells", len(experiment.cells)), 1):
             title = f"cell {number} of {len(experiment.cells)}: {cell.name}"
@@ -246,7 +246,7 @@ def run_matrix(
 
 
 @contextmanager
-def matrix_opened(experiment: Experiment, state: RunState, start: Start) -> Iterator[tuple[StatusFile, Failures]]:
+def open_matrix(experiment: Experiment, state: RunState, start: Start) -> Iterator[tuple[StatusFile, Failures]]:
     """Hold the folder of a matrix while its cells run; at the end write compare.html.
 
     Raises a ClsplatError with the exit code of the first cell that is among the failures at the end.

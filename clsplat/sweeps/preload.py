@@ -1,8 +1,8 @@
-"""What each worker process loads first: Ctrl-C is for the driver, which lets the cells save their state and stop."""
+"""Make worker processes ignore Ctrl-C: the driver handles it, and lets the cells save their state and stop."""
 
 import signal
 
 
 def dask_setup(worker: object) -> None:
-    """Ignore Ctrl-C.  The name is that which Dask calls."""
+    """Ignore Ctrl-C.  Dask calls a function of this name."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

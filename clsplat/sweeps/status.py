@@ -1,4 +1,4 @@
-"""The state of a store, from its files alone."""
+"""Report the state of a store from its files."""
 
 import time
 from contextlib import suppress
@@ -9,24 +9,24 @@ from clsplat.core.errors import DataError, one_line
 from clsplat.core.files import METRICS
 from clsplat.core.reading import read_json
 from clsplat.runs.results import read_metrics
-from clsplat.sweeps.store import CELLS, SILENT, SPEC, CellAttempt, CellFolder, Store
+from clsplat.sweeps.store import CELLS, SPEC, STALE_AFTER_S, CellAttempt, CellFolder, Store
 from clsplat.training.status import read_status
 
-GONE = 60.0  # seconds without a beat after which a run may have ended
+NO_BEAT_S = 60.0  # seconds without a beat after which a run may have ended
 
 
 def is_store(folder: Path) -> bool:
-    """Whether a folder holds a store."""
+    """Return whether a folder is a store."""
     return (folder / CELLS).is_dir()
 
 
 def store_status(root: Path) -> dict[str, Any]:
-    """Return the `cells` of a store with their states, `counts` of those, `events` by kind, and the `time` of it all.
+    """Return the `cells` of a store with their states, `counts` of states, `events` by kind, and the current `time`.
 
-    State of a cell: published, failed, running, silent (its lease has no beat for a minute), stopped, or waiting.
-    Raises DataError when the folder holds no store.
+    A cell is published, failed, running, silent (its lease had no beat for a minute), stopped, or waiting.
+    Raises DataError if the folder is not a store.
     """
-    store = Store.opened(root)
+    store = Store.open(root)
     now = time.time()
     names = {key: (sweep, name) for sweep, cells in store.sweeps() for name, key in cells.items()}
     cells = [_cell(folder, names.get(folder.key, ("", "")), now) for folder in store.folders()]
@@ -41,61 +41,61 @@ def store_status(root: Path) -> dict[str, Any]:
 
 
 def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, Any]:
-    """What is known of a cell.  names: of a sweep, and of the cell in it."""
+    """Return the state of a cell.  names: of its sweep, and of the cell in it."""
     spec: Any = {}
     with suppress(DataError):
         spec = read_json(folder.path / SPEC)
     spec = spec if isinstance(spec, dict) and isinstance(spec.get("pipeline"), dict) else {"pipeline": {}}  # damaged
     pipeline = spec["pipeline"]
-    found = {"key": folder.key, "sweep": names[0], "name": names[1], "bits": spec.get("bits")}
-    found |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
+    facts = {"key": folder.key, "sweep": names[0], "name": names[1], "bits": spec.get("bits")}
+    facts |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
     if manifest := folder.manifest():
         values = {key: manifest.get(key) for key in ("seconds", "device", "host", "worker")}
-        return {**found, "state": "published", **values, **_figures(folder)}
-    attempts = sorted(folder.attempts(), key=lambda attempt: attempt.beaten)
-    alive = [one for one in attempts if one.exit_code is None and now - one.beaten < GONE]
+        return {**facts, "state": "published", **values, **_figures(folder)}
+    attempts = sorted(folder.attempts(), key=lambda attempt: attempt.last_beat)
+    alive = [one for one in attempts if one.exit_code is None and now - one.last_beat < NO_BEAT_S]
     if (failed := folder.failed()) and not alive:
-        return {**found, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
+        return {**facts, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
     last = (alive or attempts)[-1:]
-    return {**found, "attempts": len(attempts), **(_attempt(last[0], now) if last else {"state": "waiting"})}
+    return {**facts, "attempts": len(attempts), **(_attempt(last[0], now) if last else {"state": "waiting"})}
 
 
 def _steps(pipeline: dict[str, Any]) -> int | None:
-    """The steps of all trainings of a resolved pipeline."""
+    """Return the steps of all trainings of a resolved pipeline."""
     with suppress(KeyError, TypeError, AttributeError):
         return int(sum(part.get("steps", 0) for stage in pipeline["stages"] for part in stage.values()))
     return None
 
 
 def _figures(folder: CellFolder) -> dict[str, Any]:
-    """PSNR and SSIM of a result at its first size, of its test views where it has some, and its Gaussians."""
+    """Return PSNR and SSIM of a result at its first size, of test views if it has any, and its Gaussians."""
     with suppress(DataError):
         metrics = read_metrics(folder.result / METRICS)
         sizes = [*metrics.test.values(), *metrics.train.values()]
-        found = {"psnr": sizes[0].psnr, "ssim": sizes[0].ssim} if sizes else {}
-        return {**found, "step": metrics.steps, "gaussians": metrics.gaussians}
+        quality = {"psnr": sizes[0].psnr, "ssim": sizes[0].ssim} if sizes else {}
+        return {**quality, "step": metrics.steps, "gaussians": metrics.gaussians}
     return {}
 
 
 def _attempt(attempt: CellAttempt, now: float) -> dict[str, Any]:
-    """The state of a cell by its last attempt."""
+    """Return the state of a cell by its last attempt."""
     status = read_status(attempt.path)
-    silent = now - attempt.beaten
-    told = {"message": attempt.message(attempt.exit_code)} if attempt.has_failed and attempt.exit_code else {}
+    silent = now - attempt.last_beat
+    failure = {"message": attempt.message(attempt.exit_code)} if attempt.has_failed and attempt.exit_code else {}
     if attempt.exit_code is not None:
         state = "stopped" if attempt.exit_code == 130 else "waiting"
     else:
-        state = "running" if silent < GONE else "silent"
+        state = "running" if silent < NO_BEAT_S else "silent"
     progress = {key: status.get(key) for key in ("step", "gaussians", "seconds_left", "stage", "device")}
     worker = {key: attempt.lease.get(key) for key in ("host", "worker")}
-    return {"state": state, "silent": round(max(0.0, silent)), **progress, **worker, **told}
+    return {"state": state, "silent": round(max(0.0, silent)), **progress, **worker, **failure}
 
 
-def overview_text(found: dict[str, Any]) -> str:
-    """Return what `store_status` found as lines of text, a cell a line."""
-    counts = ", ".join(f"{count} {state}" for state, count in sorted(found["counts"].items())) or "no cells"
-    lines = [f"{found['store']}: {counts}"]
-    for cell in found["cells"]:
+def overview_text(status: dict[str, Any]) -> str:
+    """Return the result of `store_status` as lines of text, one per cell."""
+    counts = ", ".join(f"{count} {state}" for state, count in sorted(status["counts"].items())) or "no cells"
+    lines = [f"{status['store']}: {counts}"]
+    for cell in status["cells"]:
         name = cell["name"] or f"{cell['pipeline']} seed={cell['seed']}"
         lines.append(f"{cell['key']}  {cell['state']:9}  {name}{_detail(cell)}")
     return "\n  ".join(map(one_line, lines))
@@ -108,6 +108,6 @@ def _detail(cell: dict[str, Any]) -> str:
     step = f", step {cell['step']}/{cell['steps']}" if cell.get("step") is not None else ""
     more = f": {cell['message']}" if cell.get("message") else ""
     if cell["state"] == "silent":
-        waits = "; it goes on when its sweep is run again" if cell["silent"] > SILENT else ""
+        waits = "; run the sweep again to continue it" if cell["silent"] > STALE_AFTER_S else ""
         more = f", no sign of life for {cell['silent']} s on {cell.get('host')}{waits}"
     return step + more

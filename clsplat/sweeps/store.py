@@ -1,17 +1,17 @@
-"""The folder that a sweep is kept in, shared by all machines that work on it.
+"""Keep the cells of a sweep in a folder that all machines share.
 
-    cells/<key>/spec.json           what the key was made of, written first, never changed
-                attempts/<uuid>/    an ordinary run folder, written by one process ever, with its lease.json
-                result/             the attempt that came first, renamed, with its manifest.json
-                failed.json         why it was given up
-    prepared/                       what `prepare` makes
-    undistorted/<scene>-<code>/     photographs without the distortion of their lenses, made once a host
-    sweeps/<name>-<hash>.json       the cells of a matrix by their names
-    cancel/all  cancel/<key>        that what began before is to stop
-    events/<host>-<process>.jsonl   one file a process: no two append to one
+    cells/<key>/spec.json           the values that the key is a hash of; written first, never changed
+                attempts/<uuid>/    an ordinary run folder, written by a single process, with its lease.json
+                result/             the first attempt that finished, renamed, with its manifest.json
+                failed.json         why the cell was given up
+    prepared/                       output of `prepare`
+    undistorted/<scene>-<code>/     undistorted photos, made once per host
+    sweeps/<name>-<hash>.json       the cells of a matrix by name
+    cancel/all  cancel/<key>        requests to stop what started before
+    events/<host>-<process>.jsonl   one file per process, so that no two append to the same file
 
-Engines start a cell at least once.  A cell counts once: attempts share no file, its bits do not depend on who runs it,
-and publishing is a rename.
+Engines start a cell at least once.  A cell counts once: attempts share no file, the bits do not depend on who runs the
+cell, and publishing is a rename.
 """
 
 import hashlib
@@ -57,15 +57,15 @@ from clsplat.sweeps.cell import CellRun
 from clsplat.training import checkpoint
 from clsplat.training.status import read_status
 
-# Files of a run folder in another one: links where that is possible.
+# Copies of a run folder, by hard links if possible.
 
-GROWING = frozenset({LOG_FILE, RECORDS, TRIAL})  # files that a run appends to: links of them would be one file
+GROWING = frozenset({LOG_FILE, RECORDS, TRIAL})  # a run appends to these files, so they are copied, not linked
 
 
 def copy_files(source: Path, target: Path, left_out: Collection[str]) -> None:
-    """Let a folder hold the files of another, also those below it, but for these names at its top.
+    """Copy a folder recursively, except the names `left_out` at its top.
 
-    Files in the way are replaced; half-written ones, and those that a process removes meanwhile, are left out.
+    Existing files are replaced.  Partial files, and files that a process removes meanwhile, are skipped.
     Raises OSError.
     """
     for base, folders, files in os.walk(source):
@@ -84,7 +84,7 @@ def copy_files(source: Path, target: Path, left_out: Collection[str]) -> None:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Let a file that is never changed in place have a second name, or copy it.  Raises OSError."""
+    """Hard-link a file that is never changed in place, or copy it.  Raises OSError."""
     try:
         os.link(source, target)
     except FileExistsError:
@@ -95,23 +95,23 @@ def link_or_copy(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-# An attempt at a cell: a run folder with a lease, and with a manifest when its run is done.
+# An attempt at a cell: a run folder with a lease, and a manifest once the run is done.
 
 LEASE, MANIFEST, PIPELINE_FILE, ERRORS = "lease.json", "manifest.json", "cell.yaml", "errors.txt"
 OWN = frozenset(
     {LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, PREPARE_SUMMARY}
 )  # of one attempt alone; NOTE has a path
-MEASURED = ("psnr", "ssim", "views")  # figures of metrics.json that a device's bits decide
+MEASURED = ("psnr", "ssim", "views")  # values of metrics.json that the bits of a device determine
 BEAT = 10.0  # seconds between two beats of a lease
-Rank = tuple[bool, int]  # of a checkpoint: whether it is of a refit, and its step
+Rank = tuple[bool, int]  # of a checkpoint: whether it belongs to a refit, and its step
 
 
 class LeaseLost(OutputError):
-    """The folder of an attempt was removed while its run went on."""
+    """The folder of an attempt was removed during its run."""
 
 
 class CellAttempt:
-    """A folder below `attempts`, written by one process."""
+    """A folder below `attempts`, written by a single process."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -119,23 +119,23 @@ class CellAttempt:
         self._last = -math.inf
 
     def take_lease(self, worker: str, since: float) -> None:
-        """Say who works here.  since: when its caller began, by the clock of the store.  Raises OutputError."""
+        """Write the lease.  since: when the caller started, by the clock of the store.  Raises OutputError."""
         self._values = {**asdict(Owner.current()), "worker": worker, "since": since, "begun": time.time()}
         self._write()
 
     def beat(self) -> None:
-        """Renew the lease where that is due.  Raises LeaseLost."""
+        """Renew the lease if it is due.  Raises LeaseLost."""
         if time.monotonic() - self._last >= BEAT:
             self.require_lease()
             self._write()
 
     def require_lease(self) -> None:
-        """Raise LeaseLost where its folder was removed."""
+        """Raise LeaseLost if the folder was removed."""
         if not (self.path / LEASE).is_file():
-            raise LeaseLost(f"{self.path}: was removed while its run went on; run the sweep again")
+            raise LeaseLost(f"{self.path}: the folder was removed during its run; run the sweep again")
 
     def end(self, exit_code: int) -> None:
-        """Note how the run ended; a lost folder stays lost."""
+        """Record how the run ended, unless the folder was removed."""
         self._values["exit_code"] = exit_code
         if self.path.is_dir():
             self._write()
@@ -146,15 +146,15 @@ class CellAttempt:
 
     @cached_property
     def lease(self) -> dict[str, Any]:
-        """What the lease says; nothing where it is missing or damaged."""
+        """The contents of the lease; empty if it is missing or damaged."""
         with suppress(DataError):
-            found = read_json(self.path / LEASE)
-            return found if isinstance(found, dict) else {}
+            lease = read_json(self.path / LEASE)
+            return lease if isinstance(lease, dict) else {}
         return {}
 
     @property
     def exit_code(self) -> int | None:
-        """How its run ended; None where it goes on, or its process was killed."""
+        """Exit code of the run; None if it is running, or its process was killed."""
         code = self.lease.get("exit_code")
         return code if isinstance(code, int) else None
 
@@ -164,34 +164,34 @@ class CellAttempt:
 
     @property
     def since(self) -> float:
-        """When its caller began, by the clock of the store."""
+        """When the caller started, by the clock of the store."""
         return float(self.lease.get("since", 0))
 
     @property
-    def begun_at(self) -> Rank:
-        """The checkpoint that it went on from."""
+    def start_rank(self) -> Rank:
+        """The rank of the checkpoint that the attempt continued from."""
         return _rank_of(str(self.lease.get("from", "")))
 
     @property
-    def beaten(self) -> float:
-        """When its lease was renewed last, by the clock of the store."""
+    def last_beat(self) -> float:
+        """When the lease was last renewed, by the clock of the store."""
         for path in (self.path / LEASE, self.path):
             with suppress(OSError):
                 return path.stat().st_mtime
         return math.inf
 
-    def go_on_from(self, others: Iterable["CellAttempt"]) -> None:
-        """Take what the attempt with the newest checkpoint that is whole has written: links where that is possible.
+    def continue_from(self, others: Iterable["CellAttempt"]) -> None:
+        """Copy the files of the attempt with the newest readable checkpoint, by links if possible.
 
-        A damaged checkpoint counts as none: the one before it is taken, of whatever attempt.  Raises OutputError.
+        Damaged checkpoints are skipped.  Raises OutputError.
         """
-        for _, path, other in whole(others):
-            own = self.path / CHECKPOINTS / path.name
+        for _, path, other in readable_checkpoints(others):
+            target = self.path / CHECKPOINTS / path.name
             with raising_output_error(self.path):
-                own.parent.mkdir(exist_ok=True)
+                target.parent.mkdir(exist_ok=True)
                 try:
-                    link_or_copy(path, own)
-                except FileNotFoundError:  # its process has removed it since
+                    link_or_copy(path, target)
+                except FileNotFoundError:  # removed meanwhile by its process
                     continue
                 copy_files(other.path, self.path, {*OWN, CHECKPOINTS})
             self._values["from"] = path.name
@@ -199,7 +199,7 @@ class CellAttempt:
             return
 
     def message(self, exit_code: int) -> str:
-        """Return why its run failed: the line of its status, or the last that it printed."""
+        """Return why the run failed: the message of its status, or the last line that it printed."""
         if text := read_status(self.path).get("message"):
             return str(text)
         lines: list[str] = []
@@ -209,7 +209,7 @@ class CellAttempt:
         return lines[-1].removeprefix("error: ") if lines else f"its process ended with {how}"
 
     def manifest(self) -> dict[str, Any]:
-        """Write the manifest: hashes of all files, and of the bits.  Return it.  Raises OutputError."""
+        """Write and return the manifest: hashes of all files, and of the bits.  Raises OutputError."""
         names = sorted(path.relative_to(self.path).as_posix() for path in self.path.rglob("*") if path.is_file())
         kept = [name for name in names if name not in (LEASE, MANIFEST, ERRORS, LOCK)]
         files = {name: sha256(self.path / name, kind=OutputError) for name in kept}
@@ -227,15 +227,15 @@ class CellAttempt:
         return values
 
 
-def whole(attempts: Iterable[CellAttempt]) -> Iterator[tuple[Rank, Path, CellAttempt]]:
-    """Yield the checkpoints of attempts that can be read, from the newest on: rank, file, and whose it is."""
-    found = [(_rank_of(path.name), path, one) for one in attempts for path in checkpoint.saved(one.path)]
-    for rank, path, one in sorted(found, key=lambda entry: entry[0], reverse=True):
+def readable_checkpoints(attempts: Iterable[CellAttempt]) -> Iterator[tuple[Rank, Path, CellAttempt]]:
+    """Yield the readable checkpoints of attempts, the newest first: rank, file and attempt."""
+    saved = [(_rank_of(path.name), path, attempt) for attempt in attempts for path in checkpoint.saved(attempt.path)]
+    for rank, path, attempt in sorted(saved, key=lambda entry: entry[0], reverse=True):
         try:
             checkpoint.load(path)
         except (DataError, ConfigError):
             continue
-        yield rank, path, one
+        yield rank, path, attempt
 
 
 def _rank_of(name: str) -> Rank:
@@ -244,9 +244,9 @@ def _rank_of(name: str) -> Rank:
 
 
 def bits_of(folder: Path, files: dict[str, str]) -> str:
-    """Return a hash of what a device computed: model files, and metrics without times.
+    """Return a hash of everything that a device computed: model files, and metrics without times.
 
-    files: the hashes of the run's files, by name.
+    files: hashes of the run's files, by name.
     """
     suffixes = tuple(suffix for codec in CODECS for suffix in codec.endings)
     models = {name: digest for name, digest in files.items() if name.lower().endswith(suffixes)}
@@ -260,16 +260,16 @@ def bits_of(folder: Path, files: dict[str, str]) -> str:
     return hashlib.sha256(json.dumps([models, figures], sort_keys=True).encode()).hexdigest()
 
 
-# The folder of one cell: its attempts, and its result.
+# The folder of a cell: its attempts, and its result.
 
 LOG = logging.getLogger("clsplat")
 SPEC, ATTEMPTS, RESULT, FAILED = "spec.json", "attempts", "result", "failed.json"
 NAME = re.compile("[0-9a-f]{32}")  # of an attempt
-SILENT = 600.0  # seconds without a beat of its lease after which an attempt may be removed
+STALE_AFTER_S = 600.0  # seconds without a beat of its lease after which an attempt may be removed
 
 
-class Different(OutputError):
-    """Two runs of one cell, on devices of one bits class, have come to other bits."""
+class BitsMismatch(OutputError):
+    """Two runs of a cell, on devices of the same bits class, gave different bits."""
 
 
 class CellFolder:
@@ -284,71 +284,70 @@ class CellFolder:
         return self.path.name
 
     def write_spec(self, spec: Mapping[str, Any]) -> None:
-        """Write what the key was made of, once, or again where it is damaged: the key is the hash of it.
+        """Write the values that the key is a hash of, if they are missing or damaged.
 
-        Raises OutputError where another one stands there.
+        Raises OutputError if other values are there.
         """
         file = self.path / SPEC
         try:
             before = read_json(file) if file.exists() else None
         except DataError as error:
-            LOG.warning("%s; it is written again", error)
+            LOG.warning("%s; writing it again", error)
             before = None
         if before is None:
             write_text(file, json.dumps(spec, indent=1, sort_keys=True) + "\n")
         elif before != spec:
-            raise OutputError(f"{file}: is of another cell, or was changed; remove {self.path}: its cell runs again")
+            raise OutputError(f"{file}: belongs to another cell, or was changed; remove {self.path} to run it again")
 
     def manifest(self) -> dict[str, Any] | None:
-        """Return what the manifest of the result says, unchecked; None where nothing was published."""
+        """Return the manifest of the result, unchecked, or None if nothing was published."""
         with suppress(DataError):
-            found = read_json(self.result / MANIFEST)
-            if isinstance(found, dict) and isinstance(found.get("files"), dict) and found.get("bits"):
-                return found
+            values = read_json(self.result / MANIFEST)
+            if isinstance(values, dict) and isinstance(values.get("files"), dict) and values.get("bits"):
+                return values
         return None
 
     def published(self) -> dict[str, Any] | None:
-        """Return the manifest of the result, whose files were compared with their hashes; None where there is none.
+        """Return the manifest of the result, after comparing the files with their hashes, or None without a result.
 
-        A damaged result becomes an attempt again, so that the cell goes on from its checkpoint.
+        A damaged result becomes an attempt again, so that the cell continues from its checkpoint.
         """
         if not self.result.is_dir():
             return None
-        found = self.manifest()
-        if found and all(sum_of(self.result / name) == digest for name, digest in found["files"].items()):
-            return found
-        with suppress(OSError):  # or another process has done so
+        manifest = self.manifest()
+        if manifest and all(sum_of(self.result / name) == digest for name, digest in manifest["files"].items()):
+            return manifest
+        with suppress(OSError):  # another process may have done so
             make_folder(self.path / ATTEMPTS)
             os.rename(self.result, self.path / ATTEMPTS / uuid.uuid4().hex)
         return None
 
     def attempts(self) -> list[CellAttempt]:
-        """Return the attempts that are there."""
-        found = (self.path / ATTEMPTS).glob("*")
-        return [CellAttempt(path) for path in found if NAME.fullmatch(path.name) and path.is_dir()]
+        """Return the existing attempts."""
+        paths = (self.path / ATTEMPTS).glob("*")
+        return [CellAttempt(path) for path in paths if NAME.fullmatch(path.name) and path.is_dir()]
 
     def begin(self, worker: str, since: float) -> CellAttempt:
-        """Make a new attempt, which goes on from the newest checkpoint of all that is whole.  Raises OutputError."""
+        """Start a new attempt, which continues from the newest readable checkpoint.  Raises OutputError."""
         attempt = CellAttempt(self.path / ATTEMPTS / uuid.uuid4().hex)
         with raising_output_error(attempt.path):
             make_folder(attempt.path)
-            (self.path / FAILED).unlink(missing_ok=True)  # it is tried again
+            (self.path / FAILED).unlink(missing_ok=True)
         attempt.take_lease(worker, since)
-        attempt.go_on_from(other for other in self.attempts() if other.path != attempt.path)
+        attempt.continue_from(other for other in self.attempts() if other.path != attempt.path)
         return attempt
 
     def failures(self, since: float) -> list[CellAttempt]:
-        """Return the attempts of callers since a time that have failed and left no newer checkpoint that is whole."""
+        """Return the attempts of callers since a time that failed without a newer readable checkpoint."""
         attempts = self.attempts()
-        newest = next((rank for rank, *_ in whole(attempts)), (False, 0))
-        return [one for one in attempts if one.has_failed and one.since >= since and one.begun_at >= newest]
+        newest = next((rank for rank, *_ in readable_checkpoints(attempts)), (False, 0))
+        return [one for one in attempts if one.has_failed and one.since >= since and one.start_rank >= newest]
 
     def publish(self, attempt: CellAttempt) -> dict[str, Any]:
         """Rename an attempt with its manifest to the result; return the manifest of the result.
 
-        Where another attempt came first, their bits are compared.
-
-        Raises Different when they differ, LeaseLost where the attempt was removed, for its process slept too long.
+        If another attempt was first, their bits are compared.  Raises BitsMismatch if they differ, and LeaseLost if the
+        attempt was removed because its process slept too long.
         """
         attempt.require_lease()
         ours = attempt.manifest()
@@ -361,15 +360,15 @@ class CellFolder:
                 (self.result / LEASE).unlink()
                 (self.path / FAILED).unlink(missing_ok=True)
             return ours
-        os.listdir(self.path)  # NFS: what was read of the folder before may be old
+        os.listdir(self.path)  # refreshes what NFS has cached of the folder
         theirs = self.manifest()
         if theirs is None:
-            raise OutputError(f"{self.result}: cannot be written, and holds no result; check the folder and its space")
+            raise OutputError(f"{self.result}: cannot be written; check the permissions of the folder and its space")
         if theirs["bits"] != ours["bits"]:
-            raise Different(
-                f"{self.path}: the same cell on devices of one bits class gave other bits: those of {self.result} on "
-                f"{theirs.get('device')}, of {attempt.path} on {ours.get('device')}; one of them computes wrongly: "
-                "`clsplat doctor` tells which"
+            raise BitsMismatch(
+                f"{self.path}: the same cell gave other bits on two devices of one bits class: {self.result} on "
+                f"{theirs.get('device')}, {attempt.path} on {ours.get('device')}; one of them computes wrongly: "
+                "`clsplat doctor` shows which"
             )
         return theirs
 
@@ -380,21 +379,21 @@ class CellFolder:
         write_text(self.path / FAILED, text + "\n")
 
     def failed(self) -> dict[str, Any] | None:
-        """Return why the cell was given up; None where it was not."""
+        """Return why the cell was given up, or None."""
         with suppress(DataError):
-            found = read_json(self.path / FAILED)
-            return found if isinstance(found, dict) else None
+            values = read_json(self.path / FAILED)
+            return values if isinstance(values, dict) else None
         return None
 
     def collect(self, now: float) -> None:
-        """Remove the attempts of a published cell whose lease had no beat for `SILENT` seconds.
+        """Remove the attempts of a published cell whose lease had no beat for STALE_AFTER_S seconds.
 
-        now: by the clock of the store.  No other attempt is touched: its process may be at work.
+        now: by the clock of the store.  Other attempts stay, since their processes may be working.
         """
         if self.manifest() is None:
             return
         for attempt in self.attempts():
-            if now - attempt.beaten > SILENT:
+            if now - attempt.last_beat > STALE_AFTER_S:
                 shutil.rmtree(attempt.path, ignore_errors=True)
 
 
@@ -403,7 +402,7 @@ ALL = "all"
 
 
 class Store:
-    """A store, as one process uses it.  Raises OutputError where it cannot be written."""
+    """A store, as a process uses it.  Raises OutputError if it cannot be written."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
@@ -411,19 +410,19 @@ class Store:
         self._own = f"{owner.host_slug}-{owner.process}"
 
     @classmethod
-    def opened(cls, root: Path) -> "Store":
-        """Return the store in a folder.  Raises DataError when it holds none."""
+    def open(cls, root: Path) -> "Store":
+        """Return the store in a folder.  Raises DataError if there is none."""
         if not (root / CELLS).is_dir():
-            raise DataError(f"{root}: has no folder `{CELLS}`; expected the store of a sweep")
+            raise DataError(f"{root}: is not the store of a sweep: it has no folder `{CELLS}`; check the path")
         return cls(root)
 
     @property
     def prepared(self) -> Path:
-        """The folder of what `prepare` makes."""
+        """The folder of the output of `prepare`."""
         return self.root / PREPARED
 
     def undistorted(self, scene: str, code: str) -> Path:
-        """Return the folder of the undistorted photographs of a scene.  Both are fingerprints, as in a cell's key."""
+        """Return the folder of a scene's undistorted photos.  Both arguments are fingerprints, as in a cell's key."""
         return self.root / UNDISTORTED / f"{scene[:16]}-{code}"
 
     def folder(self, key: str) -> CellFolder:
@@ -435,14 +434,14 @@ class Store:
         return [CellFolder(path) for path in sorted((self.root / CELLS).glob("*")) if path.is_dir()]
 
     def now(self) -> float:
-        """Return the time by the clock of the store's file system, in seconds, which all machines share."""
+        """Return the time by the clock of the store's file system, which all machines share, in seconds."""
         clock = self.root / EVENTS / f".{self._own}.clock"
         with raising_output_error(clock):
             make_folder(clock.parent)
             clock.touch()
             return clock.stat().st_mtime
 
-    def tell(self, event: str, **values: Any) -> None:
+    def log_event(self, event: str, **values: Any) -> None:
         """Append an event to the file of this process."""
         path = self.root / EVENTS / f"{self._own}.jsonl"
         with raising_output_error(path):
@@ -451,51 +450,51 @@ class Store:
                 file.write(json.dumps({"time": round(time.time(), 3), "event": event, **values}) + "\n")
 
     def events(self) -> list[dict[str, Any]]:
-        """Return what all processes have told, in order of time; a line that a crash has cut is left out."""
-        found: list[dict[str, Any]] = []
+        """Return the events of all processes, in order of time; lines cut by a crash are skipped."""
+        events: list[dict[str, Any]] = []
         for path in (self.root / EVENTS).glob("*.jsonl"):
             for line in read_file(path).decode(errors="replace").splitlines() if path.is_file() else ():
                 with suppress(ValueError):
                     event = json.loads(line)
-                    found += [event] if isinstance(event, dict) and isinstance(event.get("time"), float | int) else []
-        return sorted(found, key=lambda event: float(event["time"]))
+                    events += [event] if isinstance(event, dict) and isinstance(event.get("time"), float | int) else []
+        return sorted(events, key=lambda event: float(event["time"]))
 
     def note_sweep(self, name: str, keys: Mapping[str, str], text: str) -> None:
-        """Write the cells of a matrix, by name, for those who look at the store.
+        """Record the cells of a matrix by name, for `clsplat status`.
 
-        text: what tells this matrix from others of its name, such as its file.
+        text: distinguishes matrices with the same name, such as the text of the file.
         """
         file = f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
         write_text(self.root / SWEEPS / file, json.dumps({"name": name, "cells": keys}, indent=1) + "\n")
 
     def sweeps(self) -> list[tuple[str, dict[str, str]]]:
-        """Return the name of each matrix, and its cells: keys by the cells' names."""
-        found = []
+        """Return the name of each matrix, and the keys of its cells by name."""
+        sweeps = []
         for path in sorted((self.root / SWEEPS).glob("*.json")):
             with suppress(DataError, KeyError, TypeError, AttributeError):
                 values = read_json(path)
                 cells = {str(name): str(key) for name, key in values["cells"].items()}
-                found.append((str(values["name"]), cells))
-        return found
+                sweeps.append((str(values["name"]), cells))
+        return sweeps
 
     def add(self, cell: CellRun) -> CellFolder:
-        """Return the folder of a cell, with its spec.json.  Raises OutputError where that is another one's."""
+        """Return the folder of a cell, with its spec.json.  Raises OutputError if that belongs to another cell."""
         folder = self.folder(cell.key)
         folder.write_spec(cell.spec)
         return folder
 
     def cancel(self, cell: str | None = None) -> str:
-        """Ask that all cells that have begun stop, or one of them, by its name or key; return what was asked for.
+        """Request that all running cells stop, or one of them, by name or key; return "all" or the key.
 
-        Raises ConfigError when there is no such cell.
+        Raises ConfigError if there is no such cell.
         """
         name = ALL if cell is None else self.key_of(cell)
         self.stop(name)
-        self.tell("cancel", cell=name)
+        self.log_event("cancel", cell=name)
         return name
 
     def stop(self, name: str) -> None:
-        """Let what began under a name, or all, stop."""
+        """Request that everything that started under a name stops."""
         flag = self.root / CANCEL / name
         with raising_output_error(flag):
             make_folder(flag.parent)
@@ -503,7 +502,7 @@ class Store:
             os.utime(flag)
 
     def is_cancelled(self, names: Sequence[str], since: float) -> bool:
-        """Return whether something that began at a time of `now`, with keys or names, is to stop."""
+        """Return whether something that started at a time of `now`, under some names, has to stop."""
         for name in (ALL, *filter(None, names)):
             with suppress(OSError):
                 if (self.root / CANCEL / name).stat().st_mtime >= since:
@@ -511,14 +510,14 @@ class Store:
         return False
 
     def key_of(self, cell: str) -> str:
-        """Return the key of a cell by its name in a sweep, or by its key or the beginning of that.
+        """Return the key of a cell, given its name in a sweep, its key or the start of its key.
 
-        Of several cells of a name it is the one that is not published.
+        If several cells have the name, the one that is not published.
         """
         named = {key for _, cells in self.sweeps() for name, key in cells.items() if name == cell}
         named = {key for key in named if not self.folder(key).result.is_dir()} or named
         named = named or {folder.key for folder in self.folders() if folder.key.startswith(cell)}
         if len(named) != 1:
-            fault = f"{len(named)} cells are named so; give a key" if named else "`clsplat status` lists the cells"
+            fault = f"{len(named)} cells match; give a key" if named else "`clsplat status` lists the cells"
             raise ConfigError(f"{self.root}: no cell '{cell}'; {fault}")
         return named.pop()

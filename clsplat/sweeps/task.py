@@ -1,4 +1,4 @@
-"""What every engine runs: one cell, in attempts, until it is published, given up or stopped."""
+"""Run a cell in attempts until it is published, given up or stopped; all engines call this."""
 
 import logging
 import os
@@ -20,10 +20,10 @@ from clsplat.core.files import INPUTS, PREPARE_SUMMARY, PREPARED, UNDISTORTED, m
 from clsplat.core.reading import read_json
 from clsplat.sweeps.cell import CellRun
 from clsplat.sweeps.child import Command, supervise
-from clsplat.sweeps.store import ATTEMPTS, PIPELINE_FILE, CellAttempt, CellFolder, Different, LeaseLost, Store
+from clsplat.sweeps.store import ATTEMPTS, PIPELINE_FILE, BitsMismatch, CellAttempt, CellFolder, LeaseLost, Store
 
 LOG = logging.getLogger("clsplat")
-FINAL = (ConfigError.exit_code, DataError.exit_code, MemoryLimitError.exit_code)  # the same run would end so again
+FINAL = (ConfigError.exit_code, DataError.exit_code, MemoryLimitError.exit_code)  # a retry would fail in the same way
 
 
 @dataclass(frozen=True)
@@ -37,77 +37,80 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Terms:
-    """What a caller lets a cell have."""
+class CellOptions:
+    """How a cell is run."""
 
-    since: float  # when the caller began, by the clock of the store
+    since: float  # when the caller started, by the clock of the store
     retries: int = 3  # failures without a newer checkpoint
     worker: str = "inline"
-    sweep: str = ""  # a name that the caller's cells are stopped by
-    cores: Sequence[int] = ()  # that its run is kept to; none: those of its caller
+    sweep: str = ""  # name under which the caller's cells can be stopped
+    cores: Sequence[int] = ()  # to pin the run to; none: those of the caller
 
 
 def run_cell(
-    cell: CellRun, store: Store, command: Command, terms: Terms, is_stopped: Callable[[], bool] = lambda: False
+    cell: CellRun, store: Store, command: Command, options: CellOptions, is_stopped: Callable[[], bool] = lambda: False
 ) -> Outcome:
-    """Run a cell, unless it is published; return how it ended, whatever happens to it.
+    """Run a cell, unless it is published; return how it ended, and never raise a ClsplatError.
 
-    is_stopped: whether the caller is to stop; the store is asked too.
+    is_stopped: whether the caller has to stop; the store is checked too.
     """
     try:
-        return _run_cell(cell, store, command, terms, is_stopped)
-    except Different as error:
+        return _run_cell(cell, store, command, options, is_stopped)
+    except BitsMismatch as error:
         return Outcome("different", "", error.exit_code, one_line(error))
     except ClsplatError as error:
         return Outcome("failed", "", error.exit_code, one_line(error))
 
 
-def _run_cell(cell: CellRun, store: Store, command: Command, terms: Terms, is_stopped: Callable[[], bool]) -> Outcome:
+def _run_cell(
+    cell: CellRun, store: Store, command: Command, options: CellOptions, is_stopped: Callable[[], bool]
+) -> Outcome:
     folder = store.add(cell)
 
     def stopped() -> bool:
-        return is_stopped() or store.is_cancelled((cell.key, terms.sweep), terms.since)
+        return is_stopped() or store.is_cancelled((cell.key, options.sweep), options.since)
 
     while True:
-        if found := folder.published():
-            store.tell("skip", cell=cell.key, worker=terms.worker)
+        if manifest := folder.published():
+            store.log_event("skip", cell=cell.key, worker=options.worker)
             folder.collect(store.now())
-            return Outcome("published", str(found["bits"]))
+            return Outcome("published", str(manifest["bits"]))
         if stopped():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped")
         cell.require_files()
-        attempt = folder.begin(terms.worker, terms.since)
+        attempt = folder.begin(options.worker, options.since)
         begun_from = attempt.lease.get("from")
-        store.tell("start", cell=cell.key, attempt=attempt.path.name, worker=terms.worker, **{"from": begun_from})
+        store.log_event(
+            "start", cell=cell.key, attempt=attempt.path.name, worker=options.worker, **{"from": begun_from}
+        )
         _equip(cell, store, folder, attempt)
         try:
-            code = supervise(attempt, command, stopped, terms.cores)
-            store.tell("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
+            code = supervise(attempt, command, stopped, options.cores)
+            store.log_event("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
             if code == 0:
                 _require_same_scene(cell, attempt)
-                return _published(store, folder, attempt)
+                return _publish(store, folder, attempt)
             message = attempt.message(code)
         except LeaseLost:
             if folder.published():  # by another process, while this one was frozen
                 continue
             raise
-        except Different:
+        except BitsMismatch:
             raise
-        except OutputError as error:  # of its result: as if the run had not been able to write
+        except OutputError as error:  # while publishing: the same as if the run could not write
             code, message = error.exit_code, one_line(error)
             attempt.end(code)
         if stopped():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped, its state is saved")
-        if code in FINAL or len(folder.failures(terms.since)) >= terms.retries:
-            return _given_up(folder, store, code, message)
-        LOG.warning("cell %s: %s; it is tried again", cell.name, message)
+        if code in FINAL or len(folder.failures(options.since)) >= options.retries:
+            return _give_up(folder, store, code, message)
+        LOG.warning("cell %s: %s; trying again", cell.name, message)
 
 
 def _equip(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt) -> None:
-    """Write the pipeline file of an attempt, and let it find what other cells have made of the scene.
+    """Write the pipeline file of an attempt, and link to output of `prepare` and undistorted photos of other cells.
 
-    That is what `prepare` makes, and undistorted photographs.  Without links each cell makes its own.  Raises
-    OutputError.
+    Without links, each cell makes its own.  Raises OutputError.
     """
     write_text(attempt.path / PIPELINE_FILE, cell.text)
     shared = {UNDISTORTED: store.undistorted(cell.spec["scene"], cell.spec["code"])}
@@ -122,7 +125,7 @@ def _equip(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt
 
 
 def _require_same_scene(cell: CellRun, attempt: CellAttempt) -> None:
-    """Raise DataError where the photographs, or other files, are not those that the cell was named by."""
+    """Raise DataError if the photos or other files are not those that the cell's key was made from."""
     cell.require_files()
     for name, key in ((PREPARE_SUMMARY, "inputs"), (INPUTS, "digest")):
         if not (attempt.path / name).is_file():
@@ -134,16 +137,18 @@ def _require_same_scene(cell: CellRun, attempt: CellAttempt) -> None:
         return
 
 
-def _published(store: Store, folder: CellFolder, attempt: CellAttempt) -> Outcome:
+def _publish(store: Store, folder: CellFolder, attempt: CellAttempt) -> Outcome:
     manifest = folder.publish(attempt)
     is_first = manifest["attempt"] == attempt.path.name
-    store.tell("publish" if is_first else "second", cell=folder.key, attempt=attempt.path.name, bits=manifest["bits"])
+    store.log_event(
+        "publish" if is_first else "second", cell=folder.key, attempt=attempt.path.name, bits=manifest["bits"]
+    )
     folder.collect(store.now())
     return Outcome("published", str(manifest["bits"]))
 
 
-def _given_up(folder: CellFolder, store: Store, code: int, message: str) -> Outcome:
+def _give_up(folder: CellFolder, store: Store, code: int, message: str) -> Outcome:
     exit_code = code if code > 0 else 1
     folder.give_up(exit_code, message)
-    store.tell("failed", cell=folder.key, exit_code=exit_code)
+    store.log_event("failed", cell=folder.key, exit_code=exit_code)
     return Outcome("failed", "", exit_code, message)

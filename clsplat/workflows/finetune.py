@@ -36,7 +36,7 @@ from clsplat.runs.run_folder import Start
 from clsplat.runs.state import RunState
 from clsplat.scene.identity import Identity, decode_all, require_decodable
 from clsplat.sweeps.experiment import run_pipeline
-from clsplat.sweeps.store import CellAttempt, whole
+from clsplat.sweeps.store import CellAttempt, readable_checkpoints
 
 LOG = logging.getLogger("clsplat")
 RECIPE, TRAINING = "compress", "optimize"
@@ -57,7 +57,7 @@ class Tuning:
         """Return stages of the recipe, in its order, and one that writes the model, with other values by place."""
         path = find(RECIPE)
         data = read_yaml(path).data
-        chosen = [*_chosen(data["stages"], stages), {"export": {"file": MODEL, **export}}]
+        chosen = [*_choose_class(data["stages"], stages), {"export": {"file": MODEL, **export}}]
         document = Document({**data, "name": self.name, "stages": chosen})
         settings = {**self._scene(), **self._rendering(), **values}
         pipeline = checked(path, document, [f"{place}={json.dumps(value)}" for place, value in settings.items()])
@@ -102,7 +102,7 @@ def train_in_folder(pipeline: Pipeline, folder: Path, device: Device, file: str 
     """
     state = RunState.read(folder)
     if not state.is_whole(pipeline):
-        is_whole = any(whole([CellAttempt(folder)]))
+        is_whole = any(readable_checkpoints([CellAttempt(folder)]))
         if state.checkpoints and not is_whole:
             LOG.warning("%s: no checkpoint is whole; it is trained again from the beginning", folder)
         begun: Start = "resume" if is_whole else "restart"
@@ -125,7 +125,7 @@ def require_steps(steps: int) -> None:
         raise ConfigError(f"--steps {steps}: expected a number of at least {LEAST}")
 
 
-def _chosen(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
+def _choose_class(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
     """The stages of a file that have these names, in order; their steps count from the first of them on."""
     chosen, left, skipped = [], iter(stages), 0
     for name in names:

@@ -7,7 +7,7 @@ from clsplat.pipeline.loading import load
 from clsplat.sweeps.cell import CellRun, Scenes
 from clsplat.sweeps.child import FILE, OUT, PYTHON
 from clsplat.sweeps.devices import DeviceSlot
-from clsplat.sweeps.engines import CellLost, Wanted
+from clsplat.sweeps.engines import CellLost, PendingCell
 from clsplat.sweeps.task import Outcome
 
 KILLS = int(os.environ.get("CLSPLAT_KILLS", "0"))
@@ -23,7 +23,7 @@ WRITES = "import sys, pathlib; pathlib.Path(sys.argv[2], 'point_cloud.ply').writ
 
 
 def command(code: str) -> list[str]:
-    """A command in the place of a run: it gets the pipeline file and the run folder."""
+    """A command instead of a run: it gets the pipeline file and the run folder."""
     return [PYTHON, "-S", "-c", code, FILE, OUT]
 
 
@@ -36,15 +36,15 @@ class Fake:
     """An engine whose cells end as they were told to; a Lost is raised."""
 
     def __init__(
-        self, *ends: Outcome | type[CellLost], places: tuple[DeviceSlot, ...] = (DeviceSlot("w", "d", "b"),)
+        self, *ends: Outcome | type[CellLost], slots: tuple[DeviceSlot, ...] = (DeviceSlot("w", "d", "b"),)
     ) -> None:
-        self.ends, self._places, self.started = list(ends), places, []
+        self.ends, self._slots, self.started = list(ends), slots, []
 
-    def places(self):
-        return list(self._places)
+    def slots(self):
+        return list(self._slots)
 
-    def start(self, cell, place, terms):
-        self.started.append((cell.name, place.device, cell.spec["bits"]))
+    def start(self, cell, slot, options):
+        self.started.append((cell.name, slot.device, cell.spec["bits"]))
         end = self.ends.pop(0)
 
         class Ticket:
@@ -56,5 +56,5 @@ class Fake:
         return Ticket()
 
 
-def wanted(*costs: float) -> list[Wanted]:
-    return [Wanted(CellRun(f"{cost:g}", {**SPEC, "scene": str(cost)}, ""), cost) for cost in costs]
+def wanted(*costs: float) -> list[PendingCell]:
+    return [PendingCell(CellRun(f"{cost:g}", {**SPEC, "scene": str(cost)}, ""), cost) for cost in costs]

@@ -15,21 +15,21 @@ from clsplat.sweeps import dask
 from clsplat.sweeps.cell import CellRun
 from clsplat.sweeps.child import OUT
 from clsplat.sweeps.devices import DeviceSlot
-from clsplat.sweeps.engines import Drive, Wanted
+from clsplat.sweeps.engines import Dispatcher, PendingCell
 from clsplat.sweeps.store import Store
-from clsplat.sweeps.task import Terms
+from clsplat.sweeps.task import CellOptions
 from tests.support.cells import SPEC
 
 
 def measure(cells: int, workers: int, folder: Path) -> None:
     """Print the time a cell, the memory of the driver along the way, and the events."""
-    places = [DeviceSlot("local", f"device {number}", "b") for number in range(workers)]
-    dask.places = lambda worker, devices, packing: places
+    slots = [DeviceSlot("local", f"device {number}", "b") for number in range(workers)]
+    dask.find_slots = lambda worker, devices, packing: slots
     store, memory, process = Store(folder), [], psutil.Process()
     engine = dask.engine(Execution(engine="local"), store, None)
     engine.command_of = lambda device: ["touch", OUT]
-    wanted = [Wanted(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), 1) for i in range(cells)]
-    drive = Drive(store, engine, True, Terms(store.now()))
+    wanted = [PendingCell(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), 1) for i in range(cells)]
+    drive = Dispatcher(store, engine, True, CellOptions(store.now()))
 
     def ended(cell: CellRun, outcome: object) -> None:
         if len(memory) % max(1, cells // 10) == 0:

@@ -3,7 +3,7 @@
 import pytest
 
 from clsplat.sweeps.devices import DeviceSlot
-from clsplat.sweeps.engines import Drive
+from clsplat.sweeps.engines import Dispatcher
 from clsplat.sweeps.task import Outcome
 from tests.support.cells import Fake, wanted
 
@@ -12,29 +12,29 @@ SMALL, LARGE = (DeviceSlot("w", name, "x", memory=memory) for name, memory in ((
 OTHER = DeviceSlot("w", "o", "y", memory=3)
 
 
-def states(store, terms, engine, is_same=True, costs=(1,)):
+def states(store, options, engine, is_same=True, costs=(1,)):
     found = []
-    Drive(store, engine, is_same, terms, ended=lambda cell, end: found.append(end.state)).run(wanted(*costs))
+    Dispatcher(store, engine, is_same, options, ended=lambda cell, end: found.append(end.state)).run(wanted(*costs))
     return found
 
 
-def test_longest_cell_has_the_largest_device(store, terms):
-    engine = Fake(DONE, DONE, places=(SMALL, LARGE))
-    assert states(store, terms, engine, costs=(1, 2)) == ["published"] * 2
+def test_longest_cell_has_the_largest_device(store, options):
+    engine = Fake(DONE, DONE, slots=(SMALL, LARGE))
+    assert states(store, options, engine, costs=(1, 2)) == ["published"] * 2
     assert engine.started == [("2", "l", "x"), ("1", "s", "x")]
 
 
-def test_cell_that_does_not_fit_goes_to_a_larger_device(store, terms, caplog):
-    engine = Fake(DONE, FULL, DONE, places=(LARGE, SMALL))
-    assert states(store, terms, engine, costs=(1, 2)) == ["published"] * 2
+def test_cell_that_does_not_fit_goes_to_a_larger_device(store, options, caplog):
+    engine = Fake(DONE, FULL, DONE, slots=(LARGE, SMALL))
+    assert states(store, options, engine, costs=(1, 2)) == ["published"] * 2
     assert engine.started[1:] == [("1", "s", "x"), ("1", "l", "x")]
-    assert [record.message for record in caplog.records] == ["cell 1: memory: too small; it goes to a larger device"]
+    assert [record.message for record in caplog.records] == ["cell 1: memory: too small; trying a larger device"]
 
 
 @pytest.mark.parametrize(("is_same", "ends"), [(True, ["failed"]), (False, ["published"])])
-def test_only_devices_that_may_run_a_cell_are_tried(store, terms, is_same, ends):
+def test_only_devices_that_may_run_a_cell_are_tried(store, options, is_same, ends):
     (one,) = wanted(1)
     store.add(one.on("x"))
-    engine = Fake(FULL, *[DONE] * (not is_same), places=(SMALL, OTHER) if not is_same else (SMALL,))
-    assert states(store, terms, engine, is_same) == ends
+    engine = Fake(FULL, *[DONE] * (not is_same), slots=(SMALL, OTHER) if not is_same else (SMALL,))
+    assert states(store, options, engine, is_same) == ends
     assert [device for _, device, _ in engine.started] == (["s"] if is_same else ["s", "o"])

@@ -16,13 +16,13 @@ from clsplat.core.files import CHECKPOINTS
 from clsplat.pipeline.loading import load
 from clsplat.runs.opening import undistorted_folder
 from clsplat.sweeps import child
-from clsplat.sweeps.batch import place_copy
+from clsplat.sweeps.batch import copy_result
 from clsplat.sweeps.cell import Scenes
 from clsplat.sweeps.devices import DeviceSlot
-from clsplat.sweeps.engines import CellLost, Drive, InlineEngine, Wanted
+from clsplat.sweeps.engines import CellLost, Dispatcher, InlineEngine, PendingCell
 from clsplat.sweeps.status import overview_text, store_status
-from clsplat.sweeps.store import ATTEMPTS, LEASE, MANIFEST, CellAttempt, Different, Store
-from clsplat.sweeps.task import Outcome, Terms, run_cell
+from clsplat.sweeps.store import ATTEMPTS, LEASE, MANIFEST, BitsMismatch, CellAttempt, Store
+from clsplat.sweeps.task import CellOptions, Outcome, run_cell
 from tests.support.cells import CELL, SPEC, WRITES, Fake, command, keys, wanted
 
 WAITS = "import os, sys\nwhile os.read(0, 9): pass\nsys.exit(130)"
@@ -65,58 +65,58 @@ def test_a_fingerprint_is_what_a_run_writes_of_its_scene(few_steps, tiny_scene, 
     assert Scenes(tmp_path).known(checked).digest == expected
 
 
-def test_a_cell_is_published_once_and_then_skipped(store, terms):
-    first = run_cell(CELL, store, command(WRITES), terms)
+def test_a_cell_is_published_once_and_then_skipped(store, options):
+    first = run_cell(CELL, store, command(WRITES), options)
     assert first.state == "published"
     result = store.folder(CELL.key).result
     assert (result / "point_cloud.ply").read_bytes() == b"bits"
     assert not (result / LEASE).exists()
     assert json.loads((result / MANIFEST).read_text())["bits"] == first.bits
-    assert run_cell(CELL, store, command("raise SystemExit(1)"), terms) == first
+    assert run_cell(CELL, store, command("raise SystemExit(1)"), options) == first
     assert told(store) == ["start", "end", "publish", "skip"]
     assert json.loads((store.folder(CELL.key).path / "spec.json").read_text()) == SPEC
 
 
-def test_a_result_that_was_damaged_is_run_again(store, terms):
-    run_cell(CELL, store, command(WRITES), terms)
+def test_a_result_that_was_damaged_is_run_again(store, options):
+    run_cell(CELL, store, command(WRITES), options)
     (store.folder(CELL.key).result / "point_cloud.ply").write_bytes(b"bitz")
-    assert run_cell(CELL, store, command(WRITES), terms).state == "published"
+    assert run_cell(CELL, store, command(WRITES), options).state == "published"
     assert (store.folder(CELL.key).result / "point_cloud.ply").read_bytes() == b"bits"
     assert told(store).count("publish") == 2
 
 
 @pytest.mark.parametrize(("bits", "state"), [(b"bits", "published"), (b"others", "different")])
-def test_first_of_two_writers_publishes_and_the_second_compares(store, terms, bits, state):
+def test_first_of_two_writers_publishes_and_the_second_compares(store, options, bits, state):
     folder = store.add(CELL)
-    first = folder.begin("a", terms.since)
+    first = folder.begin("a", options.since)
     (first.path / "point_cloud.ply").write_bytes(b"bits")
     code = (
         WRITES.replace("b'bits'", repr(bits)) + f"; import os; os.rename({str(first.path)!r}, {str(folder.result)!r})"
     )
     first.manifest()
-    outcome = run_cell(CELL, store, command(code), terms)
+    outcome = run_cell(CELL, store, command(code), options)
     assert outcome.state == state
     assert (folder.result / "point_cloud.ply").read_bytes() == b"bits"
     if state == "published":
         assert told(store)[-1] == "second"
     else:
         assert "gave other bits" in outcome.message
-        drive = Drive(store, Fake(outcome), True, terms)
-        with pytest.raises(Different, match="gave other bits"):
-            drive.run([Wanted(CELL, 1)])
+        drive = Dispatcher(store, Fake(outcome), True, options)
+        with pytest.raises(BitsMismatch, match="gave other bits"):
+            drive.run([PendingCell(CELL, 1)])
 
 
 @pytest.mark.parametrize(
     ("code", "starts"), [(2, 1), (3, 1), (5, 1), (1, 3), (4, 3), (6, 3), (7, 3), (130, 0), (-9, 3)], ids=str
 )
-def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, terms, code, starts):
+def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, options, code, starts):
     end = f"import os, sys; sys.stderr.write('error: as it is\\n'); sys.stderr.flush(); os._exit({code})"
     if code == -9:
         end = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
     if code == 130:  # from elsewhere: another attempt goes on, and ends
         end = "import sys, pathlib; p = pathlib.Path(sys.argv[2]);"
         end += "n = sum(not one.is_symlink() for one in p.parent.iterdir()); sys.exit(130 if n == 1 else 0)"
-    outcome = run_cell(CELL, store, command(end), terms)
+    outcome = run_cell(CELL, store, command(end), options)
     if code == 130:
         assert (outcome.state, told(store).count("start")) == ("published", 2)
         return
@@ -125,13 +125,13 @@ def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, terms, code, 
     assert outcome.message == ("as it is" if code > 0 else "its process ended with signal 9")
     failed = json.loads((store.folder(CELL.key).path / "failed.json").read_text())
     assert (failed["exit_code"], failed["exit_codes"]) == (outcome.exit_code, [code] * starts)
-    again = replace(terms, since=store.now() + 1)
+    again = replace(options, since=store.now() + 1)
     assert run_cell(CELL, store, command(WRITES), again).state == "published", "a later sweep tries it again"
     assert not (store.folder(CELL.key).path / "failed.json").exists()
 
 
 @pytest.mark.parametrize("times", [1, 9])
-def test_a_result_that_cannot_be_written_counts_as_a_failure(store, terms, monkeypatch, times):
+def test_a_result_that_cannot_be_written_counts_as_a_failure(store, options, monkeypatch, times):
     faults = [OSError(errno.ENOSPC, "No space left on device")] * times
 
     def sync(path):
@@ -139,7 +139,7 @@ def test_a_result_that_cannot_be_written_counts_as_a_failure(store, terms, monke
             raise faults.pop()
 
     monkeypatch.setattr("clsplat.sweeps.store.sync_below", sync)
-    outcome = run_cell(CELL, store, command(WRITES), terms)
+    outcome = run_cell(CELL, store, command(WRITES), options)
     if times == 1:
         assert (outcome.state, told(store).count("start")) == ("published", 2)
         return
@@ -148,29 +148,29 @@ def test_a_result_that_cannot_be_written_counts_as_a_failure(store, terms, monke
     assert store.folder(CELL.key).failed()["exit_codes"] == [7] * 3
 
 
-def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, terms):
+def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, options):
     saves = "import sys, pathlib, shutil, os; p = pathlib.Path(sys.argv[2], 'checkpoints'); p.mkdir(exist_ok=True)\n"
     saves += f"left = sorted(pathlib.Path({str(few_steps / CHECKPOINTS)!r}).iterdir())\n"
     saves += "new = [one for one in left if not (p / one.name).exists()]\n"
     saves += "new and shutil.copy(new[0], p)\nos._exit(7)"
     count = len(list((few_steps / CHECKPOINTS).iterdir()))
     assert count > 1
-    assert run_cell(CELL, store, command(saves), replace(terms, retries=2)).state == "failed"
+    assert run_cell(CELL, store, command(saves), replace(options, retries=2)).state == "failed"
     assert told(store).count("start") == count + 2
 
 
-def test_failure_beside_a_newer_damaged_checkpoint_counts(few_steps, store, terms):
+def test_failure_beside_a_newer_damaged_checkpoint_counts(few_steps, store, options):
     old = CellAttempt(store.add(CELL).path / ATTEMPTS / ("a" * 32))
     shutil.copytree(few_steps, old.path)
     newest = max((old.path / CHECKPOINTS).glob("step_*.npz"))
     newest.write_bytes(newest.read_bytes()[:-100])
     starts = "import os, sys; sys.exit(2 if len(os.listdir(os.path.dirname(sys.argv[2]))) > 6 else 6)"
-    assert run_cell(CELL, store, command(starts), terms).exit_code == 6
-    assert told(store).count("start") == terms.retries
+    assert run_cell(CELL, store, command(starts), options).exit_code == 6
+    assert told(store).count("start") == options.retries
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped"])
-def test_attempt_resumes_from_the_newest_intact_checkpoint(few_steps, store, terms, damage):
+def test_attempt_resumes_from_the_newest_intact_checkpoint(few_steps, store, options, damage):
     folder = store.add(CELL)
     old = CellAttempt(folder.path / ATTEMPTS / ("a" * 32))
     shutil.copytree(few_steps, old.path)
@@ -179,7 +179,7 @@ def test_attempt_resumes_from_the_newest_intact_checkpoint(few_steps, store, ter
     data = bytearray(newest.read_bytes())
     data[len(data) // 2] ^= 1
     newest.write_bytes(data if damage == "flipped" else data[:-100])
-    new = folder.begin("b", terms.since)
+    new = folder.begin("b", options.since)
     assert [path.name for path in (new.path / CHECKPOINTS).iterdir()] == [before.name]
     assert new.lease["from"] == before.name
     assert not (new.path / "status.json").exists()
@@ -188,71 +188,71 @@ def test_attempt_resumes_from_the_newest_intact_checkpoint(few_steps, store, ter
     assert not os.path.samefile(old.path / "metrics.jsonl", new.path / "metrics.jsonl"), "a run appends to it"
 
 
-def test_cancelled_cell_saves_and_stops_and_a_later_call_resumes(store, terms):
+def test_cancelled_cell_saves_and_stops_and_a_later_call_resumes(store, options):
     threading.Timer(0.3, store.cancel).start()
-    outcome = run_cell(CELL, store, command(WAITS), terms)
+    outcome = run_cell(CELL, store, command(WAITS), options)
     assert (outcome.state, outcome.exit_code) == ("stopped", 130)
     assert store_status(store.root)["cells"][0]["state"] == "stopped"
-    assert run_cell(CELL, store, command(WRITES), terms).state == "stopped", "it began before"
+    assert run_cell(CELL, store, command(WRITES), options).state == "stopped", "it began before"
     time.sleep(0.02)
-    assert run_cell(CELL, store, command(WRITES), Terms(store.now())).state == "published"
+    assert run_cell(CELL, store, command(WRITES), CellOptions(store.now())).state == "published"
 
 
-def test_cell_is_cancelled_by_name_or_start_of_its_key(store, terms):
+def test_cell_is_cancelled_by_name_or_start_of_its_key(store, options):
     other = replace(CELL, spec={**SPEC, "scene": "t"})
     store.add(CELL)
     store.add(other)
     store.note_sweep("sweep", {"first": CELL.key}, "")
     assert store.cancel("first") == CELL.key == store.cancel(CELL.key[:12])
-    assert store.is_cancelled([CELL.key], terms.since)
-    assert not store.is_cancelled([other.key], terms.since)
+    assert store.is_cancelled([CELL.key], options.since)
+    assert not store.is_cancelled([other.key], options.since)
     with pytest.raises(ConfigError, match="no cell 'x'"):
         store.cancel("x")
 
 
-def test_matrices_of_one_name_keep_their_cells(store, terms):
+def test_matrices_of_one_name_keep_their_cells(store, options):
     changed = replace(CELL, spec={**SPEC, "scene": "t"})
     for cell in (CELL, changed):
         store.add(cell)
         store.note_sweep("sweep", {"first": cell.key}, cell.key)
     assert {cell["name"] for cell in store_status(store.root)["cells"]} == {"first"}
-    with pytest.raises(ConfigError, match="no cell 'first'; 2 cells are named so; give a key"):
+    with pytest.raises(ConfigError, match="no cell 'first'; 2 cells match; give a key"):
         store.cancel("first")
-    run_cell(CELL, store, command(WRITES), terms)
+    run_cell(CELL, store, command(WRITES), options)
     assert store.cancel("first") == changed.key
 
 
-def test_a_run_that_does_not_stop_is_killed(store, terms, monkeypatch):
-    monkeypatch.setattr(child, "PATIENCE", 0.1)
+def test_a_run_that_does_not_stop_is_killed(store, options, monkeypatch):
+    monkeypatch.setattr(child, "STOP_TIMEOUT_S", 0.1)
     deaf = "import time\ntime.sleep(60)"
     began = time.monotonic()
-    assert run_cell(CELL, store, command(deaf), terms, lambda: time.monotonic() > began + 0.3).state == "stopped"
+    assert run_cell(CELL, store, command(deaf), options, lambda: time.monotonic() > began + 0.3).state == "stopped"
     assert store.folder(CELL.key).attempts()[0].exit_code == -9
 
 
-def test_an_attempt_that_was_removed_ends_its_run(store, terms, monkeypatch):
+def test_an_attempt_that_was_removed_ends_its_run(store, options, monkeypatch):
     monkeypatch.setattr("clsplat.sweeps.store.BEAT", 0.0)
     removes = "import shutil, sys, time; shutil.rmtree(sys.argv[2]); time.sleep(60)"
-    outcome = run_cell(CELL, store, command(removes), terms)
+    outcome = run_cell(CELL, store, command(removes), options)
     assert outcome.state == "failed"
-    assert "was removed while its run went on" in outcome.message
+    assert "was removed during its run" in outcome.message
 
 
-def test_process_frozen_until_its_attempt_is_gone_takes_a_result(store, terms, monkeypatch):
+def test_process_frozen_until_its_attempt_is_gone_takes_a_result(store, options, monkeypatch):
     monkeypatch.setattr("clsplat.sweeps.store.BEAT", 0.0)
     folder = store.add(CELL)
-    other = folder.begin("other", terms.since)
+    other = folder.begin("other", options.since)
     (other.path / "point_cloud.ply").write_bytes(b"bits")
     publishes = f"import os, shutil, sys, time; os.rename({str(other.path)!r}, {str(folder.result)!r})\n"
     other.manifest()
-    outcome = run_cell(CELL, store, command(publishes + "shutil.rmtree(sys.argv[2]); time.sleep(60)"), terms)
+    outcome = run_cell(CELL, store, command(publishes + "shutil.rmtree(sys.argv[2]); time.sleep(60)"), options)
     assert outcome.state == "published"
     assert told(store) == ["start", "skip"]
 
 
-def test_process_frozen_after_its_run_takes_the_result(store, terms, monkeypatch):
+def test_process_frozen_after_its_run_takes_the_result(store, options, monkeypatch):
     folder = store.add(CELL)
-    other = folder.begin("other", terms.since)
+    other = folder.begin("other", options.since)
     (other.path / "point_cloud.ply").write_bytes(b"bits")
     other.manifest()
 
@@ -261,61 +261,61 @@ def test_process_frozen_after_its_run_takes_the_result(store, terms, monkeypatch
         shutil.rmtree(attempt.path)
 
     monkeypatch.setattr("clsplat.sweeps.task._require_same_scene", sleeps)
-    outcome = run_cell(CELL, store, command(WRITES), terms)
+    outcome = run_cell(CELL, store, command(WRITES), options)
     assert (outcome.state, outcome.message) == ("published", "")
     assert told(store) == ["start", "end", "skip"]
     assert not folder.attempts()
 
 
-def test_a_copy_of_a_result_gets_its_manifest_last(store, terms, tmp_path, monkeypatch):
-    run_cell(CELL, store, command(WRITES), terms)
+def test_a_copy_of_a_result_gets_its_manifest_last(store, options, tmp_path, monkeypatch):
+    run_cell(CELL, store, command(WRITES), options)
     result, copied = store.folder(CELL.key).result, []
     for name in "abcdefgh":
         (result / name).touch()
     for module in ("store", "batch"):
         monkeypatch.setattr(f"clsplat.sweeps.{module}.link_or_copy", lambda _, target: copied.append(target.name))
-    place_copy(result, tmp_path / "copy")
+    copy_result(result, tmp_path / "copy")
     assert copied[-1] == MANIFEST != copied[-2]
 
 
-def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):
+def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, options):
     folder = store.add(CELL)
-    old, young = folder.begin("a", terms.since), folder.begin("b", terms.since)
+    old, young = folder.begin("a", options.since), folder.begin("b", options.since)
     folder.collect(store.now() + 1e6)
     assert old.path.is_dir(), "nothing is published"
     os.utime(old.path / LEASE, (store.now() - 601, store.now() - 601))
-    run_cell(CELL, store, command(WRITES), terms)
+    run_cell(CELL, store, command(WRITES), options)
     assert not old.path.exists()
     assert young.path.is_dir()
     os.utime(young.path / LEASE, (store.now() - 601, store.now() - 601))
-    run_cell(CELL, store, command(WRITES), terms)
+    run_cell(CELL, store, command(WRITES), options)
     assert not young.path.exists(), "the next call finds the result, and that"
 
 
-def test_a_damaged_spec_is_written_again(store, terms):
+def test_a_damaged_spec_is_written_again(store, options):
     folder = store.add(CELL)
     (folder.path / "spec.json").write_text('{"pipe')
-    assert run_cell(CELL, store, command(WRITES), terms).state == "published"
+    assert run_cell(CELL, store, command(WRITES), options).state == "published"
     assert json.loads((folder.path / "spec.json").read_text()) == SPEC
 
 
 def test_a_spec_is_never_changed(store):
     folder = store.add(CELL)
-    with pytest.raises(OutputError, match="is of another cell"):
+    with pytest.raises(OutputError, match="belongs to another cell"):
         folder.write_spec({**SPEC, "seed": 1})
 
 
-def test_a_store_that_moved_goes_on(few_steps, store, terms, tmp_path):
+def test_a_store_that_moved_goes_on(few_steps, store, options, tmp_path):
     folder = store.add(CELL)
-    shutil.copytree(few_steps / CHECKPOINTS, folder.begin("a", terms.since).path / CHECKPOINTS)
+    shutil.copytree(few_steps / CHECKPOINTS, folder.begin("a", options.since).path / CHECKPOINTS)
     moved = Store(tmp_path / "moved")
     store.root.rename(moved.root)
-    assert moved.add(CELL).begin("b", terms.since).lease["from"] == "step_000012.npz"
+    assert moved.add(CELL).begin("b", options.since).lease["from"] == "step_000012.npz"
 
 
-def test_undistorted_photographs_are_shared_by_cells_of_a_scene(store, terms):
+def test_undistorted_photographs_are_shared_by_cells_of_a_scene(store, options):
     cells = [CELL, replace(CELL, spec={**SPEC, "seed": 1}), replace(CELL, spec={**SPEC, "scene": "another"})]
-    assert {run_cell(cell, store, command(UNDISTORTS), terms).state for cell in cells} == {"published"}
+    assert {run_cell(cell, store, command(UNDISTORTS), options).state for cell in cells} == {"published"}
     results = [store.folder(cell.key).result for cell in cells]
     assert [(result / "told.txt").read_text() for result in results] == ["made", "was there", "made"]
     assert len([*store.root.glob("undistorted/*/a.png")]) == 2
@@ -324,55 +324,55 @@ def test_undistorted_photographs_are_shared_by_cells_of_a_scene(store, terms):
     assert undistorted_folder(store.root / "run") == store.root / "run" / "undistorted", "that is no link"
 
 
-def test_the_longest_cell_is_first_and_a_lost_one_starts_again(store, terms):
+def test_the_longest_cell_is_first_and_a_lost_one_starts_again(store, options):
     done = Outcome("published")
     engine = Fake(CellLost, done, done, done)
     ended = []
-    Drive(store, engine, True, terms, ended=lambda cell, outcome: ended.append(cell.name)).run(wanted(1, 3, 2))
+    Dispatcher(store, engine, True, options, ended=lambda cell, outcome: ended.append(cell.name)).run(wanted(1, 3, 2))
     assert [name for name, *_ in engine.started] == ["3", "3", "2", "1"]
     assert ended == ["3", "2", "1"]
 
 
-PLACES = (DeviceSlot("w", "one", "x"), DeviceSlot("w", "two", "y"), DeviceSlot("w", "three", "y"))
+SLOTS = (DeviceSlot("w", "one", "x"), DeviceSlot("w", "two", "y"), DeviceSlot("w", "three", "y"))
 
 
-def test_a_sweep_stays_in_the_bits_class_of_most_devices(store, terms):
-    engine = Fake(*[Outcome("published")] * 3, places=PLACES)
-    Drive(store, engine, True, terms).run(wanted(1, 2, 3))
+def test_a_sweep_stays_in_the_bits_class_of_most_devices(store, options):
+    engine = Fake(*[Outcome("published")] * 3, slots=SLOTS)
+    Dispatcher(store, engine, True, options).run(wanted(1, 2, 3))
     assert {bits for *_, bits in engine.started} == {"y"}
 
 
-def test_in_any_class_a_cell_stays_in_that_it_has_begun_in(store, terms):
+def test_in_any_class_a_cell_stays_in_that_it_has_begun_in(store, options):
     (one,) = wanted(9)
     store.add(one.on("x"))
-    engine = Fake(*[Outcome("published")] * 4, places=PLACES)
-    Drive(store, engine, False, terms).run([one, *wanted(1, 2, 3)])
+    engine = Fake(*[Outcome("published")] * 4, slots=SLOTS)
+    Dispatcher(store, engine, False, options).run([one, *wanted(1, 2, 3)])
     assert engine.started[0] == ("9", "one", "x")
     assert {bits for *_, bits in engine.started[1:]} == {"x", "y"}
 
 
 @pytest.mark.parametrize("published", ["x", "y", None])
-def test_of_equal_classes_that_with_most_results_is_taken(store, terms, published):
+def test_of_equal_classes_that_with_most_results_is_taken(store, options, published):
     for one in wanted(1, 2) if published else []:
-        run_cell(one.on(published), store, command(WRITES), terms)
-    engine = Fake(*[Outcome("published")] * 3, places=PLACES[1::-1])
-    Drive(store, engine, True, terms).run(wanted(1, 2, 3))
+        run_cell(one.on(published), store, command(WRITES), options)
+    engine = Fake(*[Outcome("published")] * 3, slots=SLOTS[1::-1])
+    Dispatcher(store, engine, True, options).run(wanted(1, 2, 3))
     assert {bits for *_, bits in engine.started} == {published or "x"}
 
 
-def test_sweep_whose_class_has_no_device_left_names_the_others(store, terms, monkeypatch):
-    monkeypatch.setattr("clsplat.sweeps.engines.ALONE", 0.2)
-    drive = Drive(store, Fake(places=PLACES), True, terms, bits="z")
+def test_sweep_whose_class_has_no_device_left_names_the_others(store, options, monkeypatch):
+    monkeypatch.setattr("clsplat.sweeps.engines.NO_DEVICE_TIMEOUT_S", 0.2)
+    drive = Dispatcher(store, Fake(slots=SLOTS), True, options, bits="z")
     looks = iter(range(40))
     drive.is_stopped = lambda: next(looks) == 39
     with pytest.raises(DeviceError, match=r"no device of bits class z for .* of x, y; offer one of that class"):
         drive.run(wanted(1))
 
 
-def test_what_runs_costs_no_look_at_the_cells_that_wait(store, terms, monkeypatch):
+def test_what_runs_costs_no_look_at_the_cells_that_wait(store, options, monkeypatch):
     looks = []
-    suits = Drive._suits
-    monkeypatch.setattr(Drive, "_suits", lambda *values: looks.append(1) or suits(*values))
+    suits = Dispatcher._fits
+    monkeypatch.setattr(Dispatcher, "_fits", lambda *values: looks.append(1) or suits(*values))
     engine = Fake()
 
     def start(*values):
@@ -380,18 +380,18 @@ def test_what_runs_costs_no_look_at_the_cells_that_wait(store, terms, monkeypatc
         return type("Ticket", (), {"outcome": lambda self: ends.pop(0)})()
 
     engine.start = start
-    Drive(store, engine, False, terms).run(wanted(*range(5)))
+    Dispatcher(store, engine, False, options).run(wanted(*range(5)))
     assert len(looks) == 5
 
 
-def test_a_device_that_suits_no_cell_is_asked_once(store, terms, monkeypatch):
+def test_a_device_that_suits_no_cell_is_asked_once(store, options, monkeypatch):
     looks = []
-    suits = Drive._suits
+    suits = Dispatcher._fits
     monkeypatch.setattr(
-        Drive, "_suits", lambda drive, one, place, _: looks.append(place.bits) or suits(drive, one, place, _)
+        Dispatcher, "_fits", lambda drive, one, slot, _: looks.append(slot.bits) or suits(drive, one, slot, _)
     )
-    monkeypatch.setattr("clsplat.sweeps.engines.LOOK", 0.0)
-    engine, begun = Fake(places=PLACES[:2]), wanted(*range(5))
+    monkeypatch.setattr("clsplat.sweeps.engines.POLL_INTERVAL_S", 0.0)
+    engine, begun = Fake(slots=SLOTS[:2]), wanted(*range(5))
     for one in begun:
         store.add(one.on("x"))
 
@@ -400,27 +400,27 @@ def test_a_device_that_suits_no_cell_is_asked_once(store, terms, monkeypatch):
         return type("Ticket", (), {"outcome": lambda self: ends.pop(0)})()
 
     engine.start = start
-    Drive(store, engine, False, terms).run(begun)
+    Dispatcher(store, engine, False, options).run(begun)
     assert looks.count("y") == 4, "one look at each cell that waits"
 
 
-def test_a_signal_stops_a_sweep(store, terms):
-    with pytest.raises(Interrupted, match="with --resume goes on"):
-        Drive(store, Fake(), True, terms, is_stopped=lambda: True).run(wanted(1))
+def test_a_signal_stops_a_sweep(store, options):
+    with pytest.raises(Interrupted, match="and --resume"):
+        Dispatcher(store, Fake(), True, options, is_stopped=lambda: True).run(wanted(1))
 
 
-def test_the_engine_of_this_process_runs_a_cell(store, terms, monkeypatch):
+def test_the_engine_of_this_process_runs_a_cell(store, options, monkeypatch):
     monkeypatch.setattr("clsplat.sweeps.engines.run_command", lambda device, plugins: command(WRITES))
-    engine = InlineEngine(store, PLACES[0], lambda: False)
-    ticket = engine.start(CELL, PLACES[0], terms)
+    engine = InlineEngine(store, SLOTS[0], lambda: False)
+    ticket = engine.start(CELL, SLOTS[0], options)
     assert ticket.outcome().state == "published"
 
 
-def test_the_state_of_a_store_is_in_its_files(store, terms):
+def test_the_state_of_a_store_is_in_its_files(store, options):
     cells = [replace(CELL, name=name, spec={**SPEC, "scene": name}) for name in ("done", "bad", "on", "new")]
-    run_cell(cells[0], store, command(WRITES), terms)
-    run_cell(cells[1], store, command("raise SystemExit(2)"), terms)
-    store.add(cells[2]).begin("w", terms.since)
+    run_cell(cells[0], store, command(WRITES), options)
+    run_cell(cells[1], store, command("raise SystemExit(2)"), options)
+    store.add(cells[2]).begin("w", options.since)
     store.add(cells[3])
     store.note_sweep("sweep", {cell.name: cell.key for cell in cells}, "")
     found = store_status(store.root)
@@ -431,7 +431,7 @@ def test_the_state_of_a_store_is_in_its_files(store, terms):
         "new": "waiting",
     }
     text = overview_text(found)
-    store.folder(cells[1].key).begin("w", terms.since)
+    store.folder(cells[1].key).begin("w", options.since)
     assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it is tried again"
     store.folder(cells[1].key).give_up(2, "of another process, which has tried it too")
     assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it runs still"

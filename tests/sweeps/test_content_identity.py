@@ -13,7 +13,7 @@ from clsplat.pipeline.input_files import content_of, contents
 from clsplat.pipeline.loading import load
 from clsplat.stages.video import Video
 from clsplat.sweeps import cell as fingerprint
-from clsplat.sweeps.batch import wanted_cell
+from clsplat.sweeps.batch import pending_cell
 from clsplat.sweeps.cell import CellRun, Scenes
 from clsplat.sweeps.task import run_cell
 from tests.support.cells import CELL, WRITES, command, keys
@@ -79,11 +79,11 @@ def test_the_name_of_a_camera_path_is_no_file(tmp_path, monkeypatch):
 
 
 def test_a_sweep_names_its_cells_as_they_are_named_here(tiny_scene, store, tmp_path):
-    found = wanted_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
+    found = pending_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
     assert found.on("b").key == keys("smoke", tiny_scene, tmp_path)
 
 
-def test_a_cell_reads_the_same_files_in_whatever_folder_it_runs(tiny_scene, store, terms, tmp_path, monkeypatch):
+def test_a_cell_reads_the_same_files_in_whatever_folder_it_runs(tiny_scene, store, options, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     for folder, text in ((tmp_path, b"of the sweep"), (tmp_path / "elsewhere", b"of the worker")):
         (folder / "m.ply").write_bytes(text)
@@ -95,18 +95,18 @@ def test_a_cell_reads_the_same_files_in_whatever_folder_it_runs(tiny_scene, stor
     assert Path(placed.stages[0].file) == tmp_path / "m.ply"
     assert Path(placed.scene.path).samefile(tiny_scene)
     reads = "import sys, pathlib; assert '" + str(tmp_path / "m.ply") + "' in pathlib.Path(sys.argv[1]).read_text()"
-    assert run_cell(cell, store, command(reads), terms).state == "published"
+    assert run_cell(cell, store, command(reads), options).state == "published"
     (tmp_path / "m.ply").write_bytes(b"another")
-    outcome = run_cell(replace(cell, spec={**cell.spec, "bits": "c"}), store, command(WRITES), terms)
+    outcome = run_cell(replace(cell, spec={**cell.spec, "bits": "c"}), store, command(WRITES), options)
     assert (outcome.state, outcome.exit_code) == ("failed", 3)
     assert f"{tmp_path / 'm.ply'} is not what it was where the sweep began" in outcome.message
 
 
-def test_a_file_that_changes_while_a_cell_runs_fails_it(store, terms, tmp_path):
+def test_a_file_that_changes_while_a_cell_runs_fails_it(store, options, tmp_path):
     file = write(tmp_path / "m.ply", "as it was")
     cell = replace(CELL, files={str(file): content_of(file)})
     changes = f"import pathlib; pathlib.Path({str(file)!r}).write_text('another')"
-    outcome = run_cell(cell, store, command(changes), terms)
+    outcome = run_cell(cell, store, command(changes), options)
     assert (outcome.state, outcome.exit_code) == ("failed", 3)
 
 

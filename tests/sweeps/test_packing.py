@@ -13,7 +13,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.sweeps import devices
 from clsplat.sweeps.child import supervise
-from clsplat.sweeps.devices import places, shares_of
+from clsplat.sweeps.devices import find_slots, split_device_cores
 from clsplat.sweeps.store import CellAttempt
 
 CPU = DeviceInfo("a", "b", "CPU", "1", 4, 1 << 30, 1 << 29, 1 << 15, 64, 8, (0, 0))
@@ -36,10 +36,10 @@ def test_threads_match_cores_and_devices_need_no_second_check(monkeypatch):
 
 def test_only_cpus_are_shared_by_as_many_runs_as_cores(monkeypatch):
     monkeypatch.setattr(machine, "usable_cores", lambda: tuple(range(4)))
-    assert shares_of([CPU, GPU], 4) == [machine.split_cores(range(4), 4), [()]]
-    assert shares_of([CPU], 1) == [[()]], "kept to no cores"
-    with pytest.raises(ConfigError, match=r"execution.packing: 5 runs cannot share 4 cores; expected fewer"):
-        shares_of([CPU], 5)
+    assert split_device_cores([CPU, GPU], 4) == [machine.split_cores(range(4), 4), [()]]
+    assert split_device_cores([CPU], 1) == [[()]], "kept to no cores"
+    with pytest.raises(ConfigError, match=r"execution.packing: 5 runs cannot share 4 cores; set at most 4"):
+        split_device_cores([CPU], 5)
 
 
 def test_each_run_that_shares_a_device_is_a_place_of_its_own(monkeypatch):
@@ -47,10 +47,10 @@ def test_each_run_that_shares_a_device_is_a_place_of_its_own(monkeypatch):
     monkeypatch.setattr(devices, "list_devices", lambda: [CPU])
     monkeypatch.setattr(devices, "choose", lambda name: CPU)
     monkeypatch.setattr(devices, "bits_class", lambda info, infos: "b")
-    found = places("local", ["a"], 2)
-    assert [place.cores for place in found] == [(0, 1), (2, 3)]
+    found = find_slots("local", ["a"], 2)
+    assert [slot.cores for slot in found] == [(0, 1), (2, 3)]
     assert len({*found}) == 2
-    assert len({place.device for place in found}) == 1
+    assert len({slot.device for slot in found}) == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system keeps no process to cores")

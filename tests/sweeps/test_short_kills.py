@@ -7,11 +7,11 @@ import pytest
 
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Cell
-from clsplat.sweeps.batch import wanted_cell
+from clsplat.sweeps.batch import pending_cell
 from clsplat.sweeps.cell import Scenes
 from clsplat.sweeps.child import FILE, OUT, PYTHON
 from clsplat.sweeps.store import Store
-from clsplat.sweeps.task import Terms, run_cell
+from clsplat.sweeps.task import CellOptions, run_cell
 from tests.support.runs import FEW
 
 pytestmark = pytest.mark.slow
@@ -21,7 +21,7 @@ import os, signal, sys
 from clsplat.training import checkpoint
 save = checkpoint.save
 
-def killed(run, *more):  # by whatever kills without a word, at a place that does not depend on time
+def killed(run, *more):  # by whatever kills without a word, at a slot that does not depend on time
     begun_anew, path = run.step == 4, save(run, *more)
     if begun_anew:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -35,12 +35,12 @@ main()
 
 
 def test_killed_run_resumes_and_its_cell_has_undisturbed_bits(
-    tiny_scene: Path, few_steps: Path, store: Store, terms: Terms
+    tiny_scene: Path, few_steps: Path, store: Store, options: CellOptions
 ):
     """CLSPLAT_KILLS=20 kills workers, runs, drivers and schedulers, over six cells."""
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
-    cell = wanted_cell(Cell("few", checked), Scenes(store.prepared), store).on("b")
-    outcome = run_cell(cell, store, [PYTHON, "-c", RUN, FILE, OUT], terms)
+    cell = pending_cell(Cell("few", checked), Scenes(store.prepared), store).on("b")
+    outcome = run_cell(cell, store, [PYTHON, "-c", RUN, FILE, OUT], options)
     assert outcome.state == "published", outcome.message
     ends = [event["exit_code"] for event in store.events() if event["event"] == "end"]
     begun = [event["from"] for event in store.events() if event["event"] == "start"]

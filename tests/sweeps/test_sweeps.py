@@ -20,18 +20,18 @@ from clsplat.sweeps import batch, engines
 from clsplat.sweeps import batch as single
 from clsplat.sweeps.cell import CellRun, code_digest
 from clsplat.sweeps.devices import DeviceSlot
-from clsplat.sweeps.engines import Drive, Wanted
+from clsplat.sweeps.engines import Dispatcher, PendingCell
 from clsplat.sweeps.experiment import Job
 from clsplat.sweeps.status import store_status
 from clsplat.sweeps.store import Store
-from clsplat.sweeps.task import Terms
+from clsplat.sweeps.task import CellOptions
 from tests.support.cells import SPEC, WRITES, command
 from tests.support.commands import clsplat
 from tests.support.pipelines import STAGES
 
 psutil = pytest.importorskip("psutil", exc_type=ImportError)  # of Dask
 
-PLACE = DeviceSlot("inline", "a device", "b")
+SLOT = DeviceSlot("inline", "a device", "b")
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def runs(few_steps: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     monkeypatch.setattr(engines, "run_command", run_command)
     monkeypatch.setattr(single, "run_command", run_command)
     for module in (batch, single):
-        monkeypatch.setattr(module, "places", lambda worker, devices=None: [PLACE])
+        monkeypatch.setattr(module, "find_slots", lambda worker, devices=None: [SLOT])
     return ends
 
 
@@ -113,7 +113,9 @@ def test_run_continued_in_a_matrix_folder_is_not_shown_as_cell(file, runs, few_s
     pipeline.unlink()
     pipeline.write_text((few_steps / "pipeline.yaml").read_text() + "# trained for longer\n")
     (one / "checkpoints" / "step_000020.npz").write_bytes(b"later")
-    with pytest.raises(ClsplatError, match=r"seed=0: was trained on with other settings .*; move that folder") as error:
+    with pytest.raises(
+        ClsplatError, match=r"seed=0: the run was continued with other settings .*; move that folder"
+    ) as error:
         commands.run(file, out=out, start="resume")
     assert error.value.exit_code == 2
     assert "# trained" in pipeline.read_text(), "it stays"
@@ -146,7 +148,7 @@ def test_a_queue_runs_a_cell_by_its_number(file, runs, tmp_path):
     assert sweeps.run_cell(file, tmp_path / "store", index=1) == result
     spec = json.loads((result.parent / "spec.json").read_text())
     assert (spec["pipeline"]["seed"], spec["bits"]) == (1, "b")
-    with pytest.raises(ConfigError, match="expected --index from 0 to 1"):
+    with pytest.raises(ConfigError, match="--index 0 to 1"):
         sweeps.run_cell(file, tmp_path / "store")
     runs["seed: 0"] = 6
     with pytest.raises(ClsplatError, match="cell tiny-seed=0: its process ended with exit code 6") as error:
@@ -267,7 +269,7 @@ def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
 
 def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeypatch):
     pytest.importorskip("clsplat.sweeps.dask")
-    monkeypatch.setattr("clsplat.sweeps.dask.places", lambda *words: pytest.fail("a device is proved"))
+    monkeypatch.setattr("clsplat.sweeps.dask.find_slots", lambda *words: pytest.fail("a device is proved"))
     with pytest.raises(ConfigError, match=r"tls.ca \(--tls-ca\): gone.pem"):
         sweeps.run_worker("tls://127.0.0.1:1", tls=("gone.pem", authority.cert, authority.key))
 
@@ -306,9 +308,9 @@ class FakeClient:
 
 def test_workers_of_another_version_alone_end_a_sweep(tmp_path, monkeypatch):
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
-    monkeypatch.setattr(scheduler, "ALONE", -1.0)
+    monkeypatch.setattr(scheduler, "NO_DEVICE_TIMEOUT_S", -1.0)
     with pytest.raises(DeviceError, match=r"no worker of this version for .* \(1 of another version get no cells\)"):
-        scheduler.Cluster(FakeClient(old="another"), Store(tmp_path)).places()
+        scheduler.Cluster(FakeClient(old="another"), Store(tmp_path)).slots()
 
 
 @pytest.mark.parametrize("starter", ["nobody", "this machine"])
@@ -316,21 +318,21 @@ def test_a_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, start
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     client, sent = FakeClient(), []
     monkeypatch.setattr(client, "submit", lambda *words, **options: sent.append(options["workers"]))
-    found, starts = [PLACE] if starter == "this machine" else None, starter != "nobody"
+    found, starts = [SLOT] if starter == "this machine" else None, starter != "nobody"
     scheduler.Cluster(client, Store(tmp_path), object() if starts else None, found).start(
-        CellRun("a", SPEC, ""), PLACE, Terms(0.0)
+        CellRun("a", SPEC, ""), SLOT, CellOptions(0.0)
     )
-    assert sent == [None if found else [PLACE.worker]], "the workers of this machine have the same devices"
+    assert sent == [None if found else [SLOT.worker]], "the workers of this machine have the same devices"
 
 
 def test_a_worker_that_is_gone_gets_no_cell(tmp_path):
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     client = FakeClient(one=code_digest())
     cluster = scheduler.Cluster(client, Store(tmp_path))
-    assert [place.worker for place in cluster.places()] == ["one"]
+    assert [slot.worker for slot in cluster.slots()] == ["one"]
     client.info = {"workers": {}}
-    cluster._looked = -scheduler.LOOK
-    assert cluster.places() == []
+    cluster._looked = -scheduler.WORKERS_INTERVAL_S
+    assert cluster.slots() == []
 
 
 def test_a_scheduler_that_ended_is_told_with_what_to_do(tmp_path):
@@ -338,7 +340,7 @@ def test_a_scheduler_that_ended_is_told_with_what_to_do(tmp_path):
     client = FakeClient()
     cluster = scheduler.Cluster(client, Store(tmp_path))
     client.info, client.status = {}, "closed"
-    for call in (cluster.places, lambda: cluster.start(CellRun("a", SPEC, ""), PLACE, Terms(0.0))):
+    for call in (cluster.slots, lambda: cluster.start(CellRun("a", SPEC, ""), SLOT, CellOptions(0.0))):
         with pytest.raises(DeviceError, match=r"the scheduler ended; .* with --resume"):
             call()
 
@@ -355,15 +357,15 @@ def listening() -> set[str]:
 def test_local_engine_runs_cells_in_parallel_on_loopback_alone(tmp_path, monkeypatch):
     scheduler = pytest.importorskip("clsplat.sweeps.dask")
     library = pytest.importorskip("clsplat.sweeps.dask")
-    places = [DeviceSlot("local", "one", "b"), DeviceSlot("local", "two", "b")]
-    monkeypatch.setattr(scheduler, "places", lambda worker, devices, packing: places)
+    slots = [DeviceSlot("local", "one", "b"), DeviceSlot("local", "two", "b")]
+    monkeypatch.setattr(scheduler, "find_slots", lambda worker, devices, packing: slots)
     store, ended, seen = Store(tmp_path / "store"), [], set()
     before = {key: library.dask.config.get(key) for key in library.SETTINGS}
     cluster = scheduler.engine(Execution(engine="local"), store, None)
     try:
         cluster.command_of = lambda device: command(WRITES + f"; print({device!r})")
-        cells = [Wanted(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), i) for i in range(4)]
-        drive = Drive(store, cluster, True, Terms(store.now()), ended=lambda *end: ended.append(end))
+        cells = [PendingCell(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), i) for i in range(4)]
+        drive = Dispatcher(store, cluster, True, CellOptions(store.now()), ended=lambda *end: ended.append(end))
         drive.look = lambda: seen.update(listening())
         drive.run(cells)
     finally:
@@ -380,7 +382,7 @@ def test_a_cell_whose_spec_was_changed_fails_alone(file, runs, tmp_path):
     (key,) = [cells["tiny-seed=1"] for _, cells in store.sweeps()]
     (store.folder(key).path / "spec.json").write_text("{}")
     runs["seed"] = "no cell is run again"
-    with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .*remove .*: its cell runs"):
+    with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .*remove .* to run it again"):
         commands.run(file, out=tmp_path / "out", start="resume")
 
 
@@ -398,5 +400,5 @@ def test_damaged_records_of_a_store_do_not_stop_who_looks(file, runs, tmp_path):
 
 
 def test_a_single_pipeline_has_no_cell_by_number(runs, tmp_path):
-    with pytest.raises(ConfigError, match="leave --index out"):
+    with pytest.raises(ConfigError, match="remove --index"):
         single.run_one("smoke", tmp_path / "store", index=1)
