@@ -375,10 +375,7 @@ def convert(
     out: PathLike,
     *,
     sh_degree: int | None = None,
-    sh_bits: str | None = None,
-    axes: Literal["spz", "ply"] = "spz",
     quality: Literal["small", "balanced", "high"] = "balanced",
-    keep_nan: bool = False,
     crop: str | Sequence[float] | None = None,
     transform: str | None = None,
     drop_below: float = 0.0,
@@ -387,9 +384,8 @@ def convert(
 ) -> dict[str, Any]:
     """Merge models and write them as one file, in the format of its name; return `format`, `gaussians`, `bytes`.
 
-    sh_bits: SPZ, such as "8/6"; axes: of SPZ files that are read or, if none is, written; crop: x0, y0, z0, x1, y1, z1
-    in scene units, after `transform`, such as "scale=2 rotate=90,0,0" (degrees); drop_below: an opacity.  Gaussians
-    that are not finite are dropped unless `keep_nan`.
+    crop: x0, y0, z0, x1, y1, z1 in scene units, after `transform`, such as "scale=2 rotate=90,0,0" (degrees);
+    drop_below: an opacity.  Gaussians that are not finite are dropped.
     time: write a moving model as a static one, at this time from 0 to 1; frames: write this number of files, one per
     timestamp: `out` is a folder, for PLY, or a file name to which the numbers are added.
     """
@@ -401,7 +397,6 @@ def convert(
     for file in files:
         refuse_field(file)
     box = crop if isinstance(crop, str) or crop is None else ",".join(map(str, crop))
-    options = conversion.ConversionOptions(sh_bits, axes, quality, keep_nan)
     changes = conversion.Changes(
         drop_below,
         None if transform is None else conversion.parse_transform(transform),
@@ -410,8 +405,8 @@ def convert(
         check_time(time),
     )
     if frames is not None:
-        return convert_frames(files, Path(out), frames, changes, options)
-    return conversion.convert(files, Path(out), changes, options)
+        return convert_frames(files, Path(out), frames, changes, quality)
+    return conversion.convert(files, Path(out), changes, quality)
 
 
 # Pages about runs and models.

@@ -131,18 +131,9 @@ def convert(
         typer.Argument(metavar="IN… OUT", help="Models to merge, and the file to write; its name sets the format."),
     ],
     sh_degree: Annotated[int | None, typer.Option(metavar="N", help="Highest SH degree to keep.")] = None,
-    sh_bits: Annotated[
-        str | None, typer.Option(metavar="A/B", help="SPZ: bits of SH band 1 and of the others; default: by --quality.")
-    ] = None,
-    axes: Annotated[
-        Literal["spz", "ply"], typer.Option(help="Axes of the SPZ files: right, up, back (spz), or as in a PLY.")
-    ] = "spz",
     quality: Annotated[
         Literal["small", "balanced", "high"], typer.Option(help="SPZ, SOG: precision of the values.")
     ] = "balanced",
-    keep_nan: Annotated[
-        bool, typer.Option("--keep-nan", help="PLY: keep Gaussians that are not finite or too large.")
-    ] = False,
     crop: Annotated[
         str | None, typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep the Gaussians in this box, after --transform.")
     ] = None,
@@ -166,10 +157,7 @@ def convert(
         files[:-1],
         files[-1],
         sh_degree=sh_degree,
-        sh_bits=sh_bits,
-        axes=axes,
         quality=quality,
-        keep_nan=keep_nan,
         crop=crop,
         transform=transform,
         drop_below=drop_below,

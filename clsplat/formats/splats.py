@@ -125,7 +125,6 @@ class SplatFile:
 class Reading:
     """Options for reading that a file does not determine itself."""
 
-    axes: Literal["spz", "ply"] = "spz"  # of an SPZ file: those of its specification, or those of a PLY
     not_finite: Literal["refuse", "drop", "keep"] = "refuse"  # Gaussians with NaN or infinity
     quiet: bool = False  # do not log about the axes of an SPZ file
 
@@ -134,10 +133,6 @@ class Reading:
 class Writing:
     """Options for writing a model."""
 
-    sh_bits: tuple[int, int] | None = None  # SPZ: bits of band 1 and of the others, 1 to 8; None: by `quality`
-    axes: Literal["spz", "ply"] = (
-        "spz"  # SPZ: those of its specification, or those of a PLY, for readers that expect them
-    )
     quality: Quality = "balanced"  # SPZ and SOG
     quiet: bool = False  # do not warn about what the format does not store
 

@@ -7,7 +7,7 @@
                511 |c| sqrt 2 (versions 1, 2: x y z as 127.5 c + 127.5, where w >= 0)
     harmonics  128 f + 128, coefficient-major, to 1/2^(bits - 1)
 
-Axes are x right, y up, z back.  Some programs keep those of the PLY, and the file does not say which: see `axes`.
+Axes are x right, y up, z back.  Some programs keep those of the PLY, and the file does not say which.
 """
 
 import io
@@ -71,7 +71,6 @@ COLOR = 0.15
 MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # fractional bits of positions; the second for quality `high`
 ROWS = 1 << 13  # rows decoded at once, to limit temporary memory
-WHOLE = (8, 8)  # bits of SH coefficients
 # steps of SH coefficients, in levels of 256: for a Gaussian of median weight, typical and at most; at most for any
 MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
 LARGEST_STEP = {"small": 128.0, "balanced": 64.0, "high": 1.0}
@@ -191,7 +190,7 @@ def packed(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: in
     sh_steps = _sh_steps(p["sh_rest"], weights, options)
     order = np.argsort(sh_steps, kind="stable")
     p, weights = {name: table[order] for name, table in p.items()}, weights[order]
-    harmonics, base = _rounded_sh(p, sh_steps[order], options.sh_bits)
+    harmonics, base = _rounded_sh(p, sh_steps[order])
     levels = {
         "alphas": 255 * opacities(p["logit_opacity"]),
         "colors": 255 * (COLOR * base.astype(np.float64) + 0.5),
@@ -233,30 +232,26 @@ def _rotations(quats: NDArray[np.float32], step: int) -> bytes:
 
 
 def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: Writing) -> NDArray[np.float32]:
-    """Return the SH step of each Gaussian, [N] levels; 1 for all if `sh_bits` is given or nothing is rounded."""
+    """Return the SH step of each Gaussian, [N] levels; 1 for all if nothing is rounded."""
     most = LARGEST_STEP[options.quality]
-    if options.sh_bits or most == 1 or not rest.shape[1]:
+    if most == 1 or not rest.shape[1]:
         return np.ones(len(rest), np.float32)
     return quantization_steps(weights, usual_step(rest, *MEDIAN_STEP[options.quality]), most)
 
 
-def _rounded_sh(
-    p: Parameters, sh_steps: NDArray[np.float32], bits: tuple[int, int] | None
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Round SH to levels, 128 for 0: multiples of each Gaussian's step, or of 2^(8 - bits).
+def _rounded_sh(p: Parameters, sh_steps: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Round SH to levels, 128 for 0: multiples of each Gaussian's step.
 
     Also returns band 0, corrected for the rounding errors.
     """
     rest = p["sh_rest"]
     levels = np.clip(rest, -1, 1) * np.float32(128)
-    if bits is None and sh_steps.max(initial=1) > 1:
+    if sh_steps.max(initial=1) > 1:
         form = visible_form(rest)
         rounded = np.clip(round_sh(levels, sh_steps, form), -128, 128 - sh_steps[:, None])
         base = compensate_base(p["sh_base"], rest - rounded / 128, form)
     else:
-        columns = np.full(rest.shape[1], 2.0 ** (8 - (bits or WHOLE)[1]), np.float32)
-        columns[:9] = 2.0 ** (8 - (bits or WHOLE)[0])
-        rounded, base = np.rint(levels / columns) * columns, p["sh_base"]
+        rounded, base = np.rint(levels), p["sh_base"]
     return np.asarray(np.clip(rounded + 128, 0, 255), np.uint8), base
 
 
@@ -331,11 +326,11 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
     header, parameters = _unpacked_4(path, data) if data[:4] == MAGIC else _unpacked(path, data)
     if header.degree > MAX_DEGREE:
         LOG.warning("%s: dropped the bands of SH degree 4", path)
-    if options.axes == "spz":
-        flip_axes_in_place(parameters)
-    if options.axes == "spz" and not options.quiet:
+    flip_axes_in_place(parameters)
+    if not options.quiet:
         LOG.info(
-            "%s: read with the axes of SPZ; if the model is upside down, use `clsplat convert --axes ply`",
+            "%s: read with the axes of SPZ; if the model is upside down, use "
+            "`clsplat convert --transform 'rotate=180,0,0'`",
             path,
         )
     return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default")
@@ -351,7 +346,7 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     weights = log_weights(p, splats.has_sky)
     fraction = fraction_of(path, p["means"], options.quality == "high")
-    planes = packed(path, flip_axes(p) if options.axes == "spz" else p, weights, fraction, options)
+    planes = packed(path, flip_axes(p), weights, fraction, options)
     numbers = (WRITTEN_VERSION, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
     return write_bytes(path, _gzip(MAGIC + struct.pack("<2I4B", *numbers, 0) + b"".join(planes)))
 

@@ -66,8 +66,6 @@ class Codec:
     keeps_numbers: bool = False  # numbers for rendering
     keeps_nan: bool = False
     has_quality: bool = False  # writing uses Writing.quality
-    has_axes: bool = False  # files do not say their axes; reading and writing use the option
-    has_bits: bool = False  # writing uses Writing.sh_bits
 
 
 # The files of a model.
@@ -124,8 +122,6 @@ CODECS = (
         read_spz,
         write_spz,
         has_quality=True,
-        has_axes=True,
-        has_bits=True,
     ),
     Codec(
         "SOG",

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 import scipy
@@ -30,7 +30,7 @@ from clsplat.formats.splats import (
     sh_coefficients,
     with_degree,
 )
-from clsplat.formats.table import detect, format_of_name, model_bytes, writing_format
+from clsplat.formats.table import format_of_name, model_bytes, writing_format
 from clsplat.gaussians.model import Model, load, model_path
 from clsplat.gaussians.motion import static_motion, with_motion
 from clsplat.gaussians.sky import sample_texels, sky_path
@@ -75,7 +75,7 @@ def _kind(model: Model) -> str:
 
 
 WORDS = ("scale", "rotate", "translate")
-AXES, QUALITIES = ("spz", "ply"), ("small", "balanced", "high")
+QUALITIES = get_args(Quality)
 
 
 @dataclass(frozen=True)
@@ -108,36 +108,17 @@ class Changes:
         return kept
 
 
-@dataclass(frozen=True)
-class ConversionOptions:
-    """How files are read and written."""
-
-    sh_bits: str | None = None  # A/B
-    axes: Literal["spz", "ply"] = "spz"  # of SPZ files that are read, or where none is of the one that is written
-    quality: Quality = "balanced"
-    keep_nan: bool = False
-
-    def resolve(self, sources: Sequence[Path], out: Path) -> tuple[Reading, Writing]:
-        """Return them for these files.  Raises ConfigError where one has no meaning there."""
-        codec, reads_axes = writing_format(out), _reads_axes(sources)
-        for name, value, known in (("axes", self.axes, AXES), ("quality", self.quality, QUALITIES)):
-            if value not in known:
-                raise ConfigError(f"--{name} {quote(value)}: expected one of {', '.join(known)}")
-        if not codec.has_bits and self.sh_bits is not None:
-            raise ConfigError(f"{out}: --sh-bits is only for SPZ; give a name that ends in .spz")
-        if self.axes != "spz" and not codec.has_axes and not reads_axes:
-            raise ConfigError("--axes is of SPZ; expected an SPZ file to read or to write")
-        if self.quality != "balanced" and not codec.has_quality:
-            raise ConfigError(f"{out}: --quality is of SPZ and SOG; expected a name that ends in .spz or .sog")
-        if self.keep_nan and not codec.keeps_nan:
-            raise ConfigError(f"{out}: --keep-nan is of PLY; expected a name that ends in .ply")
-        bits = None if self.sh_bits is None else parse_sh_bits(self.sh_bits)
-        written = Writing(bits, "spz" if reads_axes else self.axes, self.quality)
-        return Reading(self.axes, "keep" if self.keep_nan else "drop"), written
+def writing_options(out: Path, quality: Quality) -> Writing:
+    """Return how a file is written.  Raises ConfigError for a quality that there is not, or that its format has not."""
+    if quality not in QUALITIES:
+        raise ConfigError(f"--quality {quote(quality)}: expected one of {', '.join(QUALITIES)}")
+    if quality != "balanced" and not writing_format(out).has_quality:
+        raise ConfigError(f"{out}: --quality is of SPZ and SOG; expected a name that ends in .spz or .sog")
+    return Writing(quality)
 
 
 def convert(
-    sources: Sequence[Path], out: Path, changes: Changes | None = None, options: ConversionOptions | None = None
+    sources: Sequence[Path], out: Path, changes: Changes | None = None, quality: Quality = "balanced"
 ) -> dict[str, Any]:
     """Read model files or run folders, and write one file of all their Gaussians, in the format of its name.
 
@@ -146,13 +127,15 @@ def convert(
     if not sources:
         raise ConfigError("convert: expected a model file to read, and one to write")
     check_output(sources, out)
-    reading, writing = (options or ConversionOptions()).resolve(sources, out)
-    return write_model(sources, (changes or Changes()).apply(read(sources, reading)), out, writing)
+    writing = writing_options(out, quality)
+    return write_model(sources, (changes or Changes()).apply(read(sources)), out, writing)
 
 
-def read(sources: Sequence[Path], reading: Reading) -> Model:
+def read(sources: Sequence[Path]) -> Model:
     """Return one model of all Gaussians of model files or run folders.  Raises DataError."""
-    return merge_models([load(source, reading) for source in sources], [str(source) for source in sources])
+    return merge_models(
+        [load(source, Reading(not_finite="drop")) for source in sources], [str(source) for source in sources]
+    )
 
 
 def write_model(sources: Sequence[Path], model: Model, out: Path, writing: Writing) -> dict[str, Any]:
@@ -236,13 +219,6 @@ def parse_crop(text: str) -> tuple[float, ...]:
     return box
 
 
-def parse_sh_bits(text: str) -> tuple[int, int]:
-    """Return the bits of `A/B`: of band 1 and of the others.  Raises ConfigError."""
-    if not (found := re.fullmatch("([1-8])/([1-8])", text)):
-        raise ConfigError(f"--sh-bits {quote(text)}: expected two numbers from 1 to 8, such as 8/6")
-    return int(found[1]), int(found[2])
-
-
 def check_degree(degree: int | None) -> int | None:
     """Return an SH degree.  Raises ConfigError for one that there is not."""
     if degree is not None and not 0 <= degree <= MAX_DEGREE:
@@ -258,12 +234,6 @@ def _at(model: Model, time: float) -> Model:
     if not len(shown):
         raise DataError(f"none of {len(model):,} Gaussians is shown at the time {time:g}; expected another moment")
     return shown
-
-
-def _reads_axes(sources: Sequence[Path]) -> bool:
-    """Whether one of the files is of a format that does not tell its axes."""
-    found = [detect(place) for place in map(model_path, sources) if place.is_file()]
-    return any(codec is not None and codec.has_axes for codec in found)
 
 
 def _is_same(one: Path, other: Path) -> bool:
@@ -287,7 +257,7 @@ def check_time(time: float | None) -> float | None:
 
 
 def convert_frames(
-    sources: Sequence[Path], out: Path, frames: int, changes: Changes, options: ConversionOptions
+    sources: Sequence[Path], out: Path, frames: int, changes: Changes, quality: Quality
 ) -> dict[str, Any]:
     """Write one static model of each of so many moments, evenly spaced from the first to the last.
 
@@ -305,8 +275,7 @@ def convert_frames(
     for place in places:
         check_output(sources, place)
     _require_no_others(folder, re.compile(re.escape(begin) + r"\d{4,}" + re.escape(end)), places)
-    reading, writing = options.resolve(sources, places[0])
-    model = read(sources, reading)
+    writing, model = writing_options(places[0], quality), read(sources)
     moments = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
     for moment in moments:  # before anything is written
         try:

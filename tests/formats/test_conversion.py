@@ -18,7 +18,7 @@ from clsplat.core.files import check_not_run_file
 from clsplat.core.harmonics import basis
 from clsplat.density.mixture import mass_of
 from clsplat.formats.ply import write_ply
-from clsplat.formats.splats import inverse_opacities, opacities
+from clsplat.formats.splats import flip_axes, inverse_opacities, opacities
 from clsplat.formats.table import CODECS, detect, model_bytes, read, write
 from clsplat.gaussians.conversion import parse_transform
 from clsplat.gaussians.model import Rendering, load
@@ -88,16 +88,6 @@ def test_every_number_of_a_merged_model_that_is_not_kept_is_said(tmp_path, rng, 
     caplog.clear()
     clsplat.convert([b, a], tmp_path / "d.ply")
     assert "has near = 0.2, screen_variance = 0.3, background = not given, alpha = transparency; what" in caplog.text
-
-
-def test_options_of_one_format_are_fields_of_the_table(source, tmp_path, monkeypatch):
-    """So that a format that has them is asked nowhere by its name."""
-    found = {field: [codec.name for codec in CODECS if getattr(codec, field)] for field in ("has_axes", "has_bits")}
-    assert found == {"has_axes": ["SPZ"], "has_bits": ["SPZ"]}
-    renamed = [replace(codec, name="SPZ of Niantic" if codec.name == "SPZ" else codec.name) for codec in CODECS]
-    monkeypatch.setattr("clsplat.formats.table.CODECS", renamed)
-    clsplat.convert(source, tmp_path / "b.spz", sh_bits="5/4", axes="ply")
-    clsplat.convert(tmp_path / "b.spz", tmp_path / "c.ply", axes="ply")
 
 
 EXTREME = {
@@ -188,7 +178,6 @@ WRONG = {
         "",
     ),
     "crop": (["1,2,3", "0,0,0,-1,1,1", "a", "0,0,0,1,1,nan"], "expected x0,y0,z0"),
-    "sh_bits": (["8", "9/8", "0/1", "a/b"], "from 1 to 8"),
 }
 
 
@@ -202,15 +191,11 @@ def test_a_wrong_option_is_refused_before_anything_is_written(option, text, sour
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("b.ply", {"sh_bits": "8/8"}, "--sh-bits is only for SPZ"),
-        ("b.ply", {"axes": "ply"}, "--axes is of SPZ"),
         ("b.glb", {"quality": "small"}, r"b\.glb: --quality is of SPZ and SOG; expected a name that ends in \.spz or "),
         ("b.compressed.ply", {}, "compressed PLY can be read but not written"),
-        ("b.spz", {"keep_nan": True}, r"b\.spz: --keep-nan is of PLY; expected a name that ends in \.ply"),
         ("b.xyz", {}, r"no format has the name 'b.xyz'; give a name that ends in \.ply, "),
         ("b.ply", {"sh_degree": 4}, "expected 0 to 3"),
         ("b.spz", {"quality": "best"}, "--quality 'best': expected one of small, balanced, high"),
-        ("b.spz", {"axes": "x"}, "--axes 'x': expected one of spz, ply"),
     ],
 )
 def test_an_option_without_meaning_is_refused(name, options, words, source, tmp_path):
@@ -251,15 +236,19 @@ def test_a_crop_and_an_opacity_leave_what_they_say(source, tmp_path):
         clsplat.convert(source, tmp_path / "c.ply", crop="50,50,50,51,51,51")
 
 
-def test_axes_are_of_the_file_that_is_read_or_else_written(source, tmp_path):
-    means = np.sort(load(source).means[:, 1])
-    clsplat.convert(source, tmp_path / "ply_axes.spz", axes="ply", quality="high")
-    np.testing.assert_allclose(np.sort(-load(tmp_path / "ply_axes.spz").means[:, 1]), means, atol=1e-3)
-    clsplat.convert(tmp_path / "ply_axes.spz", tmp_path / "right.spz", axes="ply", quality="high")
-    np.testing.assert_allclose(np.sort(load(tmp_path / "right.spz").means[:, 1]), means, atol=1e-3)
+def test_an_spz_with_the_axes_of_ply_is_turned(source, tmp_path):
+    upside_down = {"transform": "rotate=180,0,0", "quality": "high"}
+    clsplat.convert(source, tmp_path / "ply_axes.spz", **upside_down)
+    expected, found = load(source), load(tmp_path / "ply_axes.spz")
+    np.testing.assert_allclose(np.sort(-found.means[:, 1]), np.sort(expected.means[:, 1]), atol=1e-3)
+    clsplat.convert(tmp_path / "ply_axes.spz", tmp_path / "right.ply", transform="rotate=180,0,0")
+    right = load(tmp_path / "right.ply").tables()
+    flipped = flip_axes(found.tables())
+    for name, table in flipped.items():
+        np.testing.assert_allclose(right[name], table, atol=1e-5, err_msg=name)
 
 
-def test_gaussians_that_are_not_finite_are_dropped_or_kept(tmp_path, rng, caplog):
+def test_gaussians_that_are_not_finite_are_dropped(tmp_path, rng, caplog):
     bad = splats(rng, 20)
     bad.parameters["means"][3, 1], bad.parameters["sh_rest"][7, 0] = np.nan, np.inf
     write_ply(tmp_path / "a.ply", bad.parameters, {})
@@ -267,7 +256,6 @@ def test_gaussians_that_are_not_finite_are_dropped_or_kept(tmp_path, rng, caplog
         load(tmp_path / "a.ply")
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.spz")["gaussians"] == 18
     assert "dropped 2 Gaussians" in caplog.text
-    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", keep_nan=True)["gaussians"] == 20
     with pytest.raises(DataError, match="2 Gaussians have values that are not finite, which GLB cannot store"):
         write(tmp_path / "b.glb", bad)
 
@@ -289,7 +277,6 @@ def test_gaussians_beyond_any_codebook_are_refused_or_dropped(table, value, tmp_
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.sog")["gaussians"] == 18
     assert f"{told}; they are dropped" in caplog.text
     assert len(load(tmp_path / "b.sog")) == 18
-    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", keep_nan=True)["gaussians"] == 20
 
 
 def test_tables_that_are_not_finite_are_not_called_too_large(tmp_path, rng, caplog):

@@ -63,7 +63,7 @@ def reads_or_refuses(path: Path) -> None:
         model = outcome(read, path)
         outcome(detect, path)
         outcome(examine, path)
-        kept = outcome(read, path, Reading(axes="ply", not_finite="keep"))
+        kept = outcome(read, path, Reading(not_finite="keep"))
     if model is not None:
         assert kept is not None
         assert all(np.isfinite(table).all() for table in model.parameters.values())
