@@ -308,7 +308,7 @@ def zoom_lens(lens: Lens, factor: float) -> Lens:
         return lens
     if not can_zoom(lens):
         raise DataError(
-            f"the focal length of a {lens.model} lens cannot be changed; expected one of {', '.join(DEGREES)}: "
+            f"the focal length of the {lens.model} lens cannot be changed; expected one of {', '.join(DEGREES)}: "
             "run `clsplat data undistort` first"
         )
     focals = MODELS[lens.model][0]

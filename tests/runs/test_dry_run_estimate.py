@@ -106,11 +106,11 @@ def as_cell(asked, state, device, start):
         (describe, "scene.holdout=1", "every image is held out for testing"),
         (run_pipeline, "scene.holdout={every: 1}", "scene.holdout takes all 23 photographs"),
         (as_cell, "scene.validation=1", "scene.validation takes 20 of 20 training photographs"),
-        (describe, "scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train with"),
-        (run_pipeline, "scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected 4"),
+        (describe, "scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train on"),
+        (run_pipeline, "scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected at least 4"),
         (as_cell, "scene={train: {names: ['01', '02']}, validation: {names: ['05']}}", "'05' is left out by scene"),
         (run_pipeline, "scene.masks=masks", "masks do not fit photos that are still to be undistorted"),
-        (as_cell, "scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is held out for"),
+        (as_cell, "scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is a test view"),
     ],
 )
 def test_split_photographs_lack_is_refused_before_preparation(photos, begin, sets, complaint):
@@ -134,7 +134,7 @@ def test_list_is_not_refused_for_what_cameras_will_tell(photos, caplog):
     assert "'02' is left out by scene.train" in described
     told = describe(asked, RunState.read(out), None, "new")
     assert "if all 23 photos get a camera, the run is refused:" in told
-    assert "'00.png' is held out for testing" in told
+    assert "'00.png' is a test view" in told
     assert "the photos decide init.transparent, " in told, "what they will decide"
 
 

@@ -52,7 +52,7 @@ def test_lens_of_another_focal_length_undistorts_to_same_pixels(model):
 
 def test_a_fisheye_has_no_other_focal_length():
     assert zoom_lens(FISHEYE, 1.0) is FISHEYE
-    with pytest.raises(DataError, match=r"OPENCV_FISHEYE has no form with another focal length.*undistort"):
+    with pytest.raises(DataError, match=r"focal length of the OPENCV_FISHEYE lens cannot be changed.*undistort"):
         zoom_lens(FISHEYE, 1.01)
 
 
