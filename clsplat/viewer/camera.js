@@ -1,4 +1,4 @@
-// Cameras: x right, y down, z forward.  A camera is {rotation: [9] world to camera by rows, eye: [3], lens: [6]}, and
+// Cameras: x right, y down, z forward.  A camera is {rotation: [9], eye: [3], lens: [6]}: world to camera by rows, and
 // lens = [fx, fy, cx, cy, width, height] of its image, px.
 
 const add = (a, b, f = 1) => a.map((v, i) => v + f * b[i]);
@@ -16,7 +16,7 @@ const cameraOf = ({pose, lens}) => {
   return {rotation, eye, lens: [...lens]};
 };
 
-function quaternion(r) { // x, y, z, w of a rotation by rows
+function quaternion(r) { // x, y, z, w of a row-major rotation
   const q = [r[0] - r[4] - r[8], r[4] - r[0] - r[8], r[8] - r[0] - r[4], r[0] + r[4] + r[8]];
   const k = q.indexOf(Math.max(...q)), s = Math.sqrt(1 + q[k]) * 2, out = [0, 0, 0, 0];
   const [yz, zx, xy] = [[r[7], r[5]], [r[2], r[6]], [r[3], r[1]]];
@@ -37,7 +37,7 @@ function rotationOf([x, y, z, w]) {
     2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)];
 }
 
-function between(a, b, t) { // on the way from one camera to another
+function between(a, b, t) { // interpolate between two cameras
   if (t >= 1) return b;
   let p = quaternion(a.rotation), q = quaternion(b.rotation);
   let cosine = p.reduce((sum, v, i) => sum + v * q[i], 0);
@@ -49,7 +49,7 @@ function between(a, b, t) { // on the way from one camera to another
   return {rotation, eye: mix(a.eye, b.eye, t), lens: mix(a.lens, b.lens, t)};
 }
 
-// A camera turned by an angle about an axis of the world through a point.
+// Rotate a camera by an angle about an axis of the world through a point.
 function turned(camera, about, angle, center) {
   const c = Math.cos(angle), s = Math.sin(angle);
   const turn = v => add(add(scaled(v, c), cross(about, v), s), about, dot(about, v) * (1 - c));
@@ -57,7 +57,7 @@ function turned(camera, about, angle, center) {
     rotation: [0, 1, 2].flatMap(i => turn(axis(camera, i)))};
 }
 
-// A camera without roll, that looks the same way.
+// Remove the roll of a camera.
 function levelled(camera, up) {
   const forward = axis(camera, 2), right = cross(forward, up);
   if (size(right) < 1e-3) return camera;
@@ -65,14 +65,14 @@ function levelled(camera, up) {
   return {...camera, rotation: [...across, ...cross(forward, across), ...forward]};
 }
 
-// The area of a canvas of width x height px that the camera's image fills: its enlargement, left and top.
+// The area of a canvas of width x height px that the camera's image fills: scale, left and top.
 function fitted(lens, width, height) {
   const enlarged = Math.min(width / lens[4], height / lens[5]);
   return {enlarged, left: (width - enlarged * lens[4]) / 2, top: (height - enlarged * lens[5]) / 2};
 }
 
-// What the shaders need of a camera on a canvas.  exact: rays are clamped as in `clsplat render` of the camera's image;
-// else beyond the canvas, which shows more than that image.  unit: the enlargement that counts as none.
+// The values of a camera on a canvas that the shaders need.  exact: clamp rays as `clsplat render` does for the camera's
+// image; otherwise beyond the canvas, which shows more than that image.  native: the focal length with a scale of 1.
 function framed(camera, width, height, exact, native = 1) {
   const [fx, fy, cx, cy, w, h] = camera.lens, {enlarged, left, top} = fitted(camera.lens, width, height);
   const intrinsics = [fx * enlarged, fy * enlarged, cx * enlarged + left, cy * enlarged + top];
@@ -88,7 +88,7 @@ function framed(camera, width, height, exact, native = 1) {
 const written = camera => [camera.eye, quaternion(camera.rotation), camera.lens]
   .map(part => part.map(v => +v.toPrecision(8)).join(",")).join(";");
 
-// The camera of an address' part behind #, and the moment where it has one; null where it is none.
+// Read the camera, and the timestamp if there is one, from an address' part after #; null if it has no camera.
 function read(text) {
   const parts = text.replace(/^#/, "").split(";").map(part => part.split(",").map(Number));
   if (![3, 4].includes(parts.length) || parts.some((part, i) => part.length !== [3, 4, 6, 1][i])) return null;

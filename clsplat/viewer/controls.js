@@ -1,6 +1,6 @@
-// Pointer, wheel, touch and keyboard.  They change `viewer.camera` by `viewer.move`, which leaves a photograph's view.
+// Pointer, wheel, touch and keyboard.  They change `viewer.camera` with `viewer.move`, which leaves a photo's view.
 
-const TURN = 0.005, LEAST_TILT = 0.06; // radians a px; least angle between the view direction and up
+const TURN = 0.005, LEAST_TILT = 0.06; // radians per px; smallest angle between the view direction and up
 const KEYS = {w: [2, 1], s: [2, -1], a: [0, -1], d: [0, 1], q: [1, 1], e: [1, -1]}; // axis and sign
 
 class Controls {
@@ -37,7 +37,7 @@ class Controls {
     const now = [event.clientX, event.clientY], shift = add(now, before, -1);
     const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
     this.pointers.set(event.pointerId, now);
-    if (other) { // half of the motion of two fingers' middle, and their distance
+    if (other) { // two fingers: each event moves their center by half of the shift, and changes their distance
       this.pan(scaled(shift, 0.5));
       this.dolly(size(add(before, other, -1)) / Math.max(1, size(add(now, other, -1))));
     } else if (this.pans) this.pan(shift);
@@ -45,7 +45,7 @@ class Controls {
     else this.orbit(shift);
   }
 
-  // Tilt about the axis to the right, but not over the zenith.
+  // Tilt about the right axis, but not beyond the zenith.
   tilt(camera, angle, center) {
     const after = turned(camera, axis(camera, 0), angle, center);
     const toward = Math.abs(dot(axis(after, 2), this.viewer.up));
@@ -86,7 +86,7 @@ class Controls {
     this.viewer.move({...camera, eye: add(pivot, away, factor)});
   }
 
-  // Fly with the keys that are held; seconds: since the last time.  Return whether any is.
+  // Fly with the pressed keys; seconds: since the last call.  Return whether any key is pressed.
   fly(seconds) {
     let by = [0, 0, 0];
     for (const key of this.pressed) if (KEYS[key]) by = add(by, axis(this.viewer.camera, KEYS[key][0]), KEYS[key][1]);

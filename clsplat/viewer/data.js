@@ -1,8 +1,8 @@
-// The planes of packing.py as arrays that textures take.
+// The planes of packing.py as arrays for textures.
 
-const BLOCK = 256, ROW = 4096; // splats of a block; texels of a texture's row: what phones can hold
+const BLOCK = 256, ROW = 4096; // splats per block; texels per row of a texture, which phones support
 
-// Bytes of the text of a script element, piece by piece, so that a large page needs no second copy of its text.
+// Decode the text of a script element piece by piece, so that a large page needs no second copy of it.
 function* decoded(text) {
   const step = 1 << 20;
   for (let begin = 0; begin < text.length; begin += step) {
@@ -22,15 +22,15 @@ async function inflated(text) {
   return (await Promise.all([new Response(stream.readable).arrayBuffer(), written]))[0];
 }
 
-// texels of 16 bytes that hold the colors of a splat: 3 (degree + 1)² codes
+// texels of 16 bytes for the colors of a splat: 3 (degree + 1)² codes
 const colorTexels = degree => Math.ceil(3 * (degree + 1) ** 2 / 16);
 const splatsInRow = texels => Math.floor(ROW / texels);
 const rowsOf = (count, texels) => Math.max(1, Math.ceil(count / splatsInRow(texels)));
 
-// An array for a texture of whole rows.
+// An array for a texture with complete rows.
 const padded = (kind, count, texels, each) => new kind(rowsOf(count, texels) * splatsInRow(texels) * texels * each);
 
-// header, buffer: of packing.py; most: rows that a texture may have.  Splats beyond are left out: the least important.
+// header, buffer: from packing.py; most: largest number of rows of a texture.  Drops the least important splats beyond.
 function unpacked(header, buffer, most) {
   const whole = header.count, texels = colorTexels(header.degree);
   const count = Math.min(whole, most * splatsInRow(texels), most * ROW);
@@ -42,7 +42,7 @@ function unpacked(header, buffer, most) {
   };
   const tables = take(Float32Array, 4 * 256), blocks = take(Float32Array, 6 * Math.ceil(whole / BLOCK));
   const steps = take(Uint8Array, 6 * whole);
-  const quats = new Uint32Array(buffer.slice(place, place + 4 * whole)); // their place is no multiple of 4
+  const quats = new Uint32Array(buffer.slice(place, place + 4 * whole)); // a copy, since the offset is not aligned to 4
   place += 4 * whole;
   const shapes = take(Uint8Array, 4 * whole), codes = take(Uint8Array, 3 * (header.degree + 1) ** 2 * whole);
 

@@ -1,6 +1,6 @@
-// The cameras of the views as small pyramids over the picture.
+// The cameras of the views as small pyramids over the image.
 
-const DEPTH = 0.07, COLOR = {train: "#63b3ed", test: "#f6ad55"}; // of a pyramid, in radii of the scene
+const DEPTH = 0.07, COLOR = {train: "#63b3ed", test: "#f6ad55"}; // depth of a pyramid, in radii of the scene
 
 class Frustums {
   constructor(viewer, views) {
@@ -16,7 +16,7 @@ class Frustums {
     if (!views.length) find("cameras").previousElementSibling.hidden = find("cameras").hidden = true;
   }
 
-  // frame: of `framed` for a pane of that size in CSS px; corners: left and top of each pane
+  // frame: from `framed`, for a pane of that size in CSS px; corners: left and top of each pane
   draw(frame, corners, ratio) {
     const pen = this.canvas.getContext("2d"), {width, height} = this.viewer.canvas;
     this.canvas.hidden = !this.shown;
@@ -45,7 +45,7 @@ class Frustums {
   }
 }
 
-// The place of a point of the world on the canvas of a frame; null behind the camera.
+// Project a point of the world to the canvas of a frame; null if it is behind the camera.
 function projected({rotation, translation, intrinsics: [fx, fy, cx, cy]}, point) {
   const [x, y, z] = [0, 1, 2].map(i => dot(rotation.slice(3 * i, 3 * i + 3), point) + translation[i]);
   return z > 1e-3 ? [fx * x / z + cx, fy * y / z + cy] : null;

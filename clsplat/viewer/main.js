@@ -1,6 +1,6 @@
-// The page: its camera, when it draws, and how finely.
+// The page: when it draws, and at which quality.
 
-const REST = 200, SLOW = 40, QUICK = 20; // ms without a change until the full picture; of a frame
+const REST = 200, SLOW = 40, QUICK = 20; // ms without a change before the full image; ms per frame
 
 class Viewer extends Walk {
   constructor(info, layers, painter, canvas) {
@@ -26,7 +26,7 @@ class Viewer extends Walk {
     this.change();
   }
 
-  // Draw again; moved: the camera or a setting has changed.
+  // Draw again; moved: whether the camera or a setting changed.
   change(moved = true) {
     if (moved) this.changed = performance.now();
     this.dirty = true;
@@ -34,7 +34,7 @@ class Viewer extends Walk {
     this.scheduled ??= requestAnimationFrame(time => this.tick(time));
   }
 
-  // The size of a model's part of the stage, CSS px: halves beside each other, or one above the other.
+  // The size of a model's part of the stage, CSS px: halves side by side, or one above the other.
   pane() {
     const {clientWidth: width, clientHeight: height} = this.stage, parts = this.layers.length;
     return width >= height ? {width: width / parts, height} : {width, height: height / parts};
@@ -52,11 +52,11 @@ class Viewer extends Walk {
     this.drew = this.dirty || (resting && !this.whole);
     if (this.drew) this.draw(resting);
     const moves = this.flight || this.clock?.playing || this.controls.pressed.size;
-    if (this.whole && !moves) this.time = undefined; // a new order draws again
+    if (this.whole && !moves) this.time = undefined; // a new sorting order draws again
     else this.scheduled ??= requestAnimationFrame(later => this.tick(later));
   }
 
-  // Choose resolution and number of splats from the time of a frame while something moves.
+  // During motion, adapt resolution and number of splats to the frame time.
   adapt(passed) {
     if (passed <= 0) return;
     this.ms = this.ms === null ? passed : 0.8 * this.ms + 0.2 * passed;
@@ -64,7 +64,7 @@ class Viewer extends Walk {
     else if (passed < QUICK) this.quality = Math.min(1, this.quality * 1.1);
   }
 
-  // The number of a layer's splats that are drawn: a whole number of its parts, the most important first.
+  // The number of splats of a layer to draw: a whole number of parts, the most important first.
   first({header, count}, share) {
     return Math.min(count, header.levels[Math.max(1, Math.round(share * header.levels.length)) - 1]);
   }
@@ -102,7 +102,7 @@ class Viewer extends Walk {
     document.documentElement.dataset.ready = "1";
   }
 
-  // Turn about what is seen at a place of the stage: the nearest splat that covers it.
+  // Rotate about the nearest splat that covers a pixel of the stage.
   focus(x, y) {
     const {width, height} = this.pane(), [u, v] = [x % width, y % height], [layer] = this.layers;
     const frame = framed(this.camera, width, height, false), rows = [0, 1, 2].map(i => axis(this.camera, i));

@@ -1,4 +1,4 @@
-// The camera of a page and its ways: moved by the controls, flown to a view, held by the address.
+// The camera of a page: moved by the controls, flown to a view, stored in the address.
 
 class Walk {
   constructor(info, canvas) {
@@ -7,7 +7,7 @@ class Walk {
     this.pivot = info.pivot;
   }
 
-  // Take the camera of the address, and its moment; return whether it holds one.
+  // Take the camera and the timestamp from the address; return whether it has a camera.
   adopt() {
     const camera = location.hash === this.hash ? null : read(location.hash);
     if (camera) this.move(camera);
@@ -18,7 +18,7 @@ class Walk {
     return !!camera;
   }
 
-  // Go on from another camera, not that of a photograph.
+  // Move to a camera that is not that of a photo.
   move(camera) {
     this.flight = null;
     this.at = -1;
@@ -27,7 +27,7 @@ class Walk {
     this.change();
   }
 
-  // Fly to a camera; view: the index of the view that it is of.
+  // Fly to a camera; view: the index of its view, or -1.
   fly(camera, seconds, view = -1) {
     this.at = -1;
     if (matchMedia("(prefers-reduced-motion: reduce)").matches) seconds = 0;
@@ -47,7 +47,7 @@ class Walk {
     this.move({...this.camera, lens: [focal, focal * fy / fx, ...this.camera.lens.slice(2)]});
   }
 
-  // The size of a picture, CSS px.
+  // The size of the image, CSS px.
   pane() {
     return {width: this.stage.clientWidth, height: this.stage.clientHeight};
   }
@@ -66,11 +66,11 @@ class Walk {
     } else this.camera = between(from, to, Math.max(0, t * t * (3 - 2 * t)));
   }
 
-  // The camera is at rest: note it in the address.
+  // The camera is at rest: store it in the address.
   remember() {
     const text = `#${written(this.camera)}${this.clock ? `;${+this.moment.toFixed(4)}` : ""}`;
     if (text === location.hash) return;
     this.hash = text;
-    try { history.replaceState(null, "", text); } catch { /* too often, or not allowed: the address stays */ }
+    try { history.replaceState(null, "", text); } catch { /* too frequent, or not allowed: keep the address */ }
   }
 }

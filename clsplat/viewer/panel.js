@@ -1,4 +1,4 @@
-// What stands around the picture of every page: buttons, help, the name of the view.
+// The controls around the image: buttons, help, the name of the view.
 
 const find = name => document.getElementById(name);
 const press = (group, key, value) => {
@@ -21,7 +21,7 @@ class Panel {
     })) find(name).addEventListener("click", action);
     choices("styles", "style", style => this.style(style));
     choices("cameras", "cameras", state => this.cameras(state === "shown"));
-    find("keys").addEventListener("click", ({target}) => { // the button, or outside of the box
+    find("keys").addEventListener("click", ({target}) => { // the button, or outside the dialog
       if (target.closest("button") || target === find("keys")) find("keys").close();
     });
     if (!document.fullscreenEnabled) find("fullscreen").hidden = true;
@@ -57,7 +57,7 @@ class Panel {
     this.viewer.change();
   }
 
-  // Say in the caption why there is no photograph any more, for a while.
+  // Show a message in the caption for a while.
   tell(text) {
     const caption = find("caption");
     caption.textContent = text;

@@ -1,4 +1,4 @@
-// The settings of a page that draws the model itself, and its statistics.
+// The settings and statistics of a page that renders the model itself.
 
 class Settings extends Panel {
   constructor(viewer) {

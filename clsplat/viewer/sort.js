@@ -1,5 +1,5 @@
-// The splats from back to front, in a worker: two counting sorts of 16 bits order the depths exactly, as the bits of
-// positive floats are in the order of their values.  Splats before the near plane are left out.
+// Sort splats from back to front in a worker: two counting sorts of 16 bits order depths exactly, since the bits of
+// positive floats have the order of their values.  Splats in front of the near plane are dropped.
 
 // The presence of splat i at a time dt after that at which it is most opaque; motion: {rows, stride, bends}.
 function presence({rows, stride}, i, dt) {
@@ -7,7 +7,7 @@ function presence({rows, stride}, i, dt) {
   return Math.exp(-late * late / 2);
 }
 
-// How far it has gone along an axis by then.
+// Its displacement along an axis at that time.
 function way({rows, stride, bends}, i, axis, dt) {
   const k = i * stride + axis, bend = bends > 0 ? rows[k + 5] + (bends > 1 ? rows[k + 8] * dt : 0) : 0;
   return dt * (rows[k] + dt * bend);
@@ -28,7 +28,7 @@ function sortInWorker() {
     }
   }
 
-  // The positions at a moment; of what is not there then, no numbers.
+  // The positions at a timestamp; NaN for splats that are invisible then.
   function at(moment) {
     for (let i = 0; 3 * i < positions.length; i++) {
       const dt = moment - motion.rows[i * motion.stride + 3], gone = presence(motion, i, dt) < 1 / 255;
@@ -49,7 +49,7 @@ function sortInWorker() {
       depths[count] = depth;
       ids[count++] = i;
     }
-    for (let i = 0; i < count; i++) keys[i] = ~keys[i]; // far ones first
+    for (let i = 0; i < count; i++) keys[i] = ~keys[i]; // farthest first
     pass(0, count, keys, ids, otherKeys, otherIds);
     pass(16, count, otherKeys, otherIds, keys, ids);
     return ids.slice(0, count);
@@ -67,9 +67,9 @@ function sortInWorker() {
   };
 }
 
-// One worker; it sorts for one pose at a time, and next for the last one that was asked for.
+// A worker that sorts for one pose at a time, and then for the latest requested one.
 class Sorter {
-  // motion: {rows, stride, bends} of what moves
+  // motion: {rows, stride, bends} of a moving model
   constructor(positions, motion, near, done) {
     const code = `${presence}\n${way}\n(${sortInWorker})()`;
     const source = URL.createObjectURL(new Blob([code], {type: "text/javascript"}));
@@ -87,7 +87,7 @@ class Sorter {
     };
   }
 
-  // row: the third row of world_to_camera; first: the number of splats, the most important ones; moment: of what moves
+  // row: the third row of world_to_camera; first: number of splats, most important first; moment: timestamp
   ask(row, first, moment) {
     const key = [...row, first, moment].join();
     if (key === this.key) return;

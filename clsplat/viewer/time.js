@@ -1,9 +1,9 @@
-// The moment that a page of a scene that moves shows: a slider, and play and pause.
+// The timestamp that the page of a moving scene shows: a slider, play and pause.
 
-const LOOP = 4; // s: the scene from its first moment to its last
+const LOOP = 4; // s, to play the whole scene
 
 class Clock {
-  // moments: of the photographs, in order, of the whole
+  // moments: timestamps of the photos, in order, in [0, 1]
   constructor(viewer, moments) {
     Object.assign(this, {viewer, moments, playing: false});
     this.range = find("moment");
@@ -23,26 +23,26 @@ class Clock {
     this.show();
   }
 
-  // Go to a moment: away from the photograph of another one.
+  // Go to a timestamp, and leave a photo of another one.
   to(moment) {
     const {viewer} = this, shown = viewer.photographs.views[viewer.photographs.chosen];
     viewer.moment = Math.max(0, Math.min(1, moment));
     if (shown && Math.abs((shown.time ?? viewer.moment) - viewer.moment) > 1e-6) {
       viewer.move(viewer.camera);
-      viewer.panel.tell(`${shown.name} is of another moment`);
+      viewer.panel.tell(`${shown.name} was taken at another time`);
     }
     this.show();
     viewer.change();
   }
 
-  // The next moment of the photographs, or the last before this one, where there is one.
+  // Go to the next or the previous timestamp of the photos, if there is one.
   skip(by) {
     this.stop();
     const beyond = this.moments.filter(moment => by * (moment - this.viewer.moment) > 1e-6);
     if (beyond.length) this.to(by > 0 ? beyond[0] : beyond[beyond.length - 1]);
   }
 
-  // Go on by seconds while it plays; from the last moment to the first.
+  // Advance by seconds while playing, in a loop.
   run(seconds) {
     if (this.playing) this.to((this.viewer.moment + Math.min(0.5, seconds) / LOOP) % 1);
   }

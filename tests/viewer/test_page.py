@@ -65,7 +65,7 @@ def test_splats_too_faint_to_draw_are_told(page):
 
 
 def test_the_help_names_the_gestures_of_fingers_too(page):
-    assert "double click it · double tap it" in page.text()
+    assert "double-click it · double-tap it" in page.text()
 
 
 def test_only_the_script_and_style_of_the_package_may_run(page):
