@@ -4,9 +4,9 @@
     scene = clsplat.read_scene("data/fox")
     trainer = clsplat.Trainer(scene, "splat_7k", set={"optimize.steps": 2000})
     trainer.run()
-    picture = clsplat.Renderer(trainer.model).render(scene.split("test")[0])
+    result = clsplat.Renderer(trainer.model).render(scene.split("test")[0])
 
-Names are imported when they are first used, and no device is opened before that.
+Names are imported on first use; until then, no device is opened.
 """
 
 import importlib
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from clsplat.api.pictures import write_video as write_video
     from clsplat.api.renderer import FieldRenderer as FieldRenderer
     from clsplat.api.renderer import Gradients as Gradients
-    from clsplat.api.renderer import Picture as Picture
     from clsplat.api.renderer import Renderer as Renderer
+    from clsplat.api.renderer import RenderResult as RenderResult
     from clsplat.api.tools import devices as devices
     from clsplat.api.tools import doctor as doctor
     from clsplat.api.tools import inspect_scene as inspect_scene
@@ -88,12 +88,12 @@ class _CheckoutFinder:
 
 
 sys.meta_path.append(_CheckoutFinder)
-_ROOMS = {  # where the names come from, which `import clsplat` does not import
+_EXPORTS = {  # modules that define the names; `import clsplat` does not import them
     "clsplat.api.commands": "cancel check compare_runs compress_model convert copy_pipeline describe_run evaluate"
     " pipeline_schema pipelines plan_in_blocks resume run run_cell status status_schema"
     " run_worker train_in_blocks view write_levels",
     "clsplat.api.pictures": "camera_path render_path render_views write_cameras write_video",
-    "clsplat.api.renderer": "FieldRenderer Gradients Picture Renderer",
+    "clsplat.api.renderer": "FieldRenderer Gradients RenderResult Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",
     "clsplat.core.resources": "__version__",
@@ -107,17 +107,17 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.scene.view": "View",
     "clsplat.scene.view_selection": "Split ViewSelection",
 }
-_PLACES = {name: room for room, names in _ROOMS.items() for name in names.split()}
+_MODULE_OF = {name: module for module, names in _EXPORTS.items() for name in names.split()}
 _MODULES = {"errors": "clsplat.core.errors", "metrics": "clsplat.metrics"}
-__all__ = sorted([*_PLACES, *_MODULES])
+__all__ = sorted([*_MODULE_OF, *_MODULES])
 
 
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return importlib.import_module(_MODULES[name])
-    if name not in _PLACES:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'clsplat' has no attribute '{name}'")
-    value = getattr(importlib.import_module(_PLACES[name]), name)
+    value = getattr(importlib.import_module(_MODULE_OF[name]), name)
     globals()[name] = value
     return value
 

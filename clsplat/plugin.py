@@ -1,7 +1,6 @@
-"""What plug-ins may import: the bases of their classes, and the names that these need.
+"""Export what plug-ins may import: the base classes, and the names that these need.
 
-Modules below other packages of clsplat may move between versions; the names in this module stay. Nothing in clsplat
-imports it.
+Other modules of clsplat may move between versions, but the names in this module stay.  Nothing in clsplat imports it.
 """
 
 from clsplat.core.errors import (

@@ -1,4 +1,4 @@
-"""Pictures, films and cameras as functions; errors and `device` as in `clsplat.api.commands`."""
+"""Render images and videos, and write cameras; errors and `device` as in `clsplat.api.commands`."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -30,12 +30,12 @@ def render_views(
     time: float | None = None,
     device: "str | Device | None" = None,
 ) -> int:
-    """Render a model at the views of a scene, one file for each view; return the number of files.
+    """Render a model at the views of a scene, one file per view; return the number of files.
 
-    model: a file, with `scene`, or a run folder, whose scene is the default; downscale: divisor of the photographs'
-    size, by default that of the run, 1 for a file; kind: 8-bit images, or float32 arrays [height, width, 3]; depth,
-    alpha: files NAME_depth and NAME_alpha beside, as arrays [height, width] in scene units and in [0, 1]; time: of a
-    model that moves, in [0, 1], instead of the views' own.
+    model: a file, with `scene`, or a run folder, whose scene is the default; downscale: divisor of the image size, by
+    default that of the run, or 1 for a file; kind: 8-bit images, or float32 arrays [height, width, 3]; depth, alpha:
+    also write NAME_depth and NAME_alpha, as arrays [height, width] in scene units and in [0, 1]; time: of a moving
+    model, in [0, 1], instead of the times of the views.
     """
     from clsplat.runs import model_file
 
@@ -71,21 +71,23 @@ def render_path(
     kind: Literal["png", "npy"] = "png",
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Film a model along a camera path, as `clsplat render --path` does.
+    """Render a video of a model along a camera path, as `clsplat render --path` does.
 
-    Return a table: `files`, the number of `frames`, `fps`, the `seconds` that the film lasts, the `size` of a picture
-    and how long it `took`, s.
+    Returns `files`, the number of `frames`, `fps`, the duration in `seconds`, the `size` of a frame, and the time it
+    `took`, s.
 
-    model, scene: a file and its scene, or a run folder; video: a file that ends in .webm, or .mp4 with the extra
-    `video`; None: pictures of this `kind` into the folder `out`; path: ellipse, spiral, orbit, through, views,
-    fixed, fixed:NAME of a view, or a file camera_path.json; frames: by default 120; fps: by default 30; size: even
-    numbers, by default that of the photographs by `downscale`; times: of a model that moves, one moment in [0, 1],
-    or those of the first and the last frame, such as (0, 1) or "0..1", by default the whole or the views' own;
-    side: "photograph", of the nearest camera, or another model, on the right; depth, alpha: files of these beside.
+    model, scene: a file and its scene, or a run folder
+    video: a file that ends in .webm, or .mp4 with the extra `video`; None: images of this `kind` in the folder `out`
+    path: ellipse, spiral, orbit, through, views, fixed, fixed:NAME of a view, or a camera_path.json file
+    frames: default 120; fps: default 30; size: even numbers; default: the image size divided by `downscale`
+    times: of a moving model, one time in [0, 1], or those of the first and last frame, such as (0, 1) or "0..1";
+        default: the whole range, or the times of the views
+    side: shown on the right: "photograph", that of the nearest camera, or another model
+    depth, alpha: write videos of these too
 
-    Raises ConfigError for values out of bounds, without a scene that the path needs, and where other files would be
-    replaced; DataError for files that cannot be read, and where the scene's cameras give no such path; NumericError for
-    pictures that are not finite; OutputError where files cannot be written; the errors of the device.
+    Raises ConfigError for values out of range, without a scene that the path needs, and if other files would be
+    replaced; DataError for unreadable files, and if the path is impossible with the cameras; NumericError for
+    images that are not finite; OutputError if files cannot be written; and errors of the device.
     """
     from clsplat.runs import film
     from clsplat.viewer.video.film import Wish
@@ -99,9 +101,9 @@ def render_path(
 def camera_path(
     scene: "Scene", path: str = "ellipse", frames: int | None = None, size: Size | None = None
 ) -> "list[View]":
-    """Return the views of a camera path about or through a scene, to be rendered one by one.
+    """Return the views of a camera path around or through a scene.
 
-    path: as for `render_path`.  Raises DataError where the scene's cameras give no such path.
+    path: as for `render_path`.  Raises DataError if the path is impossible with the cameras of the scene.
     """
     import numpy as np
 
@@ -112,9 +114,9 @@ def camera_path(
 
 
 def write_video(file: PathLike, images: "Iterable[NDArray[np.generic]]", fps: float = 30) -> int:
-    """Write pictures, [height, width, 3] in [0, 1] or uint8, as .webm or .mp4; return their number.
+    """Write images, [height, width, 3] in [0, 1] or uint8, as a .webm or .mp4 video; return their number.
 
-    Raises ConfigError for another suffix and for sizes that are odd, ValueError for pictures of different sizes.
+    Raises ConfigError for other suffixes and odd sizes, and ValueError for images of different sizes.
     """
     from clsplat.viewer.video.encoding import write_all
 
@@ -130,8 +132,8 @@ def write_cameras(
     """Write the cameras of a dataset or a run folder for other programs, as `clsplat data cameras` does.
 
     format: sparse/0/*.txt of COLMAP, transforms.json of nerfstudio, or cameras.json of the reference implementation;
-    images: copy the photographs to out/images, too.  Returns the files of cameras.  Raises DataError for a lens that
-    the format cannot hold, ConfigError where a file is there.
+    images: "copy" copies the photos to out/images.  Returns the camera files.  Raises DataError for a lens that the
+    format does not support, and ConfigError if a file exists.
     """
     from clsplat.runs import model_file
     from clsplat.scene.scene import Scene

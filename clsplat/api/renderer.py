@@ -1,4 +1,4 @@
-"""Rendering and its derivatives with NumPy in and out."""
+"""Render views and compute gradients, with NumPy arrays as inputs and outputs."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -29,20 +29,20 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
 Color = float | Sequence[float]
 _OPENING = threading.Lock()
-GEOMETRY = 6  # of the sums over pixels, the ones that do not belong to the color (cl_kernels/splat.h)
+GEOMETRY = 6  # of the pixel sums, those that do not belong to the color (cl_kernels/splat.h)
 
 
-def proved(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
-    """Return an open device, one of a name, or `default_device`, on which pictures and models may be made.
+def open_checked(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
+    """Return an open device, a device by name, or `default_device`, after a check against the reference.
 
-    It was compared with the reference once, as for a run.  Raises DeviceError when it computes wrongly.
+    The check runs once per device, as for a run.  Raises DeviceError if it computes wrongly.
     """
     return open_correct(default_device(schedule) if device is None else device, schedule, sort)
 
 
 def default_device(schedule: Schedule = "auto") -> Device:
-    """Return the device that is taken where none is given; opened on first use."""
-    with _OPENING:  # two threads get the same one
+    """Return the device that is used by default, which is opened on first use."""
+    with _OPENING:  # so that all threads get the same one
         return _opened(schedule)
 
 
@@ -53,7 +53,7 @@ def _opened(schedule: Schedule) -> Device:
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """Derivatives by the parameters before activation, with their shapes, [N, components] float32."""
+    """Gradients of a loss with respect to the parameters before activation, [N, components] float32."""
 
     means: Floats
     quats: Floats
@@ -61,40 +61,40 @@ class Gradients:
     logit_opacity: Floats
     sh_base: Floats
     sh_rest: Floats
-    mean2d: Floats  # [N, 2] px⁻¹, by the projected mean
-    motion: Floats | None = None  # [N, 5 or more] where the Gaussians move
+    mean2d: Floats  # [N, 2] px⁻¹, with respect to the projected mean
+    motion: Floats | None = None  # [N, 5 or more] if the Gaussians move
 
     def __repr__(self) -> str:
         return f"Gradients(of {len(self.means):,} Gaussians)"
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """A rendered view; the arrays are the caller's own."""
+class RenderResult:
+    """A rendered view; the caller owns the arrays."""
 
-    image: Floats  # [height, width, 3], background included
-    alpha: Floats  # [height, width] in [0, 1], how much of a pixel the Gaussians cover
-    depth: Floats | None  # [height, width] scene units, mean depth of what covers a pixel; 0 where nothing does
+    image: Floats  # [height, width, 3], with the background
+    alpha: Floats  # [height, width] in [0, 1], opacity of each pixel
+    depth: Floats | None  # [height, width] scene units, mean depth of each pixel; 0 where nothing is
     view: View
     background: Floats  # [3]
-    model: DeviceModel  # as it was rendered; the picture keeps it on the device
+    model: DeviceModel  # as it was rendered; this keeps it on the device
     renderer: "Renderer"
 
     def backward(self, image: Floats | None = None, alpha: Floats | None = None) -> Gradients:
-        """Return the gradients of a loss by every parameter, from its derivatives by the picture.
+        """Return the gradients of a loss with respect to all parameters.
 
-        image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  It may be called again, and after
-        another model, or a change of its arrays: the gradients are those of what was rendered.
+        image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  May be called repeatedly, also after
+        the renderer got another model: the gradients are those of the model that was rendered.
         Raises ValueError for other shapes.
         """
         return self.renderer.backward(self, image, alpha)
 
     def __repr__(self) -> str:
         height, width = self.alpha.shape
-        return f"Picture({width} x {height} px of '{self.view.name}')"
+        return f"RenderResult({width} x {height} px of '{self.view.name}')"
 
     def png(self) -> bytes:
-        """Return the image as a PNG file of 8 bits a channel."""
+        """Return the image as an 8-bit PNG file."""
         _, data = cv2.imencode(".png", to_8_bits(self.image)[:, :, ::-1])
         return bytes(data)
 
@@ -103,7 +103,7 @@ class Picture:
 
 
 def serialized(method: Method) -> Method:
-    """Let one thread at a time into the methods of an object that are decorated so; it has a `_lock`."""
+    """Decorate a method so that only one thread at a time runs the decorated methods of an object with a `_lock`."""
 
     @wraps(method)
     def locked(self: Any, *arguments: Any, **options: Any) -> Any:
@@ -116,53 +116,53 @@ def serialized(method: Method) -> Method:
 class Renderer:
     """A model on a device.
 
-    Threads may share a renderer, which renders one image at a time.  Renderers on one device do not disturb each other.
+    Threads may share a renderer; it renders one image at a time.  Several renderers can share a device.
     """
 
     def __init__(self, model: Model, device: str | Device | None = None) -> None:
-        """Copy a model to a device, or to one by its name; by default `default_device()`.
+        """Copy a model to a device, given by name or open; default: `default_device()`.
 
-        Raises DeviceError when there is none, or when it computes wrongly.
+        Raises DeviceError if there is none, or if it computes wrongly.
         """
         self._lock = threading.RLock()
-        self.device = proved(device)
+        self.device = open_checked(device)
         self.rasterizer = Rasterizer(self.device)
         self.update(model)
 
     @serialized
     def update(self, model: Model) -> None:
-        """Take another model, or the same after its arrays were changed in place."""
+        """Use another model, or the same one after its arrays were changed in place."""
         self.model, self._model = model, model.upload(self.device)
 
     @serialized
-    def render(self, view: View, background: Color | None = None, depth: bool = False) -> Picture:
-        """Render a view; of a moving model, the moment of the view's time.
+    def render(self, view: View, background: Color | None = None, depth: bool = False) -> RenderResult:
+        """Render a view; a moving model at the time of the view.
 
-        background: a color in [0, 1], one number or three; by default the model's sky or color, else black;
-        depth: compute it, which takes another pass.  Raises ValueError for a camera that cannot be and for other
-        backgrounds, NumericError where a value of the picture is not finite.
+        background: a color in [0, 1], one number or three; default: the model's sky or color, or else black; depth:
+        whether to compute it, which takes another pass.  Raises ValueError for an invalid camera or background, and
+        NumericError if a value of the result is not finite.
         """
         view.camera.check()
         camera, color = upload_camera(self.device, view), self._color(background)
         model = self._model if background is None else replace(self._model, sky=None)
-        found = layers(self.rasterizer, model, camera, self.device.upload(color), depth)
-        for values in found.arrays:
+        rendered = layers(self.rasterizer, model, camera, self.device.upload(color), depth)
+        for values in rendered.arrays:
             require_finite(values, view)
-        return Picture(found.image, found.alpha, found.depth, view, color, model, self)
+        return RenderResult(rendered.image, rendered.alpha, rendered.depth, view, color, model, self)
 
     @serialized
-    def backward(self, picture: Picture, image: Floats | None, alpha: Floats | None) -> Gradients:
-        """Return the gradients of a loss, as Picture.backward does."""
-        camera = upload_camera(self.device, picture.view)
-        model = picture.model
+    def backward(self, result: RenderResult, image: Floats | None, alpha: Floats | None) -> Gradients:
+        """Return the gradients of a loss; see `RenderResult.backward`."""
+        camera = upload_camera(self.device, result.view)
+        model = result.model
         size = camera.height, camera.width
         sums = np.zeros((0, 0), np.float32)
-        if alpha is not None:  # alpha is the second channel of a picture that shows (depth, 1, 0) on black
+        if alpha is not None:  # alpha is the second channel of a render of (depth, 1, 0) on black
             planes = np.zeros((*size, 3), np.float32)
             planes[:, :, 1] = _checked("alpha", alpha, size)
             frame = self._forward(model, camera, np.zeros(3, np.float32), "depth")
             sums = self._pixel_sums(model, frame, planes).get()[:GEOMETRY]
-        frame = self._forward(model, camera, picture.background)
+        frame = self._forward(model, camera, result.background)
         planes = np.zeros((*size, 3), np.float32) if image is None else _checked("image", image, (*size, 3))
         pixel_sums = self._pixel_sums(model, frame, planes)
         if alpha is not None:
@@ -194,34 +194,34 @@ class Renderer:
 def _checked(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:
     array = np.asarray(derivative, np.float32)
     if array.shape != shape:
-        raise ValueError(f"the derivative by {name} has shape {array.shape}; expected {shape}, as the picture")
+        raise ValueError(f"gradient of {name}: expected shape {shape}, as the render has, got {array.shape}")
     return array
 
 
-# Rendering of a field with NumPy out.
+# Rendering of fields.
 
 
 class FieldRenderer:
     """A field on a device.  Threads may share it; it renders one image at a time."""
 
     def __init__(self, model: FieldModel, device: str | Device | None = None) -> None:
-        """Copy a field to a device, or to one by its name; by default `default_device()`.
+        """Copy a field to a device, given by name or open; default: `default_device()`.
 
-        Raises DeviceError when there is none, or when it computes wrongly.
+        Raises DeviceError if there is none, or if it computes wrongly.
         """
         self._lock = threading.RLock()
-        self.model, self.device = model, proved(device)
+        self.model, self.device = model, open_checked(device)
         self._field = model.upload(self.device)
 
     @serialized
     def render(self, view: View, depth: bool = False) -> Layers:
-        """Return `image` [height, width, 3] before the field's background, `alpha` and `depth` [height, width].
+        """Return `image` [height, width, 3] with the field's background, `alpha` and `depth` [height, width].
 
-        depth: mean depth of what covers a pixel, scene units; None where it is not asked for.
-        Raises ValueError for a camera that cannot be, NumericError where a value of the picture is not finite.
+        depth: whether to compute the mean depth of each pixel, scene units; else it is None.
+        Raises ValueError for an invalid camera, and NumericError if a value of the result is not finite.
         """
         view.camera.check()
-        found = self._field.layers(upload_camera(self.device, view), depth)
-        for values in found.arrays:
+        rendered = self._field.layers(upload_camera(self.device, view), depth)
+        for values in rendered.arrays:
             require_finite(values, view)
-        return found
+        return rendered

@@ -1,4 +1,4 @@
-"""Functions about devices, datasets and speed; errors and `device` as in `clsplat.api.commands`."""
+"""Inspect devices and datasets, and measure speed; errors and `device` as in `clsplat.api.commands`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,9 +17,9 @@ ScheduleName = Literal["auto", "wide", "simt"]  # wide for CPUs, simt for GPUs
 
 
 def devices() -> list[dict[str, Any]]:
-    """Return the OpenCL devices: name, limits in bytes and items, and as `fault` what keeps one from working, or None.
+    """Return the OpenCL devices: name, limits in bytes and items, and `fault`, why it does not work, or None.
 
-    Each is tried once, in a process of its own.
+    Each device is tested once, in its own process.
     """
     from dataclasses import asdict
 
@@ -31,9 +31,9 @@ def devices() -> list[dict[str, Any]]:
 
 
 def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -> "DeviceReport":
-    """Compare every kernel with the reference on a device; return a `verdict`, whether it is `usable`, and `data()`.
+    """Compare all kernels with the reference on a device; return `verdict`, `usable` and `data()`.
 
-    It takes a minute or two on a CPU.  page: a file to write, to be attached to a report.
+    This takes a minute or two on a CPU.  page: an HTML report to write, to attach to an issue.
     """
     from clsplat.conformance.doctor import check_html_path, examine, write_page
 
@@ -47,10 +47,10 @@ def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -
 
 
 def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection":
-    """Look at a dataset; return its `verdict`, `findings`, whether it is `trainable`, and all as `data()`.
+    """Inspect a dataset; return `verdict`, `findings`, `trainable` and `data()`.
 
-    scene: a folder, or that of a run, which stands for the one it was trained on; page: a file to write, with the
-    cameras and points in 3D.  Raises DataError only where there is no such folder.
+    scene: a dataset folder, or a run folder, for the scene it was trained on; page: an HTML page to write, with the
+    cameras and points in 3D.  Raises DataError only if the folder does not exist.
     """
     from clsplat.core.files import check_result_path
     from clsplat.prepare.inspect.findings import Inspection
@@ -78,8 +78,8 @@ def measure_speed(
 ) -> "Measurement":
     """Time the stages of a training step, as `clsplat bench` does; return times in ms, as `data()` and `text()`.
 
-    scenes: fixed ones, of A, B and C; model, scene: a splat or point cloud and its scene, timed too; pipeline: whose
-    losses, statistics and filter a step has; repeats: steps of each scene.
+    scenes: some of the fixed scenes A, B and C; model, scene: a splat or point cloud and its scene, to time as well;
+    pipeline: its losses, statistics and filters are used; repeats: steps per scene.
     """
     from clsplat.conformance.bench.measurement import measure
 
@@ -96,7 +96,7 @@ def measure_speed(
 
 
 def read_measurement(file: PathLike, pipeline: PathLike = "splat") -> dict[str, Any]:
-    """Read the `data()` of an earlier measurement from JSON, to be shown beside another of the same pipeline."""
+    """Read the `data()` of an earlier measurement from JSON, to compare it with another of the same pipeline."""
     from clsplat.conformance.bench import measurement
 
     load_plugins()
@@ -104,7 +104,7 @@ def read_measurement(file: PathLike, pipeline: PathLike = "splat") -> dict[str, 
 
 
 def load_plugin(file: PathLike) -> None:
-    """Import a plug-in, as `--plugin` does.  Raises ConfigError, with file and line, when that fails."""
+    """Import a plug-in, as `--plugin` does.  Raises ConfigError, with file and line, if that fails."""
     from clsplat.pipeline import plugins
 
     plugins.load_file(Path(file))

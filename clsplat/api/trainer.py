@@ -1,4 +1,4 @@
-"""A pipeline's training, step by step from Python."""
+"""Train a pipeline step by step from Python."""
 
 import shutil
 import tempfile
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, overrides
-from clsplat.api.renderer import proved, serialized
+from clsplat.api.renderer import open_checked, serialized
 from clsplat.core import lock
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
 from clsplat.core.files import CHECKSUMS, END_STATES
@@ -45,7 +45,7 @@ from clsplat.training.status import StatusFile
 class Report:
     """One training step."""
 
-    step: int  # global, counted from 1
+    step: int  # global, from 1
     gaussians: int
     view: ViewLosses  # of this step, ViewGradients unless it was skipped; valid until the next
 
@@ -59,11 +59,11 @@ class Report:
 
 
 class Trainer:
-    """Trains a scene as a pipeline says: a trainer and `clsplat run` give the same bits.
+    """Trains a scene with a pipeline; a trainer and `clsplat run` give the same bits.
 
-    Stages before the training are run at once, and those that change the model right behind it with its last step; the
-    others, such as `evaluate` and `export`, are not run at all: use `evaluate` and `model`.  Ctrl-C lets a step finish,
-    and training can go on.  Threads may share a trainer; one at a time is inside of it.
+    Stages before the training run at once, and those that edit the model after it run with its last step.  Other
+    stages, such as `evaluate` and `export`, do not run: use the methods `evaluate` and `model`.  On Ctrl-C a step
+    finishes, and training can continue.  Threads may share a trainer, one at a time.
     """
 
     def __init__(
@@ -78,11 +78,14 @@ class Trainer:
     ) -> None:
         """Prepare training.
 
-        scene: what `read_scene` returns, whose split is kept, or a folder; pipeline: a file, or the name of a shipped
-        one; set: settings by place, such as {"optimize.steps": 3000}; device: a part of its name, or one that is open,
-        with the schedule of the pipeline; out: the run folder, by default a temporary one that goes away with the
-        trainer; start: as for `clsplat.run`.  A trainer holds its folder until its training has ended, `close()`, or it
-        is let go.
+        scene: a folder, or the result of `read_scene`, whose split is kept
+        pipeline: a file, or the name of a shipped one
+        set: settings by key, such as {"optimize.steps": 3000}
+        device: part of its name, or an open device with the schedule of the pipeline
+        out: the run folder; default: a temporary one that is deleted with the trainer
+        start: as for `clsplat.run`
+
+        A trainer locks its folder until its training ends, or until `close()`, or until it is deleted.
         Raises ConfigError, DataError and DeviceError.
         """
         self._lock = threading.RLock()
@@ -93,9 +96,9 @@ class Trainer:
         _check(self.pipeline)
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.split)
         if without := [view.name for view in self.scene.split("train") if view.image_path == NO_FILE]:
-            raise DataError(f"{self.scene.path}: the view '{without[0]}' has no photograph; training needs one of each")
+            raise DataError(f"{self.scene.path}: the view '{without[0]}' has no image, which training needs")
         if start != "new" and out is None:
-            raise ConfigError(f"{start}: expected the folder of a run as `out`")
+            raise ConfigError(f"start='{start}': expected a run folder as `out`")
         if out is None:
             out = tempfile.mkdtemp(prefix="clsplat-")
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
@@ -103,7 +106,7 @@ class Trainer:
         before = RunState.read(self.out)
         outputs.check_output_paths(self.pipeline, before)
         rasterizer = self.pipeline.settings.rasterizer
-        opened = proved(device, rasterizer.schedule, rasterizer.sort)
+        opened = open_checked(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:
             status = holding.enter_context(run_folder.opened(before, start, step=0))
             with failures_recorded(status, as_raised=True):
@@ -111,7 +114,7 @@ class Trainer:
                 self._run = opening.make_run(self.pipeline, scene_of_run, opened, self.out, status)
                 self.pipeline = settle(self.pipeline, self._run)
                 runner.begin(self.pipeline, self._run, start)
-                (self.out / CHECKSUMS).unlink(missing_ok=True)  # it lists what the stages of a whole run write
+                (self.out / CHECKSUMS).unlink(missing_ok=True)  # it lists files of stages that a trainer does not run
                 with saved_on_failure(self._run):
                     run_until_training(self.pipeline, self._run)
             holding.callback(_left, status)
@@ -123,7 +126,7 @@ class Trainer:
 
     @serialized
     def close(self) -> None:
-        """Leave the run folder to others.  Training does not go on after it; what is left in `out` can be resumed.
+        """Unlock the run folder and end the training, which can be resumed from `out`.
 
         Before its last step status.json says `interrupted` then.  After it, and after an error, a trainer is closed by
         itself.
@@ -135,9 +138,9 @@ class Trainer:
 
     @serialized
     def step(self) -> Report:
-        """Train one step.  Raises StopIteration when the pipeline's steps are done.
+        """Train one step.  Raises StopIteration when the training is finished.
 
-        After an error inside of a step the trainer cannot go on; the next call says so.  status.json in `out` has the
+        After an error in a step, the trainer cannot continue.  status.json in `out` has the
         error, or `done` after the last step.
         """
         interrupts: list[bool] = []
@@ -151,7 +154,7 @@ class Trainer:
             raise StopIteration
         if self._state != "open":
             why = "ended with an error" if self._state == "failed" else "is closed"
-            raise ClsplatError(f"{self!r} {why}; make another, with start='resume' where `out` holds a checkpoint")
+            raise ClsplatError(f"{self!r} {why}; create another, with start='resume' if `out` has a checkpoint")
         try:
             with (
                 failures_recorded(self._run.status, as_raised=True),
@@ -171,7 +174,7 @@ class Trainer:
         return Report(self._run.step, self._run.model.gaussians.count, view)
 
     def steps(self, count: int | None = None) -> Iterator[Report]:
-        """Train step by step, as many as are given, or to the end of the pipeline's training."""
+        """Train step by step, for `count` steps or to the end of the training."""
         done = 0
         while count is None or done < count:
             try:
@@ -181,7 +184,7 @@ class Trainer:
             done += 1
 
     def run(self, count: int | None = None) -> Report | None:
-        """Train so many steps, or to the end of the pipeline's training; return the last, or None."""
+        """Train `count` steps, or to the end of the training; return the last report, or None."""
         report = None
         for report in self.steps(count):  # noqa: B007
             pass
@@ -190,25 +193,25 @@ class Trainer:
     @property
     @serialized
     def model(self) -> Model:
-        """A copy of the model as it is now; `model.baked()` makes a world filter part of its scales, as a run does."""
+        """A copy of the current model; `model.baked()` makes a world filter part of its scales, as a run does."""
         return host_model(self._run)
 
     @serialized
     def add_loss(self, function: HostFunction, weight: Schedule = 1.0) -> None:
-        """Minimize also `function(image, photograph) -> (value, derivative by the image)`, in NumPy, from now on.
+        """Add a loss in NumPy: `function(image, photograph) -> (value, gradient with respect to the image)`.
 
         Arrays are [height, width, 3] float32 in [0, 1]; weight: factor, by step.  Each step copies both images to the
-        host and the derivative back; a plug-in with a kernel does not.
-        Raises ConfigError for a weight that is not from 0 on; a step raises ValueError where the function returns
-        something else, and NumericError for values that are not finite.
+        host and the gradient back, which a plug-in with a kernel avoids.
+        Raises ConfigError for a negative weight.  A step raises ValueError if the function returns anything else, and
+        NumericError for values that are not finite.
         """
         self._run.losses.append(HostLoss(function, weight))
 
     @serialized
     def evaluate(self, split: str = "test") -> dict[str, Any]:
-        """Return the metrics of a split at the size that is trained on, with the keys of metrics.json.
+        """Return the metrics of a split at the image size of training, with the keys of metrics.json.
 
-        psnr is in dB; a split without views has `views` alone.  Raises ValueError for a split that there is not.
+        psnr is in dB; a split without views returns only `views`.  Raises ValueError for an unknown split.
         """
         run = self._run
         views = learned_scene(run).downscaled(run.downscale).split(split)
@@ -218,15 +221,15 @@ class Trainer:
 
     @serialized
     def checkpoint(self) -> Path:
-        """Save all that training needs to go on to the same bits, but for losses that were added; return the file.
+        """Save a checkpoint from which training continues to the same bits, without added losses; return the file.
 
-        It lies in `out`, where the newest two are kept.  Raises OutputError when it cannot be written.
+        The newest two are kept in `out`.  Raises OutputError if it cannot be written.
         """
         with nullcontext() if self._state == "open" else lock.lock_folder(self.out):
             return checkpoint.save(self._run, keep=2)
 
     def _record_end(self) -> None:
-        """Write `done` to status.json where no step is left."""
+        """Write `done` to status.json if no steps are left."""
         if is_trained(self.pipeline, self._run):
             self._run.status.end("done", exit_code=0)
             self._state = "done"
@@ -237,17 +240,17 @@ class Trainer:
 
 
 def _left(status: StatusFile) -> None:
-    """Write that a trainer was closed, or let go, before its end; a folder that was removed stays so."""
+    """Record that a trainer was closed or deleted before its end, unless its folder is gone."""
     if status.now.state not in END_STATES and status.out.is_dir():
         with suppress(OutputError):
             status.end("interrupted", Interrupted.exit_code, "the trainer was closed before its last step")
 
 
 def _check(pipeline: Pipeline) -> None:
-    """Raise ConfigError where a pipeline has nothing to train or more than that."""
+    """Raise ConfigError if a pipeline has no training, or prepares its scene."""
     if pipeline.settings.prepare:
         raise ConfigError(f"{pipeline.path}: prepares its scene; use clsplat.run, then train on the result")
     if not any(isinstance(stage, Optimize) for stage in pipeline.stages):
-        raise ConfigError(f"{pipeline.path}: has no stage 'optimize'; expected one to train with")
+        raise ConfigError(f"{pipeline.path}: expected a stage 'optimize'")
     for stage in pipeline.stages:
         stage.check()

@@ -53,7 +53,7 @@ def test_names_for_readers_and_for_type_checkers_agree():
         assert alias.name == alias.asname, "`import X as X` makes a name public for type checkers"
         typed[alias.name] = node.module
     modules = {name: place.rpartition(".")[0] for name, place in clsplat._MODULES.items()}
-    assert typed == {**clsplat._PLACES, **modules}
+    assert typed == {**clsplat._MODULE_OF, **modules}
     assert sorted(typed) == clsplat.__all__
     assert {*clsplat.__all__, "__version__"} == set(dir(clsplat))
 
@@ -61,7 +61,7 @@ def test_names_for_readers_and_for_type_checkers_agree():
 def test_every_name_is_there_and_says_what_it_is():
     faults = [f"{name}: has no docstring" for name in clsplat.__all__ if not getattr(clsplat, name).__doc__]
     for name in set(clsplat.__all__) - set(clsplat._MODULES):
-        if getattr(clsplat, name) is not getattr(importlib.import_module(clsplat._PLACES[name]), name):
+        if getattr(clsplat, name) is not getattr(importlib.import_module(clsplat._MODULE_OF[name]), name):
             faults.append(f"{name}: is another object")
         if any(place.exists() for place in (ROOT / "clsplat" / name, ROOT / "clsplat" / f"{name}.py")):
             faults.append(f"{name}: a module of that name would take its place when imported")
@@ -159,7 +159,7 @@ def test_a_scene_made_by_hand_is_for_rendering(device, rng):
     renderer = Renderer(model, device)
     assert [renderer.render(view).image.shape for view in scene.split("all")] == [(32, 48, 3)] * 3
     assert "<img" not in scene._repr_html_()
-    with pytest.raises(DataError, match="by hand: the view '1' has no photograph; training needs one of each"):
+    with pytest.raises(DataError, match="by hand: the view '1' has no image, which training needs"):
         clsplat.Trainer(scene, "smoke", device=device)
 
 

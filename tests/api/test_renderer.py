@@ -256,7 +256,7 @@ def test_arrays_of_a_picture_are_the_callers_own(device, rng):
     kept = picture.image.copy()
     renderer.render(case.view, 1.0).image[:] = 7
     np.testing.assert_array_equal(picture.image, kept)
-    assert repr(picture) == "Picture(33 x 21 px of 'view')"
+    assert repr(picture) == "RenderResult(33 x 21 px of 'view')"
     assert repr(picture.backward()) == "Gradients(of 20 Gaussians)"
 
 

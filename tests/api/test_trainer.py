@@ -169,7 +169,7 @@ def test_a_loss_that_is_added_acts_from_the_next_step_on(tiny_scene):
         (("smokee",), ConfigError, "no pipeline named 'smokee'"),
         (("smoke", {"optimize.step": 3}), ConfigError, "did you mean"),
         (("smoke", {"optimize.steps": np.zeros(2)}), ConfigError, "set: Object of type ndarray"),
-        (("smoke", {}, None, "resume"), ConfigError, "resume: expected the folder of a run as `out`"),
+        (("smoke", {}, None, "resume"), ConfigError, "start='resume': expected a run folder as `out`"),
     ],
 )
 def test_what_cannot_be_trained_is_a_sentence(tiny_scene, arguments, error, message):
@@ -193,7 +193,7 @@ def test_folders_that_are_missing_or_taken_are_refused(tiny_scene, tmp_path):
         clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
     no_training = tmp_path / "no.yaml"
     no_training.write_text("name: no\nstages: [init, export]\n")
-    with pytest.raises(ConfigError, match="has no stage 'optimize'"):
+    with pytest.raises(ConfigError, match="expected a stage 'optimize'"):
         clsplat.Trainer(tiny_scene, no_training)
 
 

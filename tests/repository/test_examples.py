@@ -134,7 +134,7 @@ def test_scene_to_picture_runs_and_shows_what_it_says(tiny_scene, folder):
         elif hasattr(value, "_repr_png_"):
             assert value._repr_png_().startswith(b"\x89PNG")
         shown.append(type(value).__name__)
-    assert shown == ["Scene", "dict", "Model", "Picture", "Picture", "Model", "Model"]
+    assert shown == ["Scene", "dict", "Model", "RenderResult", "RenderResult", "Model", "Model"]
     assert clsplat.metrics.psnr(names["picture"].image, names["view"].photograph(1.0)) > 20
     assert Path("scene_to_picture.ply").is_file()
 

@@ -39,7 +39,7 @@ def expected(pipeline: str, photos: Path, *sets: str) -> list[str]:
     planned = asked.preparation(out)
     names = listed(asked, planned, out)
     device = SimpleNamespace(info=SimpleNamespace(units=2))
-    return module.expected(asked, planned, names, known(asked, names), device, None)  # type: ignore[arg-type]
+    return module.estimate_time(asked, planned, names, known(asked, names), device, None)  # type: ignore[arg-type]
 
 
 def test_time_of_parts_follows_from_the_number_of_pieces(photos):
