@@ -31,7 +31,7 @@ void adam_step(
     const uint i = get_global_id(0) * LANES, first = every & undrawn;
     if (i >= count)
         return;
-    /* where each is updated, all items read the first keys, which costs nothing */
+    /* if all are updated, every item reads the first keys, which costs nothing */
     const VI seen = VLOAD_INT(depth_key + (i & ~first)) != -1;
     if (!ANY(seen | (VI)((int)first)))
         return;
@@ -41,7 +41,7 @@ void adam_step(
                 EPSILON);
 }
 
-/* Update one plane of a block.  first, gradient, g, updated: [VECTORS]; waiting: a bit for each vector that is left. */
+/* Update one plane of a block.  first, gradient, g, updated: [VECTORS]; waiting: a bit for each vector to leave out. */
 static inline void update_plane(__global float *values, __global float *moment1, __global float *moment2,
                                 const uint *first, const VF *gradient, const gradient_t *g, const VI *updated,
                                 const uint vectors, const uint waiting, const float rate, const float correction2)

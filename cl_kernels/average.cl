@@ -1,5 +1,5 @@
-/* The average of every parameter over steps (Polyak and Juditsky 1992).  Each row counts its own steps, so that a
- * Gaussian that is new begins anew.  One item = one row of one plane; dimension 1 is the plane.  No local memory.
+/* The average of every parameter over steps (Polyak and Juditsky 1992).  Each row counts its own steps, so that a new
+ * Gaussian starts a new average.  One item = one row of one plane; dimension 1 is the plane.  No local memory.
  * Deterministic: each value has one writer. */
 #include "splat.h"
 

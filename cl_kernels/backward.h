@@ -98,7 +98,7 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
 
 /* Gradients of everything but the coefficients of harmonics: those are basis[k] * color[channel]. */
 typedef struct {
-    VI touched;      // the Gaussian was drawn; where not, all gradients are zero and these values invalid
+    VI touched;      // whether the Gaussian is visible; if not, all gradients are zero and these values invalid
     VF mean2d[2];    // px^-1
     VF means[3], quats[4], log_scales[3], logit_opacity;
     VF focal;        // of the logarithm of both focal lengths
@@ -121,9 +121,9 @@ static inline void color_backward(
                                  ? VLOAD(pixel_sums + (SUM_RED + channel) * stride + i) : (VF)(0.0f);
 }
 
-/* The weight of each basis function in the derivative by direction, c_k . g, for the vectors whose harmonics begin
+/* The weight of each basis function in the derivative by direction, c_k . g, for the vectors whose harmonics start
  * at each of `first`: plane by plane, so that memory is read in runs.  unseen: a bit for each vector in which nothing
- * was drawn; its harmonics are not read. */
+ * is visible; its harmonics are not read. */
 static inline void weigh_harmonics(
     __global const float *sh_rest,  // coefficient-major, see slots.h
     const gradient_t *g, const uint vectors, const uint unseen, const uint degree, const uint stride, const uint *first,
@@ -140,7 +140,7 @@ static inline void weigh_harmonics(
     }
 }
 
-/* The gradients of Gaussians of which none was drawn. */
+/* Set the gradients of Gaussians that are not visible to zero. */
 static inline void no_gradient(gradient_t *g)
 {
     const VF zero = (VF)(0.0f);
@@ -155,7 +155,7 @@ static inline void no_gradient(gradient_t *g)
     g->logit_opacity = g->focal = zero;
 }
 
-/* The other gradients, from those of the colors and from the weights of the harmonics. */
+/* The remaining gradients, from those of the colors and the weights of the harmonics. */
 static inline void gradient_of(
     __global const float *means,            // [3,S] scene units
     __global const float *quats,            // [4,S] unnormalized

@@ -81,7 +81,7 @@ void blend_forward(
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         const uint length = end - begin < BATCH ? end - begin : BATCH;
-        /* one condition alone: with two, a compiler took 40 registers instead of 32, and a quarter fewer groups fit */
+        /* a single condition: with two, a compiler used 40 registers instead of 32, and a quarter fewer groups fit */
         for (uint j = p.t > 0.0f ? 0 : BATCH; j < length; j = p.t > 0.0f ? j + 1 : BATCH) {
             float4 quads[QUADS];
             for (uint k = 0; k < QUADS; k++)
@@ -128,8 +128,8 @@ static inline void write_sums(__global float *pair_sums, const uint pair, const 
 }
 
 /* One item owns one splat of a batch of PIXELS and adds the tile's pixels one after another: at step s, item i computes
- * pixel s - i, which item i - 1 computed at the step before, so every pixel blends its splats front to back.  With the
- * last pixel an item writes its sums, and goes on with its splat of the next batch: none waits for the others to end.
+ * pixel s - i, which item i - 1 computed in the previous step, so that every pixel blends its splats front to back.
+ * After the last pixel, an item writes its sums and continues with its splat of the next batch, without waiting.
  * No atomics, no sums across items.  Local memory, for each pixel: 72 bytes, 76 with a texture or the entropy, 80 with
  * both, 92 with inverse depths, 96 with a texture too.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1)))
@@ -148,7 +148,7 @@ void blend_backward(
     const uint first_tile)                      // of this launch
 {
     __local grad_pixels_t pixels[PIXELS];
-    __local float4 coming[PIXELS][QUADS];  // an item's splat of the next batch: the item alone reads and writes it
+    __local float4 coming[PIXELS][QUADS];  // an item's splat of the next batch: only that item reads and writes it
     __local uint coming_pair[PIXELS];
     const uint item = get_local_id(0), tile = first_tile + get_group_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;

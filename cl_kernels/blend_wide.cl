@@ -5,7 +5,7 @@
 
 #define TOGETHER (COLUMNS > 1 ? 1 : 2)  // rows of a tile that are blended together
 
-/* 1 where the pixel lies in the image, else 0: losses need planes that are zero outside. */
+/* 1 where the pixel is in the image, else 0: losses need planes that are zero outside. */
 static inline VF inside_image(__constant camera_t *camera, const VF pixel, const uint row)
 {
     const VF one = (VF)(1.0f), zero = (VF)(0.0f);
@@ -155,14 +155,14 @@ static inline void pixel_sums_of(const float *splat, const uint tile_x, const ui
     const uint y_below = low > 0.0f ? (uint)low : 0u, y_first = y_below + (low > (float)y_below ? 1u : 0u);
     const uint y_end = high < 0.0f ? 0u : high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;
 #if PIXEL_BOX
-    if (splat[BOX_TURNED] > 0.0f)  // apart, so that both loops know where their fields lie
+    if (splat[BOX_TURNED] > 0.0f)  // two loops, so that the fields are constant in each
         for (uint y = y_first; y < y_end; y++)
             add_row(splat, lines, slopes, true, top + y, y, centers, pixels + y * COLUMNS, &pixel_sums);
     else
         for (uint y = y_first; y < y_end; y++)
             add_row(splat, lines, slopes, false, top + y, y, centers, pixels + y * COLUMNS, &pixel_sums);
 #else
-    /* One vector after the other, as one loop: two together are too much code for the registers that there are. */
+    /* One vector after the other, in one loop: two at once need too many registers. */
     for (uint v = y_first * COLUMNS; v < y_end * COLUMNS; v++) {
         const row_splat_t at_row = splat_on_lines(splat, lines, slopes, v / COLUMNS);
         blend_backward_step(pixels + v, at_row, centers[v % COLUMNS], splat + SPLAT_RED, &pixel_sums);

@@ -1,14 +1,14 @@
-/* The colors of one photograph by place and luminance: a bilateral grid (Chen et al. 2007; Wang et al. 2024).
+/* The bilateral grid of one photograph: colors by position and luminance (Chen et al. 2007; Wang et al. 2024).
  *
- * At each of nx ny nz nodes over the width, the height and the luminance of an image stands what a matrix [E | b] has
- * beside that of no change.  A pixel c lies at X = (x + 1/2) / width (nx - 1), Y likewise, and Z = clamp(l . c, 0, 1)
- * (nz - 1), l the weights of the luminance; A is the trilinear mean of the nodes about it, whose weights are
- * max(0, 1 - |X - i|) for each axis, and y = min(1, c + A [c; 1]).  White is cut and passes no gradient.  A fourth
- * plane is copied.
+ * Each of nx ny nz nodes over the width, the height and the luminance of an image holds the difference of a matrix
+ * [E | b] from the identity.  A pixel c is at X = (x + 1/2) / width (nx - 1), Y likewise, and Z = clamp(l . c, 0, 1)
+ * (nz - 1), l the weights of the luminance.  A is the trilinear interpolation of the nodes around it, with weights
+ * max(0, 1 - |X - i|) for each axis, and y = min(1, c + A [c; 1]).  Clamped values pass no gradient.  A fourth plane
+ * is copied.
  *
- * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image.  A grid is [ENTRIES,nz,ny,nx].  The
- * derivative by it is summed over the pixels of a row for each of its columns of nodes, then over the rows about each
- * node in their order: each sum has one place and is written once.  Deterministic. */
+ * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image.  A grid is [ENTRIES,nz,ny,nx].  Its
+ * gradient is summed over the pixels of a row for each column of nodes, then over the rows around each node, in order;
+ * each sum is written once.  Deterministic. */
 #include "color_grid.h"
 #include "planes.h"
 
@@ -40,13 +40,13 @@ static inline VF level_of(const VF luminance, const uint nz)
     return smaller(larger(luminance, (VF)(0.0f)), (VF)(1.0f)) * (float)(nz - 1);
 }
 
-/* The place of LANES pixels from one on, in nodes; per_pixel: (n - 1) / pixels of the axis. */
+/* The positions of LANES pixels starting at one, in nodes; per_pixel: (n - 1) / pixels of the axis. */
 static inline VF places_of(const uint first, const float per_pixel)
 {
     return (to_VF(LANE_INDEX + (int)first) + 0.5f) * per_pixel;
 }
 
-/* The first pixel about a node of an axis, and the one after the last. */
+/* The first pixel that a node of an axis affects, and one past the last. */
 static inline uint begin_of_node(const uint node, const uint nodes, const uint pixels)
 {
     return node > 0 ? (node - 1) * pixels / (nodes - 1) : 0;
@@ -57,7 +57,7 @@ static inline uint end_of_node(const uint node, const uint nodes, const uint pix
     return (node + 1) * pixels / max(nodes - 1, 1u) + 1;
 }
 
-/* The grid between two rows of nodes, in a row of pixels, [ENTRIES,nz,nx]; all items of a group write it together. */
+/* The grid interpolated at a row of pixels, [ENTRIES,nz,nx]; all items of a group write it together. */
 static inline void grid_of_row(
     __global const float *grid, __local float *found, const uint nx, const uint ny, const uint nz, const uint y,
     const float per_row)
@@ -73,8 +73,8 @@ static inline void grid_of_row(
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-/* The matrices of LANES pixels from x on, `a`, by the grid of their row, and their derivatives by the level, `slopes`,
- * which may be 0 where a call does not ask for them. */
+/* The matrices of LANES pixels starting at x, `a`, from the grid of their row, and their derivatives by the level,
+ * `slopes`; a null pointer: not needed. */
 static inline void matrices_of(
     __local const float *grid, const uint nx, const uint nz, const uint x, const float per_column, const VF level,
     VF *a, VF *slopes)
@@ -133,8 +133,8 @@ void color_grid_forward(
     }
 }
 
-/* Gradient by the image, through the matrix and through the luminance at which it is read, and what passed the cut.
- * As color_grid_forward. */
+/* The gradient of the image, through the matrix and through the luminance at which it is read, and the part of the
+ * gradient that passed the clamp.  As color_grid_forward. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_backward(
     __global const float *restrict image,     // [channels,H',stride] before the change
@@ -184,7 +184,7 @@ void color_grid_backward(
     }
 }
 
-/* Sums of w p [c; 1] over the pixels of a row about a column of nodes, w the weight of its place and level.
+/* Sums of w p [c; 1] over the pixels of a row around a column of nodes, w the weight of position and level.
  * One group of TEAM items = one column of nodes in one row of pixels.  Local memory: ENTRIES * TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_row_sums(
@@ -227,7 +227,7 @@ void color_grid_row_sums(
     }
 }
 
-/* Derivatives by the grid: the rows of pixels about each row of nodes, in their order.  One item = one value. */
+/* The gradient of the grid: sums over the rows of pixels around each row of nodes, in order.  One item = one value. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void color_grid_gather(
     __global const float *restrict row_sums,  // [ENTRIES,nz,nx,H']

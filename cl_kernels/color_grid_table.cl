@@ -1,16 +1,16 @@
 /* The grids of all photographs (color_grid.cl): how smooth one is, its update, and their mean.
  *
- * Smoothness of a grid: for each axis the mean of the squared differences of neighboring nodes, times a weight (the
- * total variation of Wang et al. 2024).  A grid is [ENTRIES,nz,ny,nx], which is not always a multiple of a vector: an
- * item has one value.  Deterministic. */
+ * The smoothness of a grid is, for each axis, the mean of the squared differences of neighboring nodes, times a weight
+ * (the total variation of Wang et al. 2024).  A grid is [ENTRIES,nz,ny,nx], which is not always a multiple of a vector,
+ * so that an item has one value.  Deterministic. */
 #undef LANES
 #define LANES 1
 #include "adam.h"
 #include "color_grid.h"
 #include "planes.h"
 
-/* Derivatives of the smoothness of a photograph's grid, and its share of each value, which has the differences to the
- * next nodes.  One item = one value. */
+/* The gradient of the smoothness of a photograph's grid, and the share of each value in it: the differences to the next
+ * nodes.  One item = one value. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void color_grid_smoothness(
     __global const float *restrict values,    // [photographs,ENTRIES,nz,ny,nx]
@@ -63,9 +63,9 @@ void color_grid_update(
                 EPSILON);
 }
 
-/* Subtract from each entry at each level of luminance its mean over the photographs and the places: a color that all
- * photographs change alike, wherever it lies in them, is the model's.  One group of TEAM items = one entry at one
- * level.  Local memory: TEAM * 4 bytes. */
+/* Subtract from each entry at each level of luminance its mean over photographs and positions: a change of color that
+ * all photographs share everywhere belongs to the model.  One group of TEAM items = one entry at one level.
+ * Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_center(
     __global float *restrict values,  // [photographs,ENTRIES * nz,places]

@@ -1,8 +1,9 @@
-/* The colors of one photograph: y = min(1, E c + b) of every pixel c, with a matrix [E | b] of its own, and back.
+/* The colors of one photograph: y = min(1, E c + b) for every pixel c, with a matrix [E | b] per photograph, and its
+ * gradient.
  *
- * White is cut, since a photograph has no more; black is not, or a pixel below it would have no gradient.  What is cut
- * passes no gradient.  A fourth plane of the image is copied.  Planes are [channels,H',W'] with H', W' whole tiles,
- * zero outside the image.  One group of TEAM items = one row; each sum is written once.  Deterministic. */
+ * Values are clamped at white, as in a photograph, but not at black, where a pixel below it would have no gradient.
+ * Clamped values pass no gradient.  A fourth plane of the image is copied.  Planes are [channels,H',W'] with H', W'
+ * whole tiles, zero outside the image.  One group of TEAM items = one row; each sum is written once.  Deterministic. */
 #include "planes.h"
 
 #define SUMS 12  // derivatives by the matrix [E | b], row by row
@@ -35,7 +36,7 @@ void colors_forward(
     }
 }
 
-/* Gradient by the image, and the sums of a row that give the derivatives by the matrix.
+/* The gradient of the image, and the sums of a row that give the gradient of the matrix.
  * Local memory: TEAM * SUMS * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void colors_backward(

@@ -37,7 +37,7 @@
 #define PIXEL_BOX 0  // 1: a splat is integrated over the box of each pixel (pixel_box.h)
 #endif
 #ifndef SH_SLOTS
-#define SH_SLOTS 0  // 1: harmonics lie in slots that the host fills for each view (slots.h)
+#define SH_SLOTS 0  // 1: harmonics are in slots that the host fills for each view (slots.h)
 #endif
 #ifndef WEIGHT_ENTROPY
 #define WEIGHT_ENTROPY 0  // 1: the image has a fourth plane, the entropy of the blend weights (splat.h)
@@ -46,7 +46,7 @@
 #define INVERSE_DEPTH 0  // 1: the fourth plane of the image is the blended inverse depth (splat.h)
 #endif
 #ifndef GRAD_BEHIND
-#define GRAD_BEHIND 0  // 1: the loss depends on what the splats leave of a pixel, beside its color (splat.h)
+#define GRAD_BEHIND 0  // 1: the loss depends on the transmittance of a pixel in addition to its color (splat.h)
 #endif
 
 /* ---- constants of the method (Kerbl et al. 2023); tests change the first three to make blending smooth ---- */

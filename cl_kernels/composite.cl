@@ -10,7 +10,7 @@
  * One item = one ray.  No local memory. */
 #include "layers.h"
 
-#define DENSITY_BIAS (-1.0f)   // released code, which begins with nearly empty space
+#define DENSITY_BIAS (-1.0f)   // of the released code, which starts with nearly empty space
 #define COLOR_PADDING 0.001f  // lets colors reach 0 and 1
 #define DUST 1.0e-30f
 #define COLOR_ROWS 4          // rows of the network's colors, and of its densities: one block (layers.h)
@@ -68,7 +68,7 @@ void composite_forward(
         colors[ray * 3 + channel] = sums[channel] + (1.0f - covered) * background[channel];
 }
 
-/* Squared errors of rays, and derivatives of the loss by what the network gives. */
+/* Squared errors of rays, and the gradient of the network's outputs. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void composite_backward(
     __global const float *restrict raw_colors,    // [T,COLOR_ROWS,SAMPLES]
@@ -127,7 +127,7 @@ void composite_backward(
     }
 }
 
-/* Put the colors of rays into a picture. */
+/* Write the colors of rays to an image. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void place_colors(
     __global const float *restrict colors,  // [rays,3]

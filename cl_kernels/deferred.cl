@@ -1,16 +1,16 @@
-/* Adam's updates of harmonics that wait until a view sees them (adam.h).
+/* Deferred updates of harmonics by Adam, which wait until a view sees the Gaussian (adam.h).
  *
- * A Gaussian that a view does not draw has a gradient of zero, and its update depends on nothing but its own value and
- * moments: so many of them are done later, in their order, each with its own factors, and give the bits of an update at
- * once.  A block of LANES Gaussians is updated together; `done` counts the updates that its rows have of the list
- * `factors`, in which each update is (rate, correction2) as in adam.h.
+ * A Gaussian that a view does not show has a gradient of zero, so that its update depends only on its own value and
+ * moments.  These updates are done later, in order, each with its own factors, and give the same bits as immediate
+ * updates.  A block of LANES Gaussians is updated together; `done` counts how many updates of the list `factors` the
+ * block has had, in which each update is (rate, correction2) as in adam.h.
  *
  * One item = a block of LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
 #include "slots.h"
 
-/* Do the updates of the list that wait, for the blocks in which the view sees a Gaussian.  `every`: all ones where all
- * blocks are updated. */
+/* Do the pending updates of the list, for the blocks in which the view sees a Gaussian.  `every`: all ones to update
+ * all blocks. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void replay_updates(
     __global float *restrict values,          // [components,S], or slots (slots.h)
@@ -48,7 +48,7 @@ void replay_updates(
     done[block] = updates;
 }
 
-/* Append an update to the list, which the blocks in which the view sees a Gaussian have had. */
+/* Append an update to the list, and mark it as done for the blocks in which the view sees a Gaussian. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void note_update(
     __global const uint *restrict depth_key,  // [S] of the view: all ones when culled

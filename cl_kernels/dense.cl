@@ -43,7 +43,7 @@ void dense_forward(
 }
 
 /* Derivatives by derived_count inputs of a layer: those in the rows of `inputs` from first_input on, whose weights
- * begin at first_parameter.  kept: 0, or 1 to add to what is there, before the gate.
+ * start at first_parameter.  kept: 1 to add to the existing values, before the gate; else 0.
  * One item = BLOCK inputs of BLOCK vectors of samples. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_backward(

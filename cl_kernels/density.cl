@@ -21,7 +21,7 @@ void count_seen(
 }
 
 /* Add the Euclidean norm of this view's screen gradient, in the units of the reference: loss by normalized device
- * coordinates.  The gradient lies in planes `first` and `first` + 1. */
+ * coordinates.  The gradient is in planes `first` and `first` + 1. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void accumulate_norm(
     __global const float *restrict planes,  // [>first+1,S] px^-1

@@ -1,7 +1,7 @@
-/* Which Gaussians a step leaves out (DropGaussian, Park et al. 2025): each with one probability, and those that its
- * view hides.
+/* The Gaussians that a step drops (DropGaussian, Park et al. 2025), each with the same probability, and the Gaussians
+ * that its view hides.
  *
- * One item = one Gaussian.  No local memory.  What is drawn depends on (seed, step, Gaussian) alone. */
+ * One item = one Gaussian.  No local memory.  The random numbers depend only on (seed, step, Gaussian). */
 #include "random.h"
 
 /* Draw for every Gaussian. */

@@ -1,16 +1,16 @@
-/* A grid of features in several resolutions, which a network reads in the place of sines (Mueller et al. 2022), each
- * level weighed by how much a sample can tell of it (Barron et al. 2023, "Zip-NeRF", section 3.1).
+/* A multiresolution hash grid of features, which a network reads instead of sines (Müller et al. 2022), each level
+ * weighted by how well a sample resolves it (Barron et al. 2023, "Zip-NeRF", section 3.1).
  *
  *   place    mean of a frustum (frustum.h) in a cube, u = (x - corner) / side, and v = variance / side^2: the mean of
- *            the variances along the three axes, as if it were a ball
+ *            the variances along the three axes, as for a sphere
  *   level    a cube of n^3 cells; at the (n + 1)^3 corners an entry of GRID_FEATURES numbers.  Where a level has fewer
  *            entries, several corners share one: index (x ^ y * HASH_Y ^ z * HASH_Z) modulo the entries (equation 4)
  *   feature  w * (trilinear mean of the 8 entries around u), w = erf(1 / sqrt(8 v n^2)), by erf(x) ~ sqrt(1 - exp(-4/pi
  *            x^2)), which is off by 0.7 % at most: so w = sqrt(1 - exp(-1 / (2 pi v n^2)))
  *
- * Outside of the cube all features are 0.  Backward: an item owns a level's entries from one to another, and adds to
- * them what each sample gives, in the order of samples: no atomics, and no result depends on how many items share a
- * level.  No local memory. */
+ * Outside the cube all features are 0.  Backward: an item owns a range of a level's entries, and adds the gradients of
+ * all samples to them, in the order of samples: without atomics, and with results that do not depend on the number of
+ * items per level.  No local memory. */
 #include "frustum.h"
 #include "layers.h"
 
@@ -135,7 +135,7 @@ void grid_forward(
         VSTORE(VLOAD_PRIVATE(found[k]), own + k * SAMPLES);
 }
 
-/* Add the derivatives by the entries.  One item = a part of the entries of one level, for all samples. */
+/* Add the gradient of the entries.  One item = a range of the entries of one level, for all samples. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void grid_backward(
     __global const float *restrict places,       // [T,PLACE_ROWS,SAMPLES]

@@ -1,10 +1,10 @@
-/* One level of the Haar transform of a photograph and back, with a high-pass analysis filter h = (h0, h1) of its own
- * (AutoOpti3DGS, Nguyen et al. 2025).  Each block X of 2 x 2 pixels becomes
+/* One level of the Haar transform of a photograph and its inverse, with a trained high-pass analysis filter
+ * h = (h0, h1) (AutoOpti3DGS, Nguyen et al. 2025).  Each block X of 2 x 2 pixels becomes
  *
  *   M X M^T,  M = 1/2 [1 + u, 1 + v; 1 - u, 1 - v],  (u, v) = sqrt(2) h
  *
  * which is X for Haar's h = (1, -1) / sqrt(2), and the block's mean for h = 0.  Where a block reaches beyond the image,
- * it repeats the last row or column.  Pixels that the mask leaves out are the mean of those of their block that count.
+ * it repeats the last row or column.  Masked pixels are the mean of the pixels of their block that are not masked.
  * A block is a float4: upper left, upper right, lower left, lower right.  No local memory.  Deterministic. */
 #include "common.h"
 
@@ -64,8 +64,7 @@ void haar_forward(
     }
 }
 
-/* Sums that give the derivatives by u and v.  One item = one column of blocks in STRIP rows of them; dimensions column,
- * strip. */
+/* Sums that give the gradients of u and v.  One item = one column of blocks in STRIP rows; dimensions column, strip. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void haar_backward(
     __global const float *restrict image,     // [3,H',stride] before the change

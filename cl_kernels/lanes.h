@@ -33,8 +33,8 @@ typedef uchar VB;
 #define to_VF convert_float
 #endif
 
-/* Vectors in memory begin at any value.  They are read and written through a type that says so, and not by vload and
- * vstore, which some CPU runtimes call out of line or compose of four parts. */
+/* Vectors in memory may start at any value.  They are read and written through a type that allows it, and not by vload
+ * and vstore, which some CPU runtimes call out of line or split into four parts. */
 typedef VF __attribute__((aligned(4))) VF_in_memory;
 typedef VI __attribute__((aligned(4))) VI_in_memory;
 typedef VB __attribute__((aligned(1))) VB_in_memory;

@@ -1,8 +1,8 @@
 /* The tiles of large splats, whose rectangles have more tiles than a mask has bits (tiles.h).
  *
- * A work-group looks through `run` splats and shares the rows of each large rectangle among its TEAM items, LANES
- * columns at a time, so that no item walks over a whole image alone.  Deterministic: pairs are listed row by row, as
- * those of other splats, and each has one writer. */
+ * A work-group reads `run` splats and distributes the rows of each large rectangle among its TEAM items, LANES columns
+ * at a time, so that no single item walks over a whole image.  Deterministic: pairs are listed row by row, as for other
+ * splats, and each has one writer. */
 #include "tiles.h"
 
 #define IS_LARGE(box) ((box) >> (2 * BOX_BITS) == BOX_LARGE)
@@ -40,7 +40,7 @@ static inline uint count_share(const footprint_t *f, const rows_t share)
     return (uint)sum_lanes(count);
 }
 
-/* tile_count[i] = tiles that a large splat touches; others are left as they are.  Local memory: TEAM * 4 bytes. */
+/* tile_count[i] = tiles that a large splat touches; other counts are unchanged.  Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void count_large(
     __global const float *restrict splats,   // [N,RECORD] see splat.h
@@ -70,8 +70,8 @@ void count_large(
         }
 }
 
-/* List the touched tiles of an item's rows in the places from `pair` up to `end`, and as many more as fill the places:
- * blending finds no pixel of the splat there. */
+/* List the touched tiles of an item's rows in the slots from `pair` up to `end`, and fill the remaining slots with more
+ * tiles, in which blending finds no pixel of the splat. */
 static inline void list_share(const footprint_t *f, const rows_t share, uint pair, const uint end, const uint i,
                               const uint tiles_x, __global uint *pair_tile, __global uint *pair_splat)
 {
@@ -93,8 +93,8 @@ static inline void list_share(const footprint_t *f, const rows_t share, uint pai
         }
 }
 
-/* Fill the places from `place` up to `end` with tiles from `tile` to `last` that those from `named` to `place` do not
- * name; these are in order of tiles.  None lists the splat twice.  Return the place behind those that were filled. */
+/* Fill the slots from `place` up to `end` with tiles from `tile` to `last` that the slots from `named` to `place`,
+ * which are in order of tiles, do not contain: no tile lists the splat twice.  Return the first slot not filled. */
 static inline uint fill_up(uint place, const uint end, uint named, uint tile, const uint last, const uint i,
                            __global uint *pair_tile, __global uint *pair_splat)
 {
@@ -111,9 +111,9 @@ static inline uint fill_up(uint place, const uint end, uint named, uint tile, co
     return place;
 }
 
-/* Emit the pairs of large splats.  Tiles are tested again, and a compiler may round differently at a tile's edge in
- * another place: no item writes beyond what it has counted, none beyond the splat's places, and none of these stays
- * open.  Local memory: TEAM * 4 bytes. */
+/* Emit the pairs of large splats.  Tiles are tested again, and the compiler may round differently here at a tile's
+ * edge: so no item writes more pairs than it counted, or beyond the splat's slots, and all slots are filled.
+ * Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void emit_large(
     __global const float *restrict splats,     // [N,RECORD] see splat.h

@@ -1,13 +1,12 @@
-/* A layer of splats of its own before an image: the colors of both, and the derivatives by the image behind.
+/* A separate layer of splats in front of an image: the composite, and the gradient of the image behind.
  *
- * A pixel has the color C + T b, with C the layer's color before black, T what the layer leaves and b the image's
- * color.  A loss of what the layer covers, scale times the sum of 1 - T, keeps it open.  By the image behind, dL/db =
- * T dL/d(color); by the layer, the backward pass of blending starts from the colors of both.  Planes are
- * [channels,H',W'] with H', W' whole tiles, zero outside the image.  A fourth plane of the image, which is no color,
- * is that of both. */
+ * A pixel has the color C + T b, with C the layer's color on black, T its transmittance and b the image's color.  A
+ * loss on the cover, scale times the sum of 1 - T, keeps the layer transparent.  For the image behind, dL/db =
+ * T dL/d(color); for the layer, the backward pass of blending starts from the composite.  Planes are [channels,H',W']
+ * with H', W' whole tiles, zero outside the image.  A fourth plane of the image, which is no color, is copied. */
 #include "planes.h"
 
-/* Colors of both, T dL/dT of the cover's loss, which blend_backward reads, and the sum of 1 - T of each row.
+/* The composite, T dL/dT of the cover's loss, which blend_backward reads, and the sum of 1 - T of each row.
  * One group = one row.  Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void lay_over(
@@ -45,7 +44,7 @@ void lay_over(
         row_sums[y] = sum_items(sums);
 }
 
-/* The gradient by the image behind, in place of that by both.  One group = one row.  No local memory. */
+/* Replace the gradient of the composite by that of the image behind.  One group = one row.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void look_behind(
     __global const float *restrict transmittance,  // [H',stride] of the layer

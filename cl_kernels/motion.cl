@@ -1,4 +1,4 @@
-/* Moving Gaussians at one moment, and the gradients by their motion.
+/* Moving Gaussians at one time, and the gradient of their motion.
  *
  * A row of the table `motion` is (planes of [W,S])
  *
@@ -9,12 +9,12 @@
  *
  *   mean(t) = mean + sum_k b_k dt^k     q(t) = q + c dt     alpha(t) = alpha g,  g = exp(-1/2 (dt / s)^2)
  *
- * As logits, with o that of alpha: o + log g - log(1 + e^o (1 - g)), which is exactly o where g is 1: a Gaussian that
- * stands still for ever has the bits of one without motion.  With D = 1 + e^o (1 - g) the derivatives of that logit are
- * 1 / D by o, and (1 + e^o) / D by log g.
+ * As a logit, with o the logit of alpha: o + log g - log(1 + e^o (1 - g)), which is exactly o where g is 1: a static,
+ * permanent Gaussian has the same bits as one without motion.  With D = 1 + e^o (1 - g), the derivatives of that logit
+ * are 1 / D by o, and (1 + e^o) / D by log g.
  *
- * Where g < ALPHA_MIN nothing of a Gaussian can be seen: its mean is infinite, so that the projection culls it, and no
- * statistic counts it as seen.
+ * Where g < ALPHA_MIN, a Gaussian is invisible: its mean is infinite, so that the projection culls it, and no statistic
+ * counts it as seen.
  *
  * One item = LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
@@ -45,7 +45,7 @@ static inline void moment_of(__global const float *motion, const float time, con
     *moment = m;
 }
 
-/* Means and logits of opacity at a moment. */
+/* Means and logits of opacity at a time. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void move_forward(
     __global const float *restrict motion,         // [W,S] see above
@@ -76,7 +76,7 @@ void move_forward(
     VSTORE((m.presence < 1.0f ? faded : logit), moved_logit + i);
 }
 
-/* Quaternions at a moment. */
+/* Quaternions at a time. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void turn_forward(
     __global const float *restrict motion,  // [W,S] see above
@@ -96,14 +96,14 @@ void turn_forward(
                moved_quats + k * stride + i);
 }
 
-/* Gradients by the motion and by the opacity at the center; those by means and quaternions are those at the moment. */
+/* Gradients of the motion and of the opacity at the center; the gradients of means and quaternions do not change. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void move_backward(
     __global const float *restrict motion,         // [W,S] see above
     __global const float *restrict logit_opacity,  // [S] at the centers
     __global const float *restrict grad_means,     // [3,S] at the moment
     __global float *restrict grad_logit_opacity,   // [S] at the moment; becomes that at the center
-    __global float *restrict grad_motion,          // [W,S]; its turn is left alone
+    __global float *restrict grad_motion,          // [W,S]; its turn is unchanged
     const float time,                              // of the scene, in [0, 1]
     const uint degree,                             // of the polynomial, 1 to 3
     const uint stride,
@@ -138,7 +138,7 @@ void move_backward(
     VSTORE((m.present ? by_presence * (distance * distance) : zero), grad_motion + MOTION_DURATION * stride + i);
 }
 
-/* Gradients by the turn, added to those by the center; those by the quaternions at the center are those at the moment.
+/* Gradients of the turn, added to those of the center; the gradient of the quaternions does not change.
  * After move_backward. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void turn_backward(
@@ -164,7 +164,7 @@ void turn_backward(
     VSTORE(by_center, grad_motion + MOTION_CENTER * stride + i);
 }
 
-/* One update of some planes of the motion, whose values stay within bounds.  Dimension 1 is the plane. */
+/* One update of some planes of the motion; values stay within bounds.  Dimension 1 is the plane. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void motion_step(
     __global float *restrict motion,          // [W,S] see above
@@ -176,7 +176,7 @@ void motion_step(
     const float correction2,                  // 1 / (1 - BETA2^t)
     const float lowest,                       // value that an update leaves
     const float highest,
-    const uint every,                         // all ones: each Gaussian is updated; 0: those that were not culled
+    const uint every,                         // all ones: each Gaussian is updated; 0: only Gaussians not culled
     const uint first,                         // plane
     const uint stride,
     const uint count)

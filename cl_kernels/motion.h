@@ -1,5 +1,5 @@
-/* Planes of the table `motion`, [W,S], that every moving Gaussian has, whatever its polynomial: the time of its mean,
- * and the logarithm of its duration.  The others are told in motion.cl, with the formulas. */
+/* Planes of the table `motion`, [W,S], that every moving Gaussian has, for any polynomial: the time of its mean, and
+ * the logarithm of its duration.  motion.cl describes the others, with the formulas. */
 #ifndef CLSPLAT_MOTION_H
 #define CLSPLAT_MOTION_H
 #include "lanes.h"

@@ -2,12 +2,12 @@
  *
  *   mean += rate / (1 + exp(-100 (opacity_below - opacity))) Sigma n,  Sigma = R diag(s^2) R^T,  n 3 normal numbers
  *
- * and no noise where the opacity is REACH above opacity_below.  One item = one Gaussian.  No local memory.  A number
- * depends on (seed, step, Gaussian) alone. */
+ * and no noise where the opacity is REACH above opacity_below.  One item = one Gaussian.  No local memory.  Random
+ * numbers depend only on (seed, step, Gaussian). */
 #include "random.h"
 
 __constant float SHARPNESS = 100.0f;  // per unit of opacity: how fast the noise falls at opacity_below
-__constant float REACH = 0.1f;        // where 5e-5 of the noise is left: nothing to draw for
+__constant float REACH = 0.1f;        // 5e-5 of the noise is left there: not worth a random number
 
 /* Move every mean. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))

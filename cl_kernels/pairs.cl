@@ -41,7 +41,7 @@ void emit_pairs(
     }
 }
 
-/* Where each tile's pairs begin in the list sorted by tile.  One item = one pair, and one past the last. */
+/* The first pair of each tile in the list sorted by tile.  One item = one pair, and one past the last. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void find_tile_offsets(
     __global const uint *restrict sorted_tile,  // [P] ascending

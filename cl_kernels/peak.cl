@@ -45,8 +45,8 @@ void peak_exp(
     VSTORE(sum + other, result + i * LANES);
 }
 
-/* What an item copies at once: a vector of LANES, or of four where an item has one lane; there in the largest groups,
- * for a GPU begins small ones too slowly. */
+/* An item copies a vector of LANES, or of four where an item has one lane; then in the largest groups, since a GPU
+ * starts small ones too slowly. */
 #if LANES == 1
 #define PIECE 4
 #define COPY_GROUP (TILE * TILE)

@@ -16,7 +16,7 @@
 #define CLSPLAT_PIXEL_BOX_H
 #include "lanes.h"
 
-/* fields of a splat record in the place of the conic and of SPLAT_POWER_MIN */
+/* fields of a splat record that replace the conic and SPLAT_POWER_MIN */
 #define BOX_SLOPE 2    // k
 #define BOX_LONG 3     // s, px
 #define BOX_SHORT 4    // t, px

@@ -1,10 +1,10 @@
-/* Rows of planes [channels,H',W'], with H', W' whole tiles and zero outside the image, of which a work-group of TEAM
- * items computes one: which columns lie in the image, and the sum of what the items have found. */
+/* Rows of planes [channels,H',W'], with H', W' whole tiles and zero outside the image; a work-group of TEAM items
+ * computes one row: which columns are in the image, and the sum over the items. */
 #ifndef CLSPLAT_PLANES_H
 #define CLSPLAT_PLANES_H
 #include "lanes.h"
 
-/* 1 where the column lies in the image, else 0. */
+/* 1 where the column is in the image, else 0. */
 static inline VF inside_row(const uint column, const uint width)
 {
     return (LANE_INDEX + (int)column) < (int)width ? (VF)(1.0f) : (VF)(0.0f);

@@ -15,7 +15,7 @@
 #define CONE_RADIUS 0.577350269f      // 2 / sqrt(12)
 #define BLUR_PADDING 0.01f            // alpha of equation 18
 #define WEIGHT_FLOOR 1.0e-5f          // least sum of the weights of a ray (released code)
-#define RANDOM_PIXELS 8u              // which random numbers, beside those of other kernels
+#define RANDOM_PIXELS 8u              // stream of random numbers, different from those of other kernels
 #define RANDOM_COARSE 9u
 #define RANDOM_FINE 10u
 
@@ -41,7 +41,7 @@ void cast_rays(
     __constant camera_t *restrict camera,  // [1]
     __global float *restrict cones,        // [count,RAY_VALUES]
     const uint rays,
-    const uint count)                      // rays, and those that fill a tile
+    const uint count)                      // rays, including padding to whole tiles
 {
     const uint i = get_global_id(0);
     if (i >= count)

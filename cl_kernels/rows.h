@@ -34,7 +34,7 @@ static inline void lines_of(const float *splat, const uint tile_x, const uint ti
     }
 }
 
-/* A field at LANES pixels of row y of a tile: of their columns, or of the row alone. */
+/* A field at LANES pixels of row y of a tile: of their columns, or only of the row. */
 static inline VF field_at(const float *field, const bool turned, const uint y, const uint column)
 {
     return turned ? VLOAD_PRIVATE(field + column * LANES) : (VF)(field[y]);

@@ -1,13 +1,13 @@
-/* Where the harmonics above band 0 of a block of LANES Gaussians lie, with their moments and their gradient.
+/* The memory layout of the harmonics above band 0, of their moments and of their gradient.
  *
- * In planes [(K-1)*3,S] beside the other tables; or, with SH_SLOTS, in the slots [slots,(K-1)*3,LANES] that the blocks
- * of a view have got, all others being in the memory of the host.  Value k of row i is at
+ * They are in planes [(K-1)*3,S], as the other tables; or, with SH_SLOTS, in slots [slots,(K-1)*3,LANES] for the blocks
+ * of LANES Gaussians that a view sees, while the host keeps all others.  Value k of row i is at
  * sh_first(..., i) + k * SH_STRIDE(stride). */
 #ifndef CLSPLAT_SLOTS_H
 #define CLSPLAT_SLOTS_H
 #include "lanes.h"
 
-#define NO_SLOT 0xffffffffu  // of a block that lies in the memory of the host
+#define NO_SLOT 0xffffffffu  // for a block in host memory
 
 #if SH_SLOTS
 #define SH_STRIDE(stride) ((uint)LANES)
@@ -15,7 +15,7 @@
 #define SH_STRIDE(stride) (stride)
 #endif
 
-/* Whether the block of row i lies on the device. */
+/* Whether the block of row i is on the device. */
 static inline int sh_held(__global const uint *sh_slot, const uint i)
 {
 #if SH_SLOTS
@@ -25,7 +25,7 @@ static inline int sh_held(__global const uint *sh_slot, const uint i)
 #endif
 }
 
-/* Place of the first value of row i, the first of its block. */
+/* Index of the first value of row i, the first row of its block. */
 static inline uint sh_first(__global const uint *sh_slot, const uint sh_block, const uint i)
 {
 #if SH_SLOTS

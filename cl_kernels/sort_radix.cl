@@ -57,7 +57,7 @@ void radix_scatter(
     __local uint places[TEAM << DIGIT_BITS];
     const uint item = get_local_id(0), block = get_group_id(0);
     const uint first = (block * TEAM + item) * run;
-    if (TEAM > 1)  // one item begins where its block does
+    if (TEAM > 1)  // a single item starts where its block does
         count_digits(keys, places, first, run, shift, digits, count);
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint digit = item; digit < digits; digit += TEAM) {

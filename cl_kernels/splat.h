@@ -3,14 +3,14 @@
  *
  *   power = -1/2 (xx dx^2 + yy dy^2) - xy dx dy,  alpha = min(0.99, opacity e^power),  d = mean - pixel center
  *
- * A splat contributes to a pixel when the pixel's row lies in its extent, power_min <= power <= 0 (power_min is where
+ * A splat contributes to a pixel when the pixel's row is in its extent, power_min <= power <= 0 (power_min is where
  * alpha falls to 1/255) and blending it leaves transmittance >= 1e-4; the first splat that would leave less finishes
  * the pixel and is not blended (Kerbl et al. 2023).  A finished pixel stores its transmittance with a negative sign.
  *
  * With PIXEL_BOX alpha is the mean of that Gaussian over the pixel instead (pixel_box.h), and has to be >= 1/255.
  *
  * With WEIGHT_ENTROPY the image and its gradient have a fourth plane, H = -sum_i w_i ln w_i - T ln T with w = alpha T
- * and the last T: how far a pixel is from showing one splat alone.  With INVERSE_DEPTH, never both, it is a fourth
+ * and the last T: how far a pixel is from showing a single splat.  With INVERSE_DEPTH, never both, it is a fourth
  * channel, D = sum_i w_i / z_i with the depths of the means, and 0 behind the splats. */
 #ifndef CLSPLAT_SPLAT_H
 #define CLSPLAT_SPLAT_H

@@ -13,7 +13,7 @@ static inline float luminance_of(__global const float *image, const uint plane, 
     return 0.299f * image[at] + 0.587f * image[plane + at] + 0.114f * image[2 * plane + at];
 }
 
-/* Luminance of LANES pixels of a row with a neighbor on either side, [LANES + 2]; `x` lies in the image. */
+/* Luminance of LANES pixels of a row with a neighbor on either side, [LANES + 2]; `x` is in the image. */
 static inline void load_line(__global const float *image, const uint plane, const uint row, const uint x,
                              const uint width, float *line)
 {

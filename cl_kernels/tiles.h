@@ -78,7 +78,7 @@ static inline footprint_t footprint_of(const VF *splat, const VI visible, const 
 }
 
 /* Whether the ellipse reaches a pixel center of the tile in `column` and `row` of the rectangle: the smallest -power
- * over the centers' rectangle lies at the mean or on the edges next to it, where it is a parabola (the test of
+ * over the centers' rectangle is at the mean or on the edges next to it, where it is a parabola (the test of
  * StopThePop, Radl et al. 2024). */
 static inline VI touches_tile(const footprint_t *f, const VF column, const VF row)
 {

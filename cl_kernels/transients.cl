@@ -1,16 +1,16 @@
-/* Pixels in which a photograph shows what the scene does not have: how large residuals are, how many there are of each
- * size, and the pixels that are left when the large ones do not count.
+/* Transients, which a photograph shows and the scene does not have: residuals, their histogram, and the mask of pixels
+ * without large residuals.
  *
  * A residual is the mean over the channels of |image - photograph|; -1 in pixels that do not count.  Bins are eighths
  * of octaves from 2^-12 on: the upper bits of the float itself.  Planes are [channels,H',W'] with H', W' whole tiles,
  * zero outside the image.  Counters are integer atomics, so counts do not depend on the order of the items. */
 #include "planes.h"
 
-#define BINS 96        // twelve octaves, up to 1; the first and the last hold what lies beyond
+#define BINS 96        // twelve octaves, up to 1; the first and the last also count values beyond
 #define BIN_SHIFT 20   // bits of the mantissa that a bin does not see: 3 of 23 are left
 #define FIRST_BIN 920  // (127 - 12) * 8: the upper bits of 2^-12
 
-/* Residuals and their number by bin.  One group of TEAM items = one row.  Local memory: BINS * 4 bytes. */
+/* Residuals and their histogram.  One group of TEAM items = one row.  Local memory: BINS * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void measure_residuals(
     __global const float *restrict image,       // [3,H',stride]
@@ -62,7 +62,7 @@ void mask_transients(
     if (x >= stride)
         return;
     const float own = residuals[y * stride + x];
-    bool kept = !(own < 0.0f);  // what is not a number stays: the losses find it
+    bool kept = !(own < 0.0f);  // NaN stays: the losses find it
     if (kept && own >= threshold) {
         uint counted = 0, below = 0;
         for (uint row = y > reach ? y - reach : 0; row <= y + reach && row < height; row++)

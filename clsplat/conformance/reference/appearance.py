@@ -1,6 +1,6 @@
-"""The colors of one photograph by place and luminance: what a bilateral grid makes of an image; how smooth it is.
+"""Compute bilateral grids, color matrices and camera responses, and their gradients.
 
-Images are [3, H, W]; a grid is [3, 4, nz, ny, nx]: what matrices [E | b] differ from no change.
+Images are [3, H, W]; a grid is [3, 4, nz, ny, nx]: differences of matrices [E | b] from the identity.
 """
 
 import itertools
@@ -14,14 +14,14 @@ WEIGHTS = np.array([0.299, 0.587, 0.114])  # of the luminance, BT.601
 
 
 def gridded(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
-    """min(1, c + A [c; 1]) of every pixel, A the trilinear mean of the grid at its place and luminance."""
+    """Return min(1, c + A [c; 1]) for every pixel, A the grid interpolated at its position and luminance."""
     return np.minimum(changed_by_grid(image, grid), 1)
 
 
 def gridded_backward(
     image: NDArray[Any], grid: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Derivatives of sum(gradient * gridded) by the image and by the grid; those of what is cut are 0."""
+    """Return the gradients of sum(gradient * gridded) by the image and the grid; clamped values pass none."""
     passed = np.where(changed_by_grid(image, grid) < 1, gradient, 0)
     by_image, by_grid, with_one = passed.copy(), np.zeros(grid.shape), _with_one(image)
     luminance = np.einsum("a,ahw->hw", WEIGHTS, image)
@@ -37,7 +37,7 @@ def gridded_backward(
 
 
 def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
-    """The sum over the axes of the mean of the squared differences of neighboring nodes, and its derivatives."""
+    """Return the sum over axes of the mean squared difference of neighboring nodes, and its gradient."""
     value, derivatives = 0.0, np.zeros(grid.shape)
     for axis in (2, 3, 4):
         difference = np.diff(grid, axis=axis)
@@ -49,7 +49,7 @@ def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def centered_grids(grids: NDArray[Any]) -> NDArray[Any]:
-    """Grids [photographs, 3, 4, nz, ny, nx] less the mean, at each level, over the photographs and the places."""
+    """Subtract from grids, [photographs, 3, 4, nz, ny, nx], the mean over photographs and positions at each level."""
     return grids - grids.mean(axis=(0, 4, 5), keepdims=True)
 
 
@@ -58,13 +58,13 @@ def _with_one(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def changed_by_grid(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
-    """c + A [c; 1] of every pixel, which is not cut."""
+    """Return c + A [c; 1] for every pixel, without the clamp."""
     matrix = sum(weight * grid[:, :, k, j, i] for (k, j, i), weight, _ in _corners(image, grid))
     return np.asarray(image + np.einsum("abhw,bhw->ahw", matrix, _with_one(image)))
 
 
 def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDArray[Any], NDArray[Any]]]:
-    """The nodes about each pixel, (k, j, i) each [H, W], their weights, and the derivatives of these by the level."""
+    """Yield the nodes around each pixel, (k, j, i) each [H, W], their weights, and the derivatives by the level."""
     _, _, nz, ny, nx = grid.shape
     _, height, width = image.shape
     y, x = np.mgrid[:height, :width]
@@ -159,21 +159,21 @@ def _falloff(
 
 
 def _slopes(row: NDArray[Any], channel: int) -> NDArray[Any]:
-    """The slopes of a curve at 0, 1/4, 1/2, 3/4 and 1, of which it rises from 0 to 1."""
+    """Return the slopes of a curve from 0 to 1 at 0, 1/4, 1/2, 3/4 and 1."""
     slopes = np.exp(np.insert(row[5 + 4 * channel : 9 + 4 * channel], 2, 0.0))
     return np.asarray(slopes / _curve(np.ones(1), slopes))
 
 
 def _piece(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Which quarter a value lies in, and how far from its beginning; of those outside the nearest."""
+    """Return the quarter of [0, 1] that a value is in, or the nearest one, and its offset in that quarter."""
     inside = np.clip(x, 0, 1)
-    begin = np.minimum((4 * inside).astype(int), 3)
-    return begin, inside - begin / 4
+    quarter = np.minimum((4 * inside).astype(int), 3)
+    return quarter, inside - quarter / 4
 
 
 def _curve(x: NDArray[Any], slopes: NDArray[Any]) -> NDArray[Any]:
-    """The integral from 0 of slopes that are linear between quarters, and constant below 0 and above 1."""
-    begin, d = _piece(x)
-    at_begin = np.concatenate([[0], np.cumsum(slopes[1:] + slopes[:-1]) / 8])[begin]
-    inside = at_begin + slopes[begin] * d + 2 * (slopes[begin + 1] - slopes[begin]) * d**2
+    """Return the integral from 0 of slopes that are linear between quarters, and constant below 0 and above 1."""
+    quarter, d = _piece(x)
+    at_start = np.concatenate([[0], np.cumsum(slopes[1:] + slopes[:-1]) / 8])[quarter]
+    inside = at_start + slopes[quarter] * d + 2 * (slopes[quarter + 1] - slopes[quarter]) * d**2
     return np.asarray(inside + slopes[0] * np.minimum(x, 0) + slopes[4] * np.maximum(x - 1, 0))

@@ -1,4 +1,4 @@
-"""Blending, one splat at a time over all pixels, and its gradient; there are no tiles.
+"""Blend one splat at a time over all pixels, without tiles, and compute the gradient.
 
 Kerbl et al. 2023, eq. 3.  `grad_x` is dL/dx; H, W image.
 """
@@ -19,7 +19,7 @@ Floats = NDArray[Any]
 SLOPE, CUBIC, QUINTIC = 1.5957691, 0.07333173, -0.00059424  # Φ(x) = 1 / (1 + e^-P), P = SLOPE x + CUBIC x³ + …
 REACH = 6.0  # of Φ, standard deviations
 UNIFORM = 0.4  # a pixel below this many standard deviations from its center to its edge: m and v by their series
-STEP = 1e-5  # of finite differences, px or px², by the size of what changes
+STEP = 1e-5  # step of finite differences, px or px², relative to the size of the splat
 
 
 def cdf(x: Floats) -> Floats:
@@ -35,7 +35,7 @@ def density(x: Floats) -> Floats:
 
 
 def moments(dy: Floats, s: float) -> tuple[Floats, Floats, Floats]:
-    """Share Z of a normal distribution that lies within ½ of `dy`, and the mean and the variance there; dy >= 0."""
+    """Return the mass Z of a normal distribution within ½ of `dy`, and its mean and variance there; dy >= 0."""
     below, above = -(dy + 0.5) / s, -(dy - 0.5) / s  # mirrored, where Φ is small and exact
     share = np.maximum(cdf(above) - cdf(below), 1e-30)
     if 0.5 / s < UNIFORM:
@@ -127,7 +127,7 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
 
 
 def planes_behind(background: NDArray[Any]) -> NDArray[Any]:
-    """A background of one color, [3], or of a picture, [3, H, W], as planes."""
+    """Return a background color, [3], or image, [3, H, W], as planes."""
     array = np.asarray(background)
     return array if array.ndim == 3 else array[:, None, None]
 
@@ -148,7 +148,7 @@ def blend(
 
 
 def blend_weights(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> NDArray[Any]:
-    """What each splat contributes to each pixel, α T, [N,H,W]."""
+    """Return the contribution of each splat to each pixel, α T, [N,H,W]."""
     weights = np.zeros((len(splats.opacity), height, width))
     for step in blend_steps(splats, width, height, thresholds):
         weights[step.splat] = np.where(step.blended, step.alpha * step.before, 0)
@@ -361,19 +361,19 @@ def inverse_depth_loss(
     return weights * np.abs(difference), gradient
 
 
-# A layer before an image: the colors of both, the derivatives by the image, and the loss of what the layer covers.
+# A layer in front of an image: the composite, the gradient of the image, and the loss on the layer's cover.
 
 
 def laid_over(layer: NDArray[Any], left: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
-    """The colors of a layer, [3, H, W] before black, and an image behind it."""
+    """Return the composite of a layer, [3, H, W] on black, and an image behind it."""
     return np.concatenate([layer + left * image[:3], image[3:]])
 
 
 def gradient_behind(left: NDArray[Any], gradient: NDArray[Any]) -> NDArray[Any]:
-    """The derivative by the image behind, from that by both."""
+    """Return the gradient of the image behind from the gradient of the composite."""
     return np.concatenate([left * gradient[:3], gradient[3:]])
 
 
 def layer_cover(left: NDArray[Any], scale: float) -> tuple[float, NDArray[Any]]:
-    """The loss, scale times the sum of 1 - T, and its derivative by T."""
+    """Return the loss, scale times the sum of 1 - T, and its gradient by T."""
     return scale * float((1 - left).sum()), np.full_like(left, -scale)

@@ -1,4 +1,4 @@
-"""What the reference is told, and what it returns."""
+"""Define the inputs and outputs of the reference."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ RADIUS_TILE = 16  # px; the tile of the vanilla visibility test, whatever tile t
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The three constants of 2.3.  With `SMOOTH` nothing is skipped, so that the image is differentiable."""
+    """The thresholds of blending (Kerbl et al. 2023).  `SMOOTH` skips nothing, so that the image is differentiable."""
 
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
@@ -49,7 +49,7 @@ class PinholeCamera:
 
 @dataclass
 class RawGaussians:
-    """Raw parameters, as optimized."""
+    """Parameters as they are trained, before activations."""
 
     means: NDArray[Any]  # [N,3]
     quats: NDArray[Any]  # [N,4] w, x, y, z; not normalized
@@ -57,7 +57,7 @@ class RawGaussians:
     logit_opacity: NDArray[Any]  # [N]
     sh: NDArray[Any]  # [N,K,3]
     filter_variance: NDArray[Any] = field(default_factory=lambda: np.zeros(0))  # [N] scene units²; zeros when not given
-    opacity_factor: float = 1.0  # of all opacities: that of a step's dropout
+    opacity_factor: float = 1.0  # factor on all opacities, from a step's dropout
 
     def __post_init__(self) -> None:
         if len(self.filter_variance) == 0:

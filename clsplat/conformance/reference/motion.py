@@ -1,4 +1,4 @@
-"""Moving Gaussians at one moment, and the gradients by their motion, one Gaussian at a time.
+"""Compute moving Gaussians at one time, and the gradient of their motion, one Gaussian at a time.
 
 A row of motion: velocity [3], time center, log of the duration, then acceleration [3] and jerk [3] where the degree is
 2 or 3, then the turn [4] where Gaussians turn.  FreeTimeGS (Wang et al. 2025), Spacetime Gaussians (Li et al. 2024).
@@ -18,7 +18,7 @@ def coefficients(row: NDArray[Any], degree: int) -> list[NDArray[Any]]:
 
 
 def presence(row: NDArray[Any], time: float) -> float:
-    """The factor of the opacity at a time."""
+    """Return the factor on the opacity at a time."""
     distance = (time - row[3]) / np.exp(row[4])
     return float(np.exp(-0.5 * distance**2))
 
@@ -32,7 +32,7 @@ def moved(
     degree: int,
     turns: bool,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Means [N,3], quaternions [N,4] and logits [N] at a time; a mean is infinite where nothing can be seen."""
+    """Return means, [N,3], quaternions, [N,4], and logits, [N], at a time; invisible Gaussians have infinite means."""
     means, quats, logits = means.copy(), quats.copy(), logit_opacity.copy()
     for n, row in enumerate(motion):
         dt, factor = time - row[3], presence(row, time)

@@ -1,4 +1,4 @@
-"""A field of densities and colors, as a network, and the colors of its rays, forward and backward in float64
+"""Compute a field of densities and colors, a network, and the colors of its rays, forward and backward in float64
 (Barron et al. 2021, "Mip-NeRF"; the network is that of Mildenhall et al. 2020)."""
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ Inputs = list[Floats]  # of each layer, [S, inputs]
 
 @dataclass(frozen=True)
 class DenseNetwork:
-    """Layers in their order: `depth` of the trunk, of which the one after `skip` reads the position again, density,
+    """Layers in order: `depth` layers of the trunk, of which the one after `skip` reads the position again, density,
     bottleneck, condition, color."""
 
     depth: int
@@ -52,9 +52,9 @@ class DenseNetwork:
             after = inputs[i + 1]  # with the position, where it joins
             if i == self.skip:
                 by_position += by_x[:, weights[i][0].shape[1] :]
-            own = by_x[:, : weights[i][0].shape[1]] * (after[:, : weights[i][0].shape[1]] > 0)
-            by_outputs.insert(0, own)
-            by_x = own @ weights[i][0].T
+            by_layer = by_x[:, : weights[i][0].shape[1]] * (after[:, : weights[i][0].shape[1]] > 0)
+            by_outputs.insert(0, by_layer)
+            by_x = by_layer @ weights[i][0].T
         return [(x.T @ y, y.sum(axis=0)) for x, y in zip(inputs, by_outputs, strict=True)], by_position + by_x
 
 
@@ -197,13 +197,13 @@ def places(means: Floats, variances: Floats, corner: Floats, side: float) -> tup
 
 @dataclass(frozen=True)
 class HashLevel:
-    """A cube of n^3 cells whose corners share `entries` where they are fewer."""
+    """A cube of n^3 cells; its corners share `entries` by a hash if there are fewer entries."""
 
     cells: int
     entries: int
 
     def weights(self, variances: Floats) -> Floats:
-        """How much of a level samples can tell, [S]: nearly erf(1 / sqrt(8 v n^2)) (Barron et al. 2023)."""
+        """Return how well samples resolve a level, [S]: close to erf(1 / sqrt(8 v n^2)) (Barron et al. 2023)."""
         return np.sqrt(-np.expm1(-4 / np.pi / (8 * variances * self.cells**2)))
 
     def corners(self, at: Floats) -> tuple[NDArray[np.int64], Floats]:

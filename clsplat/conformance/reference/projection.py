@@ -1,4 +1,4 @@
-"""Projection of Gaussians to splats, one Gaussian at a time (Kerbl et al. 2023), with the filters of Yu et al. 2024."""
+"""Project Gaussians to splats, one at a time (Kerbl et al. 2023), with the filters of Yu et al. 2024."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -82,7 +82,7 @@ def ray_limits(camera: PinholeCamera) -> NDArray[Any]:
 
 
 def clamped_ray(camera: PinholeCamera, point: NDArray[Any]) -> NDArray[Any]:
-    """(tx, ty) of 2.1 step 3 for a camera-space point."""
+    """Return x and y of a camera-space point, with the ray clamped to `ray_limits`."""
     limits = ray_limits(camera)
     return point[2] * np.clip(point[:2] / point[2], limits[:, 0], limits[:, 1])
 
@@ -98,7 +98,7 @@ def determinant(matrix: NDArray[Any]) -> float:
 
 @dataclass
 class Footprint:
-    """Everything between the parameters of one Gaussian and its covariance on the screen; used by both directions."""
+    """The values between the parameters of one Gaussian and its screen covariance, for both passes."""
 
     point: NDArray[Any]  # [3] camera space
     rotation: NDArray[Any]  # [3,3] R
@@ -111,7 +111,7 @@ class Footprint:
 
 
 def footprint(gaussians: RawGaussians, n: int, camera: PinholeCamera, variance: float) -> Footprint:
-    """2.1 steps 1-4 with the world filter of 8.1."""
+    """Project the covariance of one Gaussian (EWA splatting), with the 3D filter."""
     point = camera.rotation @ gaussians.means[n] + camera.translation
     rotation = rotation_matrix(gaussians.quats[n])
     scale = np.exp(gaussians.log_scales[n])
@@ -127,7 +127,10 @@ def footprint(gaussians: RawGaussians, n: int, camera: PinholeCamera, variance: 
 
 
 def opacity_factors(logit: float, foot: Footprint, compensate: float) -> tuple[float, float, float]:
-    """sigmoid(a), ρ of 8.1, κ of 8.2 (1 where `compensate` is 0); their product is what is blended."""
+    """Return sigmoid(logit), ρ of the 3D filter, and κ of the screen filter (1 if `compensate` is 0).
+
+    Their product is the opacity that is blended.
+    """
     ratio = max(0.0, determinant(foot.sharp) / determinant(foot.dilated))  # rounding may give -1e-17
     kappa = np.sqrt(1 + compensate * (ratio - 1))
     return 1 / (1 + np.exp(-logit)), np.prod(foot.scale / foot.filtered), kappa
@@ -147,7 +150,7 @@ def unclamped_color(gaussians: RawGaussians, n: int, camera: PinholeCamera, degr
 
 
 def vanilla_radius(mean2d: NDArray[Any], dilated: NDArray[Any], width: int, height: int) -> float:
-    """Radius of 2.1 step 6, or 0 if the rectangle of step 8 is empty."""
+    """Return the radius of 3DGS, three standard deviations, or 0 if it reaches no tile."""
     middle = (dilated[0, 0] + dilated[1, 1]) / 2
     largest = middle + np.sqrt(max(0.1, middle**2 - determinant(dilated)))
     radius = np.ceil(3 * np.sqrt(largest))
@@ -329,7 +332,7 @@ def project_backward(
 def sampling_interval(
     means: NDArray[Any], cameras: list[PinholeCamera], focal: list[float], near: float = 0.2, margin: float = 0.15
 ) -> NDArray[Any]:
-    """Smallest depth / focal length over the cameras that see each mean; the largest of them where none does: [N]."""
+    """Return the smallest depth / focal length over the cameras that see each mean, [N]; if none does, the largest."""
     intervals = np.full(len(means), np.inf)
     for n, mean in enumerate(means):
         for camera, f in zip(cameras, focal, strict=True):
@@ -404,7 +407,7 @@ def pose_gradient(
             j[1, 1] * g[1, 0] - j[0, 0] * g[0, 1],
         ]
 
-        # The direction of view changes with the shift alone
+        # The viewing direction depends only on the shift
         direction, distance = view_direction(camera, gaussians.means[n])
         grad_c = grad_color[n] * (unclamped_color(gaussians, n, camera, degree) > 0)
         basis_gradient = sh_basis_gradient(direction, degree)

@@ -1,4 +1,4 @@
-"""A background of directions: an octahedral map seen through a camera, its derivatives, and the loss of what covers it.
+"""Compute the sky, an octahedral environment map behind the Gaussians, its gradient, and the loss on its cover.
 
 A map is [side, side, C]: row j, column i.  Directions are [H, W, 3] in the scene.
 """
@@ -23,7 +23,7 @@ def rays(camera: PinholeCamera, width: int, height: int) -> NDArray[Any]:
 
 
 def map_entries(direction: NDArray[Any], side: int) -> Iterator[Entry]:
-    """The four texels about a direction, [3], with their weights."""
+    """Yield the four texels around a direction, [3], with their weights."""
     x, y, z = direction / np.abs(direction).sum()
     if z < 0:
         x, y = (1 - abs(y)) * (-1 if x < 0 else 1), (1 - abs(x)) * (-1 if y < 0 else 1)

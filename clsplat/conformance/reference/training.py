@@ -1,4 +1,4 @@
-"""What changes Gaussians between two steps: Adam, penalties, density rules, splitting matrices, and shared vectors."""
+"""Compute what changes Gaussians between steps: Adam, penalties, density rules, splitting matrices, shared vectors."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -22,9 +22,9 @@ def adam_step(
     epsilon: float = 1e-15,
     seen: NDArray[Any] | None = None,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """New parameter and moments; `step` counts from 1.  PyTorch's form: epsilon outside the root.
+    """Return the new parameter and moments (Kingma and Ba 2015), with epsilon outside the root, as in PyTorch.
 
-    Rows that are not `seen`, [N], stay as they are.
+    step: counted from 1.  Rows that are not `seen`, [N], stay as they are.
     """
     first = beta1 * moment1 + (1 - beta1) * grad
     second = beta2 * moment2 + (1 - beta2) * grad**2
@@ -126,10 +126,10 @@ def adc_actions(
     rule: DensityRule = VANILLA,
     split_gradient: NDArray[Any] | None = None,
 ) -> NDArray[Any]:
-    """KEEP, CLONE, SPLIT or PRUNE per Gaussian: [N].
+    """Return KEEP, CLONE, SPLIT or PRUNE for each Gaussian, [N].
 
     Pruning comes last and sees the new rows: copies and children have their parent's opacity, children its scale / 1.6.
-    `split_gradient` is the statistic of the split test where it is another one (ḡabs); `prune_large` is i > 3000.
+    split_gradient: the statistic of the split test if it is a different one (ḡabs).
     """
     split_gradient = gradient if split_gradient is None else split_gradient
     actions = []
@@ -147,7 +147,7 @@ def adc_actions(
 
 
 def shared_logit(logit: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Logits of `rows` Gaussians in one place that together let through as much as one did: 1 - o' = (1 - o)^(1/n)."""
+    """Return the logits of `rows` equal Gaussians that together transmit as much as one: 1 - o' = (1 - o)^(1/n)."""
     log_transmittance = -np.log1p(np.exp(logit)) / rows
     return np.log(-np.expm1(log_transmittance)) - log_transmittance
 
@@ -159,12 +159,12 @@ def decayed_logit(logit: NDArray[Any], factor: float) -> NDArray[Any]:
 
 
 def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, ceiling: float = 0.01) -> NDArray[Any]:
-    """Opacity reset (6; 8.3 with `filter_ratio` = ρ): the filtered opacity becomes at most `ceiling`: [N]."""
+    """Reset opacities: after the 3D filter, whose factor is `filter_ratio`, they are at most `ceiling`, [N]."""
     opacity = np.minimum(filter_ratio / (1 + np.exp(-logit)), ceiling) / filter_ratio
     return np.log(opacity / (1 - opacity))
 
 
-# The splitting matrix (SteepGS, Wang et al. 2025): what becomes of the loss when a splat becomes two.
+# The splitting matrix (SteepGS, Wang et al. 2025): the change of the loss when a splat is split in two.
 
 
 def screen_splitting(
