@@ -71,7 +71,7 @@ function fitted(lens, width, height) {
   return {enlarged, left: (width - enlarged * lens[4]) / 2, top: (height - enlarged * lens[5]) / 2};
 }
 
-// The values of a camera on a canvas that the shaders need.  exact: clamp rays as `clsplat render` does for the camera's
+// The values of a camera on a canvas for the shaders.  exact: clamp rays as `clsplat render` does for the camera's
 // image; otherwise beyond the canvas, which shows more than that image.  native: the focal length with a scale of 1.
 function framed(camera, width, height, exact, native = 1) {
   const [fx, fy, cx, cy, w, h] = camera.lens, {enlarged, left, top} = fitted(camera.lens, width, height);
