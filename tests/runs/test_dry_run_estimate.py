@@ -16,7 +16,7 @@ from clsplat.runs.describe import describe
 from clsplat.runs.opening import check_preparation, known, listed
 from clsplat.runs.state import RunState
 from clsplat.stages.optimize import Optimize
-from clsplat.sweeps.batch import wanted_cell
+from clsplat.sweeps.batch import pending_cell
 from clsplat.sweeps.cell import Scenes
 from clsplat.sweeps.experiment import Job, run_pipeline
 from clsplat.sweeps.store import Store
@@ -91,7 +91,7 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
 
 
 def as_cell(asked, state, device, start):
-    return wanted_cell(Cell("a", asked), Scenes(state.out.parent / "scenes"), Store(state.out.parent))
+    return pending_cell(Cell("a", asked), Scenes(state.out.parent / "scenes"), Store(state.out.parent))
 
 
 @pytest.mark.parametrize(

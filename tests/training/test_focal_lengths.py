@@ -58,7 +58,7 @@ def test_a_fisheye_has_no_other_focal_length():
 
 def test_focal_length_that_cannot_be_written_is_not_learned(tiny_scene):
     scene = read_scene(tiny_scene)
-    with pytest.raises(DataError, match=r"camera_optimizer\.focal: the lens of .*OPENCV_FISHEYE.*undistort"):
+    with pytest.raises(DataError, match=r"camera_optimizer\.focal: the focal length of .*OPENCV_FISHEYE.*undistort"):
         require_zoom(replace(scene, views=(replace(scene.views[0], lens=FISHEYE),)))
 
 
@@ -150,7 +150,7 @@ def test_metrics_and_files_use_the_learned_focal_lengths(with_focals, tiny_scene
     for row in ({"focal_lengths": [1]}, {"focal_lengths": [1, -1]}, {"focal_lengths": [1e300, 60]}, []):
         broken = {name: row for name in rows}
         (tmp_path / "view_poses.json").write_text(json.dumps({"photographs": broken}))
-        with pytest.raises(DataError, match=r"view_poses.json: .*no two focal lengths within 10 times"):
+        with pytest.raises(DataError, match=r"view_poses.json: .*no focal lengths within 10 times"):
             CameraOptimizer.apply_side_files(tmp_path / "point_cloud.ply", scene)
 
 
