@@ -409,12 +409,9 @@ MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
 
 
 def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0) -> Parameters:
-    """Return one Gaussian for each point, `scale` times as large as the point, or as the distance to its neighbors."""
+    """Return one Gaussian for each point, `scale` times as large as the distance to its neighbors."""
     count = len(points)
-    log_scales = 0.5 * np.log(neighbor_distance2(points.positions))
-    if points.sizes is not None:
-        log_scales = np.where(np.isnan(points.sizes), log_scales, np.log(points.sizes))
-    log_scales = log_scales + math.log(scale)
+    log_scales = 0.5 * np.log(neighbor_distance2(points.positions)) + math.log(scale)
     quats = np.zeros((count, 4))
     quats[:, 0] = 1
     return {

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.scene.quality import point_spacing
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View
 
@@ -53,38 +52,28 @@ def swept_points(
     load: Callable[[View], NDArray[np.uint8]],
     count: int,
     seed: int,
-    chance: Callable[[Floats], Floats] | None = None,
     beside: Floats | None = None,
     shown: Callable[[View], NDArray[np.bool_] | None] = lambda view: None,
 ) -> PointCloud:
     """Return at most `count` colored points on the surfaces that neighboring views agree on, perhaps none.
 
-    center: what the cameras look at, [3].  `load` returns the photograph of a view, [H, W, 3].  `chance` returns the
-    chance of each pixel of a photograph in [0, 1] to be taken, [H, W]; then points have sizes, that of the pixels
-    between them at their depth.  Without it all pixels are alike.  beside: points [M, 3] that are there already; pixels
-    that are not new beside them give none.  `shown` returns which pixels of a view may give points, [H, W]; None: all.
+    center: what the cameras look at, [3].  `load` returns the photograph of a view, [H, W, 3].  beside: points [M, 3]
+    that are there already; pixels that are not new beside them give none.  `shown` returns which pixels of a view may
+    give points, [H, W]; None: all.
     """
-    positions, colors, sizes = [], [], []
-    for i, surface in enumerate(surfaces(views, center, load)):
+    positions, colors = [], []
+    for surface in surfaces(views, center, load):
         view, image, taken = surface.view, surface.image, surface.inverse > 0
         if (may := shown(view)) is not None:
             taken &= may
         if beside is not None:
             taken &= surface.is_new(beside)
-        chances = np.ones(taken.shape) if chance is None else chance(image)
-        taken &= np.random.default_rng([seed, count, i + 1]).random(taken.shape) < chances
         rows, columns = np.nonzero(taken)
-        depth = 1 / surface.inverse[taken]
-        positions.append(_lifted(view, rows, columns, depth))
+        positions.append(_lifted(view, rows, columns, 1 / surface.inverse[taken]))
         colors.append(image[taken])
-        sizes.append(depth / view.camera.fx * point_spacing(chances[taken], view.camera.width))
     everywhere, everything = np.concatenate(positions), np.concatenate(colors)
     chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(everywhere))[:count])
-    if chance is None:
-        return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen])
-    apart = np.sqrt(max(1.0, len(everywhere) / count))  # what is left out makes the others' distances larger
-    size = (apart * np.concatenate(sizes)[chosen]).astype(np.float32)
-    return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen], sizes=size)
+    return PointCloud(everywhere[chosen].astype(np.float32), everything[chosen])
 
 
 def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:

@@ -89,34 +89,6 @@ def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool
     return bool((values < BLURRED * median).all())
 
 
-# Detail at each pixel, where Gaussians should be dense.
-
-Floats = NDArray[np.floating]
-MAX_SPACING = 0.1  # of the width of the photograph (Meuleman et al. 2025)
-
-
-def laplacian_probability(image: Floats) -> Floats:
-    """Return the probability, [H, W], that a pixel of a photograph, [H, W, 3] in [0, 1], becomes a point.
-
-    It is min(1, ‖∇²I‖₁) with the five-point Laplacian, summed over the colors (Meuleman et al. 2025).  The paper
-    averages it over a disc; these photographs are so small that each pixel is already an average.  A pixel that differs
-    from the mean of its neighbors by a twelfth of the range in each color has probability 1.
-    """
-    framed = np.pad(image.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")
-    middle, around = framed[1:-1, 1:-1], (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
-    chance: Floats = np.minimum(np.abs(sum(around) - 4 * middle).sum(axis=2), 1)
-    return chance
-
-
-def point_spacing(chance: Floats, width: int) -> Floats:
-    """Return the mean distance in pixels between points sampled with a probability: 1/√p.
-
-    It is at most MAX_SPACING of the width of the photograph, px.
-    """
-    distance: Floats = np.minimum(1 / np.sqrt(chance), MAX_SPACING * width)
-    return distance
-
-
 # Transparency of photographs.
 
 LOOKED_AT = 3  # training photographs, since the object may fill one of them

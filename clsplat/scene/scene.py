@@ -61,20 +61,15 @@ class PointCloud:
     positions: Floats  # [M, 3] float32, scene units; as a file has them until make_scene subtracts the origin
     colors: Floats  # [M, 3] float32, in [0, 1]
     times: Floats | None = None  # [M] float32, timestamps in [0, 1], if a moving scene has them
-    sizes: Floats | None = None  # [M] float32, scene units, of the initial Gaussians; NaN and None: unknown
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def joined(self, other: "PointCloud") -> "PointCloud":
-        """Return these points followed by another cloud, with times if both have them and sizes if one has."""
+        """Return these points followed by another cloud, with times if both have them."""
         pairs = [(self.positions, other.positions), (self.colors, other.colors)]
         pairs += [(self.times, other.times)] if self.times is not None and other.times is not None else []
-        both = PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
-        if self.sizes is None and other.sizes is None:
-            return both
-        sizes = [np.full(len(c), np.nan) if c.sizes is None else c.sizes for c in (self, other)]
-        return replace(both, sizes=np.concatenate(sizes).astype(np.float32))
+        return PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
 
 
 @dataclass(frozen=True)

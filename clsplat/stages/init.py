@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.core.errors import ConfigError, DataError
@@ -16,7 +15,7 @@ from clsplat.gaussians.conversion import from_points
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.model import load
 from clsplat.scene.plane_sweep import swept_points
-from clsplat.scene.quality import is_transparent, laplacian_probability, opaque_pixels
+from clsplat.scene.quality import is_transparent, opaque_pixels
 from clsplat.scene.reprojection import require_points_in_front
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View, load_image, load_rgba
@@ -33,7 +32,6 @@ from clsplat.training.stage import Stage
 
 LOG = logging.getLogger("clsplat")
 MIN_USABLE = 100  # with fewer points from a sweep or a hull, random ones are used
-Chance = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 
 
 def scene_points(scene: Scene) -> PointCloud:
@@ -44,28 +42,28 @@ def scene_points(scene: Scene) -> PointCloud:
     return scene.points
 
 
-def swept(run: Run, count: int, chance: Chance | None) -> PointCloud:
-    """Return at most `count` points of a sweep over the training photos; `chance` as in `swept_points`."""
+def swept(run: Run, count: int) -> PointCloud:
+    """Return at most `count` points of a sweep over the training photos."""
     views = _views(run)
-    return swept_points(views, scene_center(views), load_image, count, run.seed, chance)
+    return swept_points(views, scene_center(views), load_image, count, run.seed)
 
 
-def points_and_sweep(run: Run, count: int, chance: Chance | None) -> PointCloud:
+def points_and_sweep(run: Run, count: int) -> PointCloud:
     """Return the scene's points, and at most `count` points of a sweep that add to them.
 
     Transparent and masked pixels give no points.  Raises DataError if the scene has no points.
     """
     points, views = scene_points(run.scene), _views(run)
     known = points.positions.astype(np.float64)
-    new = swept_points(views, scene_center(views), load_image, count, run.seed, chance, known, opaque_pixels)
+    new = swept_points(views, scene_center(views), load_image, count, run.seed, known, opaque_pixels)
     if not len(new):
         LOG.warning("the plane sweep found no additional points; starting from the scene's points only")
     return points.joined(new)
 
 
-def enough_swept(run: Run, count: int, chance: Chance | None) -> PointCloud | None:
+def enough_swept(run: Run, count: int) -> PointCloud | None:
     """Return the points of `swept`, or None, with a warning, if there are too few."""
-    points = swept(run, count, chance)
+    points = swept(run, count)
     if len(points) < MIN_USABLE:
         remedy = "photos taken closer together give more"
         LOG.warning("the plane sweep found only %d points; starting from random ones; %s", len(points), remedy)
@@ -86,9 +84,6 @@ def on_hull(run: Run, count: int) -> PointCloud | None:
 def _views(run: Run) -> list[View]:
     """Return the training views at the training size."""
     return [view for view in run.scene.split("train") if view.downscale == run.downscale]
-
-
-CHANCES = {"uniform": None, "laplacian": laplacian_probability}  # of a pixel to become a point of a sweep
 
 
 class Init(Stage):
@@ -120,9 +115,6 @@ class Init(Stage):
     """Number of random points; largest number of points on a visual hull."""
     sweep_points: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
-    detail: Literal["uniform", "laplacian"] = "uniform"
-    """Pixels of a sweep that become points: `uniform`, all equally likely, with sizes from their neighbors; or
-    `laplacian`, where the photos have detail, with sizes from the distances between those pixels."""
     times: Literal["uniform", "per_frame"] = "uniform"
     """Center in time of moving Gaussians: random, or the timestamp at which the dataset says that the point was seen.
     With `per_frame`, points whose neighbors were seen at all times start static; others start with the spread of their
@@ -199,18 +191,17 @@ class Init(Stage):
         source = self._source(run.scene)
         if source == "model":
             return with_motion(with_degree(self._read(), degree), run.model_settings.time, str(self.file)), source
-        chance = CHANCES[self.detail]
         sources: dict[str, Callable[[], PointCloud | None]] = {
-            "sweep": lambda: enough_swept(run, self.sweep_points, chance),
+            "sweep": lambda: enough_swept(run, self.sweep_points),
             "hull": lambda: on_hull(run, self.count),
             "points": lambda: scene_points(run.scene),
-            "points+sweep": lambda: points_and_sweep(run, self.sweep_points, chance),
+            "points+sweep": lambda: points_and_sweep(run, self.sweep_points),
         }
         points = sources[source]() if source in sources else None
         if points is None:
             points, source = self._random(run), "random"
         if source == "points" and self._is_joined(run.scene):
-            points, source = points.joined(swept(run, self.sweep_points, chance)), "points+sweep"
+            points, source = points.joined(swept(run, self.sweep_points)), "points+sweep"
         self._require_memory(run, len(points))
         parameters = from_points(points, self.opacity, degree, self.scale)
         seen = points.times if self.times == "per_frame" else None

@@ -33,7 +33,6 @@ def test_what_reads_places_at_rest_is_refused_beside_motion(override, what):
     [
         ("cleanup", r".rules\[\d\]: 'prune_far' cannot be .*: it reads .*; leave one of them out"),
         ("cleanup: {rules: [prune_far]}", r".rules\[0\]: 'prune_far' cannot be .*: it reads"),
-        ("reinit_from_depth", ": 'reinit_from_depth' cannot be .*: a depth is of one moment; leave the stage"),
     ],
 )
 def test_stages_that_need_rest_are_refused_on_reading(tmp_path, stage, words):

@@ -14,12 +14,11 @@ from scipy.spatial import cKDTree
 from clsplat.core.errors import DataError
 from clsplat.data_tools.casting import camera_pose
 from clsplat.data_tools.synthetic import CAMERA_DISTANCE, LOOK_AT, STILL_LIFE
-from clsplat.gaussians.conversion import from_points
 from clsplat.scene.camera import Camera
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.plane_sweep import MAX_DEPTH, MIN_DEPTH, PLANES, Surface, swept_points
-from clsplat.scene.quality import MAX_SPACING, laplacian_probability, opaque_pixels, point_spacing
+from clsplat.scene.quality import opaque_pixels
 from clsplat.scene.scene import PointCloud
 from clsplat.scene.view import View, load_image
 from clsplat.scene.viewpoint import scene_center
@@ -99,41 +98,32 @@ def before_a_sky(view):
     return load_image(view, (0.55, 0.7, 0.9))
 
 
-def detailed(table, shown, chance=laplacian_probability):
-    return swept_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, chance, shown=shown)
+def swept(table, shown):
+    return swept_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, shown=shown)
 
 
-def test_pixels_of_detail_lie_at_exact_depths(table):
+def test_pixels_lie_at_exact_depths(table):
     """The median error is below half of the distance between planes, in inverse depth."""
     views, depths = table
-    points = detailed(table, lambda view: np.isfinite(depths[view.name]) & (view.name == "2"))
+    points = swept(table, lambda view: np.isfinite(depths[view.name]) & (view.name == "2"))
     assert len(points) > 500
     place = points.positions @ views[2].world_to_camera[:, :3].T + views[2].world_to_camera[:, 3]
     column, row = np.floor(place[:, :2] / place[:, 2:] * views[2].camera.fx + SIDE / 2).astype(int).T
     step = (1 / MIN_DEPTH - 1 / MAX_DEPTH) / (PLANES - 1) / CAMERA_DISTANCE
     exact = depths["2"][row, column]
     assert np.median(np.abs(1 / place[:, 2] - 1 / exact)) < step / 2
-    chance = laplacian_probability(before_a_sky(views[2]) / 255)[row, column]
-    sizes = place[:, 2] / views[2].camera.fx * np.minimum(1 / np.sqrt(chance), SIDE / 10)
-    np.testing.assert_allclose(points.sizes, sizes, rtol=1e-4)
-
-
-def test_a_sky_gives_no_points_of_detail(table):
-    inner = {name: cv2.erode(np.isinf(depth).astype(np.uint8), np.ones((5, 5))) > 0 for name, depth in table[1].items()}
-    assert len(detailed(table, lambda view: inner[view.name])) == 0
-    assert len(detailed(table, lambda view: inner[view.name], chance=None)) > 500, "the sweep alone finds some"
 
 
 @pytest.fixture(scope="module")
 def everywhere(table):
-    """Points of detail on all pixels."""
-    return detailed(table, lambda view: None)
+    """Points on all pixels."""
+    return swept(table, lambda view: None)
 
 
 def test_transparent_pixels_give_no_points(table, everywhere):
     shown = {view.name: opaque_pixels(view) for view in table[0]}
     assert not any((shown[name] & np.isinf(depth)).any() for name, depth in table[1].items())
-    assert 500 < len(detailed(table, opaque_pixels)) < len(everywhere)
+    assert 500 < len(swept(table, opaque_pixels)) < len(everywhere)
 
 
 def test_pixels_that_a_mask_leaves_out_give_no_points(table, tmp_path):
@@ -144,38 +134,6 @@ def test_pixels_that_a_mask_leaves_out_give_no_points(table, tmp_path):
     np.testing.assert_array_equal(
         opaque_pixels(replace(view, mask_path=tmp_path / "mask.png")), opaque_pixels(view) & (left[:, :, 0] > 0)
     )
-
-
-def test_detail_gets_more_points(rng):
-    views, photographs = wall_views(rng, 3)
-    blurred = {name: cv2.GaussianBlur(image, (0, 0), 4) for name, image in photographs.items()}
-    half = np.arange(120) < 60
-    mixed = {name: np.where(half[:, None], image, blurred[name]) for name, image in photographs.items()}
-    center, load = np.array([0, 0, DEPTH]), lambda view: mixed[view.name]
-    sides = [np.broadcast_to(half, (90, 120)), np.broadcast_to(~half, (90, 120))]
-
-    def shares(chance):
-        return [len(swept_points(views, center, load, 10**6, 0, chance, shown=lambda view, s=s: s)) for s in sides]
-
-    (sharp, soft), (all_sharp, all_soft) = shares(laplacian_probability), shares(None)
-    assert sharp / all_sharp > 3 * soft / all_soft > 0
-
-
-def test_the_chance_of_a_pixel(rng):
-    image = rng.random((5, 7, 3)) * 0.3
-    chance = laplacian_probability(image)
-    for row, column in np.ndindex(5, 7):
-        around = [
-            (max(row - 1, 0), column),
-            (min(row + 1, 4), column),
-            (row, max(column - 1, 0)),
-            (row, min(column + 1, 6)),
-        ]
-        sums = [sum(image[place][k] for place in around) - 4 * image[row, column][k] for k in range(3)]
-        assert chance[row, column] == pytest.approx(min(1, sum(map(abs, sums))))
-    assert 0 < chance.min() < 1 == chance.max()
-    assert not laplacian_probability(np.full((4, 4, 3), 0.4)).any()
-    np.testing.assert_allclose(point_spacing(np.array([1, 0.25, 1e-9]), 160), [1, 2, MAX_SPACING * 160])
 
 
 def test_what_the_scene_has_is_not_new():
@@ -199,20 +157,11 @@ def test_what_the_scene_lacks_is_added(rng):
     assert np.mean(new[:, 0] > -0.1) > 0.95
 
 
-def test_points_of_detail_are_the_same_every_time(table, everywhere):
-    first, second = everywhere, detailed(table, lambda view: None)
-    for name in ("positions", "colors", "sizes"):
+def test_points_are_the_same_every_time(table, everywhere):
+    first, second = everywhere, swept(table, lambda view: None)
+    for name in ("positions", "colors"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    some = swept_points(table[0], LOOK_AT, before_a_sky, 700, 0, laplacian_probability)
-    assert len(some) == len(some.sizes) == 700 < len(first)
-    assert np.median(some.sizes) > 1.5 * np.median(first.sizes), "fewer points are larger"
-
-
-def test_sizes_that_are_known_are_those_of_gaussians():
-    places, gray = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32), np.full((3, 3), 0.5, np.float32)
-    known = PointCloud(places[:1], gray[:1]).joined(PointCloud(places[1:], gray[1:], sizes=np.array([0.2, 0.3])))
-    scales = from_points(known, 0.1, 0, scale=2.0)["log_scales"]
-    np.testing.assert_allclose(np.exp(scales), np.repeat([[2.0], [0.4], [0.6]], 3, axis=1), rtol=1e-6)
+    assert len(swept_points(table[0], LOOK_AT, before_a_sky, 700, 0)) == 700 < len(first)
 
 
 @pytest.mark.large
@@ -246,11 +195,10 @@ def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, cap
     assert run.model.gaussians.count == own + joined
 
 
-@pytest.mark.parametrize("detail", ["uniform", "laplacian"])
-def test_points_and_sweep(tiny_scene, tmp_path, caplog, detail):
+def test_points_and_sweep(tiny_scene, tmp_path, caplog):
     scene = read_scene(tiny_scene)
     caplog.set_level("INFO", "clsplat")
-    sets = ("init.source=points+sweep", f"init.detail={detail}", "init.sweep_points=60", "optimize.steps=1")
+    sets = ("init.source=points+sweep", "init.sweep_points=60", "optimize.steps=1")
     train(tiny_scene, tmp_path / "run", *sets)
     found = re.search(r"([\d,]+) Gaussians from the scene's points and a plane sweep", caplog.text)
     assert found
