@@ -153,7 +153,7 @@ def test_few_gaussians(device, count):
 def test_a_threshold_for_another_unit_is_not_taken():
     """The default belongs to the gradient: with it, everything would grow."""
     for keys in ({"statistic": "gain"}, {"statistic": "screen_grad", "as_many_as": "gain"}):
-        with pytest.raises(ValidationError, match="'gradient_above' is needed with 'gain', whose unit is another"):
+        with pytest.raises(ValidationError, match="'gain' has another unit than the default of 'gradient_above'"):
             Clone(**keys)
         assert Clone(gradient_above=200, **keys).gradient_above == 200
     assert Clone(statistic="gain", as_many_as="screen_grad").gradient_above == 2e-4
