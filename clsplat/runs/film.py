@@ -47,12 +47,12 @@ from clsplat.viewer.video.paths import nearest
 from clsplat.viewer.video.pictures import Canvas, Image, letterboxed
 
 LOG = logging.getLogger("clsplat")
-PHOTOGRAPH = "photograph"  # what can stand beside a picture; else a model
+PHOTOGRAPH = "photograph"  # what --side may show, besides a model
 
 
 @dataclass(frozen=True)
 class FilmTarget:
-    """Where a film goes: into a video, or as pictures into a folder."""
+    """The output of a video: a file, or images in a folder."""
 
     video: Path | None
     out: Path = Path("renders")
@@ -113,13 +113,13 @@ def film(
 
 
 def _read(model: Path) -> Loaded:
-    """What a model file or a run folder holds, wherever its photographs are."""
+    """Read the model of a file or a run folder, which does not need its photos."""
     file = shown_of_run(model) if has_pipeline(model) else model
     return read(file if is_field(file) else model)
 
 
 def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | None, needed: bool) -> Scene | None:
-    """The scene of a model at the size of its run; None where none is known and none is needed."""
+    """Return the scene of a model at the image size of its run; None if it is neither known nor needed."""
     if not needed and scene is None and not has_pipeline(model):
         return None
     try:
@@ -133,7 +133,7 @@ def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | N
 
 
 def _side(name: str | None, made: Film, scene: Scene | None, background: Background, device: Device) -> Side | None:
-    """What stands beside a picture: the photograph whose camera is nearest, or another model."""
+    """Return what is shown next to a frame: the photo with the nearest camera, or another model."""
     if name is None:
         return None
     if name != PHOTOGRAPH:
@@ -154,10 +154,10 @@ def _side(name: str | None, made: Film, scene: Scene | None, background: Backgro
     return side
 
 
-# Models, of files or run folders, on one page to walk through.
+# One or two models on a page to walk through.
 
-MOST = 2  # models beside each other
-MANY = 2_000_000  # splats: a page of more opens slowly
+MAX_MODELS = 2  # side by side
+MANY_SPLATS = 2_000_000  # a page with more is slow
 
 
 def view(
@@ -169,27 +169,27 @@ def view(
     photograph_budget: float = BUDGET,
     splats: int | None = None,
 ) -> Path:
-    """Write a page that shows one model, or two with one camera; return the page.  Raises ClsplatError.
+    """Write a page that shows one model, or two side by side; return the page.  Raises ClsplatError.
 
-    scene: whose views and photographs are in the page; by default that of the first run folder among the models.
+    scene: its views and photos are in the page; default: the scene of the first run folder among the models.
     """
-    if not 1 <= len(models) <= MOST:
+    if not 1 <= len(models) <= MAX_MODELS:
         raise ConfigError(f"view: expected one model or two, got {len(models)}")
     if out.suffix.lower() not in (".html", ".htm"):
-        raise ConfigError(f"{out}: expected a name that ends in .html, as browsers open it")
+        raise ConfigError(f"{out}: expected a name that ends in .html")
     if not (out.is_file() and is_viewer(out)):
         check_not_run_file(out)
     if splats is not None and splats < 1:
         raise ConfigError(f"--splats {splats}: expected a number of at least 1")
     if photographs not in ("none", "test", "all"):
-        raise ConfigError(f"no photographs '{photographs}'; there are none, test and all")
+        raise ConfigError(f"--photographs: expected none, test or all, got '{photographs}'")
     if not 0 <= photograph_budget < math.inf:
         raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected MB, a finite number of at least 0")
     for path in models:
         require_model(path)
     source = next((ModelSource.of(path, scene) for path in models if scene is not None or run_of(path)), None)
     if photographs == "all" and source is None:
-        raise ConfigError("--photographs all needs the photographs of a scene; give --scene, or a run folder")
+        raise ConfigError("--photographs all needs the photos of a scene; add --scene, or use a run folder")
     _tell_of_scenes(models, source)
     called = names(models)
     loaded = dict(zip(called, map(load, counted(models, "models read", len(models))), strict=True))
@@ -206,7 +206,7 @@ def view(
     stand = Viewpoint.from_points(first.means, found.views if found else (), start)
     title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
     if found is None:
-        LOG.info("without a scene up is -y; give --scene where the picture stands on its head")
+        LOG.info("without a scene, up is -y; add --scene if the model is upside down")
     packed = counted(loaded.items(), "models packed", len(loaded))
     shown = {name: pack(model, splats) for name, model in packed}
     Page(title, shown, stand, background, views).write(out)
@@ -214,30 +214,30 @@ def view(
 
 
 def _advise(loaded: Mapping[str, Model], splats: int | None) -> None:
-    """Warn of models with more splats than a page shows smoothly, before they are packed, which takes minutes."""
+    """Warn about models with too many splats for a page, before packing them, which takes minutes."""
     for name, model in loaded.items():
-        if min(len(model), splats or len(model)) > MANY:
+        if min(len(model), splats or len(model)) > MANY_SPLATS:
             LOG.warning(
-                "%s: has %s splats; they take a while to pack, and browsers show %s smoothly: --splats %d keeps the "
-                "most important",
-                *(name, f"{len(model):,}", f"{MANY:,}", MANY),
+                "%s: %s splats take long to pack, and browsers show only %s smoothly; --splats %d keeps the most "
+                "important",
+                *(name, f"{len(model):,}", f"{MANY_SPLATS:,}", MANY_SPLATS),
             )
 
 
 def _tell_of_scenes(models: Sequence[Path], source: ModelSource | None) -> None:
-    """Warn where models are of different scenes: the page has the cameras of one."""
+    """Warn if models are of different scenes, as the page has the cameras of one."""
     scenes = {}
     for name, run in zip(names(models), map(run_of, models), strict=True):
-        with suppress(ConfigError):  # of a plug-in that is missing: the model can be shown
+        with suppress(ConfigError):  # of a missing plug-in; the model can be shown without it
             if run and (path := load_pipeline(str(run / PIPELINE)).settings.scene.path):
                 scenes[name] = Path(path).resolve()
     if source and len(set(scenes.values())) > 1:
-        told = [part for one in scenes.items() for part in one]
-        LOG.warning("%s is of %s, %s of %s: both stand before the cameras of %s", *told, source.scene_name)
+        names_and_scenes = [part for item in scenes.items() for part in item]
+        LOG.warning("%s is of %s, but %s of %s; the page has the cameras of %s", *names_and_scenes, source.scene_name)
 
 
 def names(models: Sequence[Path]) -> list[str]:
-    """Return a name for each model: its folder's or file's, with more of the path where two are the same."""
+    """Return a name for each model: that of its folder or file, with more of the path to tell two apart."""
     short = [path.resolve().name if path.is_dir() else path.stem for path in models]
     parents = [path.resolve().parent.name for path in models]
     if len(set(short)) < len(short):

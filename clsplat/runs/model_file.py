@@ -1,4 +1,4 @@
-"""A model, or a field, at the views of a scene: rendering and measuring without training."""
+"""Render and measure a model, or a field, at the views of a scene, without training."""
 
 import io
 import json
@@ -48,25 +48,25 @@ from clsplat.training.modules.base import apply_side_files, read_color_model
 from clsplat.viewer.video.film import require_motion, times_of
 from clsplat.viewer.video.pictures import LAYERS, Canvas, shown, values
 
-# What pictures are made of, on the host: Gaussians, or a field.
+# Models on the host: Gaussians, or a field.
 
 Loaded = Model | FieldModel
 
 
 def read(file: Path) -> Loaded:
-    """Read a model file, or that of a field.  Raises DataError when it is missing, damaged or something else."""
+    """Read a model file or a field file.  Raises DataError if it is missing, damaged or another file."""
     return load_field(file) if is_field(file) else load(file)
 
 
 def painter_of(loaded: Loaded, device: Device, background: Background) -> Painter:
-    """Return what renders it on a device; Gaussians before a background, a field before its own."""
+    """Return its painter on a device; Gaussians with this background, a field with its own."""
     if isinstance(loaded, FieldModel):
         return loaded.upload(device)
     return SplatPainter(Rasterizer(device), loaded.upload(device), Photographs(device, background).background)
 
 
 def points_of(loaded: Loaded, scene: Scene | None) -> NDArray[np.float32]:
-    """Return where something is, [M, 3]: means of Gaussians; for a field the scene's points, if it has any."""
+    """Return points of the content, [M, 3]: the means of Gaussians, or for a field the points of the scene, if any."""
     if isinstance(loaded, Model):
         return loaded.means
     points = scene.points if scene else None
@@ -74,36 +74,36 @@ def points_of(loaded: Loaded, scene: Scene | None) -> NDArray[np.float32]:
 
 
 def moves(loaded: Loaded) -> bool:
-    """Whether it is of a scene that moves."""
+    """Whether it is a model of a moving scene."""
     return isinstance(loaded, Model) and loaded.motion is not None
 
 
 def size_of(loaded: Loaded) -> dict[str, int | None]:
-    """Return what metrics.json says of its size."""
+    """Return its size, with the keys of metrics.json."""
     if isinstance(loaded, Model):
         return {"gaussians": len(loaded)}
     return {"gaussians": None, "parameters": loaded.shape.learned}
 
 
-# Which model and which photographs a command names: by a file, by the folder of a scene, or by that of a run.
+# The model and the photos of a command, given as a file, a dataset folder, or a run folder.
 
 
 @dataclass(frozen=True)
 class ModelSource:
-    """A model file, and the photographs whose cameras look at it."""
+    """A model file, and the photos with its cameras."""
 
     file: Path
-    folder: Path  # of the photographs
-    settings: SceneSettings  # how they are read
+    folder: Path  # of the photos
+    settings: SceneSettings  # how to read them
     scene_name: str  # on pages
     alpha: Alpha | None = None  # None: as the model file says
 
     @classmethod
     def of(cls, model: Path, scene: Path | None) -> "ModelSource":
-        """Take a run folder, or a file that a run has exported, with its photographs; other files need `scene`.
+        """Find the photos of a run folder, or of a file that a run exported; other files need `scene`.
 
-        `scene`, a folder of photographs or of a run, replaces those of the model's run.  Raises DataError or
-        ConfigError when one is not known.
+        `scene`, a dataset folder or run folder, replaces the photos of the model's run.  Raises DataError or
+        ConfigError if one is unknown.
         """
         run = run_of(model)
         trained = scene if scene is not None and has_pipeline(scene) else run
@@ -125,20 +125,20 @@ class ModelSource:
         return cls(file, folder, settings, name, settings.alpha)
 
     def scene(self, model: Model | FieldModel) -> Scene:
-        """Read the photographs as the model was trained on, at their full size."""
-        found = self.settings.masked(read_scene(self.folder, self.settings.split))
-        return found.with_alpha(self.alpha or model.rendering.alpha)
+        """Read the photos as in the training of the model, at their full size."""
+        masked = self.settings.masked(read_scene(self.folder, self.settings.split))
+        return masked.with_alpha(self.alpha or model.rendering.alpha)
 
 
 def require_model(path: Path) -> None:
-    """Raise DataError for a folder that holds no Gaussians, and for the file of a field."""
+    """Raise DataError for a folder without Gaussians, and for the file of a field."""
     refuse_field(path)
     if path.is_dir() and not (file := model_path(path)).is_file():
         raise _no_model(path, file.name)
 
 
 def _no_model(folder: Path, name: str = MODEL) -> DataError:
-    """The error of a folder without a model, with the remedy for what it is."""
+    """Return the error for a folder without a model, with a remedy for its kind."""
     if _has_field(folder):
         return DataError(f"{folder}: has no file of its field; run its pipeline again with the stage export_field")
     if has_pipeline(folder):
@@ -152,25 +152,25 @@ def _no_model(folder: Path, name: str = MODEL) -> DataError:
 
 
 def refuse_field(path: Path) -> None:
-    """Raise DataError for the file of a field, and for a run that has trained one."""
+    """Raise DataError for the file of a field, and for a run that trained one."""
     if is_field(path) or (has_pipeline(path) and _has_field(path) and not run_model(path).is_file()):
         raise of_a_field(path)
 
 
 def of_a_field(path: Path) -> DataError:
-    """The error of a field where Gaussians are expected."""
-    shown = "`clsplat render` makes pictures of it where a stage export_field has written it, with --video a film"
-    return DataError(f"{path}: is a field, a network in the place of Gaussians; expected Gaussians: {shown}")
+    """Return the error for a field where Gaussians are expected."""
+    remedy = "use `clsplat render`, after a stage export_field has written the field"
+    return DataError(f"{path}: is a field, a network instead of Gaussians; expected Gaussians; {remedy}")
 
 
 def shown_of_run(run: Path) -> Path:
-    """The file of what a run has trained: Gaussians, or a field."""
+    """Return the file that a run trained: Gaussians, or a field."""
     file = run_model(run)
     return file if file.is_file() or not _has_field(run) else field_of_run(run)
 
 
 def _has_field(run: Path) -> bool:
-    """Whether a run that is done has trained a field in the place of Gaussians."""
+    """Whether a finished run trained a field instead of Gaussians."""
     try:
         return read_metrics(run / METRICS).gaussians is None
     except DataError:
@@ -178,7 +178,7 @@ def _has_field(run: Path) -> bool:
 
 
 def run_of(model: Path) -> Path | None:
-    """Return the folder of the run that a model is of: itself, or one that has exported the file; None without one."""
+    """Return the run folder of a model: itself, or that of the run that exported the file; None without one."""
     if model.is_dir():
         return model if has_pipeline(model) else None
     file = model.resolve()
@@ -192,9 +192,9 @@ def run_of(model: Path) -> Path | None:
 
 
 def photographs_of(scene: Path) -> Path:
-    """Return the folder of a scene: of a run that of the photographs it was trained on, else the folder itself.
+    """Return the dataset folder: for a run folder that of its photos, else the folder itself.
 
-    Raises ConfigError for a run whose pipeline names none or cannot be read, DataError where the folder is missing.
+    Raises ConfigError if the pipeline of a run names none or cannot be read, DataError if the folder is missing.
     """
     if not has_pipeline(scene):
         return scene
@@ -211,12 +211,12 @@ def _exports(pipeline: Pipeline) -> list[Export | ExportField]:
 
 
 def overrides_of(overrides: Sequence[str], scene: Path | None) -> list[str]:
-    """Return `overrides` with the folder of the photographs, where one is given.  Raises ConfigError, DataError."""
+    """Return `overrides` with the folder of the photos, if given.  Raises ConfigError, DataError."""
     return [*overrides, *([f"scene.path={as_setting(photographs_of(scene))}"] if scene is not None else [])]
 
 
 def as_setting(folder: Path) -> str:
-    """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
+    """Return a folder as a value for `--set`, with its full path.  Raises ConfigError if YAML cannot hold its name."""
     path = str(folder.resolve())
     try:
         path.encode()
@@ -225,12 +225,12 @@ def as_setting(folder: Path) -> str:
     return json.dumps(path)
 
 
-# Pictures of a model in a folder, one file for each view and layer.
+# Renders in a folder, one file per view and layer.
 
-FRAME = re.compile(r"frame_\d{5,6}(_[a-z]+)?\.[a-z]+")  # of a film; those of the path `views` are called as views
+FRAME = re.compile(r"frame_\d{5,6}(_[a-z]+)?\.[a-z]+")  # of a video; frames of the path `views` have the names of views
 LOG = logging.getLogger("clsplat")
 KINDS = ("png", "npy")  # of files
-RECORD = ".renders.json"  # beside renders: a table of their names, and whether each is a frame of a film
+RECORD = ".renders.json"  # next to renders: their names, and whether each is a frame of a video
 
 
 def write_pictures(
@@ -244,8 +244,8 @@ def write_pictures(
 ) -> list[Path]:
     """Write images (`kind` png) or float32 arrays (npy) of the layers of each view; return their files.
 
-    A layer but the colors has its name in that of the file.  photographs: files that no picture may mix with; film:
-    the views are a film, and frames of this kind that an earlier one has left are removed at the end.
+    The name of a layer, except color, is in the file name.  photographs: their folders must not be written to; film:
+    the views are frames of a video, and leftover frames of an earlier one are removed at the end.
     """
     own = image_paths(out, [view.name for view in views], f".{kind}")
     files = [{layer: _of_layer(path, layer) for layer in layers} for path in own]
@@ -270,7 +270,7 @@ def write_pictures(
 
 
 def _remove(out: Path, frames: set[str]) -> None:
-    """Remove frames of an earlier film from a folder and its record."""
+    """Remove frames of an earlier video from a folder and its record."""
     with raising_output_error(out):
         for name in frames:
             (out / name).unlink(missing_ok=True)
@@ -291,7 +291,7 @@ def _write_array(path: Path, array: NDArray[np.float32]) -> None:
 
 
 def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path]) -> None:
-    """Raise ConfigError where renders would mix with photographs, or replace what no earlier call has rendered."""
+    """Raise ConfigError if renders would mix with photos, or replace files that are not renders."""
     folder = out.resolve()
     for images in {path.resolve().parent for path in photographs}:
         if folder == images or folder in images.parents or images in folder.parents:
@@ -305,7 +305,7 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
 
 
 def _rendered(out: Path) -> dict[str, bool]:
-    """The files that earlier calls have rendered into a folder, and whether each is a frame of a film."""
+    """Return the renders of earlier calls in a folder, and whether each is a frame of a video."""
     try:
         found = read_json(out / RECORD)
     except DataError:
@@ -322,16 +322,16 @@ SPLITS = ("train", "test", "all")
 
 
 class ModelFile:
-    """A model opened on a device, with the scene whose cameras look at it.
+    """A model on a device, with its scene.
 
-    The numbers it was trained with come from the file's comment; files of other programs get those of 3DGS, or of
-    Mip-Splatting where the file says so.  Photographs of a run folder are read as the run read them.
+    Settings of rendering come from the comment of the file; files of other programs get those of 3DGS, or of
+    Mip-Splatting if the file says so.  Photos of a run folder are read as the run read them.
     """
 
     def __init__(
         self, model: Path, scene: Path | None = None, device: str | Device | None = None, downscale: float | None = None
     ) -> None:
-        """downscale: divisor of the photographs' size; default: that of the run, 1 for a file."""
+        """downscale: divisor of the image size; default: that of the run, or 1 for a file."""
         self.source = ModelSource.of(model, scene)
         self.loaded = read(self.source.file)
         self.device = open_correct(device)
@@ -344,14 +344,14 @@ class ModelFile:
 
     @property
     def gaussians(self) -> Model:
-        """The model.  Raises DataError where it is a field."""
+        """The model.  Raises DataError for a field."""
         if isinstance(self.loaded, FieldModel):
             raise of_a_field(self.source.file)
         return self.loaded
 
     @cached_property
     def painter(self) -> Painter:
-        """What renders it on the device."""
+        """Renders the model on the device."""
         return painter_of(self.loaded, self.device, self.background)
 
     def render(
@@ -373,7 +373,7 @@ class ModelFile:
     def evaluate(
         self, downscales: Sequence[float] | None = None, perceptual: Perceptual = PSNR_AND_SSIM
     ) -> dict[str, Any]:
-        """Return metrics by split and divisor of the photographs' size, with the keys of metrics.json."""
+        """Return metrics by split and downscale factor, with the keys of metrics.json."""
         metrics: dict[str, Any] = {"test": {}, "train": {}}
         for downscale in downscales or [self.downscale]:
             scene = self.photographs.downscaled(downscale)
@@ -430,8 +430,7 @@ def evaluate(
 def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:
     """Write cameras as files of other programs; return the files.
 
-    scene: a dataset, in a folder or as read, or a run folder, whose cameras are those that it has learned.
-    Raises ClsplatError.
+    scene: a dataset, as a folder or a scene, or a run folder, with its optimized cameras.  Raises ClsplatError.
     """
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: expected a folder to write into")

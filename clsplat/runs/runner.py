@@ -1,4 +1,4 @@
-"""Run the stages of a pipeline in order, from the newest checkpoint or from the beginning."""
+"""Run the stages of a pipeline in order, from the newest checkpoint or from the start."""
 
 import json
 import logging
@@ -28,23 +28,23 @@ from clsplat.training.checkpoint import saved_on_failure
 from clsplat.training.run import Run
 from clsplat.training.stage import Training
 
-# Training again on all photographs, for the number of steps that validation has found best.
+# The refit: training again on all photos, for the number of steps that validation found best.
 
 LOG = logging.getLogger("clsplat")
 WITHOUT = {"keep": "last", "patience": None, "refit": False}
 
 
 def is_due(run: Run) -> bool:
-    """Whether validation has found the number of steps, and they are not begun."""
+    """Whether validation has found the number of steps, and the refit has not started."""
     return run.best is not None and run.best.refit == "due"
 
 
 def begin_if_due(run: Run) -> None:
-    """Come to the beginning of the pipeline where a refit is due."""
+    """Restart the pipeline if a refit is due."""
     if run.best is None or run.best.refit != "due":
         return
     LOG.info(
-        "refit: all %d training photographs, for %d steps",
+        "refit: training on all %d photos for %d steps",
         len(run.original.train) + len(run.original.validation),
         run.best.measured.step,
     )
@@ -53,9 +53,9 @@ def begin_if_due(run: Run) -> None:
 
 
 def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
-    """Return the pipeline; in a refit with as many steps as validation has found best, and with its last model kept.
+    """Return the pipeline; in a refit with the number of steps that validation found best, keeping the last model.
 
-    The bits of a refit are those of a run of this pipeline without validation views.
+    A refit gives the same bits as a run of this pipeline without validation views.
     """
     if not run.is_refit or run.best is None:
         return pipeline
@@ -71,12 +71,12 @@ def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
 
 
 def _as_grown(stage: Densify, best: Best) -> Densify:
-    """The same, with the step from which on nothing grew in the place of its patience."""
+    """Return a stage that stops growth at the step where patience stopped it before."""
     ended = [step for step in (stage.grow_until, best.growth_ended if stage.patience else None) if step is not None]
     return stage.model_copy(update={"patience": None, "grow_until": min(ended, default=None)})
 
 
-# The record of what a run was started with, inputs.json, and its comparison when the run goes on.
+# inputs.json: the inputs of a run, and their comparison when the run resumes.
 
 
 def write_inputs(run: Run) -> None:
@@ -86,19 +86,19 @@ def write_inputs(run: Run) -> None:
 
 
 def require_same_inputs(scene: Path, identity: Identity | None, out: Path, digest: str = "") -> None:
-    """Raise ConfigError, saying what changed, when a run was started with other photographs, cameras or points.
+    """Raise ConfigError, with the changes, if a run was started with other photos, cameras or points.
 
-    digest: of those, where a checkpoint has it.
+    digest: of those, if a checkpoint has it.
     """
     before = _read(out / INPUTS)
     digest = digest or (before.digest if before else "")
     if not digest:
-        LOG.warning("%s: missing or damaged; photographs that have changed go unnoticed", out / INPUTS)
+        LOG.warning("%s: missing or damaged; cannot check that the photos are the same", out / INPUTS)
     elif identity and identity.digest != digest:
         changes = ", ".join(identity.changes(before)) if before else ""
-        changes = changes or f"{INPUTS} is missing or damaged, so what changed is not known"
+        changes = changes or f"{INPUTS} is missing or damaged, so the changes are unknown"
         raise ConfigError(
-            f"{scene}: not what the run was started with: {shorten(changes, 500)}; put that back, or begin anew: "
+            f"{scene}: not what the run was started with: {shorten(changes, 500)}; put that back, or start over: "
             "`clsplat run` with --restart or another --out"
         )
 
@@ -110,14 +110,14 @@ def _read(path: Path) -> Identity | None:
         return None
 
 
-# What a run does on Ctrl-C, SIGTERM and SIGHUP.
+# Ctrl-C, SIGTERM and SIGHUP.
 
 
 @contextmanager
 def finishing_on_interrupt(run: Run) -> Iterator[None]:
-    """Finish the step, or the view of a longer stage, and save the state at the first signal.
+    """At the first signal, finish the step, or the view of a longer stage, and save the state.
 
-    The second signal stops at once, and so does the first where there is no model to save.
+    The second signal stops at once, as does the first if there is no model to save.
     """
 
     def finish() -> None:
@@ -132,9 +132,9 @@ def finishing_on_interrupt(run: Run) -> Iterator[None]:
 
 
 def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress], None]) -> None:
-    """Run the stages, from the newest checkpoint where the run is resumed, and write the files of the run folder.
+    """Run the stages, from the newest checkpoint if the run resumes, and write the files of the run folder.
 
-    The caller records a failure.
+    The caller records failures.
     """
     run.on_progress = show
     before = begin(pipeline, run, start)
@@ -150,14 +150,14 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     check_outputs(pipeline, run, lost)
     write_checksums(pipeline, run, before)
     for name in lost:
-        LOG.warning("%s: is missing or was changed, and only --restart writes it again", run.out / name)
+        LOG.warning("%s: is missing or has changed; only --restart writes it again", run.out / name)
     run.status.end("done", exit_code=0)
 
 
 def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
-    """Take the newest checkpoint, or clear the folder, and write what a run folder holds from the beginning on.
+    """Restore the newest checkpoint, or clear the folder, and write the first files of a run folder.
 
-    Return the checksums of files that an earlier end of the run has written, and that its coming stages do not.
+    Return the checksums of files that the finished run had, and that no later stage rewrites.
     """
     taken = restore(pipeline, run) if start == "resume" else None
     check_run(pipeline, run)
@@ -166,7 +166,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
     if start == "resume":
         LOG.info("resumed at step %d" if taken else "nothing to resume; starting from the beginning%.0s", run.step)
     before = sums_before(pipeline, run) if taken else {}
-    run.status.enter("running", step=run.step)  # a refusal leaves all as it was; from here on files change
+    run.status.enter("running", step=run.step)  # until here, a refusal changes nothing
     keep_checksums(run, before)
     checkpoint.drop_later(run.out, taken)
     write_pipeline(pipeline, run)
@@ -184,16 +184,16 @@ def check_run(pipeline: Pipeline, run: Run) -> None:
 
 
 def write_pipeline(pipeline: Pipeline, run: Run) -> None:
-    """Write every setting of the run, with the reason where some are not those of the file."""
+    """Write all settings of the run, with the reason if some differ from the file."""
     reason = f"# {pipeline.reason}\n" if pipeline.reason else ""
     write_text(run.out / PIPELINE, f"{RESOLVED}{pipeline.path.name}\n{reason}{pipeline.text()}")
 
 
 def restore(pipeline: Pipeline, run: Run) -> Path | None:
-    """Take the newest checkpoint that is whole; return it, or None where none was saved so far.  Nothing is written.
+    """Restore the newest intact checkpoint; return it, or None if none was saved.  Nothing is written.
 
-    Raises ConfigError when it is of another run: with other settings, photographs, cameras or points, or of one that
-    has trained for longer already; OutputError when no checkpoint is whole.
+    Raises ConfigError if it has other settings, photos, cameras or points, or has trained longer already, and
+    OutputError if all checkpoints are damaged.
     """
     taken, remarks = checkpoint.restore(run)
     if taken:
@@ -201,8 +201,8 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
         stage = pipeline.stages[run.stage_index] if run.stage_index < len(pipeline.stages) else None
         if isinstance(stage, Training) and stage.steps < run.stage_step:
             raise ConfigError(
-                f"{taken}: already at step {run.step}; {stage.stage}.steps={stage.steps} would end before it: give "
-                f"{run.stage_step} or more, or begin anew: `clsplat run` with --restart or another --out"
+                f"{taken}: already at step {run.step}; {stage.stage}.steps={stage.steps} would end before it: use "
+                f"{run.stage_step} or more, or start over: `clsplat run` with --restart or another --out"
             )
     for remark in remarks:
         LOG.warning("%s", remark)
@@ -210,10 +210,10 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
 
 
 def run_stages(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages from where the run stands on, and again from the beginning for a refit.
+    """Run the stages from the run's current one, and all of them again for a refit.
 
-    Behind a training or an edit the run stands there until the next one begins: the stages between them see the same
-    model, and a run that goes on has them all again.
+    After a training or an edit, the current stage stays until the next training or edit starts: the stages between see
+    the same model, and a resumed run runs all of them again.
     """
     begin_if_due(run)
     for cursor, stage in enumerate(as_trained(pipeline, run).stages):

@@ -1,8 +1,8 @@
-"""The number of steps that fit into a time (`--minutes`).
+"""Choose the number of steps that fit into a time (`--minutes`).
 
-A short rehearsal says what a step takes, and what is done besides; a longer one follows where that took little of the
-time, for steps become slower as Gaussians grow.  At fixed shares of the training the number is
-corrected by the steps that were trained.  It is written into the run's pipeline, so that its bits repeat.
+A short rehearsal measures the time of a step, and of everything else.  If it took little of the time, a longer one
+follows, as steps become slower while Gaussians grow.  At fixed fractions of the training, the number of steps is
+corrected by the measured steps.  It is written to the run's pipeline, so that the run can be repeated bit by bit.
 """
 
 import logging
@@ -29,13 +29,13 @@ from clsplat.training.stage import Training
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
-CORRECTED = 0.3, 0.6, 0.85  # shares of the training
-STEPS = 200  # of the first rehearsal; a training may say that fewer of its own are enough
-LONGER = 3  # times as many steps has the next
-SHORTEST = 0.03  # share of the time: a rehearsal that took less is followed by a longer one
-REPORTS = 20  # of a training, at least: each gives the median time of its steps
-LONGEST = 0.2  # share of the time after which a rehearsal ends its steps
-TREND = 0.5  # the steepest power of the number of steps that the time of one is taken to follow
+CORRECTIONS = 0.3, 0.6, 0.85  # fractions of the training
+STEPS = 200  # of the first rehearsal; a training may declare that fewer are enough
+LONGER = 3  # factor of the number of steps of the next rehearsal
+MIN_SHARE = 0.03  # of the time: a shorter rehearsal is followed by a longer one
+REPORTS = 20  # of a training, at least; each gives the median time of its steps
+MAX_SHARE = 0.2  # of the time, after which a rehearsal ends its steps
+MAX_TREND = 0.5  # largest exponent of the growth of a step's time with the number of steps
 
 Show = Callable[[Progress], None]
 Execute = Callable[[Pipeline, Run, Start, Show], None]
@@ -43,40 +43,41 @@ Execute = Callable[[Pipeline, Run, Start, Show], None]
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """What a pipeline took in few steps, in seconds."""
+    """The times of a pipeline with few steps, in seconds."""
 
     steps: int
-    course: Sequence[float]  # a step, in equal parts of the training
-    during: float  # what comes before the training, and between its steps
-    after: float  # what follows the training
-    trend: float = 0.0  # the power of the number of steps that the time of one follows
+    step_times: Sequence[float]  # of one step, in equal parts of the training
+    during: float  # before the training, and between its steps
+    after: float  # after the training
+    trend: float = 0.0  # exponent of the growth of a step's time with the number of steps
 
     def steps_in(self, seconds: float) -> int:
         """Return the number of steps that fit."""
-        times = max(0.0, seconds - self.during - self.after) / (self.steps * fmean(self.course))
+        times = max(0.0, seconds - self.during - self.after) / (self.steps * fmean(self.step_times))
         return math.floor(self.steps * math.pow(times, 1 / (1 + self.trend)))
 
     def later(self, share: float) -> tuple[float, float]:
-        """Return how many times as long as at a share of the training steps take after it: in the mean, and last."""
-        place = min(int(share * len(self.course)), len(self.course) - 1)
-        return fmean(self.course[place:]) / self.course[place], self.course[-1] / self.course[place]
+        """Return the mean and the last time of later steps, relative to a step at a fraction of the training."""
+        index = min(int(share * len(self.step_times)), len(self.step_times) - 1)
+        now = self.step_times[index]
+        return fmean(self.step_times[index:]) / now, self.step_times[-1] / now
 
 
 class _Enough(Exception):
-    """Ends the steps of a rehearsal."""
+    """Raised to end the steps of a rehearsal."""
 
 
 def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, show: Show, execute: Execute) -> None:
-    """Execute the pipeline in as many steps as take `minutes`, with their rehearsal.
+    """Execute the pipeline in as many steps as fit into `minutes`, including the rehearsal.
 
-    Raises ConfigError where not exactly one stage trains, or its fewest steps take longer, and what `execute` raises.
+    Raises ConfigError unless exactly one stage trains and its fewest steps fit, and what `execute` raises.
     """
     until = time.perf_counter() + 60 * minutes
     _require_one_training(pipeline)
     check_run(pipeline, run)
-    found = rehearse_enough(pipeline, run, minutes, until)
-    steps, planned = pipeline.settings.training.steps, found.steps_in(until - time.perf_counter())
-    if planned < fewest(pipeline):
+    rehearsal = rehearse_enough(pipeline, run, minutes, until)
+    steps, planned = pipeline.settings.training.steps, rehearsal.steps_in(until - time.perf_counter())
+    if planned < min_steps_of(pipeline):
         raise _too_few(minutes, pipeline)
     reason = f"--minutes {minutes:g}: {planned:,} steps instead of {steps:,}, by a rehearsal"
     LOG.info("%s", reason)
@@ -84,8 +85,8 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
 
     def correct(plan: Pipeline, report: Progress) -> Pipeline:
         planned, share, each = report.steps, report.step / report.steps, report.milliseconds / 1e3
-        mean, end = (ratio * each for ratio in found.later(share))
-        rest = found.after + (1 - share) * found.during + mean * (planned - report.step)
+        mean, end = (ratio * each for ratio in rehearsal.later(share))
+        rest = rehearsal.after + (1 - share) * rehearsal.during + mean * (planned - report.step)
         more = math.floor((until - time.perf_counter() - rest) / end)
         least = min(planned, last_edit(plan.settings.training) + 2)  # and what begins behind it, once
         steps = max(report.step + 2, least, planned + more)
@@ -93,7 +94,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
         LOG.info("%s: %.0f ms", reason, report.milliseconds)
         return replace(plan, settings=with_steps(plan.settings, steps, report.step), reason=reason)
 
-    for share in CORRECTED:
+    for share in CORRECTIONS:
         corrected = _execute_until(share, plan, new_run(run, plan), start, show, execute, correct)
         if corrected is None:
             return
@@ -110,9 +111,9 @@ def _execute_until(
     execute: Execute,
     correct: Callable[[Pipeline, Progress], Pipeline],
 ) -> Pipeline | None:
-    """Execute a pipeline up to a share of its training, and save a checkpoint of the corrected one, which is returned.
+    """Execute a pipeline up to a fraction of its training, save a checkpoint, and return the corrected pipeline.
 
-    None: it ended before.
+    Returns None if it ended earlier.
     """
     corrected: list[Pipeline] = []
 
@@ -120,7 +121,7 @@ def _execute_until(
         show(report)
         if share * report.steps <= report.step < report.steps and not run.interrupted:
             corrected.append(correct(plan, report))
-            write_pipeline(corrected[0], run)  # before the checkpoint: whoever resumes takes it
+            write_pipeline(corrected[0], run)  # before the checkpoint, so that a resumed run uses it
             run.settings, run.pipeline = corrected[0].settings, corrected[0].resolved()
             run.interrupted = True
 
@@ -134,39 +135,39 @@ def _execute_until(
 
 
 def rehearse_enough(pipeline: Pipeline, run: Run, minutes: float, until: float) -> Rehearsal:
-    """Return a rehearsal in so many steps that it takes a small part of the time, with the trend since the one before.
+    """Return a rehearsal that takes at least a small part of the time, with the trend since the previous one.
 
-    until: s, on the clock.  Raises ConfigError as `rehearse`.
+    until: s, on the clock.  Raises ConfigError as `rehearse` does.
     """
     steps, began, trend = min(STEPS, pipeline.settings.training.rehearsed), time.perf_counter(), 0.0
-    found = rehearse(pipeline, run, steps, minutes, until)
-    while time.perf_counter() - began < SHORTEST * 60 * minutes:
-        before, steps, began = found, LONGER * steps, time.perf_counter()
-        found = rehearse(pipeline, run, steps, minutes, until)
-        trend = math.log(fmean(found.course) / fmean(before.course)) / math.log(LONGER)
-    return replace(found, trend=min(max(trend, -TREND), TREND))
+    rehearsal = rehearse(pipeline, run, steps, minutes, until)
+    while time.perf_counter() - began < MIN_SHARE * 60 * minutes:
+        before, steps, began = rehearsal, LONGER * steps, time.perf_counter()
+        rehearsal = rehearse(pipeline, run, steps, minutes, until)
+        trend = math.log(fmean(rehearsal.step_times) / fmean(before.step_times)) / math.log(LONGER)
+    return replace(rehearsal, trend=min(max(trend, -MAX_TREND), MAX_TREND))
 
 
 def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: float) -> Rehearsal:
-    """Run all stages of the pipeline in few steps; the run is left as it is.
+    """Run all stages of the pipeline with few steps, without changing the run.
 
-    until: s, on the clock.  Raises ConfigError as soon as it is known that the fewest steps do not fit.
+    until: s, on the clock.  Raises ConfigError as soon as the fewest steps turn out not to fit.
     """
-    LOG.info("--minutes %g: %s is rehearsed in %d steps", minutes, pipeline.settings.name, steps)
+    LOG.info("--minutes %g: rehearsing %s with %d steps", minutes, pipeline.settings.name, steps)
     short = stretched(pipeline.settings, Fraction(steps, pipeline.settings.training.steps))
     short_pipeline, began = replace(pipeline, settings=_reporting(short)), time.perf_counter()
     reports: list[tuple[float, int, float]] = []  # s on the clock, step, s of one
 
     def look() -> None:
         each = min(seconds for _, _, seconds in reports[-2:]) if len(reports) > 1 else 0.0  # one may build kernels
-        if time.perf_counter() + fewest(pipeline) * each > until:
+        if time.perf_counter() + min_steps_of(pipeline) * each > until:
             raise _too_few(minutes, pipeline)
 
     def show(report: Progress) -> None:
         run.status.count("steps", report.step, report.steps)
         reports.append((time.perf_counter(), report.step, report.milliseconds / 1e3))
         look()
-        if report.step < report.steps and reports[-1][0] - reports[0][0] > LONGEST * 60 * minutes:
+        if report.step < report.steps and reports[-1][0] - reports[0][0] > MAX_SHARE * 60 * minutes:
             raise _Enough
 
     run.status.note(seconds_left=None)
@@ -179,21 +180,21 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, until: fl
             one.next_stage(one.stage_index + 1)
             run_stages(short_pipeline, one)
     trained, done, _ = reports[-1]
-    course = [seconds for _, _, seconds in reports]
-    during = (trained - began - done * fmean(course)) * steps / done
-    course += [course[-1]] * (round(len(course) * steps / done) - len(course))
-    return Rehearsal(steps, course, max(0.0, during), time.perf_counter() - trained)
+    step_times = [seconds for _, _, seconds in reports]
+    during = (trained - began - done * fmean(step_times)) * steps / done
+    step_times += [step_times[-1]] * (round(len(step_times) * steps / done) - len(step_times))
+    return Rehearsal(steps, step_times, max(0.0, during), time.perf_counter() - trained)
 
 
-def fewest(pipeline: Pipeline) -> int:
-    """Return the fewest steps that the training is cut to: its edits keep apart, and a rehearsal has as many."""
+def min_steps_of(pipeline: Pipeline) -> int:
+    """Return the fewest steps of a shortened training: its edits stay apart, and a rehearsal is not longer."""
     training = pipeline.settings.training
     return max(min(STEPS, training.rehearsed), min_steps(training))
 
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
-    """Return a run of the pipeline as this one was before its first step, with its device, scene and photographs."""
-    own: dict[str, Any] = {
+    """Return a run of the pipeline in the state before its first step, with the same device, scene and photos."""
+    reset: dict[str, Any] = {
         "best": None,
         "best_tables": {},
         "scalars": {},
@@ -201,11 +202,11 @@ def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
         "metrics": {},
         "changes": [],
     }
-    return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved(), **own, **changes)
+    return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved(), **reset, **changes)
 
 
 def _reporting(settings: PipelineFile) -> PipelineFile:
-    """The settings with REPORTS reports of the training, or more."""
+    """Return settings with at least REPORTS reports of the training."""
 
     def often(training: Training) -> Training:
         return training.model_copy(update={"log_every": min(training.log_every, -(-training.steps // REPORTS))})
@@ -214,7 +215,7 @@ def _reporting(settings: PipelineFile) -> PipelineFile:
 
 
 def _require_one_training(pipeline: Pipeline) -> None:
-    """Raise ConfigError where the time of the training does not follow from one number of steps."""
+    """Raise ConfigError if the time of the training does not depend on a single number of steps."""
     trainings = [stage for stage in pipeline.stages if isinstance(stage, Training)]
     if len(trainings) != 1:
         raise ConfigError(
@@ -228,6 +229,6 @@ def _require_one_training(pipeline: Pipeline) -> None:
 
 def _too_few(minutes: float, pipeline: Pipeline) -> ConfigError:
     return ConfigError(
-        f"--minutes {minutes:g}: too few for this scene on this device, where {fewest(pipeline)} steps are the fewest; "
-        "give more minutes, or smaller photographs (--set scene.downscale=2)"
+        f"--minutes {minutes:g}: too short: this scene needs at least {min_steps_of(pipeline)} steps on this device; "
+        "use more minutes, or smaller images (--set scene.downscale=2)"
     )

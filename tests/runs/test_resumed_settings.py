@@ -41,7 +41,7 @@ def test_what_tables_depend_on_may_not_change(change, killed_run, tiny_scene):
 
 def test_a_run_that_has_trained_for_longer_is_refused(killed_run, tiny_scene, caplog):
     before = (killed_run / "pipeline.yaml").read_text()
-    words = r"already at step 8; optimize.steps=6 would end before it: give 8 or more, or begin anew: `clsplat run`"
+    words = r"already at step 8; optimize.steps=6 would end before it: use 8 or more, or start over: `clsplat run`"
     with pytest.raises(ConfigError, match=words):
         train(tiny_scene, killed_run, *FEW, "optimize.steps=6", resume=True)
     assert "bits" not in caplog.text, "nothing goes on"

@@ -63,7 +63,7 @@ def test_it_takes_the_time_that_was_given(monkeypatch, minutes, growth, until_sh
     monkeypatch.setattr(time_budget, "check_run", lambda *given: None)
     time_budget.execute_within(minutes, load("splat_7k"), SimpleNamespace(), "new", lambda progress: None, execute)
     assert clock[0] == pytest.approx(60 * minutes, rel=0.05)
-    assert len(planned) == 1 + len(time_budget.CORRECTED)
+    assert len(planned) == 1 + len(time_budget.CORRECTIONS)
     assert done[0] == planned[-1]
 
 
@@ -141,31 +141,31 @@ def test_rehearsal_that_takes_too_long_ends_its_steps(tiny_scene, tmp_path, monk
     brief = lambda pipeline, run, *given: time_budget.rehearse(pipeline, run, 10, 0.0, math.inf)  # noqa: E731
     monkeypatch.setattr(time_budget, "rehearse_enough", brief)
     monkeypatch.setattr(Rehearsal, "steps_in", seen)
-    with pytest.raises(ConfigError, match="too few"):
+    with pytest.raises(ConfigError, match="too short"):
         clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=1.0)
     (rehearsal,) = found
-    assert len(rehearsal.course) == 10
-    assert len({*rehearsal.course[2:]}) == 1
+    assert len(rehearsal.step_times) == 10
+    assert len({*rehearsal.step_times[2:]}) == 1
     assert rehearsal.after > 0
 
 
 @pytest.mark.slow
 def test_too_few_minutes_are_refused_in_the_rehearsal(tiny_scene, tmp_path, few_steps):
     """A run that is done stays so, and a new one leaves nothing."""
-    told = r"--minutes 1e-06: too few for this scene on this device, where 200 steps are the fewest; give more minutes"
+    told = r"--minutes 1e-06: too short: this scene needs at least 200 steps on this device; use more minutes"
     with pytest.raises(ConfigError, match=told):
         clsplat.run("smoke", tiny_scene, tmp_path / "new", minutes=1e-6)
     assert not list(tmp_path.iterdir())
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set={"optimize.steps": 2})
-    with pytest.raises(ConfigError, match="too few"):
+    with pytest.raises(ConfigError, match="too short"):
         clsplat.run("smoke", tiny_scene, out, start="restart", minutes=1e-6)
     assert clsplat.status(out)["state"] == "done"
     assert clsplat.check(out)["whole"]
 
 
 def test_training_is_not_cut_below_what_keeps_edits_apart():
-    assert time_budget.fewest(load("splat")) == 300
-    assert time_budget.fewest(load("mip_nerf")) == 20
+    assert time_budget.min_steps_of(load("splat")) == 300
+    assert time_budget.min_steps_of(load("mip_nerf")) == 20
 
 
 def test_what_cannot_be_fitted_is_refused(tiny_scene, tmp_path, few_steps):

@@ -47,11 +47,11 @@ def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
 
 
 def test_more_splats_than_a_page_shows_smoothly_come_with_advice(run, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("clsplat.runs.film.MANY", 10)
+    monkeypatch.setattr("clsplat.runs.film.MANY_SPLATS", 10)
     heard = []
     with listening(lambda *what, seconds_left: heard.append(what)):
         clsplat.view(run, out=tmp_path / "a.html")
-    assert "browsers show 10 smoothly: --splats 10 keeps" in caplog.text
+    assert "browsers show only 10 smoothly; --splats 10 keeps" in caplog.text
     assert heard == [("models read", i, 1) for i in (0, 1)] + [("models packed", i, 1) for i in (0, 1)]
     caplog.clear()
     clsplat.view(run, out=tmp_path / "a.html", splats=10)
@@ -158,7 +158,7 @@ def test_models_of_different_scenes_are_told(run, tiny_scene, tmp_path):
     for_all = ["--out", tmp_path / "a.html"]
     done = CliRunner().invoke(app, [str(word) for word in ("view", run, other, *for_all)])
     warning = (
-        f"run is of {tiny_scene}, other of {tmp_path / 'kitchen'}: both stand before the cameras of {tiny_scene.name}"
+        f"run is of {tiny_scene}, but other of {tmp_path / 'kitchen'}; the page has the cameras of {tiny_scene.name}"
     )
     assert warning in done.output.replace("\n", ""), done.output
     for models in ([run, same], [run]):
@@ -178,7 +178,7 @@ def test_no_page_takes_the_place_of_another_file_of_a_run(run, tmp_path):
 
 def test_which_way_is_up_is_said_where_no_view_tells(run, tmp_path):
     for_all = ["--out", tmp_path / "a.html"]
-    assert "up is -y; give --scene" in command("view", shutil.copy(run / "point_cloud.ply", tmp_path), *for_all)
+    assert "up is -y; add --scene" in command("view", shutil.copy(run / "point_cloud.ply", tmp_path), *for_all)
     assert "-y" not in command("view", run, *for_all)
 
 
@@ -217,7 +217,7 @@ def test_errors_are_one_line(run, tmp_path):
 def test_errors_of_the_function(run, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="one model or two, got 0"):
         clsplat.view()
-    with pytest.raises(ConfigError, match="no photographs 'some'; there are none, test and all"):
+    with pytest.raises(ConfigError, match="--photographs: expected none, test or all, got 'some'"):
         clsplat.view(run, out=tmp_path / "a.html", photographs="some")
     for budget in (float("inf"), float("nan"), -1.0):
         with pytest.raises(ConfigError, match=rf"--photograph-budget {budget:g}: expected MB, a finite number"):
