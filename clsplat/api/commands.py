@@ -195,7 +195,7 @@ def run_job(job: "Job", device: "str | Device | None", live: int | None = None, 
     from clsplat.pipeline.matrix import Experiment
 
     work = job.work
-    if not isinstance(work, Experiment) or work.execution.store_folder is None:
+    if not isinstance(work, Experiment) or not work.execution.has_store:
         job.run(device, live, minutes)
         return job.out
     if live is not None or minutes is not None:

@@ -248,16 +248,17 @@ CHECKPOINTS = "checkpoints"
 UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
+STORE = "store"  # of the cells of a matrix
 MODULE_FILE_PREFIX = "view_"  # of the side files of training modules
 RESERVED = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, PREPARE_SUMMARY, INPUTS, CHECKSUMS, LOCK),
-        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json"),
+        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, STORE, "cameras.json"),
     }
 )
 EARLY_RUN_FILES = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml
 RUN_FILES = EARLY_RUN_FILES | {PIPELINE, METRICS, RECORDS, TRIAL, PREPARE_SUMMARY, INPUTS, CHECKSUMS, CHECKPOINTS}
-MATRIX_FILES = frozenset({STATUS, LOCK, PIPELINE, COMPARISON})
+MATRIX_FILES = frozenset({STATUS, LOCK, PIPELINE, COMPARISON, STORE})
 END_STATES = ("done", "failed", "interrupted")  # states in status.json
 HEARTBEAT_TIMEOUT = 60  # seconds without a heartbeat in status.json after which a run may have ended
 MAX_NAME_BYTES = 200  # systems allow 255, and temporary names are longer

@@ -44,6 +44,7 @@ class Settings(BaseModel):
     keyed_by_type: ClassVar[bool] = False  # a list has each type at most once and is addressed by type
     rate_keys: ClassVar[frozenset[str]] = frozenset()  # schedules that are divided by that scale, so that sums stay
     family: ClassVar[str] = ""  # a name besides its type by which `conflicts` may refer to it
+    unavailable: ClassVar[Mapping[str, str]] = {}  # unknown keys that other settings have, with what to do
     conflicts: ClassVar[Mapping[str, str]] = {}
     """Types or families that exclude this one, in the same stage or outside of stages: `why; what to do`."""
 

@@ -1,21 +1,27 @@
-"""Define where the cells of a matrix run: the keys of `execution:`, or of a file given by `--on`."""
+"""Define where the cells of a matrix run: the keys of `execution:`, and of a file given by `--on`.
+
+A pipeline file may come from a stranger, so it names neither other machines nor folders outside of the run folder.
+"""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from clsplat.core.errors import ConfigError
+from clsplat.core.files import STORE
 from clsplat.core.settings import InputPath, Settings
 from clsplat.pipeline.explanation import explain, first_fault
 from clsplat.pipeline.yaml_file import read_yaml
 
-STORE = "runs/store"
+HERE = r"^(inline|local)$"
 ENGINE = r"^(inline|local|(dask|tls)://[^/:\s]+:(\d{1,5}))$"
 LAST_PORT = 65_535
 LOOPBACK = ("127.0.0.1", "localhost")
 STORE_KEYS = ("devices", "placement", "retries")  # have an effect only with a store
+ON_ONLY = "a pipeline file may not set this; give it in a file with --on"
 
 
 class Placement(Settings):
@@ -44,14 +50,19 @@ def _engine(value: Any) -> Any:
     return value
 
 
-class Execution(Settings):
-    """Where the cells of a matrix run, and where they are kept."""
+def _engine_here(value: Any) -> Any:
+    if isinstance(value, str) and not re.fullmatch(HERE, value):
+        raise ValueError("expected inline or local; give the address of a scheduler in a file with --on")
+    return value
 
-    engine: Annotated[str, BeforeValidator(_engine), Field(pattern=ENGINE)] = "inline"
-    """inline: one after another in this process; local: one process per device of this machine; dask://HOST:PORT or
-    tls://HOST:PORT: the devices that `clsplat worker` offers to that scheduler."""
-    store: InputPath | None = None
-    """Folder of cells and results, shared by all machines; default: runs/store, or no store with engine inline."""
+
+class LocalExecution(Settings):
+    """How the cells of a matrix run on this machine."""
+
+    unavailable: ClassVar[Mapping[str, str]] = dict.fromkeys(("store", "insecure", "tls"), ON_ONLY)
+
+    engine: Annotated[str, BeforeValidator(_engine_here), Field(pattern=HERE)] = "inline"
+    """inline: one after another in this process; local: one process per device of this machine, with a store."""
     devices: Literal["auto"] | Annotated[list[str], Field(min_length=1)] = "auto"
     """Devices of this machine, named as for `--device`; auto: all that work; engine inline uses the first."""
     placement: Placement = Placement()
@@ -60,6 +71,35 @@ class Execution(Settings):
     """With engine local: processes that run on each CPU device at the same time and share its cores."""
     retries: Annotated[int, Field(ge=1)] = 3
     """Number of failures without a newer checkpoint after which a cell is given up."""
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> "LocalExecution":
+        """Refuse keys without an effect."""
+        for key, reason in self._unused().items():
+            if getattr(self, key) != type(self).model_fields[key].default:
+                raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; leave it out")
+        return self
+
+    def _unused(self) -> dict[str, str]:
+        """Return the keys that have no effect, with the reasons."""
+        unused = {} if self.has_store else dict.fromkeys(STORE_KEYS, "it needs a store")
+        return unused if self.engine == "local" else unused | {"packing": "it is for engine local"}
+
+    @property
+    def has_store(self) -> bool:
+        """Whether cells are kept in a store."""
+        return self.engine != "inline"
+
+
+class Execution(LocalExecution):
+    """Where the cells of a matrix run, and where they are kept."""
+
+    engine: Annotated[str, BeforeValidator(_engine), Field(pattern=ENGINE)] = "inline"
+    """inline: one after another in this process; local: one process per device of this machine; dask://HOST:PORT or
+    tls://HOST:PORT: the devices that `clsplat worker` offers to that scheduler."""
+    store: InputPath | None = None
+    """Folder of cells and results, shared by all machines; default: `store` in the run folder, or no store with engine
+    inline."""
     insecure: bool = False
     """Allow a scheduler on another machine without TLS.  Anyone who reaches its port can run code."""
     tls: Tls | None = None
@@ -73,28 +113,30 @@ class Execution(Settings):
         return store
 
     @model_validator(mode="after")
-    def _check_keys(self) -> "Execution":
-        """Refuse keys without an effect, and a scheduler that anyone could reach."""
-        scheme = self.engine.partition("://")[0]
-        unused = {} if self.store_folder else dict.fromkeys(STORE_KEYS, "it needs a store")
-        if self.has_workers:
-            unused["devices"] = "the workers choose the devices they offer"
-        if scheme != "tls":
-            unused["tls"] = "it is for engine tls://HOST:PORT"
-        if scheme != "local":
-            unused["packing"] = "it is for engine local"
-        if scheme != "dask":
-            unused["insecure"] = "it is for engine dask://HOST:PORT"
-        for key, reason in unused.items():
-            if getattr(self, key) != type(self).model_fields[key].default:
-                raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; leave it out")
-        if scheme == "dask" and not self.is_local and not self.insecure:
+    def _is_safe(self) -> "Execution":
+        """Refuse a scheduler that anyone could reach."""
+        if self.engine.startswith("dask://") and not self.is_local and not self.insecure:
             raise ValueError(f"{self.engine}: expected tls:// for another machine, or insecure: true (--insecure)")
-        if scheme == "tls" and self.tls is None:
+        if self.engine.startswith("tls://") and self.tls is None:
             raise ValueError(
                 f"{self.engine}: expected tls: {{ca: …, cert: …, key: …}} (--tls-ca, --tls-cert and --tls-key)"
             )
         return self
+
+    def _unused(self) -> dict[str, str]:
+        unused = super()._unused()
+        if self.has_workers:
+            unused["devices"] = "the workers choose the devices they offer"
+        if not self.engine.startswith("tls://"):
+            unused["tls"] = "it is for engine tls://HOST:PORT"
+        if not self.engine.startswith("dask://"):
+            unused["insecure"] = "it is for engine dask://HOST:PORT"
+        return unused
+
+    @property
+    def has_store(self) -> bool:
+        """Whether cells are kept in a store."""
+        return self.store is not None or super().has_store
 
     @property
     def has_workers(self) -> bool:
@@ -111,12 +153,9 @@ class Execution(Settings):
         """The scheduler's address, as Dask writes it."""
         return self.engine.replace("dask://", "tcp://")
 
-    @property
-    def store_folder(self) -> Path | None:
-        """The folder of the store, if there is one."""
-        if self.store is None:
-            return None if self.engine == "inline" else Path(STORE)
-        return Path(self.store)
+    def store_folder(self, out: Path) -> Path:
+        """Return the folder of the store, for cells whose results go to the folder `out`."""
+        return Path(self.store) if self.store else out / STORE
 
 
 def read_execution(file: Path | None) -> dict[str, Any] | None:

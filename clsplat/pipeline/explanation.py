@@ -140,6 +140,8 @@ def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[KeyPath,
 def _complaint(error: dict[str, Any], key_path: KeyPath, model: type[BaseModel] | None, annotation: Any) -> str:
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
+        if advice := getattr(model, "unavailable", {}).get(key_path[-1]):
+            return str(advice)
         known = [name for name in (model.model_fields if model else {}) if name not in TAGS]
         return f"unknown key {quote(key_path[-1])}{_nearest(str(key_path[-1]), known)}"
     if kind == "missing":

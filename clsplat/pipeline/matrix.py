@@ -26,7 +26,7 @@ from pydantic import Field, JsonValue, ValidationError, model_validator
 from clsplat.core.errors import ConfigError, OverrideError, quote, shorten
 from clsplat.core.files import invalid_output_reason
 from clsplat.core.settings import InputPath, Settings
-from clsplat.pipeline.execution import Execution
+from clsplat.pipeline.execution import Execution, LocalExecution
 from clsplat.pipeline.explanation import explain, key_path_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
@@ -90,8 +90,8 @@ class MatrixFile(Settings):
     """Name of the matrix, and of its run folder."""
     matrix: Matrix
     """The axes."""
-    execution: Execution = Execution()
-    """Where the cells run and are stored, as in a file for `--on`; default: one after another in the run folder."""
+    execution: LocalExecution = LocalExecution()
+    """How the cells run on this machine; `--on FILE` replaces it; default: one after another in the run folder."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def load_experiment(
 ) -> Experiment | None:
     """Read and check a pipeline file with `matrix:` and all its cells; None for a file without `matrix:`.
 
-    execution: keys that replace those of the file.
+    execution: keys that replace those of the file, and are not in the text of the experiment, which may be passed on.
     Raises ConfigError with file and line.
     """
     path = find(name)
@@ -154,9 +154,11 @@ def load_experiment(
         cells = [_in_steps(cell, file.matrix.steps) for cell in cells]
     _check_names(path, cells)
     data = {**document.data, "matrix": {**document.data["matrix"], "options": overrides}}
-    if execution is not None:
-        data["execution"] = execution
-    chosen = file.execution if execution is None else Execution.model_validate(execution)
+    if execution is None:
+        execution = document.data.get("execution", {})
+    else:
+        data.pop("execution", None)
+    chosen = Execution.model_validate(execution)
     return Experiment(path, file.name, yaml_text(data) if has_options else read_pipeline(path), cells, chosen)
 
 

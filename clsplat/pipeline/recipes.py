@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.files import path_exists, write_text
 from clsplat.core.settings import Settings, needs_settings, variants
 from clsplat.core.text_table import text_table
-from clsplat.pipeline.execution import Execution
+from clsplat.pipeline.execution import LocalExecution
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.files import find, origin, shipped
 from clsplat.pipeline.loading import load
@@ -93,7 +93,7 @@ def json_schema() -> dict[str, Any]:
         ]
     schema["properties"]["stages"]["items"] = _items(variants(Stage))
     schema["properties"]["prepare"]["items"] = _items(variants(Step))
-    others: dict[str, type[Settings]] = {"matrix": Matrix, "execution": Execution}
+    others: dict[str, type[Settings]] = {"matrix": Matrix, "execution": LocalExecution}
     for key, kind in others.items():
         own = kind.model_json_schema()
         definitions |= {**own.pop("$defs", {}), kind.__name__: own}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from clsplat.core import terminal
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted
-from clsplat.core.files import PIPELINE, raising_output_error
+from clsplat.core.files import PIPELINE, STORE, raising_output_error
 from clsplat.core.progress import Count
 from clsplat.core.reading import read_json
 from clsplat.core.signals import stop_at_once, stopping_on_signals
@@ -108,6 +108,9 @@ class Batch:
         driving = threading.Event()
         with stopping_on_signals(lambda: ask_to_stop(self._stop, driving)), terminal.counts_on_terminal():
             wanted = self._pending_cells()
+            if not wanted:
+                self.ready()
+                return
             with _engine(execution, self.store, device, self._is_stopped) as engine:
                 options = CellOptions(self.store.now(), execution.retries)
                 drive = Dispatcher(self.store, engine, execution.placement.bits == "same", options, self._stop.is_set)
@@ -136,9 +139,11 @@ class Batch:
         return self._stop.is_set()
 
     def _pending_cells(self) -> list[PendingCell]:
-        """Return the cells whose scenes can be read; the others fail."""
+        """Return the cells without an outcome whose scenes can be read; the others fail."""
         scenes, pending = Scenes(self.store.prepared), []
         for cell in self.cells:
+            if cell.name in self.outcomes:
+                continue
             with self.failures.kept(cell.name):
                 pending.append(pending_cell(cell, scenes, self.store))
         return pending
@@ -147,7 +152,7 @@ class Batch:
         drive.ended, drive.look = self._ended, self._look
 
         def began(cell: CellRun) -> None:
-            if drive.is_same and not self.running and not self.outcomes:  # so that `clsplat status` shows waiting cells
+            if drive.is_same and not self._keys:  # so that `clsplat status` shows waiting cells
                 for one in wanted:
                     self._keys[one.cell.name] = one.on(cell.spec["bits"]).key
                     with suppress(ClsplatError):  # reported when that cell runs
@@ -287,12 +292,16 @@ def run_sweep(
     device: for the engine inline.  A failed cell does not stop the others; at the end a ClsplatError is raised with
     the exit code of the first one.  Raises Interrupted, BitsMismatch.
     """
-    store = Store(execution.store_folder or Path())
+    store = Store(execution.store_folder(state.out))
     with open_matrix(experiment, state, start) as (status, failures):
+        status.note(store=str(store.root) if execution.store else STORE)
         sweep = _Sweep(
             experiment.name, experiment.text, experiment.cells, state.out, store, failures, start == "restart"
         )
         sweep.status = status
+        for cell in experiment.cells if start == "resume" else ():
+            if RunState.read(state.out / cell.name).is_whole(cell.pipeline):  # wherever it ran
+                sweep.outcomes[cell.name] = Outcome("published")
         sweep.run(execution, device)
 
 
@@ -303,6 +312,7 @@ class _Sweep(Batch):
 
     def ready(self) -> None:
         self.status.enter("running")
+        self.on_change(None)
 
     def on_change(self, started: str | None) -> None:
         if started is not None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -116,6 +117,11 @@ def _digest_of(path: Path) -> str:
 
 
 KEY = 20  # hexadecimal digits of the hash that names a cell
+
+
+def is_key(value: Any) -> bool:
+    """Return whether a value, such as one in a store of somebody else, can name the folder of a cell."""
+    return isinstance(value, str) and re.fullmatch(f"[0-9a-f]{{{KEY}}}", value) is not None
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.core import terminal
-from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, shell_quote
-from clsplat.core.files import COMPARISON, LOG_FILE, MATRIX_FILES, PIPELINE, STATUS, path_exists, write_text
+from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, shell_quote, shorten
+from clsplat.core.files import COMPARISON, LOG_FILE, MATRIX_FILES, PIPELINE, STATUS, STORE, path_exists, write_text
 from clsplat.core.reading import sha256
 from clsplat.core.signals import stop_at_once, stop_if_signaled, stopping_on_signals
 from clsplat.opencl.device import Device
@@ -129,6 +129,12 @@ class Job:
         experiment = load_experiment(pipeline, changes, execution)
         if experiment is None and execution is not None:
             raise ConfigError(f"{pipeline}: is a single run; --on is for a file with `matrix:`")
+        if experiment and state and start == "resume" and execution is None and state.phase is not Phase.DONE:
+            before, now = state.status.get("store"), STORE if experiment.execution.has_store else None
+            if before not in (None, now):
+                raise ConfigError(
+                    f"{state.out}: was started with --on; its cells are in {shorten(str(before))}: give --on FILE again"
+                )
         if state:
             return cls(experiment or load(pipeline, changes), state, start)
         if experiment:

@@ -53,7 +53,7 @@ from clsplat.core.machine import Owner
 from clsplat.core.reading import read_file, read_json, sha256
 from clsplat.formats.table import CODECS
 from clsplat.runs.state import sum_of
-from clsplat.sweeps.cell import CellRun
+from clsplat.sweeps.cell import CellRun, is_key
 from clsplat.training import checkpoint
 from clsplat.training.status import read_status
 
@@ -462,18 +462,19 @@ class Store:
     def note_sweep(self, name: str, keys: Mapping[str, str], text: str) -> None:
         """Record the cells of a matrix by name, for `clsplat status`.
 
-        text: distinguishes matrices with the same name, such as the text of the file.
+        text: distinguishes matrices with the same name, such as the text of the file.  Other cells of it stay recorded.
         """
-        file = f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
-        write_text(self.root / SWEEPS / file, json.dumps({"name": name, "cells": keys}, indent=1) + "\n")
+        file = self.root / SWEEPS / f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
+        cells = {**dict(self.sweeps([file])).get(name, {}), **keys}
+        write_text(file, json.dumps({"name": name, "cells": cells}, indent=1) + "\n")
 
-    def sweeps(self) -> list[tuple[str, dict[str, str]]]:
-        """Return the name of each matrix, and the keys of its cells by name."""
+    def sweeps(self, files: Sequence[Path] | None = None) -> list[tuple[str, dict[str, str]]]:
+        """Return the name of each matrix, and the keys of its cells by name; what is not a key is left out."""
         sweeps = []
-        for path in sorted((self.root / SWEEPS).glob("*.json")):
+        for path in sorted((self.root / SWEEPS).glob("*.json")) if files is None else files:
             with suppress(DataError, KeyError, TypeError, AttributeError):
                 values = read_json(path)
-                cells = {str(name): str(key) for name, key in values["cells"].items()}
+                cells = {str(name): key for name, key in values["cells"].items() if is_key(key)}
                 sweeps.append((str(values["name"]), cells))
         return sweeps
 

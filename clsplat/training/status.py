@@ -71,6 +71,8 @@ class Status(BaseModel):
     """Number of finished cells of a matrix."""
     failed: dict[str, str] | None = None
     """Failed cells of a matrix, with reasons."""
+    store: str | None = None
+    """Store of the cells of a matrix, if it has one; `store` if it is in the folder of the matrix."""
     exit_code: int | None = None
     """Exit code of a run that ended."""
     message: str | None = None

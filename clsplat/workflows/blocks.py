@@ -121,7 +121,7 @@ class Blocks:
         self, scene: Path, out: Path, plan: BlocksPlan, device: str | Device | None, execution: Execution | None = None
     ) -> None:
         """execution: where blocks are trained; without it one after the other in this process."""
-        if execution is not None and execution.store_folder is None:
+        if execution is not None and not execution.has_store:
             raise ConfigError("--on: blocks are trained as cells of a store; expected the key store, or another engine")
         self.out, self.plan, self.execution = out, plan, execution
         self._name = device if isinstance(device, str) else None
@@ -215,7 +215,7 @@ class Blocks:
             if not is_trained(pipeline, self.out / name)
         ]
         if cells:
-            name, store = f"{self.pipeline.settings.name}-{self.out.name}", Store(execution.store_folder or Path())
+            name, store = f"{self.pipeline.settings.name}-{self.out.name}", Store(execution.store_folder(self.out))
             Batch(name, str(self.out.resolve()), cells, self.out, store, failures).run(execution, self._name)
 
     def merge(self, parts: list[tuple[Block, Path]]) -> Path:

@@ -24,7 +24,7 @@ READ = {  # text that is read, or compared, and never the name of something that
     "SceneSettings.masks", "InverseDepth.folder",
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",
     "Video.path", "Video.size", "ViewSelection.names", "ViewSelection.file", "Execution.engine",
-    "Execution.devices", "Tls.ca", "Tls.cert", "Tls.key",
+    "LocalExecution.engine", "LocalExecution.devices", "Execution.devices", "Tls.ca", "Tls.cert", "Tls.key",
 }  # fmt: skip
 NAMES = {"PipelineFile.name", "MatrixFile.name", "Execution.store"}  # of folders
 OUTSIDE = [

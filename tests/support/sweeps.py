@@ -44,14 +44,15 @@ class Sweep:
 
     def __init__(self, folder: Path, scene: Path, seeds: int, engine: str = "local") -> None:
         self.folder, self.out, self.store = folder, folder / "out", Store(folder / "store")
-        self.file = folder / "sweep.yaml"
+        self.file, self.on = folder / "sweep.yaml", folder / "on.yaml"
         execution = {"engine": engine, "store": str(self.store.root)}
         axes = {"scenes": [str(scene)], "seeds": list(range(seeds))}
-        self.file.write_text(f"name: sweep\nmatrix: {json.dumps(axes)}\nexecution: {json.dumps(execution)}\n{PIPELINE}")
+        self.on.write_text(json.dumps(execution))
+        self.file.write_text(f"name: sweep\nmatrix: {json.dumps(axes)}\n{PIPELINE}")
 
     def start(self) -> "subprocess.Popen[str]":
         """Start the command, also again."""
-        words = ["run", str(self.file), "--out", str(self.out), "--resume"]
+        words = ["run", str(self.file), "--out", str(self.out), "--resume", "--on", str(self.on)]
         return subprocess.Popen(
             [sys.executable, "-m", "clsplat", *words],
             stdout=subprocess.DEVNULL,

@@ -81,7 +81,7 @@ def test_a_store_goes_on_under_another_mount_point(tiny_scene, tmp_path, expecte
     elsewhere = tmp_path / "elsewhere"
     with mounted(elsewhere, "--bind", str(sweep.store.root)):
         stopped_by(sweep, signal.SIGTERM)
-        sweep.file.write_text(sweep.file.read_text().replace(str(sweep.store.root), str(elsewhere)))
+        sweep.on.write_text(sweep.on.read_text().replace(str(sweep.store.root), str(elsewhere)))
         finish(sweep, expected)
         assert any(event.get("from") for event in sweep.store.events()), "it went on from a checkpoint"
 

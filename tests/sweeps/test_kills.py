@@ -93,7 +93,7 @@ def test_a_signal_saves_and_the_same_command_goes_on_elsewhere(tiny_scene, tmp_p
     assert "Traceback" not in errors
     assert not left_behind(tmp_path)
     moved = sweep.store.root.rename(tmp_path / "elsewhere")  # as another mount point would
-    sweep.file.write_text(sweep.file.read_text().replace(str(sweep.store.root), str(moved)))
+    sweep.on.write_text(sweep.on.read_text().replace(str(sweep.store.root), str(moved)))
     process = sweep.start()
     errors = process.communicate()[1]
     assert process.returncode == 0, errors

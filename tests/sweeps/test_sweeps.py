@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -16,6 +17,7 @@ from clsplat.api import commands as sweeps
 from clsplat.core.errors import ClsplatError, ConfigError, DeviceError
 from clsplat.pipeline.execution import Execution, Tls, from_options, read_execution
 from clsplat.pipeline.recipes import json_schema
+from clsplat.runs.state import RunState
 from clsplat.sweeps import batch, engines
 from clsplat.sweeps import batch as single
 from clsplat.sweeps.cell import CellRun, code_digest
@@ -37,10 +39,14 @@ SLOT = DeviceSlot("inline", "a device", "b")
 @pytest.fixture
 def file(tiny_scene: Path, tmp_path: Path) -> Path:
     path = tmp_path / "x.yaml"
-    path.write_text(
-        f"name: sweep\nmatrix: {{scenes: ['{tiny_scene}'], seeds: [0, 1]}}\n"
-        f"execution: {{engine: inline, store: '{tmp_path / 'store'}'}}\n{STAGES}"
-    )
+    path.write_text(f"name: sweep\nmatrix: {{scenes: ['{tiny_scene}'], seeds: [0, 1]}}\n{STAGES}")
+    return path
+
+
+@pytest.fixture
+def on(tmp_path: Path) -> Path:
+    path = tmp_path / "on.yaml"
+    path.write_text(f"{{engine: inline, store: '{tmp_path / 'store'}'}}\n")
     return path
 
 
@@ -61,8 +67,8 @@ def runs(few_steps: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     return ends
 
 
-def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_steps, tmp_path):
-    out = commands.run(file, out=tmp_path / "out")
+def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, on, runs, few_steps, tmp_path):
+    out = commands.run(file, out=tmp_path / "out", on=on)
     assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["tiny-seed=0", "tiny-seed=1"]
     assert "sweep: 2 runs" in (out / "compare.html").read_text()
     status = json.loads((out / "status.json").read_text())
@@ -77,7 +83,7 @@ def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_
     shutil.rmtree(out / "tiny-seed=1")
     (out / "tiny-seed=0" / "metrics.json").unlink()  # as a kill while it was placed would leave it
     runs["seed"] = "it is not run again"
-    assert commands.resume(out) == out, "with the execution that its file names"
+    assert commands.resume(out, on=on) == out
     for cell in ("tiny-seed=0", "tiny-seed=1"):
         assert (out / cell / "metrics.json").is_file()
     assert [event["event"] for event in store.events()].count("start") == 2
@@ -101,13 +107,13 @@ def test_the_tasks_of_a_job_array_run_the_cells_of_a_matrix(file, runs, tmp_path
     assert [cell["state"] for cell in store_status(store)["cells"]] == ["published"] * 2
 
 
-def test_run_continued_in_a_matrix_folder_is_not_shown_as_cell(file, runs, few_steps, tmp_path):
-    out = commands.run(file, out=tmp_path / "out")
+def test_run_continued_in_a_matrix_folder_is_not_shown_as_cell(file, on, runs, few_steps, tmp_path):
+    out = commands.run(file, out=tmp_path / "out", on=on)
     one = out / "tiny-seed=0"
     model, expected = one / "point_cloud.ply", (few_steps / "point_cloud.ply").read_bytes()
     model.unlink()
     model.write_bytes(b"another")
-    commands.run(file, out=out, start="resume")
+    commands.run(file, out=out, start="resume", on=on)
     assert model.read_bytes() == expected
     pipeline = one / "pipeline.yaml"
     pipeline.unlink()
@@ -116,28 +122,28 @@ def test_run_continued_in_a_matrix_folder_is_not_shown_as_cell(file, runs, few_s
     with pytest.raises(
         ClsplatError, match=r"seed=0: the run was continued with other settings .*; move that folder"
     ) as error:
-        commands.run(file, out=out, start="resume")
+        commands.run(file, out=out, start="resume", on=on)
     assert error.value.exit_code == 2
     assert "# trained" in pipeline.read_text(), "it stays"
-    commands.run(file, out=out, start="restart")
+    commands.run(file, out=out, start="restart", on=on)
     assert pipeline.read_bytes() == (few_steps / "pipeline.yaml").read_bytes()
     assert not (one / "checkpoints" / "step_000020.npz").exists()
 
 
-def test_a_cell_that_fails_leaves_the_others_and_its_exit_code(file, runs, tmp_path):
+def test_a_cell_that_fails_leaves_the_others_and_its_exit_code(file, on, runs, tmp_path):
     runs["seed: 1"] = 3
     with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .* exit code 3") as error:
-        commands.run(file, out=tmp_path / "out")
+        commands.run(file, out=tmp_path / "out", on=on)
     assert error.value.exit_code == 3
     assert "tiny-seed=1 failed and is not shown" in (tmp_path / "out" / "compare.html").read_text()
     assert commands.status(tmp_path / "store")["counts"] == {"failed": 1, "published": 1}
 
 
-def test_a_scene_that_cannot_be_read_fails_its_cells_alone(file, runs, tmp_path):
+def test_a_scene_that_cannot_be_read_fails_its_cells_alone(file, on, runs, tmp_path):
     (tmp_path / "empty").mkdir()
     file.write_text(file.read_text().replace("scenes: [", f"scenes: ['{tmp_path / 'empty'}', "))
     with pytest.raises(ClsplatError, match=r"2 of 4 cells failed; the first, empty-seed=0: ") as error:
-        commands.run(file, out=tmp_path / "out")
+        commands.run(file, out=tmp_path / "out", on=on)
     assert error.value.exit_code == 3
     assert json.loads((tmp_path / "out" / "status.json").read_text())["done"] == 4
     assert commands.status(tmp_path / "store")["counts"] == {"published": 2}
@@ -156,15 +162,38 @@ def test_a_queue_runs_a_cell_by_its_number(file, runs, tmp_path):
     assert error.value.exit_code == 6
 
 
-def test_another_execution_replaces_the_files_and_is_noted(file, tmp_path):
+def test_on_replaces_the_execution_of_a_file_and_is_not_noted(file, tmp_path):
     on = tmp_path / "lab.yaml"
-    on.write_text("engine: inline\n")
+    file.write_text(f"execution: {{engine: local}}\n{file.read_text()}")
+    job = Job.open(str(file), out=tmp_path / "out")
+    assert job.work.execution.store_folder(job.out) == tmp_path / "out" / "store", "a store is in the run folder"
+    on.write_text("{engine: 'dask://far:1', insecure: true, store: away, retries: 4}\n")
     job = Job.open(str(file), out=tmp_path / "out", execution=read_execution(on))
-    assert job.work.execution.store_folder is None
-    assert "engine: inline" in job.work.text
-    assert "store" not in job.work.text
+    assert (job.work.execution.engine, job.work.execution.store) == ("dask://far:1", "away")
+    assert not {"execution", "far", "away", "insecure"} & set(re.findall(r"\w+", job.work.text))
     with pytest.raises(ConfigError, match="--on is for a file with `matrix:`"):
         Job.open("smoke", execution=read_execution(on))
+
+
+def test_a_sweep_that_has_begun_elsewhere_resumes_there_alone(file, on, runs, tmp_path):
+    out = tmp_path / "out"
+    runs["seed: 1"] = 6
+    with pytest.raises(ClsplatError, match="1 of 2 cells failed"):
+        commands.run(file, out=out, on=on)
+    with pytest.raises(
+        ConfigError, match=r"out: was started with --on; its cells are in .*store: give --on FILE again"
+    ):
+        commands.resume(out)
+
+
+def test_a_result_in_the_run_folder_is_not_run_again(file, on, runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(RunState, "is_whole", lambda state, pipeline: state.out.name == "tiny-seed=0")
+    out = commands.run(file, out=tmp_path / "out", on=on)
+    shutil.rmtree(tmp_path / "store")
+    shutil.rmtree(out / "tiny-seed=1")
+    commands.resume(out, on=on)
+    assert [cell["name"] for cell in store_status(tmp_path / "store")["cells"]] == ["tiny-seed=1"]
+    assert json.loads((out / "status.json").read_text())["done"] == 2
 
 
 def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
@@ -176,15 +205,36 @@ def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
     assert ran == [(None, None, None)]
 
 
+ONLY_ON = "a pipeline file may not set this; give it in a file with --on"
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("engin: local", "x.yaml:3: execution.engin: unknown key 'engin'"),
-        ("retries: 0", "x.yaml:3: execution.retries: expected a value of at least 1"),
-        ("store: ''", "x.yaml:3: execution.store: expected the path of a folder, got ''"),
+        ("engin: local", "engin: unknown key 'engin'"),
+        ("retries: 0", "retries: expected a value of at least 1"),
         ("retries: 2", "retries has no effect with engine inline: it needs a store"),
         ("placement: {bits: any}", "placement has no effect with engine inline: it needs a store"),
         ("devices: [pocl]", "devices has no effect with engine inline: it needs a store"),
+        ("store: ../elsewhere", f"execution.store: {ONLY_ON}"),
+        ("insecure: true", f"execution.insecure: {ONLY_ON}"),
+        ("tls: {ca: a, cert: b, key: c}", f"execution.tls: {ONLY_ON}"),
+        ("engine: 'dask://127.0.0.1:1'", "execution.engine: expected inline or local; .* with --on, got 'dask://127"),
+    ],
+)
+def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
+    file = tmp_path / "x.yaml"
+    file.write_text(f"name: a\nmatrix: {{seeds: [0]}}\nexecution:\n  {text}\n{STAGES}")
+    for call in (commands.check, commands.run):
+        with pytest.raises(ConfigError, match=rf"x.yaml:[34]: .*{words}"):
+            call(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("engin: local", "engin: unknown key 'engin'"),
+        ("store: ''", "store: expected the path of a folder, got ''"),
         (
             "engine: local, tls: {ca: a, cert: b, key: c}",
             "tls has no effect with engine local: it is for engine tls://",
@@ -196,28 +246,20 @@ def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
         ),
         ("engine: dask://far:1", "expected tls:// for another machine, or insecure: true"),
         ("engine: tls://far:1", "tls://far:1: expected tls: "),
-        ("engine: ray", "x.yaml:3: execution.engine: expected inline, local, or the address of a scheduler"),
-        (
-            "engine: dask://h:99999",
-            "x.yaml:3: execution.engine: expected inline, local, or the address of a scheduler",
-        ),
+        ("engine: ray", "engine: expected inline, local, or the address of a scheduler"),
+        ("engine: dask://h:99999", "engine: expected inline, local, or the address of a scheduler"),
     ],
 )
-def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
-    file = tmp_path / "x.yaml"
-    file.write_text(f"name: a\nmatrix: {{seeds: [0]}}\nexecution: {{{text}}}\n{STAGES}")
-    for call in (commands.check, commands.run):
-        with pytest.raises(ConfigError, match=words):
-            call(file)
+def test_a_wrong_file_for_on_is_refused_with_its_line(tmp_path, text, words):
     on = tmp_path / "lab.yaml"
     on.write_text(f"{{{text}}}\n")
-    with pytest.raises(ConfigError, match=f"lab.yaml:1: .*{words.removeprefix('x.yaml:3: execution.')}"):
+    with pytest.raises(ConfigError, match=f"lab.yaml:1: .*{words}"):
         read_execution(on)
 
 
 def test_the_schema_of_pipeline_files_has_the_keys_of_execution():
-    assert json_schema()["properties"]["execution"] == {"$ref": "#/$defs/Execution"}
-    assert {"Execution", "Placement", "Tls"} <= json_schema()["$defs"].keys()
+    assert json_schema()["properties"]["execution"] == {"$ref": "#/$defs/LocalExecution"}
+    assert {"LocalExecution", "Placement"} <= json_schema()["$defs"].keys()
 
 
 @pytest.mark.parametrize(
@@ -376,18 +418,18 @@ def test_local_engine_runs_cells_in_parallel_on_loopback_alone(tmp_path, monkeyp
     assert len({event["worker"] for event in store.events() if event["event"] == "start"}) == 1
 
 
-def test_a_cell_whose_spec_was_changed_fails_alone(file, runs, tmp_path):
-    commands.run(file, out=tmp_path / "out")
+def test_a_cell_whose_spec_was_changed_fails_alone(file, on, runs, tmp_path):
+    commands.run(file, out=tmp_path / "out", on=on)
     store = Store(tmp_path / "store")
     (key,) = [cells["tiny-seed=1"] for _, cells in store.sweeps()]
     (store.folder(key).path / "spec.json").write_text("{}")
     runs["seed"] = "no cell is run again"
     with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .*remove .* to run it again"):
-        commands.run(file, out=tmp_path / "out", start="resume")
+        commands.run(file, out=tmp_path / "out", start="resume", on=on)
 
 
-def test_damaged_records_of_a_store_do_not_stop_who_looks(file, runs, tmp_path):
-    commands.run(file, out=tmp_path / "out")
+def test_damaged_records_of_a_store_do_not_stop_who_looks(file, on, runs, tmp_path):
+    commands.run(file, out=tmp_path / "out", on=on)
     store = Store(tmp_path / "store")
     before = store_status(store.root)
     (store.root / "events" / "x.jsonl").write_text('3\n[1]\n{"time": "x"}\n{"time": null}\n{"ti')
