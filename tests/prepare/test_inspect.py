@@ -76,7 +76,7 @@ def test_observations_and_errors_of_a_real_model():
     pycolmap = pytest.importorskip("pycolmap")
     facts = Inspection.from_folder(data_set("kitchen")).facts
     theirs = pycolmap.Reconstruction(data_set("kitchen") / "sparse" / "0")
-    assert facts.seen == {image.name: image.num_points3D for image in theirs.images.values()}
+    assert facts.points_per_view == {image.name: image.num_points3D for image in theirs.images.values()}
     errors = [point.error for point in theirs.points3D.values()]
     assert facts.points.error_mean == pytest.approx(np.mean(errors), rel=0.005)  # cameras were rounded afterwards
     assert facts.points.error_90 == pytest.approx(np.quantile(errors, 0.9), rel=0.005)
@@ -85,9 +85,9 @@ def test_observations_and_errors_of_a_real_model():
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 def test_text_and_binary_models_see_the_same_points(kind):
     folder = data_set("colmap_models/statue_OPENCV")
-    seen = Inspection.from_folder(folder / "text" if kind == "txt" else folder).facts.seen
+    seen = Inspection.from_folder(folder / "text" if kind == "txt" else folder).facts.points_per_view
     assert len(seen) == 9
-    assert seen == Inspection.from_folder(folder).facts.seen
+    assert seen == Inspection.from_folder(folder).facts.points_per_view
 
 
 def test_blender_and_nerfstudio(tiny_scene):
@@ -103,7 +103,7 @@ def test_blurred_or_differently_exposed_photographs_are_named(scene, tmp_path):
     seconds = {image.name: 0.01 * (4 if i > 11 else 1) for i, image in enumerate(images)}
     write_exposures(scene / "images", {name: CameraExposure(one, 2.0, 100.0) for name, one in seconds.items()})
     inspection = Inspection.from_folder(scene)
-    assert said(inspection, "warning").startswith(f"1 photograph is blurred ({images[3].name}): leave them out")
+    assert said(inspection, "warning").startswith(f"1 photograph is blurred ({images[3].name}): remove or retake them")
     notes = [finding.text for finding in inspection.findings if finding.level == "note"]
     assert notes[0].startswith(f"{images[5].name}, {images[9].name} look the same")
     assert f"jumps by more than a stop 1 time ({images[11].name} to {images[12].name}: 2.0)" in notes[1]
@@ -124,7 +124,7 @@ def test_a_missing_image(scene):
     (scene / "images" / "03.png").unlink()
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.missing == ["images/03.png"]
-    assert "1 of 24 registered images are missing on disk (images/03.png): put" in said(inspection, "error")
+    assert "1 of 24 registered images are missing on disk (images/03.png): restore" in said(inspection, "error")
     assert inspection.verdict.startswith("cannot train: 1 of 24 registered images")
     assert inspection.facts.train is None
     assert inspection.facts.points.in_two == 1.0  # the rest is inspected all the same
@@ -140,7 +140,7 @@ def test_pipe_named_as_an_image_is_not_reported_as_missing(scene):
 
 
 @pytest.mark.parametrize(
-    ("size", "word"), [((32, 20), "not of the camera's size"), ((48, 64), "width and height are swapped")]
+    ("size", "word"), [((32, 20), "not the size of the camera"), ((48, 64), "width and height are swapped")]
 )
 def test_images_of_another_size(scene, size, word):
     photograph(scene / "images" / "05.png", size)
@@ -198,7 +198,7 @@ def test_a_truncated_file_is_one_error_and_the_rest_is_inspected(scene, stem):
 def test_photographs_without_poses(tmp_path):
     photograph(tmp_path / "a.png")
     inspection = Inspection.from_folder(tmp_path)
-    assert "holds 1 photograph but no camera poses" in said(inspection, "error")
+    assert "contains 1 photograph but no camera poses" in said(inspection, "error")
 
 
 def test_an_empty_folder(tmp_path):
@@ -300,7 +300,7 @@ def test_equal_poses(tmp_path):
 def test_all_cameras_in_one_place(tmp_path):
     model = orbit()
     images = [replace(model.images[0], name=image.name) for image in model.images]
-    assert "all cameras are at the same place" in said(
+    assert "all cameras are at the same position" in said(
         Inspection.from_folder(write(tmp_path, replace(model, images=images))), "warning"
     )
 
@@ -314,14 +314,14 @@ def test_points_behind_all_cameras(tmp_path):
     moved = replace(flipped[4], translation=(0.0, 0.0, 0.0))  # stands in the middle and sees some
     inspection = Inspection.from_folder(write(tmp_path, replace(model, images=[*flipped[:4], moved, *flipped[5:]])))
     assert 0.1 < inspection.facts.points.behind < 0.9
-    assert "% of the points lie behind all cameras" in said(inspection, "warning")
+    assert "% of the points are behind all cameras" in said(inspection, "warning")
 
 
 def test_points_beside_all_images(tmp_path):
     model = orbit()
     above = [replace(point, position=(0, 0, 4 + i % 7)) for i, point in enumerate(model.points)]
     inspection = Inspection.from_folder(write(tmp_path, replace(model, points=above)))
-    assert "only 0 % of the points lie in the image of two views" in said(inspection, "warning")
+    assert "only 0 % of the points project into two or more views" in said(inspection, "warning")
 
 
 def test_points_that_are_not_finite_or_very_far(tmp_path):
@@ -344,8 +344,8 @@ def test_views_that_see_few_points(scene):
     write_model(scene / "sparse" / "0", orbit(), "txt")
     (scene / "sparse" / "0" / "images.txt").write_text("\n".join(lines) + "\n")
     inspection = Inspection.from_folder(scene)
-    assert inspection.facts.seen == {f"{i:02}.png": 5 if i == 3 else 50 for i in range(COUNT)}
-    assert "fewer than 30 points are seen by 1 view (03.png: 5)" in said(inspection, "warning")
+    assert inspection.facts.points_per_view == {f"{i:02}.png": 5 if i == 3 else 50 for i in range(COUNT)}
+    assert "1 view shows fewer than 30 points (03.png: 5)" in said(inspection, "warning")
 
 
 def test_imprecise_poses(scene):
@@ -362,7 +362,7 @@ def test_a_cut_image_and_one_on_its_side(tmp_path):
     (path / "images" / "06.jpg").write_bytes(with_exif(whole, ">", 6))
     inspection = Inspection.from_folder(path)
     assert "the end is missing from 1 image file (05.jpg): copy" in said(inspection, "error")
-    assert "1 photograph is rotated by the EXIF data" in said(inspection, "note")
+    assert "1 photograph is rotated by EXIF" in said(inspection, "note")
 
 
 def test_images_on_their_side_that_the_reader_turns(tmp_path):

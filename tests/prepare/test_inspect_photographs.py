@@ -25,7 +25,7 @@ def test_inspected_folder_is_named_as_a_shell_reads_it(tmp_path):
         (scene / name).parent.mkdir(parents=True, exist_ok=True)
         photograph(scene / name)
     assert said(Inspection.from_folder(scene), "error") == (
-        f"{scene} holds 3 photographs but no camera poses: `clsplat run photos --scene '{scene}'` finds the cameras"
+        f"{scene} contains 3 photographs but no camera poses: `clsplat run photos --scene '{scene}'` finds the cameras"
     )
 
 

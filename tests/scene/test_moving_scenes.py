@@ -12,7 +12,7 @@ from clsplat.core.errors import DataError
 from clsplat.data_tools.moving import STANDING, Moving, shapes_at
 from clsplat.data_tools.sync_frames import write_sync_frames
 from clsplat.data_tools.synthetic import write_dataset
-from clsplat.prepare.inspect.findings import Inspection, figures
+from clsplat.prepare.inspect.findings import Inspection, summarize
 from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.camera_files import write_cameras
 from clsplat.scene.colmap_writer import write_model
@@ -99,9 +99,9 @@ def test_the_folder_is_the_same_each_time(folder, tmp_path):
     assert "already complete" in write_dataset(folder, SMALL)
 
 
-def test_inspect_tells_the_moments_and_the_places(folder):
+def test_inspect_reports_timestamps_and_cameras(folder):
     found = Inspection.from_folder(folder)
-    assert figures(found.facts)["times"] == "6 moments, seen from 3 places"
+    assert summarize(found.facts)["times"] == "6 timestamps from 3 cameras"
     assert not found.facts.same_pose
     assert found.trainable
 
@@ -125,7 +125,7 @@ def test_a_blender_scene_has_one_clock_for_both_files(tmp_path):
 def test_a_scene_without_times_does_not_move(tmp_path):
     path = write(tmp_path / "a", **LENS, frames=frames("0.png", "1.png"))
     assert [view.time for view in read_scene(path).views] == [None, None]
-    assert "times" not in figures(Inspection.from_folder(path).facts)
+    assert "times" not in summarize(Inspection.from_folder(path).facts)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_folder_of_frames_per_camera_is_a_moving_scene(tmp_path):
         ("right/0002.png", 1.0),
     ]
     assert [view.static_path for view in scene.split("test")] == [folder / "static" / "left.png"] * 3
-    assert figures(Inspection.from_folder(folder).facts)["times"] == "3 moments, seen from 2 places"
+    assert summarize(Inspection.from_folder(folder).facts)["times"] == "3 timestamps from 2 cameras"
     assert len(group_by_camera(scene.views)) == 2
 
 

@@ -1,1 +1,1 @@
-"""The inspection of a dataset: facts, findings with remedies, and their page."""
+"""Inspect datasets: measure facts, derive findings with remedies, and write a page."""

@@ -1,4 +1,4 @@
-"""The facts about a dataset that decide whether, and how well, it trains."""
+"""Measure the facts about a dataset that decide whether it trains, and how well."""
 
 import logging
 import os
@@ -29,73 +29,77 @@ from clsplat.scene.scene import camera_extent, outlier_cameras
 from clsplat.scene.times import distinct_times, group_by_camera
 from clsplat.scene.view import NO_FILE, View, fits_camera, load_exposures
 
-# What photographs look like beside each other: blurred ones, the same one twice, exposures that jump.
+# Compare the photographs with each other: find blurred ones, duplicates, and jumps of the exposure.
 
-THUMBNAIL = 32  # px, of each side
-SAME = 1.0  # gray levels between thumbnails: frames of a video are 9 apart, two codings of one photograph 0.3
-JUMP = 1.0  # stops from one photograph to the next
-STEP = 2.0  # brightness of a photograph by that of the one before: at most 1.4 in five captures with one exposure
+THUMBNAIL = 32  # px, each side
+MAX_DUPLICATE_RMS = 1.0  # gray levels; frames of a video differ by 9, two encodings of one photograph by 0.3
+MAX_STOPS = 1.0  # from one photograph to the next
+MAX_BRIGHTNESS_RATIO = 2.0  # from one photograph to the next; at most 1.4 in five captures with a fixed exposure
 
 
 @dataclass(frozen=True)
 class PhotographMeasures:
-    """What is measured of one photograph."""
+    """Measurements of one photograph."""
 
-    sharpness: NDArray[np.float64]  # both
-    brightness: NDArray[np.float64]  # mean and median, gray levels
+    sharpness: NDArray[np.float64]  # [2], the two measures of both_sharpnesses
+    brightness: NDArray[np.float64]  # [2], mean and median, gray levels
     thumbnail: NDArray[np.float32]  # [THUMBNAIL²], gray levels
 
 
 @dataclass(frozen=True)
-class LookFacts:
-    """Names of photographs that stand out."""
+class ComparisonFacts:
+    """The names of photographs that stand out."""
 
-    blurred: list[str]  # much less sharp than the others
+    blurred: list[str]  # much blurrier than the others
     same: list[list[str]]  # photographs that look the same
-    jumps: list[tuple[str, str, float]]  # one and the next, and the stops between their exposures as EXIF tells them
-    steps: list[tuple[str, str, float]]  # one, the next, and its brightness by that of the first; where EXIF is silent
+    jumps: list[tuple[str, str, float]]  # a photograph, the next one, and the stops between their EXIF exposures
+    steps: list[
+        tuple[str, str, float]
+    ]  # a photograph, the next one, and their brightness ratio, if EXIF lacks exposures
     unreadable: dict[str, str]  # the reason why they cannot be decoded
 
 
-def looks_of(parts: Parts, missing: Container[Path]) -> LookFacts:
-    """Compare the photographs of the views of a dataset, or where it has no views, all of its folder."""
-    shown = [view for view in parts.views if view.image_path != NO_FILE and view.image_path not in missing]
-    if not shown:
+def compare_views(parts: Parts, missing: Container[Path]) -> ComparisonFacts:
+    """Compare the photographs of a dataset's views, or all photographs in its folder if it has no views."""
+    views = [view for view in parts.views if view.image_path != NO_FILE and view.image_path not in missing]
+    if not views:
         return compare_photos({os.path.relpath(file, parts.path).replace(os.sep, "/"): file for file in parts.on_disk})
-    exposures: list[CameraExposure | None] = [None] * len(shown)
+    exposures: list[CameraExposure | None] = [None] * len(views)
     with suppress(DataError):
-        exposures = load_exposures(shown)
-    files = {view.name: view.image_path for view in shown}
-    return compare_photos(files, {view.name: one for view, one in zip(shown, exposures, strict=True)})
+        exposures = load_exposures(views)
+    files = {view.name: view.image_path for view in views}
+    return compare_photos(files, {view.name: exposure for view, exposure in zip(views, exposures, strict=True)})
 
 
 def compare_photos(
     files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | None] | None = None
-) -> LookFacts:
-    """Compare photographs, by name; those that cannot be read are left out.  Without `exposures`, EXIF tells them."""
+) -> ComparisonFacts:
+    """Compare photographs by name, skipping unreadable ones.  Without `exposures`, read them from EXIF."""
     names = sorted(files)
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8), "looking") as pool:
-        read = counted(pool.map(_look, (files[name] for name in names)), "photographs looked at", len(names))
-        looked = dict(zip(names, read, strict=True))
-    found = {name: look for name, look in looked.items() if not isinstance(look, DataError)}
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8), "comparing") as pool:
+        results = counted(pool.map(_measure, (files[name] for name in names)), "photographs compared", len(names))
+        measured = dict(zip(names, results, strict=True))
+    photos = {name: result for name, result in measured.items() if not isinstance(result, DataError)}
     if exposures is None:
-        exposures = {name: read_exif_exposure(files[name]) for name in found}
+        exposures = {name: read_exif_exposure(files[name]) for name in photos}
     values = [(name, exposure.value) for name in names if (exposure := exposures.get(name))]
-    steps = [(a, b, round(abs(y - x), 2)) for (a, x), (b, y) in pairwise(values)]
-    middle = np.median([look.sharpness for look in found.values()], axis=0) if found else np.zeros(2)
-    return LookFacts(
-        blurred=[name for name, look in found.items() if is_blurred(look.sharpness, middle)],
-        same=_same(list(found), [look.thumbnail for look in found.values()]),
-        jumps=[step for step in steps if step[2] > JUMP],
-        steps=_steps({name: look.brightness for name, look in found.items()}, {name for name, _ in values}),
+    stops = [(a, b, round(abs(y - x), 2)) for (a, x), (b, y) in pairwise(values)]
+    median = np.median([photo.sharpness for photo in photos.values()], axis=0) if photos else np.zeros(2)
+    return ComparisonFacts(
+        blurred=[name for name, photo in photos.items() if is_blurred(photo.sharpness, median)],
+        same=_duplicates(list(photos), [photo.thumbnail for photo in photos.values()]),
+        jumps=[jump for jump in stops if jump[2] > MAX_STOPS],
+        steps=_brightness_steps(
+            {name: photo.brightness for name, photo in photos.items()}, {name for name, _ in values}
+        ),
         unreadable={
-            name: why_unreadable(files[name], error) for name, error in looked.items() if isinstance(error, DataError)
+            name: why_unreadable(files[name], error) for name, error in measured.items() if isinstance(error, DataError)
         },
     )
 
 
-def _look(file: Path) -> PhotographMeasures | DataError:
-    """Measure a photograph; or return why it cannot be read."""
+def _measure(file: Path) -> PhotographMeasures | DataError:
+    """Measure a photograph; if it cannot be read, return the error."""
     try:
         gray = read_gray(file, SIDE)[0]
     except DataError as error:
@@ -105,37 +109,40 @@ def _look(file: Path) -> PhotographMeasures | DataError:
     return PhotographMeasures(both_sharpnesses(gray), brightness, small.astype(np.float32).ravel())
 
 
-def _steps(brightness: Mapping[str, NDArray[np.float64]], told: Container[str]) -> list[tuple[str, str, float]]:
-    """Neighbors of which mean and median both differ by more than STEP times: one of them follows what is shown.
+def _brightness_steps(
+    brightness: Mapping[str, NDArray[np.float64]], exposed: Container[str]
+) -> list[tuple[str, str, float]]:
+    """Return neighbors whose mean and median both differ by more than MAX_BRIGHTNESS_RATIO.
 
-    told: photographs whose exposures are known; two of them make no step.
+    One of the two may differ because of the content alone.  exposed: photographs with known exposures; pairs of them
+    are skipped.
     """
-    found = []
+    steps = []
     for (a, x), (b, y) in pairwise(brightness.items()):
         ratios = y / x
-        if a in told and b in told:
+        if a in exposed and b in exposed:
             continue
-        if min(ratios) > STEP or max(ratios) < 1 / STEP:
-            found.append((a, b, round(float(ratios[0]), 2)))
-    return found
+        if min(ratios) > MAX_BRIGHTNESS_RATIO or max(ratios) < 1 / MAX_BRIGHTNESS_RATIO:
+            steps.append((a, b, round(float(ratios[0]), 2)))
+    return steps
 
 
-def _same(names: Sequence[str], thumbnails: Sequence[NDArray[np.float32]]) -> list[list[str]]:
-    """Groups of photographs whose thumbnails are the same; plain ones say nothing."""
+def _duplicates(names: Sequence[str], thumbnails: Sequence[NDArray[np.float32]]) -> list[list[str]]:
+    """Return groups of photographs with nearly equal thumbnails; thumbnails without contrast are skipped."""
     groups: list[list[int]] = []
-    for i, one in enumerate(thumbnails):
-        if one.std() <= SAME:
+    for i, thumbnail in enumerate(thumbnails):
+        if thumbnail.std() <= MAX_DUPLICATE_RMS:
             continue
-        firsts = np.array([thumbnails[group[0]] for group in groups]).reshape(len(groups), len(one))
-        near = np.flatnonzero(((firsts - one) ** 2).mean(axis=1) < SAME**2)
+        firsts = np.array([thumbnails[group[0]] for group in groups]).reshape(len(groups), len(thumbnail))
+        near = np.flatnonzero(((firsts - thumbnail) ** 2).mean(axis=1) < MAX_DUPLICATE_RMS**2)
         groups[near[0]].append(i) if len(near) else groups.append([i])
     return [[names[i] for i in group] for group in groups if len(group) > 1]
 
 
-# The facts about the sparse points of a dataset.
+# Measure the sparse points of a dataset.
 
 SAMPLE_SIZE = 20_000  # points that coverage is measured on
-MAX_DISTANCE = 100.0  # camera extents from the middle of the cameras: photographs resolve nothing beyond
+MAX_DISTANCE = 100.0  # camera extents from the median camera center; photographs resolve nothing beyond
 
 
 @dataclass(frozen=True)
@@ -147,16 +154,16 @@ class PointFacts:
     distant: int  # beyond MAX_DISTANCE camera extents
     error_mean: float | None  # px
     error_90: float | None  # px; 90 % of the points have less
-    in_two: float | None  # share that lies in the image of at least two views, hidden or not
-    behind: float | None  # share that lies behind all cameras
+    in_two: float | None  # share that projects into at least two images, occluded or not
+    behind: float | None  # share behind all cameras
 
 
 def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.floating]) -> PointFacts:
-    """Measure the points of a dataset that has some.  extent: of its cameras; centers: of these, [N, 3]."""
+    """Measure the points of a dataset with points.  extent: of the cameras; centers: camera centers, [N, 3]."""
     assert parts.points is not None
     positions = parts.points.positions
     finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
-    known = _errors(parts, np.asarray(finite))
+    errors = _errors(parts, np.asarray(finite))
     good = positions[finite].astype(np.float64)
     distance = np.linalg.norm(good - np.median(centers, axis=0), axis=1) if len(centers) else np.empty(0)
     sample = good[:: max(1, -(-len(good) // SAMPLE_SIZE))]
@@ -165,26 +172,26 @@ def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.float
         count=len(positions),
         not_finite=int(np.count_nonzero(~finite)),
         distant=int(np.count_nonzero(distance > MAX_DISTANCE * extent)) if extent else 0,
-        error_mean=float(known.mean()) if len(known) else None,
-        error_90=float(np.quantile(known, 0.9)) if len(known) else None,
+        error_mean=float(errors.mean()) if len(errors) else None,
+        error_90=float(np.quantile(errors, 0.9)) if len(errors) else None,
         in_two=in_two,
         behind=behind,
     )
 
 
 def _errors(parts: Parts, finite: NDArray[np.bool_]) -> NDArray[np.floating]:
-    """Reprojection errors of points, px at the full size: by where photographs show them, else as the file has them."""
-    found = reprojection_errors(parts.scene.tracks, parts.scene.views) if parts.scene else None
-    if found is not None:
-        return found
+    """Return reprojection errors of points, px at the full size: from the observations, otherwise from the file."""
+    errors = reprojection_errors(parts.scene.tracks, parts.scene.views) if parts.scene else None
+    if errors is not None:
+        return errors
     assert parts.points is not None
     error = parts.points.error[finite] if len(parts.points.error) else np.empty(0)
     known = error[np.isfinite(error) & (error > 0)]
-    return known if len(np.unique(known)) > 1 else np.empty(0)  # a placeholder
+    return known if len(np.unique(known)) > 1 else np.empty(0)  # equal errors are a placeholder
 
 
 def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float, float]:
-    """Shares of points [M, 3] that project into at least two views, and that lie behind all of them."""
+    """Return the shares of points, [M, 3], that project into at least two views, and that are behind all of them."""
     inside, ahead = np.zeros(len(points), int), np.zeros(len(points), bool)
     for view in views:
         camera = view.camera
@@ -197,38 +204,38 @@ def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float
     return float((inside >= min(2, len(views))).mean()), float((~ahead).mean())
 
 
-MIN_SEEN = 30  # points; COLMAP itself registers no image with fewer inliers
+MIN_SEEN = 30  # points; COLMAP does not register images with fewer inliers
 
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """Views of the same size, lens and focal length."""
+    """Facts about the views with the same image size, lens and focal length."""
 
     views: int
     model: str
     width: int
     height: int
     focal: tuple[float, float]  # px
-    distortion: float | None  # px: the largest displacement by the lens at the border; None where it overflows
-    kept: float  # share of the photograph that is left when it is undistorted
-    centered: bool  # whether the principal point lies in the photograph
+    distortion: float | None  # px, the largest displacement by the lens along the border; None if it overflows
+    kept: float  # share of the photograph that undistortion keeps
+    centered: bool  # whether the principal point is inside the photograph
 
 
 @dataclass(frozen=True)
 class PhotographFacts:
-    """The image files and masks of the views, by name."""
+    """Facts about the image files and masks of the views, by name."""
 
     unreadable: dict[str, str]  # the reason why they cannot be decoded
-    cut: list[str]  # the end of the file is missing; they cannot be decoded either
-    misfits: dict[str, str]  # the sizes of file and camera
+    cut: list[str]  # cannot be decoded because the end of the file is missing
+    misfits: dict[str, str]  # the differing sizes of file and camera
     on_side: list[str]  # misfits whose width and height are swapped
-    exif_turned: list[str]  # read as stored although their Exif data have a rotation
+    exif_turned: list[str]  # read as stored although EXIF contains a rotation
     masks: int
 
 
 @dataclass(frozen=True)
 class Facts:
-    """All measurements of a dataset; names are those of the views, paths are relative to the dataset."""
+    """All measurements of a dataset.  Names are names of views; paths are relative to the dataset."""
 
     path: str
     kind: str
@@ -238,34 +245,35 @@ class Facts:
     on_disk: int
     missing: list[str]
     unregistered: list[str]
-    folders: int  # that the registered images lie in
+    folders: int  # number of folders that contain registered images
     submodels: dict[str, int]  # images of each COLMAP model; the first is used
     cameras: list[CameraFacts]
     photos: PhotographFacts
-    comparison: LookFacts
+    comparison: ComparisonFacts
     points: PointFacts | None
-    seen: dict[str, int]  # points seen by each view; empty where the dataset has no such counts
+    points_per_view: dict[str, int]  # sparse points that each view shows; empty if the dataset does not say
     extent: float | None  # scene units
     outlier_cameras: list[str]
-    moments: int  # different times of the views; 0 where the scene does not move
-    stations: int  # different cameras that took the views, where the scene moves
-    one_place: bool  # all cameras have the same center
+    timestamps: int  # distinct times of the views; 0 for static scenes
+    moving_cameras: int  # distinct cameras of a dynamic scene; 0 for static scenes
+    same_center: bool  # all cameras have the same center
     same_pose: list[list[str]]
     same_but_case: list[list[str]]
     left_out: list[str]  # sentences about files that `prepare` does not read as photographs
-    faults: list[str]  # why pieces of it cannot be read
+    faults: list[str]  # why parts of it cannot be read
     refusal: str  # why training does not start
 
     @property
-    def few_seen(self) -> list[str]:
-        """Views that see fewer than MIN_SEEN points."""
-        return sorted((name for name, count in self.seen.items() if count < MIN_SEEN), key=lambda name: self.seen[name])
+    def few_points(self) -> list[str]:
+        """The views that show fewer than MIN_SEEN points, the worst first."""
+        counts = self.points_per_view
+        return sorted((name for name, count in counts.items() if count < MIN_SEEN), key=counts.__getitem__)
 
 
 def measure_dataset(parts: Parts) -> Facts:
-    """Measure a dataset that was read in pieces."""
+    """Measure a dataset that was read in parts."""
     views, expected = parts.views, parts.expected
-    missing = [file for file in expected if not os.path.exists(file)]  # never raises
+    missing = [file for file in expected if not os.path.exists(file)]  # Path.exists may raise
     known = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
     names = [view.name for view in views]
     centers = np.stack([view.position for view in views]) if views else np.empty((0, 3))
@@ -283,16 +291,16 @@ def measure_dataset(parts: Parts) -> Facts:
         submodels=parts.submodels,
         cameras=_cameras(parts),
         photos=_photographs(views, set(missing)),
-        comparison=looks_of(parts, set(missing)),
+        comparison=compare_views(parts, set(missing)),
         points=measure_points(parts, extent, centers) if parts.points else None,
-        seen=parts.observed if any(parts.observed.values()) else {},
+        points_per_view=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
         outlier_cameras=[view.name for view, far in zip(views, outlier_cameras(views), strict=True) if far]
         if views
         else [],
-        moments=len(distinct_times(views)),
-        stations=len(group_by_camera(views)) if distinct_times(views) else 0,
-        one_place=len(views) > 1 and bool(np.allclose(centers, centers[0], rtol=0, atol=1e-9)),
+        timestamps=len(distinct_times(views)),
+        moving_cameras=len(group_by_camera(views)) if distinct_times(views) else 0,
+        same_center=len(views) > 1 and bool(np.allclose(centers, centers[0], rtol=0, atol=1e-9)),
         same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         left_out=parts.left_out,
@@ -302,7 +310,7 @@ def measure_dataset(parts: Parts) -> Facts:
 
 
 def distortion(lens: Lens) -> float | None:
-    """Return the largest displacement by the lens along the border, in pixels; None where it overflows."""
+    """Return the largest displacement by the lens along the border, px; None if it overflows."""
     camera, along = lens.camera, np.linspace(0, 1, BORDER_POINTS)
     zeros, ones = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
     x = np.concatenate([along, along, zeros, ones]) * lens.width
@@ -318,7 +326,7 @@ def _relative(file: Path, parts: Parts) -> str:
 
 
 def _repeated(names: Sequence[str], keys: Iterable[object]) -> list[list[str]]:
-    """Names whose keys are equal, in groups of two and more."""
+    """Return the groups of two or more names with equal keys."""
     groups = defaultdict(list)
     for name, key in zip(names, keys, strict=True):
         groups[key].append(name)
@@ -329,7 +337,7 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
     grouped: dict[object, list[View]] = defaultdict(list)
     for view in parts.views:
         grouped[(view.lens or view.camera, parts.models.get(view.name))].append(view)
-    found = []
+    cameras = []
     for views in grouped.values():
         lens, camera = views[0].lens, views[0].camera
         original = lens.camera if lens else camera
@@ -337,8 +345,8 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
         kept = camera.width * camera.height / (original.width * original.height)
         centered = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
         size, focal = (original.width, original.height), (original.fx, original.fy)
-        found.append(CameraFacts(len(views), model, *size, focal, distortion(lens) if lens else 0.0, kept, centered))
-    return sorted(found, key=lambda facts: -facts.views)
+        cameras.append(CameraFacts(len(views), model, *size, focal, distortion(lens) if lens else 0.0, kept, centered))
+    return sorted(cameras, key=lambda facts: -facts.views)
 
 
 def _photographs(views: Sequence[View], missing: set[Path]) -> PhotographFacts:
@@ -354,7 +362,7 @@ def _photographs(views: Sequence[View], missing: set[Path]) -> PhotographFacts:
 
 
 def _photograph(facts: PhotographFacts, view: View, name: str, path: Path, file: ImageFile) -> None:
-    """Note what there is to say about a view's photograph or mask."""
+    """Add a view's photograph or mask to the facts."""
     camera = view.lens or view.camera
     if file.cut:
         facts.cut.append(name)
@@ -364,19 +372,17 @@ def _photograph(facts: PhotographFacts, view: View, name: str, path: Path, file:
         facts.misfits[name] = f"{file.size[0]}x{file.size[1]}, its camera {camera.width}x{camera.height}"
         if fits_camera(view, file.size[::-1]):
             facts.on_side.append(name)
-    else:
-        # the reader rotates only files whose stored size does not fit
-        if file.orientation > 1 and fits_camera(view, file.size):
-            facts.exif_turned.append(name)
+    elif file.orientation > 1 and fits_camera(view, file.size):
+        facts.exif_turned.append(name)  # the reader rotates only files whose stored size does not fit
 
 
-# Read a dataset in pieces: a damaged piece becomes a fault, and the other pieces are read.
+# Read a dataset in parts: a damaged part becomes a fault, and the other parts are still read.
 
 LOG = logging.getLogger("clsplat")
 
 
 def read_parts(path: Path) -> Parts:
-    """Read a dataset as read_scene does, but every piece on its own.  Raises DataError when there is no such folder."""
+    """Read a dataset like read_scene, but each part separately.  Raises DataError if there is no such folder."""
     parts = Parts(path)
     with log_level(logging.ERROR):
         try:
@@ -400,13 +406,13 @@ def read_parts(path: Path) -> Parts:
     else:
         folders = sorted({file.parent for file in parts.expected})
         parts.on_disk = [file for folder in folders for file in image_files(folder, deep=False)]
-    if parts.scene:  # some views may be on no split's list
+    if parts.scene:  # list_parts may also list views that belong to no split
         parts.views = list(parts.scene.views)
     return parts
 
 
 def _list_photographs(parts: Parts) -> None:
-    """List the photographs of a folder without cameras, and what their preparation would say of them."""
+    """List the photographs of a folder without cameras, and the warnings that preparing them would log."""
     parts.on_disk = list(image_files(parts.path, deep=True))
     with captured_log(logging.WARNING) as parts.left_out:
         try:
@@ -417,7 +423,7 @@ def _list_photographs(parts: Parts) -> None:
 
 
 def image_files(folder: Path, deep: bool) -> Iterator[Path]:
-    """Yield the image files in a folder, and with `deep` those in all below it, by name."""
-    for place, folders, names in os.walk(folder):
+    """Yield the image files in a folder, by name; with `deep`, also those in its subfolders."""
+    for parent, folders, names in os.walk(folder):
         folders[:] = sorted(f for f in folders if not f.startswith(".")) if deep else []
-        yield from (Path(place) / n for n in sorted(names) if is_image(Path(n)) and not n.startswith("."))
+        yield from (Path(parent) / n for n in sorted(names) if is_image(Path(n)) and not n.startswith("."))

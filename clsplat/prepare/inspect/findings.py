@@ -1,4 +1,4 @@
-"""Findings: what the facts about a dataset mean for training, each with its remedy."""
+"""Derive findings from the facts about a dataset: what is wrong for training, and how to fix it."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -23,15 +23,13 @@ from clsplat.prepare.inspect.facts import (
 )
 from clsplat.scene.reader import Parts
 
-# What is wrong with a dataset, and its remedy.
-
 Level = Literal["error", "warning", "note"]
 LEVELS: tuple[Level, ...] = ("error", "warning", "note")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of a dataset and its remedy.  With an error, training does not start."""
+    """A fault of a dataset and its remedy.  Errors keep training from starting."""
 
     level: Level
     fault: str
@@ -39,27 +37,24 @@ class Finding:
 
     @property
     def text(self) -> str:
-        """Fault and remedy in one sentence."""
+        """The fault and the remedy in one sentence."""
         return f"{self.fault}: {self.remedy}" if self.remedy else self.fault
 
 
-# What a preparation would say of a folder of photographs without cameras.
-
-
 def unprepared(facts: Facts) -> Iterator[Finding]:
-    """Yield that there are no cameras, and how to find them; then the files that a preparation leaves out."""
+    """Yield findings about a folder of photographs without cameras: how to find them, and which files are left out."""
     count, damaged = facts.on_disk, facts.comparison.unreadable
     if facts.kind != "none" or not (count or facts.left_out):
         return
-    held = f"{pluralize(count, 'photograph')} but" if count else "no photographs that can be read, and"
+    contents = f"{pluralize(count, 'photograph')} but" if count else "no readable photographs and"
     readable = count - len(damaged)
-    if count < MIN_PHOTOGRAPHS:  # told with the files that are left out
+    if count < MIN_PHOTOGRAPHS:  # the refusal already names the files that are left out
         remedy, texts = facts.refusal.removeprefix(f"{facts.path}: "), []
     else:
         remedy, texts = f"`clsplat run photos --scene {shell_quote(facts.path)}` finds the cameras", facts.left_out
         if readable < MIN_PHOTOGRAPHS:
             remedy = f"only {readable} of {count} photographs can be read; {remedy_for(damaged)}"
-    yield Finding("error", f"{facts.path} holds {held} no camera poses", remedy)
+    yield Finding("error", f"{facts.path} contains {contents} no camera poses", remedy)
     for text in texts + warnings_for({"damaged": damaged, "photographs": readable}):
         yield Finding("warning", text.removeprefix(f"{facts.path}: "))
 
@@ -67,44 +62,29 @@ def unprepared(facts: Facts) -> Iterator[Finding]:
 MAX_NAMES = 4  # names in a finding
 MIN_VIEWS = 10  # for training
 MIN_POINTS = 100
-MAX_SHARE_LEFT_OUT = 0.1  # share of the photographs that a model may leave out without a warning
+MAX_SHARE_LEFT_OUT = 0.1  # share of the photographs that may lack a pose without a warning
 MAX_ERROR = 2.0  # px of mean reprojection error; COLMAP drops observations above 4
-POSES_ERROR = 1.0  # px from which pipelines/photos.yaml learns poses
+POSES_ERROR = 1.0  # px, from which pipelines/photos.yaml optimizes poses
 POSES = "optimize.modules.camera_optimizer={start: 500}"
-MAX_SHARE_BEHIND, MIN_SHARE_IN_TWO = 0.1, 0.5  # shares of points
-MIN_SHARE_KEPT = 0.6  # share of a photograph
-FOCAL_RANGE = (0.2, 20.0)  # focal length by image width: 136 to 3 degrees
+MAX_SHARE_BEHIND, MIN_SHARE_IN_TWO = 0.1, 0.5  # of points
+MIN_SHARE_KEPT = 0.6  # of a photograph
+FOCAL_RANGE = (0.2, 20.0)  # focal length / image width, 136 to 3 degrees
 
 
 def findings(facts: Facts) -> list[Finding]:
     """Return the findings about a dataset, errors first, then warnings and notes."""
-    parts = (unprepared, _unreadable, _photographs, _looks, _cameras, _poses, _points)
-    found = [finding for part in parts for finding in part(facts)]
-    if facts.refusal and not any(finding.level == "error" for finding in found):
-        found.append(Finding("error", facts.refusal))
-    return sorted(found, key=lambda finding: LEVELS.index(finding.level))
+    parts = (unprepared, _unreadable, _photographs, _comparison, _cameras, _poses, _points)
+    results = [finding for part in parts for finding in part(facts)]
+    if facts.refusal and not any(finding.level == "error" for finding in results):
+        results.append(Finding("error", facts.refusal))
+    return sorted(results, key=lambda finding: LEVELS.index(finding.level))
 
 
 def few_views(train: int) -> Iterator[Finding]:
-    """Yield a warning where a scene has few training views."""
+    """Yield a warning if a scene has few training views."""
     if train < MIN_VIEWS:
         fault = f"there {_are(train, 'training view', 'only ')}"
         yield Finding("warning", fault, "expect floaters and blur far from the photographs; take 30 or more")
-
-
-def trainable(found: Sequence[Finding]) -> bool:
-    """Return whether no finding is an error."""
-    return all(finding.level != "error" for finding in found)
-
-
-def verdict(found: Sequence[Finding]) -> str:
-    """Return the findings in one sentence: the first error or warning, and the number of the others."""
-    errors, warnings = ([f.fault for f in found if f.level == level] for level in ("error", "warning"))
-    worst, start = (errors, "cannot train: ") if errors else (warnings, "trains, but ")
-    if not worst:
-        return "ready to train"
-    more = f" (and {pluralize(len(worst) - 1, 'more ' + ('error' if errors else 'warning'))})" if len(worst) > 1 else ""
-    return f"{start}{worst[0]}{more}"
 
 
 def _unreadable(facts: Facts) -> Iterator[Finding]:
@@ -118,7 +98,7 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
     photographs, colmap = facts.photos, facts.kind == "COLMAP"
     if facts.missing:
         fault = f"{len(facts.missing)} of {facts.registered} registered images are missing on disk"
-        remedy = "put the files back, or do without: --set scene.missing=skip"
+        remedy = "restore the files, or skip them with --set scene.missing=skip"
         yield Finding("error", f"{fault} ({_listed(facts.missing)})", remedy)
     if photographs.unreadable:
         unreadable, reason = _listed(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
@@ -129,8 +109,8 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         yield Finding("error", fault, "copy them again")
     if photographs.misfits:
         sizes = [f"{name} is {size}" for name, size in photographs.misfits.items()]
-        fault = f"{_are(len(sizes), 'image file')} not of the camera's size ({_listed(sizes, 2)})"
-        remedy = "use the images that the cameras were made from"
+        fault = f"{_are(len(sizes), 'image file')} not the size of the camera ({_listed(sizes, 2)})"
+        remedy = "use the images that the cameras were calibrated on"
         if len(photographs.on_side) == len(sizes):
             remedy = "width and height are swapped: " + remedy
         yield Finding("error", fault, remedy)
@@ -140,13 +120,13 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
             f"{len(facts.unregistered)} of {facts.on_disk} images on disk have no pose ({_listed(facts.unregistered)})"
         )
         serious = colmap and facts.registered and share > MAX_SHARE_LEFT_OUT
-        remedy = "they are not trained on" + (
-            "; more overlapping photographs or colmap exhaustive_matcher may place them" if colmap else ""
+        remedy = "they are not used for training" + (
+            "; more overlapping photographs or colmap exhaustive_matcher may register them" if colmap else ""
         )
         if facts.registered:
             yield Finding("warning" if serious else "note", fault, remedy)
     if photographs.exif_turned:
-        fault = f"{_are(len(photographs.exif_turned), 'photograph')} rotated by the EXIF data"
+        fault = f"{_are(len(photographs.exif_turned), 'photograph')} rotated by EXIF"
         yield Finding(
             "note", fault, "clsplat reads the pixels as stored, as COLMAP does, so renders may be rotated too"
         )
@@ -155,39 +135,43 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
 
 
-def _looks(facts: Facts) -> Iterator[Finding]:
+def _comparison(facts: Facts) -> Iterator[Finding]:
     blurred, jumps = facts.comparison.blurred, facts.comparison.jumps
     if blurred:
         fault = f"{_are(len(blurred), 'photograph')} blurred ({_listed(blurred)})"
-        yield Finding("warning", fault, "leave them out, or take them again: the model learns the blur")
+        yield Finding("warning", fault, "remove or retake them: the model learns the blur")
     for names in facts.comparison.same[:MAX_NAMES]:
         yield Finding("note", f"{_listed(names)} look the same", "one of them is enough")
     if jumps:
         named = _listed([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
         fault = f"the exposure jumps by more than a stop {pluralize(len(jumps), 'time')} ({named})"
-        yield Finding("note", fault, "--set optimize.modules.exposure={} gives each photograph its own")
+        yield Finding("note", fault, "--set optimize.modules.exposure={} gives each photograph its own exposure")
     if steps := facts.comparison.steps:
         named = _listed([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
         fault = f"{_are(len(steps), 'photograph')} more than twice as bright or dark as the one before ({named})"
-        remedy = "EXIF does not tell both; if exposures changed, --set optimize.modules.exposure={} gives each its own"
+        remedy = (
+            "EXIF lacks an exposure; if it changed, --set optimize.modules.exposure={} gives each photograph its own"
+        )
         yield Finding("note", fault, remedy)
 
 
 def _cameras(facts: Facts) -> Iterator[Finding]:
     sizes = {(camera.width, camera.height) for camera in facts.cameras}
     if len(sizes) > 1:
-        remedy = "this is allowed; a larger view takes more time in a step"
+        remedy = "this is allowed; steps on larger views take longer"
         yield Finding("note", f"the photographs have {len(sizes)} sizes", remedy)
     for camera in facts.cameras:
-        name = f"the {_camera_name(camera)} of {pluralize(camera.views, 'view')}"
+        name = f"the {camera.model} camera {camera.width}x{camera.height} of {pluralize(camera.views, 'view')}"
         if not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
             fault = f"{name} has a focal length of {camera.focal[0]:.4g} px, which is not plausible"
-            yield Finding("warning", fault, "calibrate it again, or find the poses with the right focal length")
+            yield Finding("warning", fault, "calibrate it again, or compute the poses with the correct focal length")
         if not camera.centered:
             yield Finding("warning", f"{name} has its principal point outside the image", "calibrate it again")
         if camera.kept < MIN_SHARE_KEPT:
             fault = f"undistorting {name} keeps only {100 * camera.kept:.0f} % of each photograph"
-            yield Finding("warning", fault, "use a narrower lens, or crop and undistort the images yourself")
+            yield Finding(
+                "warning", fault, "use a lens with less distortion, or crop and undistort the images yourself"
+            )
 
 
 def _poses(facts: Facts) -> Iterator[Finding]:
@@ -196,36 +180,37 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         parts = ", ".join(f"{name} with {facts.submodels[name]} images" for name in others)
         large = any(facts.submodels[name] > MAX_SHARE_LEFT_OUT * facts.submodels[used] for name in others)
         fault = f"COLMAP made {len(facts.submodels)} models and only {used} ({facts.submodels[used]} images) is used"
-        remedy = f"left out is {parts}; colmap model_merger may join them where they share images"
+        remedy = f"not used: {parts}; colmap model_merger may merge models that share images"
         yield Finding("warning" if large else "note", fault, remedy)
     if facts.train is not None:
         yield from few_views(facts.train)
     if facts.test == 0:
-        yield Finding("note", "there are no test views", "clsplat measures quality on training views only")
-    if facts.one_place:
-        fault = "all cameras are at the same place"
-        yield Finding("warning", fault, "they show no depth; take photographs from different places")
+        yield Finding("note", "there are no test views", "quality is measured on training views only")
+    if facts.same_center:
+        fault = "all cameras are at the same position"
+        yield Finding("warning", fault, "they show no depth; take photographs from different positions")
     if facts.outlier_cameras:
         fault = (
             f"{_are(len(facts.outlier_cameras), 'camera')} far away from all others ({_listed(facts.outlier_cameras)})"
         )
         yield Finding(
-            "warning", fault, "the pose is probably wrong; remove the image from the dataset or place it again"
+            "warning", fault, "the pose is probably wrong; remove the image from the dataset or register it again"
         )
-    for names in facts.same_pose[:MAX_NAMES] if not facts.one_place else ():
+    for names in facts.same_pose[:MAX_NAMES] if not facts.same_center else ():
         fault = f"{_listed(names)} have exactly the same pose"
-        yield Finding("note", fault, "training counts copies of a photograph twice; keep one of them")
-    if facts.few_seen:
-        counted = [f"{name}: {facts.seen[name]}" for name in facts.few_seen]
-        fault = f"fewer than {MIN_SEEN} points are seen by {pluralize(len(counted), 'view')} ({_listed(counted)})"
-        yield Finding("warning", fault, "their poses are unreliable; look at their renders, or remove these images")
+        yield Finding("note", fault, "if they are copies of one photograph, training counts it twice; keep one of them")
+    if facts.few_points:
+        counts = [f"{name}: {facts.points_per_view[name]}" for name in facts.few_points]
+        verb = "shows" if len(counts) == 1 else "show"
+        fault = f"{pluralize(len(counts), 'view')} {verb} fewer than {MIN_SEEN} points ({_listed(counts)})"
+        yield Finding("warning", fault, "the poses are unreliable; check the renders, or remove these images")
 
 
 def _points(facts: Facts) -> Iterator[Finding]:
     points = facts.points
     if points is None or points.count == 0:
         if facts.registered and not any("points3d" in fault.lower() for fault in facts.faults):
-            remedy = "training starts from a plane sweep, or from random points where photographs are transparent"
+            remedy = "training starts from a plane sweep, or from random points if the photographs are transparent"
             yield Finding("note", "there are no points", remedy)
         return
     if points.count < MIN_POINTS:
@@ -233,37 +218,31 @@ def _points(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning", fault, "try init: {source: random} as well")
     if points.not_finite:
         fault = f"{_are(points.not_finite, 'point')} not finite"
-        yield Finding("warning", fault, "clsplat leaves them out; the file may be damaged: export it again")
+        yield Finding("warning", fault, "they are ignored; the file may be damaged: export it again")
     if points.distant:
         fault = f"{_are(points.distant, 'point')} more than {MAX_DISTANCE:g} times the cameras' extent away"
-        yield Finding("note", fault, "usually sky or wrong matches; they become very large Gaussians")
+        yield Finding("note", fault, "they are usually sky or wrong matches, and become very large Gaussians")
     if not facts.refusal:
         yield from _coverage(points)
     if points.error_mean is not None and points.error_mean >= POSES_ERROR:
         fault = f"the mean reprojection error of the points is {points.error_mean:.2f} px at the full size"
         remedy = (
-            "renders will be blurred; run bundle adjustment (colmap bundle_adjuster), or learn the cameras too: "
-            f'--set "{POSES}", as `photos` does by itself from {POSES_ERROR:g} px on at the size of training'
+            "renders will be blurry; run bundle adjustment (colmap bundle_adjuster), or optimize the cameras too: "
+            f'--set "{POSES}", which `photos` does from {POSES_ERROR:g} px at the training size'
         )
         yield Finding("warning" if points.error_mean > MAX_ERROR else "note", fault, remedy)
 
 
 def _coverage(points: PointFacts) -> Iterator[Finding]:
-    axes = "the poses do not belong to these points, or their axes are flipped; export both together again"
+    axes = "the poses do not match these points, or their axes are flipped; export both again together"
     if points.behind is not None and points.behind > MAX_SHARE_BEHIND:
-        yield Finding("warning", f"{100 * points.behind:.0f} % of the points lie behind all cameras", axes)
+        yield Finding("warning", f"{100 * points.behind:.0f} % of the points are behind all cameras", axes)
     elif points.in_two is not None and points.in_two < MIN_SHARE_IN_TWO:
-        yield Finding(
-            "warning", f"only {100 * points.in_two:.0f} % of the points lie in the image of two views or more", axes
-        )
-
-
-def _camera_name(camera: CameraFacts) -> str:
-    return f"{camera.model} camera {camera.width}x{camera.height}"
+        yield Finding("warning", f"only {100 * points.in_two:.0f} % of the points project into two or more views", axes)
 
 
 def _are(count: int, word: str, before: str = "") -> str:
-    """Return a count with its verb: `3 views are`, or with words before the count `are only 3 views`."""
+    """Return a count with its verb: `3 views are`, or with `before`: `are only 3 views`."""
     verb = "is" if count == 1 else "are"
     return f"{verb} {before}{pluralize(count, word)}" if before else f"{pluralize(count, word)} {verb}"
 
@@ -272,12 +251,9 @@ def _listed(names: Sequence[str], limit: int = MAX_NAMES) -> str:
     return ", ".join(map(shorten, names[:limit])) + (", …" if len(names) > limit else "")
 
 
-# One look at a dataset: pieces, facts, findings and the verdict.
-
-
 @dataclass(frozen=True)
 class Inspection:
-    """The pieces of a dataset, the facts about them and the findings."""
+    """The parts of a dataset, the facts about them, and the findings."""
 
     parts: Parts
     facts: Facts
@@ -285,21 +261,27 @@ class Inspection:
 
     @classmethod
     def from_folder(cls, path: Path) -> "Inspection":
-        """Inspect the dataset in a folder.  Raises DataError only where there is no such folder."""
+        """Inspect the dataset in a folder.  Raises DataError only if there is no such folder."""
         parts = read_parts(path)
         facts = measure_dataset(parts)
         return cls(parts, facts, findings(facts))
 
     @property
     def trainable(self) -> bool:
-        return trainable(self.findings)
+        return all(finding.level != "error" for finding in self.findings)
 
     @property
     def verdict(self) -> str:
-        return verdict(self.findings)
+        """The findings in one sentence: the first error or warning, and the number of the others."""
+        errors, warnings = ([f.fault for f in self.findings if f.level == level] for level in ("error", "warning"))
+        worst, start, kind = (errors, "cannot train: ", "error") if errors else (warnings, "trains, but ", "warning")
+        if not worst:
+            return "ready to train"
+        more = f" (and {pluralize(len(worst) - 1, f'more {kind}')})" if len(worst) > 1 else ""
+        return f"{start}{worst[0]}{more}"
 
     def data(self) -> dict[str, Any]:
-        """Return verdict, findings and facts as plain data for JSON."""
+        """Return the verdict, findings and facts as plain data for JSON."""
         return {
             "verdict": self.verdict,
             "trainable": self.trainable,
@@ -308,26 +290,27 @@ class Inspection:
         }
 
 
-# The facts as short lines of text, for the terminal and the page.
+# Format the facts as short lines, for the terminal and the page.
 
-MAX_CAMERAS = 4  # cameras, by the number of their views
+MAX_CAMERAS = 4  # those with the most views
 
 
-def figures(facts: Facts) -> dict[str, str]:
-    """Return the figures that a dataset has, by name."""
+def summarize(facts: Facts) -> dict[str, str]:
+    """Return the main facts as text, by name."""
     lines = {"dataset": facts.kind if facts.kind != "none" else "none found", "images": _images(facts)}
     if facts.train is not None:
         lines["views"] = f"{facts.train} for training, {facts.test} for testing"
-    if facts.moments:
-        lines["times"] = f"{pluralize(facts.moments, 'moment')}, seen from {pluralize(facts.stations, 'place')}"
+    if facts.timestamps:
+        cameras = pluralize(facts.moving_cameras, "camera")
+        lines["times"] = f"{pluralize(facts.timestamps, 'timestamp')} from {cameras}"
     if len(facts.submodels) > 1:
         lines["models"] = ", ".join(f"{name} ({pluralize(count, 'image')})" for name, count in facts.submodels.items())
     for i, camera in enumerate(facts.cameras[:MAX_CAMERAS]):
         lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_line(camera)
     if facts.extent is not None:
-        lines["extent"] = f"{facts.extent:.4g} scene units around the cameras"
+        lines["extent"] = f"{facts.extent:.4g} scene units, of the cameras"
         if facts.outlier_cameras:
-            lines["extent"] += f", without {len(facts.outlier_cameras)} that are far away from all others"
+            lines["extent"] += f", without {len(facts.outlier_cameras)} far away from all others"
     if points := facts.points:
         lines["points"] = f"{points.count:,}"
         if points.error_mean is not None:
@@ -337,17 +320,17 @@ def figures(facts: Facts) -> dict[str, str]:
             lines["coverage"] += f", {100 * points.behind:.0f} % behind all cameras" if points.behind else ""
     elif facts.registered:
         lines["points"] = "none"
-    if counts := list(facts.seen.values()):
+    if counts := list(facts.points_per_view.values()):
         lines["points per view"] = f"{min(counts):,} to {max(counts):,}, median {median(counts):,.0f}"
     return lines
 
 
 def camera_line(camera: CameraFacts) -> str:
-    """Return a camera on one line."""
+    """Return a camera as one line of text."""
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
-    bent = "without bounds" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
-    lens = f", distortion {bent}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
+    distortion = "unbounded" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
+    lens = f", distortion {distortion}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
     size = f"{camera.width}x{camera.height}"
     return f"{camera.model} {size}, focal length {focal} px{lens}; {pluralize(camera.views, 'view')}"
 
@@ -356,22 +339,20 @@ def _images(facts: Facts) -> str:
     if not facts.registered:
         return f"{facts.on_disk} on disk"
     parts = [f"{facts.registered} with a pose"]
-    parts += [f"{len(facts.missing)} of them missing on disk"] if facts.missing else []
+    parts += [f"{len(facts.missing)} of them missing from disk"] if facts.missing else []
     parts += [f"{len(facts.unregistered)} more on disk without a pose"] if facts.unregistered else []
     parts += [f"in {facts.folders} folders"] if facts.folders > 1 else []
     parts += [f"{facts.photos.masks} with a mask"] if facts.photos.masks else []
     return ", ".join(parts)
 
 
-# An inspection as a table for the terminal.
-
 STYLES = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 
 def show(inspection: Inspection, console: Console) -> None:
-    """Print figures, findings and the verdict."""
+    """Print the facts, the findings and the verdict."""
     table = Table.grid(padding=(0, 2))
-    for name, value in figures(inspection.facts).items():
+    for name, value in summarize(inspection.facts).items():
         table.add_row(Text(name, "bold"), Text(value))
     for finding in inspection.findings:
         table.add_row(Text(finding.level, STYLES[finding.level]), Text(finding.text))

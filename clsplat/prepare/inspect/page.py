@@ -1,4 +1,4 @@
-"""Write an inspection as a page that opens offline: verdict, findings, figures, cameras and points."""
+"""Write an inspection as a page that opens offline, with verdict, findings, facts, cameras and points."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import pluralize
 from clsplat.core.files import write_text
 from clsplat.core.page import render, safe_charts
-from clsplat.prepare.inspect.findings import Inspection, figures
+from clsplat.prepare.inspect.findings import Inspection, summarize
 from clsplat.scene.points import MAX_VALUE
 from clsplat.viewer.charts import camera_plans, histogram
 
@@ -18,12 +18,12 @@ MAX_VIEWS = 8  # in the table of views with the lowest numbers of points
 
 
 def write_page(inspection: Inspection, out: Path) -> None:
-    """Write the page.  Raises OutputError when that fails."""
+    """Write the page.  Raises OutputError if that fails."""
     write_text(out, inspection_page(inspection))
 
 
 def inspection_page(inspection: Inspection) -> str:
-    """Return the page."""
+    """Return the page as HTML."""
     path = inspection.facts.path
     name = path.rstrip("/").rpartition("/")[2] or path
     worst = inspection.findings[0].level if inspection.findings else "note"
@@ -34,10 +34,10 @@ def inspection_page(inspection: Inspection) -> str:
         state="ready" if worst == "note" else worst,
         verdict=inspection.verdict[0].upper() + inspection.verdict[1:],
         findings=inspection.findings,
-        figures=figures(inspection.facts),
+        figures=summarize(inspection.facts),
         cameras=_cameras(inspection),
         far=pluralize(len(inspection.facts.outlier_cameras), "camera") if inspection.facts.outlier_cameras else "",
-        seen=_seen(inspection),
+        points_per_view=_points_per_view(inspection),
         lists=_lists(inspection),
     )
 
@@ -56,27 +56,27 @@ def _cameras(inspection: Inspection) -> list[Markup]:
     return safe_charts(camera_plans(views, finite))
 
 
-def _seen(inspection: Inspection) -> tuple[list[Markup], list[tuple[str, int]]] | None:
-    """Draw a histogram, and list the views with the lowest numbers; None if the dataset has no such numbers."""
-    seen = inspection.facts.seen
-    if not seen:
+def _points_per_view(inspection: Inspection) -> tuple[list[Markup], list[tuple[str, int]]] | None:
+    """Draw the histogram of points per view, and list the views with the lowest counts; None without counts."""
+    counts = inspection.facts.points_per_view
+    if not counts:
         return None
-    lowest = sorted(seen.items(), key=lambda item: item[1])[:MAX_VIEWS]
-    return safe_charts([histogram("views by their number of points", list(seen.values()))]), lowest
+    lowest = sorted(counts.items(), key=lambda item: item[1])[:MAX_VIEWS]
+    return safe_charts([histogram("views by their number of points", list(counts.values()))]), lowest
 
 
 def _lists(inspection: Inspection) -> list[tuple[str, list[str], int]]:
-    """The names behind figures: a title, MAX_NAMES of them, and their number."""
+    """Return lists of names: the title, up to MAX_NAMES names, and the number of all names."""
     facts, photographs = inspection.facts, inspection.facts.photos
     lists = {
-        "registered but missing on disk": facts.missing,
+        "registered but missing from disk": facts.missing,
         "on disk but without a pose": facts.unregistered,
         "cannot be read": [f"{name}: {reason}" for name, reason in photographs.unreadable.items()],
-        "not of the camera's size": [f"{name}: {size}" for name, size in photographs.misfits.items()],
+        "not the size of the camera": [f"{name}: {size}" for name, size in photographs.misfits.items()],
         "end of the file is missing": photographs.cut,
-        "rotated by the EXIF data": photographs.exif_turned,
+        "rotated by EXIF": photographs.exif_turned,
         "far away from all others": facts.outlier_cameras,
         "same pose": [" = ".join(names) for names in facts.same_pose],
-        "few points": facts.few_seen,
+        "few points": facts.few_points,
     }
     return [(title, names[:MAX_NAMES], len(names)) for title, names in lists.items() if names]
