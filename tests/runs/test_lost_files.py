@@ -106,7 +106,7 @@ def test_records_are_named_until_they_return(saved_late, copy):
     (copy / "metrics.jsonl").write_text((copy / "metrics.jsonl").read_text().replace('"step": 4', '"step": 3'))
     for _ in range(2):
         said = command("resume", copy).stderr
-        assert f"{copy / 'metrics.jsonl'}: is missing or was changed, and only --restart writes it again" in said
+        assert f"{copy / 'metrics.jsonl'}: is missing or has changed; only --restart writes it again" in said
         assert damaged(copy) == ["metrics.jsonl"]
         assert read_status(copy)["state"] == "done"
     shutil.copy(saved_late / "metrics.jsonl", copy / "metrics.jsonl")
@@ -142,7 +142,7 @@ def test_lost_model_of_an_earlier_stage_leaves_the_run_done(tiny_scene, tmp_path
     for lost in ("b.ply", "checksums.json"):
         (out / lost).unlink(missing_ok=True)
         said = command("resume", out).stderr
-        assert f"{out}/a.ply: is missing or was changed, and only --restart writes it again" in said
+        assert f"{out}/a.ply: is missing or has changed; only --restart writes it again" in said
         assert read_status(out)["state"] == "done"
         assert damaged(out) == ["a.ply"], "also without its checksum: the checkpoint has one"
 

@@ -223,7 +223,7 @@ def test_errors_of_the_function(run, tmp_path, monkeypatch):
         with pytest.raises(ConfigError, match=rf"--photograph-budget {budget:g}: expected MB, a finite number"):
             clsplat.view(run, out=tmp_path / "a.html", photograph_budget=budget)
     alone = shutil.copy(run / "point_cloud.ply", tmp_path)
-    with pytest.raises(ConfigError, match="--photographs all needs the photographs of a scene; give --scene"):
+    with pytest.raises(ConfigError, match="--photographs all needs the photos of a scene; add --scene"):
         clsplat.view(alone, out=tmp_path / "a.html", photographs="all")
     Path(alone).unlink()
     monkeypatch.setattr(module, "MAX_SIZE", 0.15)

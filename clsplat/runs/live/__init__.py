@@ -1,1 +1,1 @@
-"""A page that shows a run while it trains, served to this machine only."""
+"""Serve a page that shows a run while it trains, to this machine only."""

@@ -1,4 +1,4 @@
-"""The live preview of a run: what the thread that trains does for the pages that are open."""
+"""Run the live preview: the part of it in the training thread."""
 
 import logging
 import secrets
@@ -18,17 +18,17 @@ from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
-LOOKING = 5.0  # s after its last question that a page counts as open: then the memory of pictures is given back
-ABSENT = 120.0  # s without a page that end a pause: browsers ask once a minute for a page in the background
-FAREWELL = 1.5  # s that the end of a run waits for a page to hear of it
+LOOKING = 5.0  # s after its last request that a page counts as open; then the memory of previews is freed
+ABSENT = 120.0  # s without a request that end a pause; background pages ask once a minute
+FAREWELL = 1.5  # s that a finished run waits for the page to learn of its end
 TOKEN = 16  # bytes
 
 
 class Live:
-    """Serves a page while runs train, one after the other.  A context manager: the server ends with the block."""
+    """Serves a page while runs train, one after another.  As a context manager, it stops the server at the end."""
 
     def __init__(self, port: int = 0) -> None:
-        """port: of the loopback address; 0: the usual one, or the next that is free.  Raises ConfigError."""
+        """port: on the loopback address; 0: the default one, or the next free one.  Raises ConfigError."""
         self.desk = Desk()
         self._preview: Preview | None = None
         self._server = Server(port, secrets.token_urlsafe(TOKEN), Answers(self.desk))
@@ -45,7 +45,7 @@ class Live:
 
     @property
     def text(self) -> str:
-        """Where the page is, and how it is reached from another machine."""
+        """The address of the page, and how to reach it from another machine."""
         port = self._server.port
         return (
             f"live preview: {self.address}\n"
@@ -53,26 +53,26 @@ class Live:
         )
 
     def close(self) -> None:
-        """End the server, once a page that is open has heard how the run has ended."""
+        """Stop the server, once an open page knows how the run ended."""
         desk = self.desk
         desk.pause(False)
         desk.ended = True
         try:
             end = time.monotonic() + FAREWELL
             while desk.silent() < LOOKING and not desk.told and time.monotonic() < end:
-                self._leave()  # a page that waits for a picture asks for nothing else
+                self._leave()  # a page that waits for a preview makes no other request
                 time.sleep(0.05)
         finally:
             self._server.stop()
             self._leave()
 
     def follow(self, status: StatusFile) -> None:
-        """Show the state of a run that begins."""
+        """Show the state of a run that starts."""
         self.desk.status = status
 
     @contextmanager
     def showing(self, run: Run) -> Iterator[None]:
-        """Show a run in the block: what it trains, and its reports."""
+        """Show the model and the reports of a run during the block."""
         self._enter(run)
         try:
             yield
@@ -107,13 +107,13 @@ class Live:
         desk.budget.skip()
 
     def _leave(self) -> None:
-        """Let go of the run: its model may be large."""
+        """Release the run, as its model may be large."""
         self.desk.step, self._preview = 0, None
         while order := self.desk.orders.first():
             self.desk.orders.deliver(order, None)
 
     def _on_step(self, run: Run) -> None:
-        """Draw what is asked for, if there is time for it; wait while the page says so."""
+        """Render requested previews, if there is time; wait while the page pauses the training."""
         desk, preview = self.desk, self._preview
         if preview is None or not (run.has_model and run.is_consistent):
             return
@@ -126,7 +126,7 @@ class Live:
             self._pause(run, preview)
 
     def _draw(self, run: Run, preview: Preview, free: bool = False) -> None:
-        """Draw the first order; where the time does not allow it, it waits.  free: the training waits anyway."""
+        """Render the first request, if there is time for it.  free: the training is paused anyway."""
         order = self.desk.orders.first()
         if order is None:
             return
@@ -135,14 +135,16 @@ class Live:
             return
         started = time.perf_counter()
         run.device.finish()
-        if run.device.info.kind == "CPU":  # it computes in that time; the host's lead over a GPU is lost with it
+        if (
+            run.device.info.kind == "CPU"
+        ):  # on a CPU only the time of rendering is lost; on a GPU also the queue of the host
             started = time.perf_counter()
         self._deliver(order, preview)
         if not free:
             self.desk.budget.spend(time.perf_counter() - started)
 
     def _deliver(self, order: PageCamera, preview: Preview) -> None:
-        """Draw an order; what fails is told on the page, and the training goes on."""
+        """Render a request; failures are shown on the page, and the training continues."""
         try:
             self.desk.orders.deliver(order, preview.draw(order))
             self.desk.fault = ""
@@ -151,17 +153,17 @@ class Live:
             self.desk.fault = str(error)
 
     def _pause(self, run: Run, preview: Preview) -> None:
-        """Wait until the page says to go on, nobody looks for a while, or the run is to stop."""
+        """Wait until the page resumes the training, nobody looks for a while, or the run should stop."""
         desk = self.desk
-        LOG.info("paused at step %d by the live page", run.step)
+        LOG.info("paused at step %d from the live page", run.step)
         with run.status.stage("paused"):
             while desk.paused and not run.interrupted:
                 if desk.silent() > ABSENT:
-                    LOG.info("no page has asked for %.0f s", ABSENT)
+                    LOG.info("no live page for %.0f s", ABSENT)
                     desk.pause(False)
                 elif desk.orders:
                     self._draw(run, preview, free=True)
                 else:
                     desk.orders.wait(0.2)
         desk.budget.skip()
-        LOG.info("going on" if not run.interrupted else "stopping")
+        LOG.info("resumed" if not run.interrupted else "stopping")

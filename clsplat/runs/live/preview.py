@@ -1,4 +1,4 @@
-"""Pictures of the model in training, with memory of their own: the run's state is read and never changed."""
+"""Render previews of the model in training, in separate memory; the run's state is only read."""
 
 import logging
 import os
@@ -29,13 +29,13 @@ from clsplat.viewer.page import LARGEST, THUMBNAIL
 
 # Pictures that pages wait for, from a few at a time.
 
-MOST = 4  # that wait at a time
-Pace = Literal["moving", "still", "again"]  # in motion; at rest for the first time; the same once more
+MAX_WAITING = 4  # requests
+Pace = Literal["moving", "still", "again"]  # the camera moves; it just stopped; it stands still
 
 
 @dataclass(frozen=True)
 class EncodedPicture:
-    """An encoded picture, and the step that it shows."""
+    """An encoded image, and the step that it shows."""
 
     jpeg: bytes
     step: int
@@ -43,9 +43,9 @@ class EncodedPicture:
 
 @dataclass(eq=False)
 class PageCamera:
-    """A camera that a page looks through."""
+    """The camera of a page."""
 
-    page: int  # a number that tells pages apart
+    page: int  # identifies the page
     view: View
     pace: Pace
     done: threading.Event = field(default_factory=threading.Event)
@@ -53,20 +53,20 @@ class PageCamera:
 
 
 class Orders:
-    """A short queue between the threads that answer and the one that trains."""
+    """A short queue between the threads of the server and the training thread."""
 
     def __init__(self) -> None:
         self._waiting: deque[PageCamera] = deque()
         self._changed = threading.Condition()
 
     def ask(self, order: PageCamera, seconds: float) -> bool:
-        """Wait for the picture of an order, in the place of one that its page still waits for.
+        """Wait for the preview of an order, which replaces one that its page still waits for.
 
         Returns False where too many wait; the order has no picture when the time was too short.
         """
         with self._changed:
             before = next((other for other in self._waiting if other.page == order.page), None)
-            if before is None and len(self._waiting) >= MOST:
+            if before is None and len(self._waiting) >= MAX_WAITING:
                 return False
             if before is not None:
                 self._waiting.remove(before)
@@ -83,7 +83,7 @@ class Orders:
                 self._waiting.remove(order)
 
     def first(self) -> PageCamera | None:
-        """The order that has waited longest for a picture of a camera in motion, else of one at rest."""
+        """Return the order that has waited longest, those of moving cameras first."""
         with self._changed:
             return min(self._waiting, key=lambda order: order.pace == "again", default=None)
 
@@ -94,7 +94,7 @@ class Orders:
         order.done.set()
 
     def wait(self, seconds: float) -> None:
-        """Wait until something is asked for, or the pause ends."""
+        """Wait until there is a request, or the pause ends."""
         with self._changed:
             if not self._waiting:
                 self._changed.wait(seconds)
@@ -109,27 +109,27 @@ class Orders:
 
 LOG = logging.getLogger("clsplat")
 SIDES = (400, 280, 200, 140)  # px, the longer side
-AIMS: dict[Pace, float] = {"moving": 0.04, "still": 0.4, "again": 0.4}  # s for a picture, that choose its side
-GUESS = 0.03  # s, before anything was measured
+AIMS: dict[Pace, float] = {"moving": 0.04, "still": 0.4, "again": 0.4}  # s per preview, which determine its size
+GUESS = 0.03  # s, before the first measurement
 QUALITY = 85  # of JPEG
-MAX_PAIRS = 1 << 23  # in memory at a time: 100 MB or so; frames with more are drawn in bands
-ROOM = 0.95  # of the device's memory that may be in use
+MAX_PAIRS = 1 << 23  # in memory at a time, about 100 MB; frames with more are rendered in bands
+ROOM = 0.95  # fraction of the device's memory that may be used
 
 
 class Preview:
-    """Draws the model of a run between its steps."""
+    """Renders the model of a run between its steps."""
 
     def __init__(self, run: Run) -> None:
         self.run = run
         self._rasterizer: Rasterizer | None = None
-        self._costs: dict[int, float] = {}  # s, of the last picture of each side
+        self._costs: dict[int, float] = {}  # s, of the last preview of each size
 
     def cost(self, pace: Pace) -> float:
-        """Return the estimated time of the next picture, s."""
+        """Return the estimated time of the next preview, s."""
         return self._estimate(self._side(pace))
 
     def draw(self, order: PageCamera) -> EncodedPicture:
-        """Draw what an order asks for.  Raises MemoryLimitError where the device has no room beside the training."""
+        """Render an order.  Raises MemoryLimitError if the device has no memory left next to the training."""
         side, rasterizer = self._side(order.pace), self._opened()
         started = time.perf_counter()
         view = fitted(order.view, side)
@@ -140,14 +140,14 @@ class Preview:
         return EncodedPicture(jpeg, self.run.step)
 
     def release(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         self._rasterizer = None
 
     def _opened(self) -> Rasterizer:
         device, training = self.run.device, self.run.rasterizer
         if device.allocated + training.workspace.nbytes > ROOM * device.info.memory:
             self.release()
-            raise MemoryLimitError("the device has no memory for pictures beside the training")
+            raise MemoryLimitError("the training leaves no device memory for previews")
         if self._rasterizer is None:
             limits = Limits(min(MAX_PAIRS, training.budget.pairs), training.budget.tiles)
             sort = training.tiler.sort
@@ -156,18 +156,18 @@ class Preview:
         return self._rasterizer
 
     def _side(self, pace: Pace) -> int:
-        """The largest side whose picture is cheap enough."""
+        """Return the largest size whose preview is fast enough."""
         return next((side for side in SIDES if self._estimate(side) <= AIMS[pace]), SIDES[-1])
 
     def _estimate(self, side: int) -> float:
-        """As long as the last one of that side, else by the area of those that are known."""
+        """Return the time of the last preview of a size, or an estimate from others by area."""
         if side in self._costs:
             return self._costs[side]
         return max((cost * min(1.0, (side / known) ** 2) for known, cost in self._costs.items()), default=GUESS)
 
 
 def fitted(view: View, side: int) -> View:
-    """Return a view whose picture has `side` px at most."""
+    """Return a view of at most `side` px."""
     camera = view.camera
     factor = max(camera.width, camera.height) / side
     return view if factor <= 1 else replace(view, camera=camera.downscaled(factor))
@@ -177,28 +177,28 @@ def fitted(view: View, side: int) -> View:
 
 
 class Credit:
-    """Credit that grows with time: who asks before an expense spends no more than `share` of the time that passed."""
+    """A budget that grows with time, for callers that may use a fraction `share` of the time."""
 
     def __init__(self, share: float, most: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """share: credit a second; most: credit that is kept: a rest is followed by a burst and not by a flood."""
+        """share: credit per second; most: largest credit, which limits bursts after a rest."""
         self.share, self.most, self.spent = share, most, 0.0
         self._clock, self._credit, self._at = clock, 0.0, clock()
         self._lock = threading.Lock()
 
     @property
     def credit(self) -> float:
-        """What may be spent now; negative after an expense that was larger than its estimate."""
+        """The time that may be spent now; negative after an expense larger than its estimate."""
         with self._lock:
             return self._grown()
 
     def spend(self, amount: float) -> None:
-        """Take an expense off the credit."""
+        """Subtract an expense from the credit."""
         with self._lock:
             self._credit = self._grown() - amount
             self.spent += amount
 
     def skip(self) -> None:
-        """Let the time since the last question give no credit."""
+        """Give no credit for the time since the last call."""
         with self._lock:
             self._at = self._clock()
 
@@ -214,11 +214,11 @@ class Credit:
 Kind = Literal["thumbnail", "photograph"]
 JPEG_SIDES: dict[Kind, int] = {"thumbnail": THUMBNAIL, "photograph": LARGEST}
 JPEG_QUALITY = 88
-PATIENCE = 20.0  # s that a page waits for its share of the time
+PATIENCE = 20.0  # s that a page waits for its turn
 
 
 class Pictures:
-    """Reads one photograph at a time.  Its time on all processors counts as that of a drawn picture."""
+    """Reads one photo at a time.  Its CPU time counts as rendering time."""
 
     def __init__(
         self, views: Sequence[View], background: tuple[float, float, float], undistorted: Path | None, budget: Credit
@@ -227,7 +227,7 @@ class Pictures:
         self._lock = threading.Lock()
 
     def get(self, kind: Kind, index: int) -> bytes | None:
-        """Return a JPEG; None where there is no time for it now.  Raises DataError where it cannot be read."""
+        """Return a JPEG; None if there is no time for it now.  Raises DataError if the photo cannot be read."""
         if not self._lock.acquire(timeout=PATIENCE):
             return None
         try:
@@ -259,12 +259,12 @@ def encoded(image: NDArray[np.uint8], quality: int) -> bytes:
 
 # What the reports of a run say, as points of curves.
 
-MAX_POINTS = 600  # points that are kept: of more, every second one goes
+MAX_POINTS = 600  # of more, every second point is dropped
 Point = tuple[int, float, float, int | None]  # step, loss, PSNR in dB, Gaussians
 
 
 class Curves:
-    """The points of one run, in the order of their steps."""
+    """The points of one run, in order of steps."""
 
     def __init__(self, points: list[Point]) -> None:
         self._points = points
@@ -275,7 +275,7 @@ class Curves:
         self._thin()
 
     def after(self, step: int) -> list[Point]:
-        """Return the points behind a step."""
+        """Return the points after a step."""
         return [point for point in list(self._points) if point[0] > step]
 
     def _thin(self) -> None:
@@ -285,14 +285,14 @@ class Curves:
 
 # What the thread that trains and the threads that answer share.
 
-SHARE = 0.025  # of the time, for pictures; the lead that the host loses by each, and answers, cost about as much again
-SAVED = 1.0  # s of it that are kept for a motion
-RESERVE = 0.3  # s of those that pictures of a camera at rest leave alone
+SHARE = 0.025  # of the time, for previews; waiting for the device and answering cost about as much again
+SAVED = 1.0  # s of it that are saved for moving cameras
+RESERVE = 0.3  # s of those that previews of still cameras do not use
 
 
 @dataclass(frozen=True)
 class ShownRun:
-    """What a page needs to know of one run; another run of a matrix has another number."""
+    """What a page shows of one run; each run of a matrix has another number."""
 
     number: int
     title: str
@@ -304,28 +304,28 @@ class ShownRun:
 
 @dataclass
 class Desk:
-    """The state of a live preview; each field is written by one side and replaced as a whole."""
+    """The state of a live preview; each field has one writer, which replaces it as a whole."""
 
     orders: Orders = field(default_factory=Orders)
     budget: Credit = field(default_factory=lambda: Credit(SHARE, SAVED))
     status: StatusFile | None = None
     shown: ShownRun | None = None
-    step: int = 0  # of the model that can be drawn; 0: none can
+    step: int = 0  # of the model that can be rendered; 0: there is none
     paused: bool = False
     ended: bool = False
-    told: bool = False  # that it has ended, to a page
-    fault: str = ""  # why there are no pictures
-    heard: float = float("-inf")  # when a page last asked
+    told: bool = False  # whether a page knows that it ended
+    fault: str = ""  # why there are no previews
+    heard: float = float("-inf")  # time of the last request of a page
 
     def hear(self) -> None:
-        """Note that somebody looks."""
+        """Record a request of a page."""
         self.heard = time.monotonic()
 
     def silent(self) -> float:
-        """Return for how long no page has asked, s."""
+        """Return the time since the last request of a page, s."""
         return time.monotonic() - self.heard
 
     def pause(self, paused: bool) -> None:
-        """Let the training wait, or go on."""
+        """Pause or resume the training."""
         self.paused = paused
         self.orders.wake()

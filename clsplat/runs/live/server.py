@@ -1,4 +1,4 @@
-"""The server: threads that read requests on the loopback address, and write answers."""
+"""Serve requests on the loopback address, in threads."""
 
 import hmac
 import json
@@ -30,10 +30,12 @@ from clsplat.viewer.page import camera_data, joined, style, viewpoint_data
 # What a browser asks, and who may ask: GET alone, by a name of this machine, below a secret path.
 
 FIELDS = 8  # of a query
-NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})  # another one is a page elsewhere whose name leads here
-HEADERS = {  # where an answer has no others
+NAMES = frozenset(
+    {"127.0.0.1", "localhost", "[::1]"}
+)  # other hosts are foreign pages whose name resolves to this machine
+HEADERS = {  # of all answers without others
     "Cache-Control": "no-store",
-    "Referrer-Policy": "no-referrer",  # the address holds the secret
+    "Referrer-Policy": "no-referrer",  # the address contains the secret
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -43,7 +45,7 @@ HEADERS = {  # where an answer has no others
 
 @dataclass(frozen=True)
 class Answer:
-    """A status, a body and its kind."""
+    """A response: status, body and content type."""
 
     status: int
     body: bytes = b""
@@ -56,7 +58,7 @@ class Answer:
 
 
 class Refused(Exception):
-    """A request that is not answered but for the reason; carries the answer."""
+    """A request is refused; carries the response."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(why)
@@ -65,7 +67,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for: the path behind the secret, and the fields of the query."""
+    """A request: the path after the secret, and the fields of the query."""
 
     path: str
     query: dict[str, str]
@@ -79,7 +81,7 @@ class Request:
 
 
 def read(target: str, host: str, token: str) -> Request:
-    """Return what a request asks for.  Raises Refused: 400, 403, 404."""
+    """Parse a request.  Raises Refused: 400, 403, 404."""
     if host_name(host.strip().lower()) not in NAMES:
         raise Refused(403, "this page answers to 127.0.0.1 and localhost alone")
     try:
@@ -94,39 +96,39 @@ def read(target: str, host: str, token: str) -> Request:
 
 
 def host_name(host: str) -> str:
-    """Return a Host without its port: a tunnel may end at another one."""
+    """Return a Host without its port, as a tunnel may use another one."""
     name, colon, port = host.rpartition(":")
     return name if colon and port.isdecimal() else host
 
 
 LOG = logging.getLogger("clsplat")
 LOOPBACK = "127.0.0.1"
-PORT, TRIED = 8710, 20  # the first port that is tried where none is given, and how many
-IDLE = 15.0  # seconds until a connection that asks for nothing more is closed
-RATE, BURST = 30.0, 120.0  # answers a second, and at once after a rest: a page opens with many small pictures
-POLL = 0.1  # seconds until the server sees that it is to stop
+PORT, PORTS = 8710, 20  # the first default port, and how many are tried
+IDLE = 15.0  # s until an idle connection is closed
+RATE, BURST = 30.0, 120.0  # responses per second, and at once after a rest, as a page starts with many small images
+POLL = 0.1  # s between checks whether the server should stop
 
 
 class Server(socketserver.ThreadingTCPServer):
-    """Answers requests below /TOKEN/ on the loopback address, in threads that end with the process."""
+    """Answers requests under /TOKEN/ on the loopback address, in daemon threads."""
 
     daemon_threads = True
     block_on_close = False
     request_queue_size = 32
-    allow_reuse_address = os.name == "posix"  # elsewhere it lets two programs share a port
+    allow_reuse_address = os.name == "posix"  # on Windows it would let two programs share a port
 
     def __init__(self, port: int, token: str, answer: Callable[[Request], Answer]) -> None:
-        """port: 0 takes the first one from PORT on that is free.  Raises ConfigError where it is in use."""
+        """port: 0 uses the first free one from PORT on.  Raises ConfigError if it is in use."""
         self.token, self.answer, self.ended, self._rate = token, answer, False, Credit(RATE, BURST)
         self._rate.spend(-BURST)
-        for self.port in [port] if port else range(PORT, PORT + TRIED):
+        for self.port in [port] if port else range(PORT, PORT + PORTS):
             try:
                 super().__init__((LOOPBACK, self.port), _Connection)
                 break
             except OSError as error:
                 reason = error.strerror
         else:
-            which = f"port {port}" if port else f"ports {PORT} to {PORT + TRIED - 1}"
+            which = f"port {port}" if port else f"ports {PORT} to {PORT + PORTS - 1}"
             raise ConfigError(
                 f"--live: {which} of {LOOPBACK} cannot be used ({reason}); give another one"
                 + ("" if not port else ", or none: the next that is free is taken")
@@ -134,13 +136,13 @@ class Server(socketserver.ThreadingTCPServer):
         threading.Thread(target=self.serve_forever, args=(POLL,), name="live", daemon=True).start()
 
     def stop(self) -> None:
-        """Answer no more; a connection that is open ends after the answer that it is being given."""
+        """Stop answering; open connections end after their current response."""
         self.ended = True
         self.shutdown()
         self.server_close()
 
     def pace(self) -> None:
-        """Wait until another answer may be given."""
+        """Wait until the next response is allowed."""
         while self._rate.credit < 1:
             sleep(1 / RATE)
         self._rate.spend(1)
@@ -150,12 +152,12 @@ class Server(socketserver.ThreadingTCPServer):
 
 
 class _Connection(BaseHTTPRequestHandler):
-    """One connection: requests one after the other."""
+    """One connection, with requests one after another."""
 
     server: Server
     protocol_version = "HTTP/1.1"
     timeout = IDLE
-    wbufsize = -1  # an answer is one packet
+    wbufsize = -1  # send a response as one packet
     disable_nagle_algorithm = True
 
     def do_GET(self) -> None:
@@ -169,7 +171,7 @@ class _Connection(BaseHTTPRequestHandler):
         self.close_connection |= self.server.ended
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        self.close_connection = True  # what follows may be a body
+        self.close_connection = True  # the rest may be a body
         self._send(Answer(code, f"{message}\n".encode()))
 
     def _send(self, answer: Answer) -> None:
@@ -192,7 +194,7 @@ OWN = ("curves", "link", "live")
 
 
 def page() -> bytes:
-    """Return the page, which asks for all else."""
+    """Return the page, which requests everything else."""
     own = [(FOLDER / f"{name}.js").read_text("utf-8") for name in OWN]
     text = render(
         "live.html.j2",
@@ -203,7 +205,7 @@ def page() -> bytes:
 
 
 def scene_data(number: int, title: str, views: Sequence[View], test: set[str], stand: Viewpoint) -> dict[str, Any]:
-    """Return what live.js reads of a run: its views and the frame of motion."""
+    """Return the data of a run for live.js: its views and its viewpoint."""
 
     def described(index: int, view: View) -> dict[str, Any]:
         of = f"view={index}&scene={number}"
@@ -218,14 +220,14 @@ def scene_data(number: int, title: str, views: Sequence[View], test: set[str], s
 
 # The answers of the server: the page, the scene, the state, pictures, and the two buttons.
 
-WAIT = 4.0  # s until a page that waits for a picture asks again
-LARGEST = 1e9  # of a number of a camera
-MAX_SIDE, MAX_ASPECT = 16384, 8.0  # of a picture that is asked for
+WAIT = 4.0  # s until a page that waits for a preview asks again
+MAX_NUMBER = 1e9  # of a camera
+MAX_SIDE, MAX_ASPECT = 16384, 8.0  # of a requested preview
 STATUS_KEYS = {"state", "stage", "progress", "step", "steps", "gaussians", "seconds_left", "message", "device", "host"}
 
 
 class Answers:
-    """Answers requests, in any thread."""
+    """Answers requests from any thread."""
 
     def __init__(self, desk: Desk) -> None:
         self.desk = desk
@@ -242,7 +244,7 @@ class Answers:
         }
 
     def __call__(self, request: Request) -> Answer:
-        """Return the answer.  Raises Refused."""
+        """Return the response.  Raises Refused."""
         if (route := self._routes.get(request.path)) is None:
             raise Refused(404, "not found")
         self.desk.hear()
@@ -250,7 +252,7 @@ class Answers:
 
     def _state(self, request: Request) -> Answer:
         desk, shown = self.desk, self.desk.shown
-        ended = desk.ended  # at one time, before the rest: who hears of the end hears how it was
+        ended = desk.ended  # read first, so that a page that learns of the end gets the final state
         status = desk.status.now.model_dump(include=STATUS_KEYS, exclude_none=True) if desk.status else {}
         state: dict[str, Any] = {**status, "scene": shown.number if shown else 0, "drawn": desk.step}
         state |= {"paused": desk.paused, "ended": ended, "fault": desk.fault}
@@ -263,7 +265,7 @@ class Answers:
         return Answer.json(self._shown().scene)
 
     def _frame(self, request: Request) -> Answer:
-        """A picture through a camera: of `view`, or `camera` as written by camera.js, at a `time` where one is given.
+        """Return a preview of a `view`, or of a `camera` as camera.js writes it, at a `time` if given.
 
         204 when it is not ready yet.
         """
@@ -309,7 +311,7 @@ class Answers:
 
 
 def moment(text: str) -> float:
-    """Return a moment of the scene.  Raises Refused."""
+    """Return a time of the scene.  Raises Refused."""
     try:
         found = float(text)
     except ValueError:
@@ -320,7 +322,7 @@ def moment(text: str) -> float:
 
 
 def camera(text: str) -> View:
-    """Return the view that camera.js has written: eye; quaternion x, y, z, w; fx, fy, cx, cy, width, height.
+    """Parse a view as camera.js writes it: eye; quaternion x, y, z, w; fx, fy, cx, cy, width, height.
 
     Raises Refused.
     """
@@ -328,7 +330,7 @@ def camera(text: str) -> View:
         eye, turn, lens = ([float(value) for value in part.split(",")] for part in text.split(";"))
     except ValueError:
         raise Refused(400, "camera: expected eye;quaternion;lens") from None
-    if (len(eye), len(turn), len(lens)) != (3, 4, 6) or not all(abs(v) <= LARGEST for v in [*eye, *turn, *lens]):
+    if (len(eye), len(turn), len(lens)) != (3, 4, 6) or not all(abs(v) <= MAX_NUMBER for v in [*eye, *turn, *lens]):
         raise Refused(400, "camera: expected 3, 4 and 6 finite numbers")
     fx, fy, cx, cy, width, height = lens
     sides = sorted((width, height))
