@@ -1,10 +1,10 @@
-"""glTF with KHR_gaussian_splatting in its binary container, and OpenUSD as text, which is only written.
+"""Read and write glTF with KHR_gaussian_splatting in its binary container; write OpenUSD as text.
 
     POSITION 3 · ROTATION x y z w, unit · SCALE 3, linear · OPACITY in [0, 1] · SH_DEGREE_l_COEF_m 3, in the order and
     with the signs of f_rest · COLOR_0 r g b a, linear, for viewers without the extension
 
-Axes of glTF are x right, y up, z back: y and z of the Gaussians are turned, not the node, for the extension leaves it
-to a viewer whether it turns harmonics with a node.
+Axes of glTF are x right, y up, z back.  The Gaussians are converted instead of rotating the node, because the extension
+does not say whether viewers rotate SH with a node.
 """
 
 import json
@@ -36,29 +36,28 @@ from clsplat.formats.splats import (
     unit,
 )
 
-# The parts of glTF that hold Gaussians: primitives, where their node stands, and accessors.
+# The parts of glTF with Gaussians: primitives, the transforms of their nodes, and accessors.
 
 LOG = logging.getLogger("clsplat")
 EXTENSION = "KHR_gaussian_splatting"
 PREFIX = f"{EXTENSION}:"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-SHARED = 8  # times that a byte is read, on average: equal columns may be one accessor
-FLIP = np.diag([1.0, -1, -1, 1])  # between the axes of glTF and those of a PLY
+SHARED = 8  # times that a byte may be read on average, because equal columns may share an accessor
+FLIP = np.diag([1.0, -1, -1, 1])  # converts between the axes of glTF and of a PLY
 
 
 class Gltf:
-    """A file's primitives of Gaussians, all in the same place.
+    """The Gaussian primitives of a file, which must share one transform.
 
-    Raises DataError where there are none, or more than one place; for a tree that is damaged the errors of Python,
-    which `fault` tells in words.
+    Raises DataError if there are none or their transforms differ; a damaged tree raises Python's own errors.
     """
 
     def __init__(self, path: Path, tree: dict[str, Any], binary: bytes) -> None:
         self.path, self.tree, self.binary = path, tree, binary
         self.left = SHARED * len(binary)  # bytes that may still be read
         self.primitives: list[dict[str, Any]] = []
-        self.placement: NDArray[np.float64] | None = None  # [4, 4] in the axes of a PLY
+        self.placement: NDArray[np.float64] | None = None  # [4, 4], in the axes of a PLY
         placements = []
         for mesh, matrix in self._meshes():
             for primitive in tree["meshes"][mesh]["primitives"]:
@@ -68,43 +67,41 @@ class Gltf:
                     self.primitives.append(primitive)
                     placements.append(matrix)
         if not self.primitives:
-            raise DataError(
-                f"{path}: holds no Gaussians ({EXTENSION}); expected a primitive that has some: export it again"
-            )
-        if any(not np.allclose(one, placements[0]) for one in placements):
-            raise DataError(f"{path}: its Gaussians stand in several places; export them apart, then merge them")
+            raise DataError(f"{path}: has no Gaussians ({EXTENSION}); export it again with that extension")
+        if any(not np.allclose(matrix, placements[0]) for matrix in placements):
+            raise DataError(f"{path}: its Gaussians have different transforms; export them separately and merge them")
         if not np.allclose(placements[0], np.eye(4)):
             self.placement = FLIP @ placements[0] @ FLIP
 
     def accessor(self, number: Any, width: int) -> NDArray[np.float32]:
-        """Return the rows of an accessor, [count, width]; normalized whole numbers as those in [-1, 1]."""
+        """Return the rows of an accessor, [count, width]; normalized integers are scaled to [-1, 1]."""
         one = self.tree["accessors"][_index(number)]
         kind, count, start = COMPONENTS[one["componentType"]], _index(one["count"]), _index(one.get("byteOffset", 0))
         view = self.tree["bufferViews"][_index(one["bufferView"])]
         buffer = self.tree["buffers"][_index(view["buffer"])]
         if WIDTHS.get(one["type"]) != width or "sparse" in one or view["buffer"] or "uri" in buffer:
             raise DataError(
-                f"{self.path}: accessor {number} is a {quote(one['type'])}, or lies elsewhere; expected {width} "
-                "numbers a row in the file itself: export it again"
+                f"{self.path}: accessor {number} is a {quote(one['type'])} or outside of the file; expected {width} "
+                "numbers per row in the file itself; export it again"
             )
         size = width * np.dtype(kind).itemsize
         stride = _index(view.get("byteStride", size))
         length, offset = _index(view["byteLength"]), _index(view.get("byteOffset", 0))
         if stride < size:
             raise DataError(
-                f"{self.path}: the rows of accessor {number} are {stride} bytes apart; expected {size} at least: "
+                f"{self.path}: the rows of accessor {number} are {stride} bytes apart; expected at least {size}; "
                 "export it again"
             )
         held = min(_index(buffer["byteLength"]), len(self.binary))
         if offset + length > held or start + stride * max(count - 1, 0) + size * min(count, 1) > length:
             raise DataError(
-                f"{self.path}: accessor {number} has {count} rows, more than its view of {length} bytes from {offset} "
-                f"on holds, or than the file, whose buffer has {held} bytes; copy or export it again"
+                f"{self.path}: accessor {number} has {count} rows, more than fit into its view of {length} bytes at "
+                f"{offset}, or into the file, whose buffer has {held} bytes; copy or export it again"
             )
         start += offset
         self.left -= count * size
         if self.left < 0:
-            raise DataError(f"{self.path}: its accessors share their numbers too often; export it again")
+            raise DataError(f"{self.path}: its accessors share too much data; export it again")
         rows = np.ndarray((count, width), kind, self.binary, start, (stride, np.dtype(kind).itemsize))
         if not one.get("normalized") or kind == "<f4":
             return rows.astype(np.float32)
@@ -113,33 +110,31 @@ class Gltf:
     def _check(self, extension: dict[str, Any]) -> None:
         kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
         if kernel != "ellipse":
-            raise DataError(f"{self.path}: its kernel is {quote(kernel)}; expected 'ellipse': export it again")
+            raise DataError(f"{self.path}: its kernel is {quote(kernel)}; expected 'ellipse'; export it again")
         if space != "srgb_rec709_display":
-            LOG.warning("%s: its colors are %s; they are taken as they are", self.path, quote(space))
+            LOG.warning("%s: its colors are %s; they are used unchanged", self.path, quote(space))
 
     def _meshes(self) -> list[tuple[int, NDArray[np.float64]]]:
-        """The meshes of the scene, each with the matrix of its node."""
+        """Return the meshes of the scene, each with the matrix of its node."""
         nodes = self.tree["nodes"]
-        found: list[tuple[int, NDArray[np.float64]]] = []
+        meshes: list[tuple[int, NDArray[np.float64]]] = []
         seen: set[int] = set()
         waiting = [(_index(root), np.eye(4)) for root in self._roots()]
         while waiting:
             number, above = waiting.pop()
             if number in seen:
-                raise DataError(f"{self.path}: its nodes are no tree, node {number} occurs twice; export it again")
+                raise DataError(f"{self.path}: its nodes are not a tree: node {number} occurs twice; export it again")
             seen.add(number)
             matrix = above @ self._matrix(number)
             if not np.isfinite(matrix).all():
-                raise DataError(
-                    f"{self.path}: node {number} has no finite place; expected finite numbers: export it again"
-                )
+                raise DataError(f"{self.path}: node {number} has no finite transform; export it again")
             if "mesh" in nodes[number]:
-                found.append((_index(nodes[number]["mesh"]), matrix))
+                meshes.append((_index(nodes[number]["mesh"]), matrix))
             waiting += [(_index(child), matrix) for child in nodes[number].get("children", [])]
-        return found
+        return meshes
 
     def _matrix(self, number: int) -> NDArray[np.float64]:
-        """Where a node stands in the one above, [4, 4].  Raises DataError for a quaternion without a direction."""
+        """Return the transform of a node, [4, 4].  Raises DataError for a quaternion without a direction."""
         node = self.tree["nodes"][number]
         if "matrix" in node:
             return np.array(node["matrix"], np.float64).reshape(4, 4).T
@@ -147,7 +142,7 @@ class Gltf:
         length = np.linalg.norm(quaternion)
         if not 0 < length < np.inf:
             raise DataError(
-                f"{self.path}: the rotation of node {number} is a quaternion of length {length:g}; expected 1: export "
+                f"{self.path}: the rotation of node {number} is a quaternion of length {length:g}; expected 1; export "
                 "it again"
             )
         x, y, z, w = quaternion / length
@@ -158,7 +153,7 @@ class Gltf:
         return matrix
 
     def _roots(self) -> list[int]:
-        """The nodes of the scene; without one, those that are nobody's child."""
+        """Return the root nodes of the scene; without a scene, those without a parent."""
         if "scenes" in self.tree and (roots := self.tree["scenes"][_index(self.tree.get("scene", 0))]["nodes"]):
             return list(roots)
         nodes = self.tree["nodes"]
@@ -173,15 +168,15 @@ def _index(value: Any) -> int:
 
 
 MAGIC = b"glTF"
-JSON, BINARY = 0x4E4F534A, 0x004E4942  # kinds of chunks
+JSON, BINARY = 0x4E4F534A, 0x004E4942  # types of chunks
 POINTS = 0  # mode of a primitive
-FLOAT, BYTE = 5126, 5121  # kinds of components
+FLOAT, BYTE = 5126, 5121  # component types
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 MAX_JSON = 1 << 26  # bytes
 
 
 def read_glb(path: Path) -> SplatFile:
-    """Read the Gaussians of a .glb file.  Raises DataError when it is missing, damaged or has none."""
+    """Read the Gaussians of a .glb file.  Raises DataError if it is missing, damaged, or has none."""
     data = read_file(path, "a .glb file", limit=MAX_FILE)
     text, binary = _chunks(path, data)
     try:
@@ -195,7 +190,7 @@ def read_glb(path: Path) -> SplatFile:
             f"{path}: its JSON is damaged ({type(error).__name__}: {one_line(error)}); copy or export the file again"
         ) from error
     if len(degrees) > 1:
-        raise DataError(f"{path}: its parts have different SH degrees; expected one: export them apart")
+        raise DataError(f"{path}: its parts have different SH degrees; export them separately")
     parameters = flip_axes({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
     ours = extras.get("clsplat") if isinstance(extras, dict) else None
     rendering = check_rendering(path, ours) if isinstance(ours, dict) else {}
@@ -251,7 +246,7 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
 
 
 def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
-    """What is written, by name: tables [N, c] of float32 or uint8."""
+    """Return the attributes by name: tables [N, c] of float32 or uint8."""
     alpha = opacities(p["logit_opacity"])
     color = np.clip(SH_C0 * p["sh_base"].astype(np.float64) + 0.5, 0, 1)
     linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)  # sRGB, IEC 61966-2-1
@@ -276,29 +271,29 @@ def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
-    """The JSON and the binary chunk."""
-    found: dict[int, bytes] = {}
+    """Return the JSON and the binary chunk."""
+    chunks: dict[int, bytes] = {}
     start = 12
     if data[:4] != MAGIC or len(data) < 20 or data[4:8] != b"\2\0\0\0":
         raise DataError(f"{path}: not a .glb file of glTF 2.0; copy or export it again")
     while start + 8 <= len(data):
         length, kind = struct.unpack_from("<2I", data, start)
         if length > len(data) - start - 8:
-            raise DataError(f"{path}: holds {len(data)} bytes; its chunks are longer: copy or export it again")
-        found.setdefault(kind, data[start + 8 : start + 8 + length])
+            raise DataError(f"{path}: has {len(data)} bytes, but its chunks are longer; copy or export it again")
+        chunks.setdefault(kind, data[start + 8 : start + 8 + length])
         start += 8 + length
-    text = found.get(JSON, b"")
+    text = chunks.get(JSON, b"")
     if not text:
-        raise DataError(f"{path}: has no chunk of JSON; copy or export it again")
+        raise DataError(f"{path}: has no JSON chunk; copy or export it again")
     if len(text) > MAX_JSON:
         raise DataError(
-            f"{path}: its JSON has {len(text)} bytes; expected {MAX_JSON} at most: export it with fewer primitives"
+            f"{path}: its JSON has {len(text)} bytes; expected at most {MAX_JSON}; export it with fewer primitives"
         )
-    return text, found.get(BINARY, b"")
+    return text, chunks.get(BINARY, b"")
 
 
 def _parameters(path: Path, found: Gltf, primitive: dict[str, Any]) -> Parameters:
-    """The Gaussians of one primitive, in the axes of glTF."""
+    """Return the Gaussians of one primitive, in the axes of glTF."""
     names = primitive["attributes"]
 
     def table(name: str, width: int) -> NDArray[np.float32]:
@@ -323,9 +318,9 @@ def _parameters(path: Path, found: Gltf, primitive: dict[str, Any]) -> Parameter
     return parameters
 
 
-# OpenUSD as text: a prim ParticleField3DGaussianSplat (UsdVol from 26.03 on), which is written only.
+# OpenUSD as text: a prim ParticleField3DGaussianSplat (UsdVol 26.03 and later), write only.
 
-BLOCK = 4096  # rows of text at a time
+BLOCK = 4096  # rows formatted at once
 EXTENT = 3.0  # standard deviations around the means
 START = """#usda 1.0
 (
@@ -367,7 +362,7 @@ def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
 
 
 def _array(file: Output, name: str, table: NDArray[np.floating]) -> None:
-    """One attribute, with as many digits as float32 has."""
+    """Write one attribute with the full precision of float32."""
     width = table.shape[1]
     row = ", ".join(["%.9g"] * width) if width == 1 else f"({', '.join(['%.9g'] * width)})"
     file.write(f"    {name} = [".encode())

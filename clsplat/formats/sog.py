@@ -1,11 +1,11 @@
-"""SOG of PlayCanvas, versions 1 and 2: numbers as lossless WebP images, in a ZIP or a folder, with meta.json.
+"""Read SOG of PlayCanvas, versions 1 and 2, and write version 2: lossless WebP images and meta.json in a ZIP or folder.
 
     means_l, means_u  low and high bytes of 65535 (t - min) / (max - min), t = sign(x) log(1 + |x|)
     quats   the three smallest of w x y z as 255 (c / sqrt 2 + 1/2); alpha is 252 + the index of the largest
     scales  indices into a codebook of logarithms · sh0  indices into one of f_dc, and 255 opacity
     shN     a palette: labels in 16 bits, and centroids, 64 a row, as indices into a codebook
 
-In version 1 scales, sh0, the logit of opacity, and shN lie between a least and a largest value, in 8 bits.
+In version 1, scales, sh0, the opacity logit, and shN are 8-bit values between a minimum and a maximum.
 """
 
 import io
@@ -55,19 +55,19 @@ from clsplat.formats.splats import (
     unit,
 )
 
-# The files of a SOG: in a ZIP, or beside a meta.json.
+# The files of a SOG, in a ZIP or next to a meta.json.
 
 META = "meta.json"
-PARTS = ("means", "scales", "quats", "sh0")  # of a meta.json, and shN
+PARTS = ("means", "scales", "quats", "sh0")  # in meta.json, as well as shN
 MAX_META = 1 << 24  # bytes
 MAX_IMAGE = 1 << 30
 KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-RATIO = 2  # most bytes of images that one byte of a ZIP may stand for: they are compressed already
-SLACK = 1 << 16  # bytes, or px, beyond what the numbers need
+RATIO = 2  # largest accepted compression ratio of images in a ZIP; they are already compressed
+SLACK = 1 << 16  # bytes or px allowed beyond what is needed
 
 
 def sog_folder_files(path: Path) -> list[Path]:
-    """Return a meta.json and the images beside it that it names and that are there; of a damaged one it alone."""
+    """Return a meta.json and the existing images that it names; only itself if it is damaged."""
     try:
         meta = read_json(path, limit=MAX_META)
     except DataError:
@@ -80,41 +80,41 @@ def sog_folder_files(path: Path) -> list[Path]:
 
 
 def is_sibling(name: str) -> bool:
-    """Whether a name does not leave its folder."""
+    """Return whether a name is a file in the same folder."""
     return name == Path(name).name and "\\" not in name and bool(name.strip("."))
 
 
 class Files:
-    """The files of a SOG, each read once: members of a ZIP, wherever they lie in it, or files beside a meta.json."""
+    """The files of a SOG, each read once: members of a ZIP, in any of its folders, or files next to a meta.json."""
 
     def __init__(self, path: Path, archive: zipfile.ZipFile | None = None, size: int = MAX_FILE) -> None:
-        self.path, self.archive, self.most = path, archive, size
-        self.held: dict[str, bytes] = {}
+        self.path, self.archive, self.max_size = path, archive, size
+        self.contents: dict[str, bytes] = {}
 
     @property
     def size(self) -> int:
-        """Bytes of those that were read, as they lie on the disk."""
-        return min(self.most, sum(map(len, self.held.values())))
+        """Bytes read so far, at most the size on disk."""
+        return min(self.max_size, sum(map(len, self.contents.values())))
 
     def read(self, name: str) -> bytes:
-        """The bytes of a file.  Raises DataError."""
-        if name not in self.held:
-            self.held[name] = self._member(self.archive, name) if self.archive else self._beside(name)
-        return self.held[name]
+        """Return the content of a file.  Raises DataError."""
+        if name not in self.contents:
+            self.contents[name] = self._member(self.archive, name) if self.archive else self._sibling(name)
+        return self.contents[name]
 
-    def _beside(self, name: str) -> bytes:
+    def _sibling(self, name: str) -> bytes:
         return read_file(self.path.with_name(name), "a file of a SOG", limit=MAX_META if name == META else MAX_IMAGE)
 
     def _member(self, archive: zipfile.ZipFile, name: str) -> bytes:
-        found = next((one for one in archive.infolist() if one.filename.rpartition("/")[2] == name), None)
-        if found is None or found.compress_type not in KINDS:
-            fault = f"has no {quote(name)}" if found is None else f"{quote(name)} is compressed in another way"
+        info = next((info for info in archive.infolist() if info.filename.rpartition("/")[2] == name), None)
+        if info is None or info.compress_type not in KINDS:
+            fault = f"has no {quote(name)}" if info is None else f"{quote(name)} uses an unsupported compression"
             raise DataError(
-                f"{self.path}: {fault}; expected the files that {META} names, stored or deflated: export it again"
+                f"{self.path}: {fault}; expected the files that {META} names, stored or deflated; export it again"
             )
-        images = sum(len(data) for one, data in self.held.items() if one != META)
-        most = MAX_META if name == META else min(MAX_IMAGE, SLACK + RATIO * self.most - images)
-        with archive.open(found) as member:
+        images = sum(len(data) for key, data in self.contents.items() if key != META)
+        most = MAX_META if name == META else min(MAX_IMAGE, SLACK + RATIO * self.max_size - images)
+        with archive.open(info) as member:
             data = member.read(most + 1)
         if len(data) > most:
             raise DataError(f"{self.path}: {quote(name)} has more than {most} bytes; export it again")
@@ -123,7 +123,7 @@ class Files:
 
 @contextmanager
 def sog_files(path: Path) -> Iterator[Files]:
-    """The files of a folder or of a ZIP."""
+    """Open the files of a folder or of a ZIP.  Raises DataError."""
     if path.name == META:
         yield Files(path)
         return
@@ -135,7 +135,7 @@ def sog_files(path: Path) -> Iterator[Files]:
         raise DataError(f"{path}: a damaged ZIP ({quote(error)}); copy or export the file again") from error
 
 
-PIXELS_PER_BYTE = 16  # of all images; real ones have less than one
+PIXELS_PER_BYTE = 16  # of all images; real files have less than one
 PER_ROW = 64  # centroids
 MAX_PALETTE = 1 << 16  # centroids, as labels have 16 bits
 WIDTHS = {3: 1, 8: 2, 15: 3}  # degree by coefficients of a centroid
@@ -144,22 +144,22 @@ ROTATED = 252  # alpha of a quaternion whose largest component is w
 
 
 def looks_like_sog(data: bytes) -> bool:
-    """Return whether bytes begin a ZIP, or the meta.json of a folder."""
+    """Return whether the first bytes are those of a ZIP or of a SOG folder's meta.json."""
     return data.startswith(b"PK\3\4") or (data.lstrip()[:1] == b"{" and b'"means"' in data)
 
 
 def read_sog(path: Path) -> SplatFile:
-    """Read a `.sog`, or the meta.json of a folder.  Raises DataError when it is missing or damaged."""
+    """Read a `.sog`, or the meta.json of a folder.  Raises DataError if it is missing or damaged."""
     with sog_files(path) as files:
         try:
             meta = json.loads(files.read(META))
         except (ValueError, RecursionError) as error:
-            raise DataError(f"{path}: {META} is no JSON; copy or export the file again") from error
+            raise DataError(f"{path}: {META} is not valid JSON; copy or export the file again") from error
         return _Sog(path, meta, files).splats()
 
 
 class _Sog:
-    """One SOG: its meta.json, and the files that it names."""
+    """A SOG: its meta.json and the files that it names."""
 
     def __init__(self, path: Path, meta: Any, files: Files) -> None:
         self.path, self.meta, self.files = path, meta, files
@@ -167,14 +167,16 @@ class _Sog:
         self.old = "version" not in meta and isinstance(first, list)
         version = 1 if self.old else meta.get("version")
         if version not in (1, 2):
-            raise DataError(f"{path}: SOG of version {quote(version)}; expected 1 or 2: export it again")
+            raise DataError(f"{path}: SOG of version {quote(version)}; expected 1 or 2; export it again")
         self.count = self._whole("count", first[0] if self.old and first else meta.get("count"))
         self.images = {name: self._data(name) for name in PARTS}
         if self.count > SLACK + PIXELS_PER_BYTE * files.size:
-            raise DataError(f"{path}: declares {self.count} splats; its files have {files.size} bytes: copy it again")
+            raise DataError(
+                f"{path}: declares {self.count} splats, but its files have only {files.size} bytes; copy it again"
+            )
 
     def splats(self) -> SplatFile:
-        """Everything, as parameters."""
+        """Decode all parameters."""
         base = self._pixels("sh0", 0)
         scales, opacity = self._looked_up("scales", self._pixels("scales", 0)[:, :3]), base[:, 3]
         if self.old:
@@ -201,15 +203,15 @@ class _Sog:
         lows, highs = self._ends("means", 3)
         span = np.where(highs > lows, highs - lows, 1)
         t = lows + (low | high << np.uint16(8)) / 65535.0 * span
-        with np.errstate(over="ignore"):  # infinity is refused
+        with np.errstate(over="ignore"):  # infinity is refused later
             return (np.sign(t) * np.expm1(np.abs(t))).astype(np.float32)
 
     def _quats(self) -> NDArray[np.float32]:
         pixels = self._pixels("quats", 0)
-        known = pixels[:, 3] >= ROTATED
-        largest = np.where(known, pixels[:, 3], ROTATED).astype(np.intp) - ROTATED
+        valid = pixels[:, 3] >= ROTATED
+        largest = np.where(valid, pixels[:, 3], ROTATED).astype(np.intp) - ROTATED
         quats = from_smallest_three(largest, (pixels[:, :3] / 255.0 - 0.5) * 2**0.5)
-        quats[~known] = [1, 0, 0, 0]
+        quats[~valid] = [1, 0, 0, 0]
         return quats
 
     def _rest(self) -> NDArray[np.float32]:
@@ -217,7 +219,7 @@ class _Sog:
             return np.zeros((self.count, 0), np.float32)
         files = self._data("shN")
         if len(files) != 2:
-            raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels: export it again")
+            raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels; export it again")
         labels = packing.decode(self.path, "labels of shN", files[1], self.count, self._most(self.count))
         chosen = labels[: self.count, 0].astype(np.intp) | labels[: self.count, 1].astype(np.intp) << 8
         used = entries = 1 + int(chosen.max(initial=0))
@@ -229,7 +231,7 @@ class _Sog:
         size = sh_coefficients(degree) - 1
         if used > entries:
             raise DataError(
-                f"{self.path}: labels of shN name {used} centroids; shN.count is {entries}: export it again"
+                f"{self.path}: labels of shN use {used} centroids, but shN.count is {entries}; export it again"
             )
         most = self._most(size * MAX_PALETTE)
         centroids = packing.decode(self.path, "centroids of shN", files[0], entries * size, most)
@@ -237,16 +239,16 @@ class _Sog:
         return np.asarray(self._looked_up("shN", table)[chosen])
 
     def _degree_of_width(self, data: bytes) -> int:
-        """The degree of a version 1, which no number tells: its centroids are 64 a row."""
+        """Return the SH degree of a version 1 file, from the width of its centroids, 64 per row."""
         width, _ = packing.size(self.path, "centroids of shN", data)
         if width // PER_ROW not in WIDTHS:
             raise DataError(
-                f"{self.path}: centroids of shN are {width} px wide; expected 192, 512 or 960: export it again"
+                f"{self.path}: centroids of shN are {width} px wide; expected 192, 512, or 960; export it again"
             )
         return WIDTHS[width // PER_ROW]
 
     def _looked_up(self, name: str, levels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The numbers that bytes stand for: entries of a codebook, or in version 1 shares of a range."""
+        """Decode bytes: indices into a codebook, or, in version 1, fractions of a range."""
         if not self.old:
             entries = self._numbers(f"{name}.codebook", self._part(name).get("codebook"), 256)
             return np.asarray(entries.astype(np.float32)[levels])
@@ -258,11 +260,11 @@ class _Sog:
         return (lows + levels / 255.0 * (highs - lows)).astype(np.float32)
 
     def _pixels(self, name: str, number: int) -> NDArray[np.uint8]:
-        """The first pixels of an image, one for each splat, [count, 4]."""
+        """Return the first pixels of an image, one per splat, [count, 4]."""
         group = self.images[name]
         if number >= len(group):
             raise DataError(
-                f"{self.path}: {name} names {len(group)} files; expected {number + 1} at least: export it again"
+                f"{self.path}: {name} names {len(group)} files; expected at least {number + 1}; export it again"
             )
         pixels = packing.decode(
             self.path, f"image {number} of {name}", group[number], self.count, self._most(self.count)
@@ -277,68 +279,68 @@ class _Sog:
         part = self.meta.get(name) if isinstance(self.meta, dict) else None
         if not isinstance(part, dict):
             raise DataError(
-                f"{self.path}: {META} has no '{name}'; expected means, scales, quats and sh0: export it again"
+                f"{self.path}: {META} has no '{name}'; expected means, scales, quats, and sh0; export it again"
             )
         return part
 
     def _data(self, name: str) -> list[bytes]:
-        """The files of a part.  Raises DataError for names that leave the folder."""
+        """Return the files of a part.  Raises DataError for names outside of the folder."""
         names = self._part(name).get("files")
         if not isinstance(names, list) or not 1 <= len(names) <= 2 or not all(isinstance(one, str) for one in names):
             raise DataError(
-                f"{self.path}: {name}.files is {quote(names)}; expected the names of one or two files: export it again"
+                f"{self.path}: {name}.files is {quote(names)}; expected one or two file names; export it again"
             )
-        if wrong := [one for one in names if not is_sibling(one)]:
+        if wrong := [file for file in names if not is_sibling(file)]:
             raise DataError(
                 f"{self.path}: {name}.files has {quote(wrong[0])}; "
-                "expected the name of a file beside it: export it again"
+                "expected the name of a file in the same folder; export it again"
             )
-        return [self.files.read(one) for one in names]
+        return [self.files.read(file) for file in names]
 
     def _ends(self, name: str, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         part = self._part(name)
         lows, highs = (self._numbers(f"{name}.{key}", part.get(key), count) for key in ("mins", "maxs"))
         return lows, highs
 
-    def _numbers(self, place: str, value: Any, count: int) -> NDArray[np.float64]:
-        """A list of numbers, `count` at least."""
+    def _numbers(self, key_path: str, value: Any, count: int) -> NDArray[np.float64]:
+        """Validate a list of at least `count` numbers."""
         fits = isinstance(value, list) and count <= len(value) <= 256
         if not fits or not all(isinstance(one, int | float) and abs(one) < LIMIT for one in value):
             raise DataError(
-                f"{self.path}: {place} is {quote(value)}; expected {count} numbers below {LIMIT:g}: export it again"
+                f"{self.path}: {key_path} is {quote(value)}; expected {count} numbers below {LIMIT:g}; export it again"
             )
         return np.array(value, np.float64)
 
-    def _whole(self, place: str, value: Any, most: int = packing.MAX_SIDE**2) -> int:
+    def _whole(self, key_path: str, value: Any, most: int = packing.MAX_SIDE**2) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most or math.isnan(value):
             raise DataError(
-                f"{self.path}: {place} is {quote(value)}; expected a whole number from 1 to {most}: export it again"
+                f"{self.path}: {key_path} is {quote(value)}; expected a whole number from 1 to {most}; export it again"
             )
         return value
 
 
-# Write SOG, version 2: the same model gives the same bytes.
+# Writing SOG version 2; the same model gives the same bytes.
 
-PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most, of a palette for all
+PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # largest palette for training
 SHARES = {
     "small": 0.16,
     "balanced": 0.42,
     "high": 0.45,
-}  # of a splat, of one that is not trained
-MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of its vectors, in 128ths
-TURN_STEP = 4  # levels of 255
-SIZE_SHARE = 0.25  # of a Gaussian's size, for its position: of one of median weight
-SCALE_STEP = 0.1  # of logarithms of standard deviations
-COLOR_STEP = 0.05  # of the coefficients of band 0; 1 changes a color by 0.28
-SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
-DIGITS = 16  # of the SHA-256 of an image in a folder, in its name
-EPOCH = (1980, 1, 1, 0, 0, 0)  # of files in the ZIP: the same model gives the same bytes
+}  # entries per splat, of a palette that is not trained
+MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of palette vectors, in 128ths
+TURN_STEP = 4  # of quaternions, in levels of 255
+SIZE_SHARE = 0.25  # step of positions of median weight, relative to the Gaussian's size
+SCALE_STEP = 0.1  # of log scales
+COLOR_STEP = 0.05  # of coefficients of band 0; 1 changes a color by 0.28
+SMALLEST = 1024  # palette entries for 1,024 splats; grows in proportion
+DIGITS = 16  # of the SHA-256 in the name of an image in a folder
+EPOCH = (1980, 1, 1, 0, 0, 0)  # time of files in the ZIP, fixed so that the same model gives the same bytes
 
 
 def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write a `.sog`, or where the name is meta.json the files of a folder.  Raises OutputError, DataError.
+    """Write a `.sog`, or the files of a folder if the name is meta.json.  Raises OutputError, DataError.
 
-    The images of a folder have their content in their names, so that none of another model is replaced.
+    The names of images in a folder include a hash, so that images of another model are never replaced.
     """
     require_gaussians(path, splats)
     require_in_range(path, splats, "SOG")
@@ -347,9 +349,9 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
 
 
 def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: Writing) -> str:
-    """Write a SOG as `write_sog` does, whose splats stay in the order that they have.
+    """Write a SOG as `write_sog` does, but keep the order of the splats.
 
-    weights: their binary logarithms, [N], of `log_weights`: of the model that the splats may be a part of.
+    weights: base-2 logarithms, [N], of `log_weights` of the whole model, of which the splats may be a part.
     """
     in_folder = path.name == META
     p, harmonics = _quantized(splats.parameters, weights, options)
@@ -380,21 +382,21 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
     if harmonics is not None:
         meta["shN"] = _write_harmonics(harmonics, splats.sh_degree, image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
-    return _write_beside(path, images) if in_folder else write_bytes(path, _zipped(images))
+    return _write_folder(path, images) if in_folder else write_bytes(path, _zipped(images))
 
 
-def _write_beside(path: Path, images: dict[str, bytes]) -> str:
-    """Write images and then their meta.json: until it is renamed, the model before is whole.  Images of no use go."""
+def _write_folder(path: Path, images: dict[str, bytes]) -> str:
+    """Write images and then meta.json, so that the old model stays valid until then; remove unused images."""
     before, new = set(sog_folder_files(path)), {path.with_name(name) for name in images}
     kept = before
     try:
         sums = [write_bytes(path.with_name(name), data) for name, data in images.items()]
         kept = new
     finally:
-        for one in (before | new) - kept - set(sog_folder_files(path)):
-            if one.suffix == ".webp":
+        for file in (before | new) - kept - set(sog_folder_files(path)):
+            if file.suffix == ".webp":
                 with suppress(OSError):
-                    one.unlink()
+                    file.unlink()
     return sums[-1]
 
 
@@ -410,13 +412,13 @@ def _means(p: Parameters, image: Any) -> dict[str, Any]:
 
 
 def _alpha(p: Parameters) -> NDArray[np.float64]:
-    """Opacities in 255 steps, 1 at least: lossless WebP forgets the color under 0."""
+    """Return opacities in levels of 255, at least 1, because lossless WebP drops the color under 0."""
     return np.maximum(np.rint(255 * opacities(p["logit_opacity"][:, 0])), 1)
 
 
 @dataclass(frozen=True)
 class Harmonics:
-    """What a SOG holds of harmonics: numbers [256], a palette [E, c] of their indices, and a label for each splat."""
+    """The SH of a SOG: a codebook [256], a palette [E, c] of indices into it, and a label per splat."""
 
     numbers: NDArray[np.float64]
     palette: NDArray[np.uint8]
@@ -431,10 +433,10 @@ class Harmonics:
         better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
         step: float | None = None,
     ) -> "Harmonics":
-        """Quantize harmonics [N, c] by few vectors, for training; those of `values` come out as they are.
+        """Fit a small palette to SH [N, c], for training; the result of `values` is reproduced exactly.
 
-        weights: how much errors count, [N].  better: makes of a palette [E, c] another one, and the label of each
-        splat.  step: of numbers, where those are few enough.
+        weights: weights of errors, [N].  better: refines a palette [E, c] and returns it with the label of each splat.
+        step: rounding of codebook numbers, used if few enough remain.
         """
         vectors, labels = palette(rest, _few(len(rest), quality), weights)
         if weights.any() and not np.array_equal(vectors[labels].astype(np.float32), rest):
@@ -445,26 +447,26 @@ class Harmonics:
     def from_vectors(
         cls, vectors: NDArray[np.float64], labels: NDArray[np.int64], step: float | None = None
     ) -> "Harmonics":
-        """Those that vectors [E, c] and labels [N] stand for."""
+        """Return the palette of vectors [E, c] and labels [N], with their codebook."""
         numbers = np.array([_short(number) for number in codebook(vectors, step)])
         return cls(numbers, nearest_entries(vectors, numbers), labels)
 
     @property
     def values(self) -> NDArray[np.float32]:
-        """The harmonics as they are read back, [N, c]."""
+        """The SH coefficients as they are read back, [N, c]."""
         return self.numbers.astype(np.float32)[self.palette][self.labels]
 
 
 def _few(count: int, quality: Quality) -> int:
-    """Entries of a palette for all Gaussians."""
+    """Return the number of palette entries for training."""
     return min(PALETTES[quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(count / SMALLEST)))))
 
 
 def _quantized(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
-    """The tables, rounded, and a palette of the harmonics.
+    """Return the rounded tables and a palette of the SH.
 
-    Harmonics that are a palette already stay as they are, and so do the tables then: whoever made it rounded them.
-    In `high` the tables have the precision of the format.
+    SH that already form a palette stay unchanged, and so do the tables, which were then rounded in training.
+    Quality `high` rounds tables only to the precision of the format.
     """
     rest, base = p["sh_rest"], p["sh_base"]
     most = min(MAX_PALETTE, max(_few(len(rest), options.quality), int(SHARES[options.quality] * len(rest))))
@@ -495,12 +497,12 @@ def _write_harmonics(found: Harmonics, bands: int, image: Any) -> dict[str, Any]
 
 
 def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:
-    """A number in few digits, as float32 has it: the last bit of logarithms and means is the processor's."""
+    """Round to 8 digits, because the last bits of logarithms and means differ between processors."""
     return float(Context(8, rounding).create_decimal(float(number)))
 
 
 def _zipped(images: dict[str, bytes]) -> bytes:
-    """A ZIP without times, systems and compression of its own."""
+    """Return a ZIP without timestamps, operating system, and compression."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for name, data in images.items():

@@ -1,10 +1,10 @@
-"""Streamed SOG of PlayCanvas, version 1: levels of detail, each in SOG files of its own, and a tree of boxes.
+"""Read and write streamed SOG of PlayCanvas, version 1: levels of detail in SOG files, and a tree of boxes.
 
     lod-meta.json   version 1, count of all levels, counts by level, lodLevels, filenames, tree, and an environment
     a node          bound {min, max}, and two children, or as a leaf lods: by level a file, an offset and a count
-    L_i/meta.json   a SOG of level L as a folder, which holds runs of leaves one after the other; 0 is the finest
+    L_i/meta.json   a SOG folder of level L with consecutive runs of leaves; level 0 is the finest
 
-A program that shows it takes of each leaf the level that its distance asks for.  Read is the finest level.
+A viewer chooses the level of each leaf by its distance.  Reading returns the finest level.
 """
 
 import json
@@ -34,22 +34,22 @@ from clsplat.formats.splats import (
 )
 
 LOD_META = "lod-meta.json"
-MOST_LEVELS = 64  # writers make about ten
+MAX_LEVELS = 64  # programs write about ten
 Run = tuple[int, int]  # offset and count of a leaf's splats in a file
-Runs = dict[int, list[Run]]  # of a level, ascending, by the number of their file
+Runs = dict[int, list[Run]]  # of one level, ascending, by file number
 
 
 def looks_like_lod(data: bytes) -> bool:
-    """Return whether bytes begin a lod-meta.json."""
+    """Return whether the first bytes are those of a lod-meta.json."""
     return data.lstrip()[:1] == b"{" and b'"lodLevels"' in data
 
 
 def read_lod(path: Path) -> SplatFile:
-    """Read the finest level of a lod-meta.json, and its environment.  Raises DataError when it is damaged."""
+    """Read the finest level of a lod-meta.json and its environment.  Raises DataError if it is damaged."""
     meta = _meta(path)
     runs = _runs(path, meta)[0]
     if not runs:
-        raise DataError(f"{path}: its leaves name no file of level 0; export it again")
+        raise DataError(f"{path}: its leaves have no file of level 0; export it again")
     parts = [_part(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
     _require_count(path, meta, 0, runs)
     if "environment" in meta:
@@ -61,7 +61,7 @@ def read_lod(path: Path) -> SplatFile:
 
 
 def find_level_faults(path: Path) -> list[str]:
-    """Return a sentence for each file of the coarser levels that is missing or damaged; `read_lod` reads the others."""
+    """Return a message for each missing or damaged file of the coarser levels; `read_lod` checks the finest."""
     meta, faults = _meta(path), []
     levels = _runs(path, meta)
     spare: Runs = {file: [] for file in {*range(len(meta["filenames"]))}.difference(*levels)}
@@ -75,7 +75,7 @@ def find_level_faults(path: Path) -> list[str]:
 
 
 def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
-    """A sentence for each of some files that is missing or damaged."""
+    """Return a message for each of the given files that is missing or damaged."""
     faults = []
     for file, own in sorted(runs.items()):
         try:
@@ -89,32 +89,32 @@ def lod_files(path: Path) -> list[Path]:
     """Return a lod-meta.json and all files of its levels."""
     meta = _meta(path)
     names = [*meta["filenames"], *([meta["environment"]] if "environment" in meta else [])]
-    places = [path.parent / _inside(path, name) for name in names]
-    return [path, *(file for place in places for file in sog_folder_files(place))]
+    metas = [path.parent / _inside(path, name) for name in names]
+    return [path, *(file for meta in metas for file in sog_folder_files(meta))]
 
 
 def _meta(path: Path) -> dict[str, Any]:
     meta = read_json(path, "a lod-meta.json", limit=MAX_META)
     if not isinstance(meta, dict) or meta.get("version") != 1:
         version = quote(meta.get("version") if isinstance(meta, dict) else meta)
-        raise DataError(f"{path}: streamed SOG of version {version}; expected 1: export it again")
+        raise DataError(f"{path}: streamed SOG of version {version}; expected 1; export it again")
     names, counts = meta.get("filenames"), meta.get("counts")
     if not isinstance(names, list) or len({_inside(path, name) for name in names}) < len(names):
-        raise DataError(f"{path}: filenames is {quote(names)}; expected names of files, each once: export it again")
-    if not isinstance(counts, list) or not 1 <= len(counts) <= MOST_LEVELS:
+        raise DataError(f"{path}: filenames is {quote(names)}; expected distinct file names; export it again")
+    if not isinstance(counts, list) or not 1 <= len(counts) <= MAX_LEVELS:
         raise DataError(
-            f"{path}: counts is {quote(counts)}; expected a number for each of 1 to {MOST_LEVELS} levels: export it "
+            f"{path}: counts is {quote(counts)}; expected a number for each of 1 to {MAX_LEVELS} levels; export it "
             "again"
         )
     if (levels := meta.get("lodLevels")) != len(counts):
         raise DataError(
-            f"{path}: lodLevels is {quote(levels)}; expected {len(counts)}, as it has counts: export it again"
+            f"{path}: lodLevels is {quote(levels)}; expected {len(counts)}, the number of counts; export it again"
         )
     return meta
 
 
 def _inside(path: Path, name: Any) -> str:
-    """The name of a meta.json below the folder."""
+    """Validate the name of a meta.json below the folder."""
     if not isinstance(name, str) or not _is_meta_below(name):
         raise DataError(f"{path}: names {quote(name)}; expected a {META} in a folder below; export it again")
     return name
@@ -126,20 +126,20 @@ def _is_meta_below(name: str) -> bool:
 
 
 def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
-    """The runs of each level."""
+    """Return the runs of each level."""
     levels: list[Runs] = [{} for _ in meta["counts"]]
     numbers = {str(level): level for level in range(len(levels))}
     for leaf in _leaves(path, meta.get("tree")):
         for name, run in leaf.items():
             if name not in numbers:
                 raise DataError(
-                    f"{path}: a leaf names level {quote(name)}; expected 0 to {len(levels) - 1}: export it again"
+                    f"{path}: a leaf refers to level {quote(name)}; expected 0 to {len(levels) - 1}; export it again"
                 )
             file, offset, count = (_whole(path, key, run) for key in ("file", "offset", "count"))
             levels[numbers[name]].setdefault(file, []).append((offset, count))
     for level, runs in enumerate(levels):
         if max(runs, default=-1) >= len(meta["filenames"]):
-            raise DataError(f"{path}: its leaves name a file of level {level} that it has not; export it again")
+            raise DataError(f"{path}: a leaf refers to a missing file of level {level}; export it again")
     return [{file: sorted(one) for file, one in runs.items()} for runs in levels]
 
 
@@ -147,12 +147,12 @@ def _require_count(path: Path, meta: dict[str, Any], level: int, runs: Runs) -> 
     found, declared = sum(count for one in runs.values() for _, count in one), meta["counts"][level]
     if found != declared:
         raise DataError(
-            f"{path}: declares {quote(declared)} splats of level {level}; its leaves have {found}: export it again"
+            f"{path}: declares {quote(declared)} splats of level {level}, but its leaves have {found}; export it again"
         )
 
 
 def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
-    """What each leaf holds by level."""
+    """Yield the runs of each leaf by level."""
     waiting = [tree]
     while waiting:
         node = waiting.pop()
@@ -162,50 +162,50 @@ def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
         elif isinstance(children, list):
             waiting += children[::-1]
         else:
-            raise DataError(f"{path}: a node of its tree is {quote(node)}; expected children or lods: export it again")
+            raise DataError(f"{path}: a node of its tree is {quote(node)}; expected children or lods; export it again")
 
 
 def _whole(path: Path, key: str, run: Any) -> int:
     value = run.get(key) if isinstance(run, dict) else None
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise DataError(f"{path}: {key} of a leaf is {quote(value)}; expected a whole number: export it again")
+        raise DataError(f"{path}: {key} of a leaf is {quote(value)}; expected a whole number; export it again")
     return value
 
 
 def _part(path: Path, name: str, runs: list[Run]) -> SplatFile:
-    """The splats of a file that are in leaves.  runs: ascending."""
+    """Return the splats of a file that are in leaves.  runs: ascending."""
     part = read_sog(path.parent / name)
     rows, end = [np.arange(0)], 0
     for offset, count in runs:
         if offset < end or offset + count > len(part):
             raise DataError(
-                f"{path}: a leaf has {count} splats from {offset} on of {quote(name)}, which holds {len(part)} and "
-                f"whose first {end} are in other leaves; export it again"
+                f"{path}: a leaf has {count} splats at {offset} of {quote(name)}, which has {len(part)} and of which "
+                f"the first {end} are in other leaves; export it again"
             )
         end = offset + count
         rows.append(np.arange(offset, end))
     return part.rows(np.concatenate(rows))
 
 
-# The tree of a streamed SOG: boxes that are halved until they are small, over the splats of all levels.
+# The tree of a streamed SOG: boxes of the splats of all levels, halved until they are small.
 
-MAX_LOG_SCALE = 80.0  # of a box: JSON has no infinity
+MAX_LOG_SCALE = 80.0  # for boxes, because JSON has no infinity
 Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class LeafLimits:
-    """What a leaf holds at most: numbers of PlayCanvas."""
+    """The limits of a leaf; the defaults are those of PlayCanvas."""
 
-    splats: int = 512 * 1024  # of all levels; and a file no more than these and one leaf's
-    extent: float = 16.0  # scene units, of the longest side of its means' box
-    few: int = 1024  # splats, which are not divided for their extent
+    splats: int = 512 * 1024  # of all levels; a file exceeds it by one leaf at most
+    extent: float = 16.0  # longest side of the bounding box of means, scene units
+    few: int = 1024  # splats that are never split because of their extent
 
 
 @dataclass(frozen=True)
 class Node:
-    """A box, and two halves, or the rows of its splats by level, each along a Morton curve."""
+    """A box with two children, or a leaf with the rows of its splats by level, each along a Morton curve."""
 
     low: Floats  # [3] scene units
     high: Floats
@@ -213,7 +213,7 @@ class Node:
     rows: tuple[Rows, ...] = ()
 
     def leaves(self) -> Iterator["Node"]:
-        """All leaves, from left to right."""
+        """Yield all leaves from left to right."""
         if not self.children:
             yield self
         for child in self.children:
@@ -221,7 +221,7 @@ class Node:
 
 
 def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
-    """Return the tree of levels, the finest first, none without splats."""
+    """Build the tree of levels, finest first; no level may be empty."""
     means = np.concatenate([level["means"] for level in levels]).astype(np.float64)
     reach = np.concatenate([half_boxes(level) for level in levels])
     starts = np.cumsum([0, *(len(level["means"]) for level in levels)])
@@ -244,26 +244,26 @@ def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
 
 
 def half_boxes(level: Parameters) -> Floats:
-    """Return half the sides of the boxes around turned boxes of one standard deviation, [N, 3] scene units."""
+    """Return half the sides of the bounding boxes of Gaussians at one sigma, [N, 3] scene units."""
     from scipy.spatial.transform import Rotation
 
-    turned = np.abs(Rotation.from_quat(np.roll(unit(level["quats"]), -1, axis=1)).as_matrix())
+    axes = np.abs(Rotation.from_quat(np.roll(unit(level["quats"]), -1, axis=1)).as_matrix())
     scales = np.exp(np.minimum(level["log_scales"].astype(np.float64), MAX_LOG_SCALE))
-    half: Floats = np.einsum("nij,nj->ni", turned, scales)
+    half: Floats = np.einsum("nij,nj->ni", axes, scales)
     return half
 
 
-# Write streamed SOG, version 1: the same levels give the same bytes.
+# Writing streamed SOG version 1; the same levels give the same bytes.
 
-USUAL = LeafLimits()
+DEFAULT_LIMITS = LeafLimits()
 
 
 def write_lod(
-    folder: Path, levels: Sequence[SplatFile], options: Writing | None = None, limits: LeafLimits = USUAL
+    folder: Path, levels: Sequence[SplatFile], options: Writing | None = None, limits: LeafLimits = DEFAULT_LIMITS
 ) -> str:
-    """Write levels, the finest first, into a folder; return the SHA-256 of its JSON, which is written last.
+    """Write levels, finest first, into a folder; return the SHA-256 of its JSON, which is written last.
 
-    Raises DataError for a level without Gaussians, or one that SOG cannot hold, OutputError.
+    Raises DataError for a level that is empty or that SOG cannot store, and OutputError.
     """
     for level in levels:
         require_gaussians(folder / LOD_META, level)
@@ -290,15 +290,15 @@ def write_lod(
 
 @dataclass
 class _Files:
-    """The files of all levels: a file takes leaves until it holds more than so many splats."""
+    """The files of all levels; a file takes leaves until it has more than `splats` splats."""
 
     splats: int
     rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by name: the level, and runs of its rows
     held: dict[str, int] = field(default_factory=dict)
-    open: dict[int, int] = field(default_factory=dict)  # by level the number of the file that takes the next leaf
+    open: dict[int, int] = field(default_factory=dict)  # by level, the number of the file for the next leaf
 
     def shape(self, node: Node) -> dict[str, Any]:
-        """A node as JSON, whose leaves' rows get places in files."""
+        """Return a node as JSON, and assign the rows of its leaves to files."""
         bound = {"bound": {"min": _short(node.low), "max": _short(node.high)}}
         if node.children:
             return {**bound, "children": [self.shape(child) for child in node.children]}
@@ -318,5 +318,5 @@ class _Files:
 
 
 def _short(numbers: NDArray[np.float64]) -> list[float]:
-    """Numbers in 7 digits, as float32 has them."""
+    """Round numbers to 7 digits, the precision of float32."""
     return [float(f"{number:.7g}") for number in numbers]

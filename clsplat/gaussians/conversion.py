@@ -1,4 +1,4 @@
-"""Model files into one of another format: merged, moved, cropped, and with fewer Gaussians or harmonics."""
+"""Convert model files to another format: merge, transform, crop, and reduce them."""
 
 import logging
 import math
@@ -36,18 +36,17 @@ from clsplat.gaussians.motion import static_motion, with_motion
 from clsplat.gaussians.sky import sample_texels, sky_path
 from clsplat.scene.scene import PointCloud
 
-# Several models as one.
+# Merging models.
 
 LOG = logging.getLogger("clsplat")
-KEPT = ("near", "screen_variance", "background", "alpha")  # of the first model
+KEPT = ("near", "screen_variance", "background", "alpha")  # numbers taken from the first model
 
 
 def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
-    """Return one model of all Gaussians, with the numbers of the first for rendering and the largest SH degree.
+    """Merge all Gaussians into one model, with the rendering numbers of the first and the largest SH degree.
 
-    Where one has a world filter and another has none, it is baked; where some move, the others stand still.  Raises
-    DataError where some are mip models and others are not, or of the pixel's box, for one filter serves all, and where
-    they move in different ways.
+    World filters are baked unless all models have one; if some models move, the others become static in time.
+    Raises DataError if the models use different screen filters or incompatible motions.
     """
     first = models[0]
     if len(models) == 1:
@@ -55,10 +54,10 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     for model, name in zip(models, names, strict=True):
         kinds = [_kind(m) for m in (first, model)]
         if kinds[0] != kinds[1]:
-            raise DataError(f"{name}: is {kinds[1]}, {names[0]} is {kinds[0]}; expected the same: one filter draws all")
+            raise DataError(f"{name}: is {kinds[1]}, but {names[0]} is {kinds[0]}; merge only models of one kind")
         own, kept = model.rendering.comment(), first.rendering.comment()
-        if other := [f"{one} = {own.get(one, 'not given')}" for one in KEPT if own.get(one) != kept.get(one)]:
-            LOG.warning("%s: has %s; what %s says is kept", name, ", ".join(other), names[0])
+        if other := [f"{key} = {own.get(key, 'not given')}" for key in KEPT if own.get(key) != kept.get(key)]:
+            LOG.warning("%s: has %s; the values of %s are used", name, ", ".join(other), names[0])
     if any(model.filter_variance is None for model in models):
         models = [model.baked() for model in models]
     degree = max(model.sh_degree for model in models)
@@ -68,10 +67,10 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
 
 
 def _kind(model: Model) -> str:
-    """Say whether a model is a mip model."""
+    """Describe the screen filter of a model."""
     if model.rendering.pixel_box:
-        return "one of the pixel's box"
-    return "a mip model" if model.rendering.compensate else "none"
+        return "a model with a pixel box filter"
+    return "a mip model" if model.rendering.compensate else "a plain model"
 
 
 WORDS = ("scale", "rotate", "translate")
@@ -80,16 +79,16 @@ QUALITIES = get_args(Quality)
 
 @dataclass(frozen=True)
 class Changes:
-    """What is done to a model, in this order."""
+    """Changes of a model, applied in this order."""
 
-    drop_below: float = 0.0  # opacity: fainter Gaussians go
-    transform: NDArray[np.float64] | None = None  # [4, 4], one scale, a rotation and a translation
-    crop: tuple[float, ...] | None = None  # x0, y0, z0, x1, y1, z1, scene units: means outside go
+    drop_below: float = 0.0  # opacity below which Gaussians are dropped
+    transform: NDArray[np.float64] | None = None  # [4, 4], a uniform scale, rotation, and translation
+    crop: tuple[float, ...] | None = None  # x0, y0, z0, x1, y1, z1, scene units; Gaussians outside are dropped
     sh_degree: int | None = None  # at most
-    time: float | None = None  # of a moving model: that moment of it
+    time: float | None = None  # of a moving model: the timestamp to extract
 
     def apply(self, model: Model) -> Model:
-        """Return the changed model.  Raises DataError where nothing is left, ConfigError for a transform too far."""
+        """Return the changed model.  Raises DataError if nothing is left, and ConfigError for an extreme transform."""
         model = model if self.time is None else _at(model, self.time)
         kept = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:
@@ -104,42 +103,41 @@ class Changes:
         if self.sh_degree is not None and self.sh_degree < kept.sh_degree:
             kept = replace(kept, sh_rest=with_degree(kept.tables(), self.sh_degree)["sh_rest"])
         if not len(kept) and len(model):
-            raise DataError(f"none of {len(model):,} Gaussians is left; expected some inside of the crop and as opaque")
+            raise DataError(f"none of {len(model):,} Gaussians is left; use a larger crop or a lower opacity threshold")
         return kept
 
 
 def writing_options(out: Path, quality: Quality) -> Writing:
-    """Return how a file is written.  Raises ConfigError for a quality that there is not, or that its format has not."""
+    """Return the options for writing a file.  Raises ConfigError for an unknown quality, or one without effect."""
     if quality not in QUALITIES:
         raise ConfigError(f"--quality {quote(quality)}: expected one of {', '.join(QUALITIES)}")
     if quality != "balanced" and not writing_format(out).has_quality:
-        raise ConfigError(f"{out}: --quality is of SPZ and SOG; expected a name that ends in .spz or .sog")
+        raise ConfigError(f"{out}: --quality is only for SPZ and SOG; give a name that ends in .spz or .sog")
     return Writing(quality)
 
 
 def convert(
     sources: Sequence[Path], out: Path, changes: Changes | None = None, quality: Quality = "balanced"
 ) -> dict[str, Any]:
-    """Read model files or run folders, and write one file of all their Gaussians, in the format of its name.
+    """Read model files or run folders and write all their Gaussians to one file, in the format of its name.
 
-    Returns `file`, `format`, `gaussians`, `bytes` and the `bytes_read`.  Raises ConfigError, DataError, OutputError.
+    Returns `file`, `format`, `gaussians`, `bytes`, and `bytes_read`.  Raises ConfigError, DataError, OutputError.
     """
     if not sources:
-        raise ConfigError("convert: expected a model file to read, and one to write")
+        raise ConfigError("convert: give a model file to read and one to write")
     check_output(sources, out)
     writing = writing_options(out, quality)
     return write_model(sources, (changes or Changes()).apply(read(sources)), out, writing)
 
 
 def read(sources: Sequence[Path]) -> Model:
-    """Return one model of all Gaussians of model files or run folders.  Raises DataError."""
-    return merge_models(
-        [load(source, Reading(not_finite="drop")) for source in sources], [str(source) for source in sources]
-    )
+    """Read and merge model files or run folders, without Gaussians that are not finite.  Raises DataError."""
+    models = [load(source, Reading(not_finite="drop")) for source in sources]
+    return merge_models(models, [str(source) for source in sources])
 
 
 def write_model(sources: Sequence[Path], model: Model, out: Path, writing: Writing) -> dict[str, Any]:
-    """Write a model that was read from sources, and return what `convert` does.  Raises OutputError."""
+    """Write a model that was read from `sources`; return the same as `convert`.  Raises OutputError."""
     size = sum(model_bytes(model_path(source)) for source in sources)
     model.save(out, writing)
     kind = writing_format(out).name
@@ -147,21 +145,21 @@ def write_model(sources: Sequence[Path], model: Model, out: Path, writing: Writi
 
 
 def check_output(sources: Sequence[Path], out: Path) -> None:
-    """Raise ConfigError where the file to write is one of those that are read, or belongs to a run."""
+    """Raise ConfigError if the output is one of the sources or belongs to a run."""
     if any(_is_same(out, model_path(source)) for source in sources):
-        raise ConfigError(f"{out}: is one of the files that are read; give another name")
+        raise ConfigError(f"{out}: is one of the input files; give another name")
     check_not_run_file(out)
 
 
 def parse_transform(text: str) -> NDArray[np.float64]:
-    """Return the matrix [4, 4] of words such as `scale=2 rotate=90,0,0 translate=0,1,0`, done from left to right.
+    """Parse a transform such as `scale=2 rotate=90,0,0 translate=0,1,0`, applied from left to right; return [4, 4].
 
-    Rotations are in degrees about x, then y, then z.  12 or 16 numbers, with commas, are a matrix row by row.
+    Rotations are in degrees about x, then y, then z.  12 or 16 comma-separated numbers are a matrix, row by row.
     Raises ConfigError.
     """
     expected = (
-        f"--transform {quote(text)}: expected scale=S, rotate=X,Y,Z (degrees) and translate=X,Y,Z with blanks "
-        "between, or the 12 or 16 numbers of a matrix, row by row"
+        f"--transform {quote(text)}: expected scale=S, rotate=X,Y,Z (degrees), and translate=X,Y,Z separated by "
+        "spaces, or the 12 or 16 numbers of a matrix, row by row"
     )
     try:
         if "=" not in text:
@@ -172,28 +170,28 @@ def parse_transform(text: str) -> NDArray[np.float64]:
             matrix = np.eye(4)
             for part in text.split():
                 word, _, values = part.partition("=")
-                with np.errstate(over="ignore", invalid="ignore"):  # told below
+                with np.errstate(over="ignore", invalid="ignore"):  # checked below
                     matrix = _step(word, [float(value) for value in values.split(",")]) @ matrix
     except ValueError as error:
         raise ConfigError(expected) from error
-    turned = matrix[:3, :3]
-    if not np.abs(matrix).max() < MAX_NUMBER or not (np.abs(turned).max() or 1) > 1 / MAX_NUMBER:
+    linear = matrix[:3, :3]
+    if not np.abs(matrix).max() < MAX_NUMBER or not (np.abs(linear).max() or 1) > 1 / MAX_NUMBER:
         raise ConfigError(
-            f"--transform {quote(text)}: expected a scale from {1 / MAX_NUMBER:g} to {MAX_NUMBER:g}, and a "
-            "translation below that"
+            f"--transform {quote(text)}: expected a scale from {1 / MAX_NUMBER:g} to {MAX_NUMBER:g} and a "
+            "smaller translation"
         )
-    scale2 = turned @ turned.T
+    scale2 = linear @ linear.T
     if (
         not np.allclose(matrix[3], [0, 0, 0, 1])
-        or np.linalg.det(turned) <= 0
+        or np.linalg.det(linear) <= 0
         or not np.allclose(scale2, scale2[0, 0] * np.eye(3), atol=1e-5 * scale2[0, 0])
     ):
-        raise ConfigError(f"--transform {quote(text)}: stretches or mirrors; expected one scale and a rotation")
+        raise ConfigError(f"--transform {quote(text)}: stretches or mirrors; expected a uniform scale and a rotation")
     return matrix
 
 
 def _step(word: str, values: list[float]) -> NDArray[np.float64]:
-    """The matrix of one word.  Raises ValueError."""
+    """Return the matrix of one step of a transform.  Raises ValueError."""
     from scipy.spatial.transform import Rotation
 
     if word not in WORDS or len(values) != (1 if word == "scale" else 3):
@@ -209,48 +207,48 @@ def _step(word: str, values: list[float]) -> NDArray[np.float64]:
 
 
 def parse_crop(text: str) -> tuple[float, ...]:
-    """Return the box of `x0,y0,z0,x1,y1,z1`.  Raises ConfigError."""
+    """Parse a box `x0,y0,z0,x1,y1,z1`.  Raises ConfigError."""
     try:
         box = tuple(float(part) for part in text.split(","))
     except ValueError:
         box = ()
     if len(box) != 6 or not all(low <= high for low, high in zip(box[:3], box[3:], strict=True)):
-        raise ConfigError(f"--crop {quote(text)}: expected x0,y0,z0,x1,y1,z1, the least first, in scene units")
+        raise ConfigError(f"--crop {quote(text)}: expected x0,y0,z0,x1,y1,z1, the minimum first, in scene units")
     return box
 
 
 def check_degree(degree: int | None) -> int | None:
-    """Return an SH degree.  Raises ConfigError for one that there is not."""
+    """Validate an SH degree and return it.  Raises ConfigError."""
     if degree is not None and not 0 <= degree <= MAX_DEGREE:
         raise ConfigError(f"--sh-degree {degree}: expected 0 to {MAX_DEGREE}")
     return degree
 
 
 def _at(model: Model, time: float) -> Model:
-    """A moment of a model that moves.  Raises ConfigError for one that does not, DataError where nothing is shown."""
+    """Return a moving model at one time.  Raises ConfigError for a static one, DataError if nothing is visible."""
     if model.motion is None:
-        raise ConfigError("a moment was asked for, and the model does not move; leave --time and --frames out")
-    shown = model.at(time)
-    if not len(shown):
-        raise DataError(f"none of {len(model):,} Gaussians is shown at the time {time:g}; expected another moment")
-    return shown
+        raise ConfigError("the model does not move; leave out --time and --frames")
+    frame = model.at(time)
+    if not len(frame):
+        raise DataError(f"none of {len(model):,} Gaussians is visible at time {time:g}; give another time")
+    return frame
 
 
 def _is_same(one: Path, other: Path) -> bool:
-    """Whether two names are of one file."""
+    """Return whether two paths are the same file."""
     try:
         return one.samefile(other)
-    except (OSError, ValueError):  # there is no such file
+    except (OSError, ValueError):  # one does not exist
         return False
 
 
-# A moving model as files that stand still: one of a moment, or one of each of many moments.
+# Static models of a moving model, at one time or at many.
 
 MAX_FRAMES = 10_000  # files
 
 
 def check_time(time: float | None) -> float | None:
-    """Return a time.  Raises ConfigError for one that is not of a scene."""
+    """Validate a timestamp and return it.  Raises ConfigError."""
     if time is not None and not is_timestamp(time):
         raise ConfigError(f"--time {time:g}: {EXPECTED_TIME}")
     return time
@@ -259,112 +257,112 @@ def check_time(time: float | None) -> float | None:
 def convert_frames(
     sources: Sequence[Path], out: Path, frames: int, changes: Changes, quality: Quality
 ) -> dict[str, Any]:
-    """Write one static model of each of so many moments, evenly spaced from the first to the last.
+    """Write static models at `frames` timestamps, evenly spaced from start to end.
 
-    out: a folder, in which they are PLYs with a number for a name; or a file, to whose name a number is added.
-    Returns what `convert` does, with the sums over files, the largest number of `gaussians`, and `files`.
+    out: a folder for numbered PLY files, or a file name to which numbers are added.
+    Returns the same as `convert`, with sums over files, the largest number of `gaussians`, and `files`.
     Raises ConfigError, DataError, OutputError.
     """
     if not 2 <= frames <= MAX_FRAMES:
-        raise ConfigError(f"--frames {frames}: expected 2 to {MAX_FRAMES:,} moments; `--time T` writes one")
+        raise ConfigError(f"--frames {frames}: expected 2 to {MAX_FRAMES:,} frames; `--time T` writes one")
     if changes.time is not None:
-        raise ConfigError("--frames and --time: expected one of them")
-    folder, begin, end = _name_of(out)
+        raise ConfigError("--frames and --time: give only one of them")
+    folder, prefix, suffix = _split_name(out)
     digits = max(4, len(str(frames - 1)))
-    places = [folder / f"{begin}{number:0{digits}}{end}" for number in range(frames)]
-    for place in places:
-        check_output(sources, place)
-    _require_no_others(folder, re.compile(re.escape(begin) + r"\d{4,}" + re.escape(end)), places)
-    writing, model = writing_options(places[0], quality), read(sources)
-    moments = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
-    for moment in moments:  # before anything is written
+    files = [folder / f"{prefix}{number:0{digits}}{suffix}" for number in range(frames)]
+    for file in files:
+        check_output(sources, file)
+    _require_no_others(folder, re.compile(re.escape(prefix) + r"\d{4,}" + re.escape(suffix)), files)
+    writing, model = writing_options(files[0], quality), read(sources)
+    changes_by_frame = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
+    for change in changes_by_frame:  # check all before anything is written
         try:
-            moment.apply(model)
+            change.apply(model)
         except DataError as error:
-            raise DataError(f"--frames {frames}: the moment {moment.time:g}: {error}; nothing was written") from error
+            raise DataError(f"--frames {frames}: time {change.time:g}: {error}; nothing was written") from error
     done: list[dict[str, Any]] = []
-    with _all_or_as_before([*places, *map(sky_path, places)]):
-        for place, moment in zip(places, moments, strict=True):
-            done.append(write_model(sources, moment.apply(model), place, replace(writing, quiet=bool(done))))
+    with _restored_on_failure([*files, *map(sky_path, files)]):
+        for file, change in zip(files, changes_by_frame, strict=True):
+            done.append(write_model(sources, change.apply(model), file, replace(writing, quiet=bool(done))))
     return {
         **done[0],
         "file": str(out),
-        "files": [str(place) for place in places],
-        "gaussians": max(one["gaussians"] for one in done),
-        "bytes": sum(one["bytes"] for one in done),
+        "files": [str(file) for file in files],
+        "gaussians": max(result["gaussians"] for result in done),
+        "bytes": sum(result["bytes"] for result in done),
     }
 
 
 @contextmanager
-def _all_or_as_before(places: Sequence[Path]) -> Iterator[None]:
-    """Where the block fails, as on a disk that fills, give places in one folder what they had; a new folder goes.
+def _restored_on_failure(files: Sequence[Path]) -> Iterator[None]:
+    """Restore files in one folder if the block fails, as on a full disk, and remove a new folder.
 
     Raises OutputError.
     """
-    folder = places[0].parent
-    was_there = path_exists(folder)
+    folder = files[0].parent
+    existed = path_exists(folder)
     try:
-        with scratch_folder(folder / "series") as kept, raising_output_error(folder):
-            before = [place for place in places if place.is_file()]
-            for place in before:
-                _keep(place, kept / place.name)
+        with scratch_folder(folder / "series") as backup, raising_output_error(folder):
+            before = [file for file in files if file.is_file()]
+            for file in before:
+                _link_or_copy(file, backup / file.name)
             try:
                 yield
             except BaseException:
-                for place in places:
-                    if place in before:
-                        os.replace(kept / place.name, place)
-                    elif place.is_file():
-                        place.unlink()
+                for file in files:
+                    if file in before:
+                        os.replace(backup / file.name, file)
+                    elif file.is_file():
+                        file.unlink()
                 raise
     finally:
-        if not was_there:
-            with suppress(OSError):  # it is not empty
+        if not existed:
+            with suppress(OSError):  # not empty
                 folder.rmdir()
 
 
-def _keep(place: Path, other: Path) -> None:
-    """Give a file, which is replaced and not changed, another name; where a disk has no links, copy it."""
+def _link_or_copy(file: Path, other: Path) -> None:
+    """Link a file, or copy it on a file system without links; writing replaces files and never changes them."""
     try:
-        os.link(place, other)
+        os.link(file, other)
     except OSError:
-        shutil.copy2(place, other)
+        shutil.copy2(file, other)
 
 
-def _require_no_others(folder: Path, names: re.Pattern[str], places: Sequence[Path]) -> None:
-    """Raise ConfigError where a folder has frames of another series, which a player would take for this one's."""
-    own = {place.name for place in places}
+def _require_no_others(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:
+    """Raise ConfigError if a folder has frames of another series, which a player would show too."""
+    own = {file.name for file in files}
     with raising_output_error(folder):
-        there = sorted(os.listdir(folder)) if folder.is_dir() else []
-    if others := [name for name in there if names.fullmatch(name) and name not in own]:
+        existing = sorted(os.listdir(folder)) if folder.is_dir() else []
+    if others := [name for name in existing if names.fullmatch(name) and name not in own]:
         raise ConfigError(
-            f"{folder / others[0]}: is not of {len(places):,} frames, and would be taken for one; give a new name"
+            f"{folder / others[0]}: is not one of the {len(files):,} frames but looks like one; give a new name"
         )
 
 
-def _name_of(out: Path) -> tuple[Path, str, str]:
-    """The folder of frames, and what stands before and after the number in their names."""
+def _split_name(out: Path) -> tuple[Path, str, str]:
+    """Return the folder of frames, and the text before and after the number in their names."""
     if format_of_name(out) is None and out.suffix == "":
         return out, "", ".ply"
     codec = writing_format(out)
     ending = next((end for end in sorted(codec.endings, key=len, reverse=True) if out.name.lower().endswith(end)), "")
     if not ending.startswith("."):
-        raise ConfigError(f"{out}: --frames adds a number to a name; expected a folder, or a name such as frame.spz")
+        raise ConfigError(f"{out}: --frames adds numbers to a name; give a folder, or a name such as frame.spz")
     return out.parent, f"{out.name[: -len(ending)]}_", out.name[-len(ending) :]
 
 
-# A sky as Gaussians on a far sphere, for programs that know no map of directions.
+# A sky as Gaussians on a distant sphere, for programs without environment maps.
 
-COUNT = 10_000  # Gaussians, 2 degrees from each other
-RADIUS = 10.0  # of the sphere, by the distance that holds SHARE of the model (WildGaussians, Kulhanek et al. 2024)
+COUNT = 10_000  # Gaussians, 2 degrees apart
+RADIUS = 10.0  # of the sphere, relative to the distance of SHARE of the model (WildGaussians, 2024)
 SHARE = 0.97
-WIDTH = 0.65  # standard deviation, by the distance of neighbors: gaps let 2 % through (ours)
-FLAT = 0.1  # standard deviation along the ray, by that across
-LOGIT = 6.0  # of the opacity
+WIDTH = 0.65  # standard deviation, relative to the distance of neighbors; gaps let 2 % of the light through
+FLAT = 0.1  # standard deviation along the ray, relative to that across
+LOGIT = 6.0  # of the opacity of sky Gaussians
 
 
 def with_sky_splats(model: Model, count: int = COUNT) -> Model:
-    """Return a model without a sky, and with Gaussians in its place; one without a sky stays as it is."""
+    """Replace the sky of a model by Gaussians; a model without a sky is returned unchanged."""
     if (sky := model.sky) is None:
         return model
     model = model.baked()
@@ -375,7 +373,7 @@ def with_sky_splats(model: Model, count: int = COUNT) -> Model:
     across = np.log(radius * np.sqrt(4 * np.pi / count) * WIDTH)
     added: dict[str, NDArray[Any]] = {
         "means": center + radius * directions,
-        "quats": _turns(directions),
+        "quats": _rotations_to(directions),
         "log_scales": np.tile([across, across, across + np.log(FLAT)], (count, 1)),
         "logit_opacity": np.full((count, 1), LOGIT),
         "sh_base": (np.clip(sample_texels(sky.texels, directions), 0, 1) - 0.5) / SH_C0,
@@ -389,7 +387,7 @@ def with_sky_splats(model: Model, count: int = COUNT) -> Model:
 
 
 def fibonacci(count: int) -> NDArray[np.float64]:
-    """Return directions that lie evenly on a sphere, unit vectors, [count, 3]."""
+    """Return evenly distributed unit vectors (a Fibonacci sphere), [count, 3]."""
     number = np.arange(count)
     z = 1 - (2 * number + 1) / count
     angle = number * np.pi * (3 - np.sqrt(5))
@@ -397,15 +395,15 @@ def fibonacci(count: int) -> NDArray[np.float64]:
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
 
 
-def _turns(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternions, [N, 4], that turn the z axis into unit vectors."""
+def _rotations_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return quaternions, [N, 4], that rotate the z axis to unit vectors."""
     x, y, z = directions.T
     return np.stack([1 + z, -y, x, np.zeros_like(x)], axis=1)
 
 
-# Gaussians of points.
+# Gaussians from points.
 
-MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
+MIN_DISTANCE2 = 1.0e-7  # scene units², so that coincident points still get a size
 
 
 def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0) -> Parameters:
@@ -425,7 +423,7 @@ def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 
 
 
 def neighbor_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the mean squared distance to the three nearest neighbors, exact, [N] scene units²."""
+    """Return the exact mean squared distance to the three nearest neighbors, [N] scene units²."""
     neighbors = min(4, len(positions))
     if neighbors < 2:
         return np.full(len(positions), 1.0)

@@ -1,9 +1,9 @@
-"""Adam's updates of the harmonics above band 0 that wait until a view sees their Gaussians.
+"""Defer Adam updates of the SH bands above 0 until a view sees their Gaussians.
 
-The update of a value whose gradient is zero depends on nothing but that value, its moments and the factors of the step.
-So a block of Gaussians that no view sees keeps its rows, and has those updates when one sees it, in their order: the
-bits are those of updates at once.  81 % of the numbers of a Gaussian of degree 3 are such; means, scales, quaternions
-and opacities decide what is seen, and move on by their moments while they are not.
+The update of a value with zero gradient only depends on the value, its moments, and the factors of the step.  So rows
+in a block that no view sees wait, and get their updates in order when a view sees the block: the bits are those of
+immediate updates.  This covers 81 % of the numbers of a Gaussian of SH degree 3.  Means, scales, quaternions, and
+opacities are not deferred, because they decide what is seen and keep moving by their moments.
 """
 
 from typing import Any, ClassVar
@@ -16,26 +16,26 @@ from clsplat.gaussians.sh_offload import slot_arguments, slot_defines
 from clsplat.gaussians.structs import HARMONICS
 from clsplat.opencl.device import Array
 
-LONGEST = 32  # updates that wait at most; then all rows have theirs, in one pass over the tables
+LONGEST = 32  # deferred updates at most; then all rows are updated in one pass
 
 
 class Deferred:
-    """The updates that rows of `sh_rest` and of its moments wait for.
+    """The deferred updates of `sh_rest` and its moments.
 
-    Whoever reads the tables otherwise than by the rows that a view sees calls `flush` first, as `Gaussians` does.
+    Any code that reads other rows than those that a view sees calls `flush` first, as `Gaussians` does.
     """
 
     names: ClassVar[tuple[str, ...]] = HARMONICS
 
     def __init__(self, gaussians: Gaussians, longest: int = LONGEST) -> None:
-        """longest: updates that wait at most; results do not depend on it."""
+        """longest: deferred updates at most; results do not depend on it."""
         device = gaussians.device
         self.gaussians, self.longest = gaussians, longest
-        self.updates = 0  # in the list
-        self._degree = 0  # of the harmonics, when they were noted
+        self.updates = 0  # recorded now
+        self._degree = 0  # SH degree of the recorded updates
         self._lanes = int(device.tuning["LANES"])
         self._factors = device.zeros((longest, 2))
-        self._all = device.zeros(self._lanes, np.uint32)  # in the place of the keys of a view
+        self._all = device.zeros(self._lanes, np.uint32)  # replaces the keys of a view
         self._done = device.zeros(self._blocks, np.uint32)
 
     @property
@@ -43,16 +43,16 @@ class Deferred:
         return self.gaussians.capacity // self._lanes
 
     def array(self, name: str) -> Array:
-        """Return one of `names` as it lies: [components, S], in which rows wait."""
+        """Return one of `names`, [components, S], without applying deferred updates."""
         return self.gaussians.tables[name].array
 
     def catch_up(self, depth_key: Array) -> None:
-        """Do what waits for the blocks of rows that a view sees.  depth_key: [S], all ones where it culls."""
+        """Apply deferred updates of the blocks that a view sees.  depth_key: [S], all bits set for culled Gaussians."""
         if self.updates:
             self._replay(depth_key, every=0)
 
     def flush(self) -> None:
-        """Do what waits for all rows."""
+        """Apply deferred updates of all rows."""
         if self.updates:
             on_host = self.gaussians.on_host
             for _ in on_host.parts() if on_host else [None]:
@@ -61,20 +61,20 @@ class Deferred:
             self.updates = 0
 
     def prepare(self, degree: int) -> None:
-        """Make room in the list for an update of the bands up to a degree.
+        """Make room for recording an update of the bands up to `degree`.
 
-        All rows have had what waits where the degree changes, where the list is full, and where rows were moved.
+        All deferred updates are applied if the degree changes or the list is full.
         """
         if self.updates == self.longest or degree != self._degree:
             self.flush()
         self._degree = degree
-        if self._done.shape != (self._blocks,):  # whatever moves rows has flushed
+        if self._done.shape != (self._blocks,):  # rows were moved, after a flush
             self._done = self.gaussians.device.zeros(self._blocks, np.uint32)
 
     def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
-        """Note an update that the blocks of rows that the view sees have had; factors: rate and correction2 of adam.h.
+        """Record an update that the blocks in the view have already had; factors: rate and correction2 of adam.h.
 
-        They must have been brought up to date by `catch_up`, with the same keys.
+        `catch_up` must have been called before, with the same keys.
         """
         self.gaussians.device.program("deferred.cl").note_update(
             items=-(-self.gaussians.count // self._lanes),

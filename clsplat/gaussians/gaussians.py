@@ -1,12 +1,12 @@
-"""Gaussians on the device: a struct of arrays, and the one operation that changes their number.
+"""Store Gaussians on the device as a struct of arrays, with the one operation that changes their number.
 
-Every table is a set of planes [components, capacity] on the device, and [N, components] on the host.  Parameters,
-Adam's moments and statistics are all tables, so that their rows always move together.
+Each table is [components, capacity] on the device and [N, components] on the host.  Parameters, Adam's moments, and
+statistics are all tables, so that their rows always move together.
 
     means [3] scene units · quats [4] (w, x, y, z), unnormalized · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
-    filter_variance [1] scene units², the world filter; zero when there is none, never optimized
-    motion [W] of Gaussians that move (clsplat/formats/splats.py); absent where none does
+    filter_variance [1] scene units², the world filter; zero if there is none, never optimized
+    motion [W] of moving Gaussians (clsplat/formats/splats.py); absent in static models
 """
 
 from collections.abc import Collection, Mapping
@@ -23,17 +23,17 @@ from clsplat.gaussians.sky import DeviceSky
 from clsplat.gaussians.structs import HARMONICS, DeferredUpdates, Struct, check_rows, moment_tables
 from clsplat.opencl.device import Array, Device
 
-# Which parameters of Gaussians are numbers.
+# Finding NaN and infinity.
 
 
 def not_finite(gaussians: Struct) -> list[str]:
-    """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
-    device, found = gaussians.device, set()
+    """Return the names of parameters that have NaN or infinity, or whose moments do."""
+    device, names = gaussians.device, set()
     counters = {name: device.zeros(1, np.uint32) for name in gaussians.trained}
     for name, counter in counters.items():
         for table in gaussians.tables.keys() & {name, *moment_tables(name)}:
             if gaussians.on_host and table in gaussians.on_host:
-                found |= set() if np.isfinite(gaussians.get(table)).all() else {name}
+                names |= set() if np.isfinite(gaussians.get(table)).all() else {name}
                 continue
             device.program("check.cl").count_not_finite(
                 items=(gaussians.count, gaussians.tables[table].components),
@@ -42,15 +42,15 @@ def not_finite(gaussians: Struct) -> list[str]:
                 stride=gaussians.capacity,
                 count=gaussians.count,
             )
-    return [name for name, counter in counters.items() if name in found or counter.get_item(0) > 0]
+    return [name for name, counter in counters.items() if name in names or counter.get_item(0) > 0]
 
 
-# Gaussians that one step of a training leaves out.
+# Dropout of Gaussians in a training step.
 
 
 @dataclass(frozen=True)
 class DropoutMask:
-    """What one step leaves out: each Gaussian with a probability below 1, by (seed, step, row)."""
+    """The Gaussians that one step drops: each with a probability below 1, drawn by (seed, step, row)."""
 
     probability: float
     seed: int
@@ -58,14 +58,14 @@ class DropoutMask:
 
     @property
     def opacity_factor(self) -> float:
-        """Factor of the opacities of the others, which keeps the mean opacity of a Gaussian (Park et al. 2025)."""
+        """The factor on other opacities that conserves a Gaussian's mean opacity (DropGaussian, Park et al. 2025)."""
         return 1 / (1 - self.probability)
 
 
-HIDDEN = "hidden"  # which training views leave a Gaussian out
-INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
-ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
-GROWTH = 1.125  # of the capacity: every edit moves all tables in any case
+HIDDEN = "hidden"  # which training views hide a Gaussian
+INTERVAL2 = "sampling_interval2"  # scene units², smallest over training views; only exists if needed
+ALIGNMENT = 64  # capacity is a multiple of this, so that wide kernels need no tail
+GROWTH = 1.125  # of the capacity; small, since every edit copies all tables anyway
 
 
 @dataclass
@@ -87,8 +87,8 @@ class Gaussians:
         self.capacity = _aligned(self.count)
         self.sh_degree = sh_degree_of(parameters["sh_rest"].shape[1])
         self.tables: dict[str, Table] = {}
-        self.deferred: DeferredUpdates | None = None  # updates that rows wait for
-        self.on_host: HostTables | None = None  # tables that lie on the host
+        self.deferred: DeferredUpdates | None = None  # deferred Adam updates
+        self.on_host: HostTables | None = None  # tables in host memory
         self.no_slot = device.zeros(1, np.uint32)
         for name in PARAMETERS:
             self.add(name, parameters[name].shape[1])
@@ -102,11 +102,11 @@ class Gaussians:
 
     def __getitem__(self, name: str) -> Array:
         if self.on_host and name in self.on_host:
-            raise ConfigError(f"{name} lies in the memory of the host; expected `rasterizer.harmonics: device`")
-        return self._settled(name).array
+            raise ConfigError(f"{name} is in host memory; set `rasterizer.harmonics: device`")
+        return self._up_to_date(name).array
 
-    def _settled(self, name: str) -> Table:
-        """A table whose rows wait for no update."""
+    def _up_to_date(self, name: str) -> Table:
+        """Return a table after applying its deferred updates."""
         if self.deferred and name in self.deferred.names:
             self.deferred.flush()
         return self.tables[name]
@@ -117,7 +117,7 @@ class Gaussians:
         return {name: table.components for name, table in self.tables.items()}
 
     def add(self, name: str, components: int, zero_fresh: bool = False) -> None:
-        """Attach a table of zeros."""
+        """Add a table of zeros."""
         if self.on_host and name in HARMONICS:
             array = self.on_host.add(name, components)
         else:
@@ -125,7 +125,7 @@ class Gaussians:
         self.tables[name] = Table(array, components, zero_fresh)
 
     def move_to_host(self) -> None:
-        """Keep the harmonics above band 0 and their moments on the host; the device has those that a view sees."""
+        """Move the SH bands above 0 and their moments to the host; the device keeps those that a view sees."""
         if self.on_host:
             return
         present = {name: self.get(name) for name in HARMONICS if name in self.tables}
@@ -136,7 +136,7 @@ class Gaussians:
 
     def get(self, name: str) -> NDArray[np.float32]:
         """Copy a table to the host, [N, components]."""
-        table = self._settled(name)
+        table = self._up_to_date(name)
         if self.on_host and name in self.on_host:
             return self.on_host.get(name)
         planes = table.array.get()
@@ -144,7 +144,7 @@ class Gaussians:
 
     def set(self, name: str, values: NDArray[Any]) -> None:
         """Copy [N, components] from the host into a table."""
-        table = self._settled(name)
+        table = self._up_to_date(name)
         if values.shape != (self.count, table.components):
             raise ValueError(f"{name}: expected {(self.count, table.components)}, got {values.shape}")
         if self.on_host and name in self.on_host:
@@ -157,9 +157,9 @@ class Gaussians:
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[Any]) -> None:
         """Write [n, components] from the host into some rows of a table.
 
-        rows: [n] integers, as in `check_rows`.  Raises ValueError for other rows and for values of another shape.
+        rows: [n] integers, see `check_rows`.  Raises ValueError for invalid rows or shapes.
         """
-        table, rows = self._settled(name), check_rows(rows, self.count)
+        table, rows = self._up_to_date(name), check_rows(rows, self.count)
         if values.shape != (len(rows), table.components):
             raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
         if self.on_host and name in self.on_host:
@@ -178,11 +178,11 @@ class Gaussians:
     def zero_rows(self, names: Collection[str], rows: NDArray[np.integer]) -> None:
         """Set some rows of tables to zero.
 
-        rows: [n] integers, as in `check_rows`.  Raises ValueError for other rows.
+        rows: [n] integers, see `check_rows`.  Raises ValueError for invalid rows.
         """
         uploaded = self.device.upload(check_rows(rows, self.count))
         for name in names:
-            table = self._settled(name)
+            table = self._up_to_date(name)
             if self.on_host and name in self.on_host:
                 self.on_host.set_rows(name, rows, np.zeros((len(rows), table.components), np.float32))
                 continue
@@ -195,7 +195,7 @@ class Gaussians:
             )
 
     def lower_sh_degree(self, degree: int) -> None:
-        """Drop the bands of spherical harmonics above a degree, and their moments; a lower degree stays."""
+        """Drop SH bands above a degree, and their moments; a lower degree stays."""
         if degree >= self.sh_degree:
             return
         self.sh_degree, components = degree, 3 * (sh_coefficients(degree) - 1)
@@ -206,30 +206,30 @@ class Gaussians:
 
     @property
     def trained(self) -> tuple[str, ...]:
-        """The names of the tables that training changes: the parameters, and the motion where there is one."""
+        """The names of the tables that training changes: the parameters, and the motion if there is one."""
         return (*PARAMETERS, *([MOTION] if self.is_moving else []))
 
     @property
     def is_moving(self) -> bool:
-        """Whether the Gaussians have a motion."""
+        """Whether the Gaussians move over time."""
         return MOTION in self.tables
 
     @property
     def zero_fresh(self) -> list[str]:
-        """The names of the tables that are zero in fresh rows."""
+        """The names of the tables that are zero in new rows."""
         return [name for name, table in self.tables.items() if table.zero_fresh]
 
     def not_finite(self) -> list[str]:
-        """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
+        """Return the names of parameters that have NaN or infinity, or whose moments do."""
         return not_finite(self)
 
     def rearrange(self, source: Array, fresh: Array, count: int) -> None:
-        """Make row i of every table its row source[i]; set fresh rows of moments and statistics to zero.
+        """Replace row i of every table by its row source[i]; set moments and statistics of fresh rows to zero.
 
         source, fresh: [count] uint32.  The only operation that changes the number of Gaussians.
         """
         capacity = self.capacity
-        self._settled("sh_rest")
+        self._up_to_date("sh_rest")
         if count > capacity:
             widest = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
             roomy = min(int(self.capacity * GROWTH), self.device.info.allocation // widest - ALIGNMENT)
@@ -256,20 +256,20 @@ class Gaussians:
 
 @dataclass
 class DeviceModel:
-    """Gaussians and the numbers with which they are rendered."""
+    """Gaussians on the device and the numbers for rendering them."""
 
     gaussians: Gaussians
     degree: int  # active SH degree
     near: float = 0.2  # scene units
     screen_variance: float = 0.3  # px²
-    compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
-    pixel_box: float = 0.0  # 1: splats are integrated over the box of each pixel instead
-    dropout: DropoutMask | None = None  # of a step
-    sky: DeviceSky | None = None  # behind them, in place of a background of one color
+    compensate: float = 0.0  # 1: the screen filter reduces opacities to conserve energy
+    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead
+    dropout: DropoutMask | None = None  # of this training step
+    sky: DeviceSky | None = None  # behind the Gaussians, instead of a background color
 
     @property
     def defines(self) -> dict[str, int]:
-        """What chooses the programs that project, list and blend these splats."""
+        """The macros of the kernels that project, list, and blend these splats."""
         return ({"PIXEL_BOX": 1} if self.pixel_box else {}) | slot_defines(self.gaussians)
 
 
@@ -277,31 +277,30 @@ def _aligned(count: int) -> int:
     return max(ALIGNMENT, -(-count // ALIGNMENT) * ALIGNMENT)
 
 
-# Gaussians that a picture leaves out: those that a training view hides, and those that a step drops.
+# Gaussians that a render omits: those hidden in a training view, and those dropped in a step.
 
-HIDDEN_VIEWS = 22  # to a component, a whole number that to_VI of lanes.h converts
+HIDDEN_VIEWS = 22  # per component: whole numbers that to_VI in lanes.h converts exactly
 
 
-def hide(gaussians: Gaussians, left_out: NDArray[np.bool_]) -> None:
-    """Write which Gaussians each training view leaves out, [V, N], into the table HIDDEN.
+def hide(gaussians: Gaussians, hidden: NDArray[np.bool_]) -> None:
+    """Write which Gaussians each training view hides, [V, N], into the table HIDDEN.
 
     View v has bit v % HIDDEN_VIEWS of component v // HIDDEN_VIEWS.
     """
-    views, count = left_out.shape
+    views, count = hidden.shape
     bits = np.zeros((count, -(-views // HIDDEN_VIEWS)), np.float32)  # whole numbers
     for view in range(views):
         plane, bit = divmod(view, HIDDEN_VIEWS)
-        bits[:, plane] += left_out[view] * np.float32(1 << bit)
+        bits[:, plane] += hidden[view] * np.float32(1 << bit)
     if HIDDEN not in gaussians.tables:
         gaussians.add(HIDDEN, bits.shape[1])
     gaussians.set(HIDDEN, bits)
 
 
 def visibility_arguments(model: DeviceModel, view: int | None, drawn: Array) -> dict[str, Any]:
-    """Return the arguments of project_forward that leave Gaussians out.
+    """Return the arguments of project_forward that omit Gaussians.
 
-    view: the number of a training view, whose hidden ones are among them; drawn: [S], written where the model has a
-    dropout.
+    view: the index of a training view with hidden Gaussians; drawn: [S], written if the model has a dropout.
     """
     hidden = _hidden(model.gaussians, view)
     if model.dropout is None:
@@ -322,6 +321,10 @@ def visibility_arguments(model: DeviceModel, view: int | None, drawn: Array) -> 
 
 def _hidden(gaussians: Gaussians, view: int | None) -> dict[str, Any]:
     if view is None or HIDDEN not in gaussians.tables:
-        return {"hidden": gaussians["filter_variance"], "hidden_plane": 0, "hidden_bit": 0}  # any table: no bit counts
+        return {
+            "hidden": gaussians["filter_variance"],
+            "hidden_plane": 0,
+            "hidden_bit": 0,
+        }  # any table, since no bit is set
     plane, bit = divmod(view, HIDDEN_VIEWS)
     return {"hidden": gaussians[HIDDEN], "hidden_plane": plane, "hidden_bit": 1 << bit}

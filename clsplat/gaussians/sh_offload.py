@@ -1,8 +1,8 @@
-"""The harmonics above band 0, with their moments, in the memory of the host.
+"""Offload the SH bands above 0 and their moments to host memory.
 
-They are 540 of the 708 bytes of a Gaussian of degree 3 with its moments.  On the device are the blocks of LANES rows
-that a view sees, in slots (cl_kernels/slots.h), in the order of their rows: sent before the view is drawn, and fetched
-when another comes.
+They are 540 of the 708 bytes of a Gaussian of SH degree 3 with its moments.  The device has the blocks of LANES rows
+that a view sees, in slots (cl_kernels/slots.h), in row order: uploaded before the view is rendered, and downloaded
+before the next one.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,22 +15,22 @@ from clsplat.gaussians.structs import Struct
 from clsplat.opencl.device import Array
 
 NO_SLOT = 0xFFFFFFFF  # slots.h
-GROWTH = 1.25  # of the slots, where a view sees more
-FEWEST = 4096  # rows in the slots, as many as are sent at a time where all rows are needed
+GROWTH = 1.25  # of the number of slots, when a view needs more
+MIN_ROWS = 4096  # of the slots; also the rows per upload when all are needed
 
 
 class HostTables:
-    """Tables of a Gaussians struct that lie on the host, [blocks, components, LANES] each; blocks: of LANES rows."""
+    """Tables of Gaussians in host memory, each [blocks, components, LANES]; a block has LANES rows."""
 
     def __init__(self, gaussians: Struct) -> None:
-        """gaussians: they change `tables`, where each of these is its slots."""
+        """gaussians: in its `tables`, each of these tables is replaced by its slots."""
         self.gaussians, self.device = gaussians, gaussians.device
         self.lanes = int(self.device.tuning["LANES"])
         self.tables: dict[str, NDArray[np.float32]] = {}
-        self.held = np.zeros(0, np.int64)  # blocks that have slots, in their order
-        self.slot = self._no_slots()  # of each block
+        self.held = np.zeros(0, np.int64)  # blocks in the slots, in order
+        self.slot = self._no_slots()  # slot of each block
         self._slots = 0
-        self._fetched: dict[str, Callable[[], NDArray[np.float32]]] = {}  # of slots that the device has changed
+        self._fetched: dict[str, Callable[[], NDArray[np.float32]]] = {}  # pending downloads of changed slots
 
     def __contains__(self, name: str) -> bool:
         return name in self.tables
@@ -41,11 +41,11 @@ class HostTables:
 
     @property
     def block(self) -> int:
-        """Values of a block of the harmonics in its slot."""
+        """The number of SH values in a slot."""
         return int(self.tables["sh_rest"].shape[1]) * self.lanes
 
     def add(self, name: str, components: int) -> Array:
-        """Attach a table of zeros; return its slots."""
+        """Add a table of zeros; return its slots."""
         self.put_back()
         self._forget_slots()
         self.tables[name] = np.zeros((self._blocks, components, self.lanes), np.float32)
@@ -68,18 +68,18 @@ class HostTables:
         self.tables[name] = np.ascontiguousarray(rows.reshape(self._blocks, self.lanes, components).transpose(0, 2, 1))
 
     def bring(self, depth_key: Array) -> None:
-        """Send the blocks of rows that a view sees.  depth_key: [S], all ones where it culls.  Waits for the device."""
+        """Upload the blocks that a view sees and wait.  depth_key: [S], all bits set for culled Gaussians."""
         rows = self._blocks * self.lanes
         seen = (depth_key.get()[:rows] != NO_SLOT).reshape(-1, self.lanes).any(axis=1)
         self.load(np.flatnonzero(seen))
 
     def load(self, blocks: NDArray[np.int64]) -> None:
-        """Put these blocks, in growing order, into the slots."""
+        """Load these blocks, in ascending order, into the slots."""
         self.put_back()
         if np.array_equal(blocks, self.held):
             return
         if len(blocks) > self._slots:
-            self._slots = max(int(GROWTH * len(blocks)), FEWEST // self.lanes)
+            self._slots = max(int(GROWTH * len(blocks)), MIN_ROWS // self.lanes)
             for name, table in self.tables.items():
                 held = self.gaussians.tables[name]
                 held.array = self.device.empty(0)  # released before its successor is allocated
@@ -92,31 +92,31 @@ class HostTables:
         self.held = blocks
 
     def begin_to_fetch(self) -> None:
-        """Fetch the slots, which the device has changed, after all that is enqueued so far."""
+        """Start to download the slots after the commands enqueued so far."""
         self._fetched = {name: self._part(name, len(self.held)).get_later() for name in self.tables}
 
     def put_back(self) -> None:
-        """Write what was fetched into the tables; waits for it."""
+        """Wait for the download and write it into the tables."""
         for name, values in self._fetched.items():
             self.tables[name][self.held] = values()
         self._fetched = {}
 
     def parts(self) -> Iterator[None]:
-        """Have all blocks in the slots, some at a time; then those that were there."""
-        before, some = self.held, max(self._slots, FEWEST // self.lanes)
-        for first in range(0, self._blocks, some):
-            self.load(np.arange(first, min(first + some, self._blocks)))
+        """Load all blocks into the slots, some at a time, and finally those loaded before."""
+        before, size = self.held, max(self._slots, MIN_ROWS // self.lanes)
+        for first in range(0, self._blocks, size):
+            self.load(np.arange(first, min(first + size, self._blocks)))
             yield
         self.load(before)
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.float32]) -> None:
-        """Write [n, components] into some rows, [n], of a table."""
+        """Write [n, components] into rows, [n], of a table."""
         table = self.get(name)
         table[rows] = values
         self.set(name, table)
 
     def rearranged(self, source: NDArray[np.uint32], fresh: NDArray[np.uint32]) -> dict[str, NDArray[np.float32]]:
-        """Return the tables as `Gaussians.rearrange` makes them, [rows, components]."""
+        """Return the tables after `Gaussians.rearrange`, [rows, components]."""
         tables = {name: self.get(name)[source] for name in self.tables}
         for name, table in tables.items():
             if self.gaussians.tables[name].zero_fresh:
@@ -124,7 +124,7 @@ class HostTables:
         return tables
 
     def _part(self, name: str, count: int) -> Array:
-        """The first slots of a table."""
+        """Return the first slots of a table."""
         slots = self.gaussians.tables[name].array
         return Array(self.device, slots.buffer, (count, *slots.shape[1:]), slots.dtype)
 
@@ -136,12 +136,12 @@ class HostTables:
 
 
 def slot_arguments(gaussians: Struct) -> dict[str, Any]:
-    """Return the arguments of kernels that say where the harmonics lie (cl_kernels/slots.h)."""
+    """Return the kernel arguments that locate the SH (cl_kernels/slots.h)."""
     if gaussians.on_host:
         return {"sh_slot": gaussians.on_host.slot, "sh_block": gaussians.on_host.block}
     return {"sh_slot": gaussians.no_slot, "sh_block": 0}
 
 
 def slot_defines(gaussians: Struct) -> dict[str, int]:
-    """Return what chooses the programs that find the harmonics there."""
+    """Return the macros of kernels that read SH from slots."""
     return {"SH_SLOTS": 1} if gaussians.on_host else {}

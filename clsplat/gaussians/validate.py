@@ -1,4 +1,4 @@
-"""Look at a model file: what it is, whether its numbers can be, and how many of its Gaussians show nothing."""
+"""Inspect a model file: its format, invalid values, and degenerate Gaussians."""
 
 from pathlib import Path
 from typing import Any
@@ -11,40 +11,40 @@ from clsplat.formats.streamed_sog import LOD_META, find_level_faults
 from clsplat.formats.table import detect, format_of_name, model_file
 from clsplat.gaussians.model import Model, load
 
-ENOUGH = 16  # Gaussians, from which their numbers tell something
-FLAT = 1e-6  # scene units: a smaller scale is that of a disc or a needle
-FAINT = 0.999 / 255  # opacity: less is not drawn
-LARGE = 0.05  # of the model's extent: linear scales, taken for logarithms, become larger
+ENOUGH = 16  # Gaussians needed for statistics
+FLAT = 1e-6  # scene units; smaller scales are those of discs or needles
+FAINT = 0.999 / 255  # opacities below are not rendered
+LARGE = 0.05  # relative to the extent; linear scales misread as logarithms exceed it
 NEARLY_ALL = 0.99
 DEGENERATE = {"not_finite": "not finite", "no_rotation": "without rotation", "flat": "flat", "invisible": "invisible"}
 
 
 def is_model(path: Path) -> bool:
-    """Return whether a path is a model, by its content or its name; pipeline files are none."""
-    place = model_file(path)
-    if place.suffix in (".yaml", ".yml"):
+    """Return whether a path is a model, by content or name; pipeline files are not."""
+    file = model_file(path)
+    if file.suffix in (".yaml", ".yml"):
         return False
-    return bool(format_of_name(place) or (place.is_file() and detect(place)))
+    return bool(format_of_name(file) or (file.is_file() and detect(file)))
 
 
 def examine(path: Path) -> dict[str, Any]:
-    """Return what a model file holds: `model` (its path), `format`, `gaussians`, `sh_degree`, `mode`, if it `moves`,
-    `ranges`, `bounds` in scene units, `degenerate` counts, `findings` in words, if it is `valid`: without them.
+    """Summarize a model file: `model` (its path), `format`, `gaussians`, `sh_degree`, `mode`, `moves`, `ranges`,
+    `bounds` in scene units, counts of `degenerate` Gaussians, `findings` as text, and `valid` (no findings).
 
-    Raises DataError where it cannot be read.
+    Raises DataError if it cannot be read.
     """
     codec = detect(model_file(path))
     model = load(path, Reading(not_finite="keep"))
     bad = not_finite(model.tables())
     whole = model[~bad] if bad.any() else model
-    findings = [f"{int(bad.sum()):,} of {len(model):,} Gaussians hold values that are not finite"] if bad.any() else []
-    findings += [told] if (told := too_large_message(whole.tables())) else []
+    findings = [f"{int(bad.sum()):,} of {len(model):,} Gaussians have values that are not finite"] if bad.any() else []
+    findings += [message] if (message := too_large_message(whole.tables())) else []
     findings += _activated(whole)
     length = np.linalg.norm(whole.quats.astype(np.float64), axis=1)
     if zero := int((length == 0).sum()):
-        findings.append(f"{zero} quaternions have no length")
+        findings.append(f"{zero} quaternions have length 0")
     if not len(model):
-        findings.append("it holds no Gaussians")
+        findings.append("it has no Gaussians")
     if model_file(path).name == LOD_META:
         findings += find_level_faults(model_file(path))
     return {
@@ -69,7 +69,7 @@ def examine(path: Path) -> dict[str, Any]:
 
 
 def lines(found: dict[str, Any]) -> str:
-    """Return what `examine` found, a line for each fact."""
+    """Format the result of `examine`, one line per fact."""
     marks = " (mip)" * (found["mode"] == "mip") + " (filter_3D)" * found["world_filter"] + " (moves)" * found["moves"]
     rows = [
         f"{found['model']}: {found['format']}, {found['gaussians']:,} Gaussians, SH degree {found['sh_degree']}{marks}"
@@ -85,37 +85,37 @@ def lines(found: dict[str, Any]) -> str:
 
 
 def verdict(found: dict[str, Any]) -> str:
-    """Return a sentence about what `examine` found."""
+    """Summarize the result of `examine` in one sentence."""
     if found["valid"]:
         return f"{found['model']}: valid"
     if not found["gaussians"]:
-        return f"{found['model']}: it holds no Gaussians; export it again"
+        return f"{found['model']}: it has no Gaussians; export it again"
     remedy = "write it again" if found["format"] == "streamed SOG" else "export it again"
     if found["degenerate"]["not_finite"]:
-        remedy += ", or drop those that are not finite with `clsplat convert`"
+        remedy += ", or drop invalid Gaussians with `clsplat convert`"
     return f"{found['model']}: {'; '.join(found['findings'])}; {remedy}"
 
 
 def _activated(model: Model) -> list[str]:
-    """What looks as if it were activated already, which viewers do again."""
+    """Return findings about values that look already activated."""
     if len(model) < ENOUGH:
         return []
-    found = []
+    findings = []
     extent = float(np.linalg.norm(np.ptp(model.means.astype(np.float64), axis=0)))
     middle = float(np.exp(min(float(np.median(model.log_scales)), 80)))
     if (model.log_scales >= 0).mean() > NEARLY_ALL and middle > LARGE * extent:
-        found.append("its scales look like scales, not logarithms of them")
+        findings.append("its scales look linear, not logarithmic")
     logit = model.logit_opacity
     if ((logit >= 0) & (logit <= 1)).mean() > NEARLY_ALL:
-        found.append("its opacities look like opacities, not logits of them")
+        findings.append("its opacities look like opacities, not logits")
     base = model.sh_base
     if ((base >= 0) & (base <= 1)).mean() > NEARLY_ALL and np.ptp(base) > 0:
-        found.append("its base colors look like colors, not coefficients around gray")
-    return found
+        findings.append("its base colors look like colors, not SH coefficients")
+    return findings
 
 
 def _ranges(model: Model) -> dict[str, list[float]]:
-    """Least, median and largest of each quantity after activation."""
+    """Return minimum, median, and maximum of each quantity after activation."""
     with np.errstate(over="ignore"):
         scales = np.exp(np.minimum(model.log_scales.astype(np.float64), 700))
     quantities: dict[str, NDArray[Any]] = {

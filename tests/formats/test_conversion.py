@@ -83,11 +83,14 @@ def test_every_number_of_a_merged_model_that_is_not_kept_is_said(tmp_path, rng, 
     a, b, c = (tmp_path / f"{name}.ply" for name in "abc")
     clsplat.convert([a, b, c], tmp_path / "d.ply")
     assert caplog.messages == [
-        f"{b}: has near = 5.0, screen_variance = 0.1, background = white, alpha = mask; what {a} says is kept"
+        f"{b}: has near = 5.0, screen_variance = 0.1, background = white, alpha = mask; the values of {a} are used"
     ]
     caplog.clear()
     clsplat.convert([b, a], tmp_path / "d.ply")
-    assert "has near = 0.2, screen_variance = 0.3, background = not given, alpha = transparency; what" in caplog.text
+    assert (
+        "has near = 0.2, screen_variance = 0.3, background = not given, alpha = transparency; the values of"
+        in caplog.text
+    )
 
 
 EXTREME = {
@@ -145,7 +148,7 @@ def test_faint_opacities_keep_their_digits():
 
 def test_a_mip_model_is_not_merged_with_another(source, tmp_path, rng):
     write(tmp_path / "b.ply", splats(rng, 30, 1, "mip"))
-    with pytest.raises(DataError, match=r"b\.ply: is a mip model, .*a\.ply is none; expected the same"):
+    with pytest.raises(DataError, match=r"b\.ply: is a mip model, .*a\.ply is a plain model; merge only"):
         clsplat.convert([source, tmp_path / "b.ply"], tmp_path / "c.ply")
 
 
@@ -191,7 +194,11 @@ def test_a_wrong_option_is_refused_before_anything_is_written(option, text, sour
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("b.glb", {"quality": "small"}, r"b\.glb: --quality is of SPZ and SOG; expected a name that ends in \.spz or "),
+        (
+            "b.glb",
+            {"quality": "small"},
+            r"b\.glb: --quality is only for SPZ and SOG; give a name that ends in \.spz or ",
+        ),
         ("b.compressed.ply", {}, "compressed PLY can be read but not written"),
         ("b.xyz", {}, r"no format has the name 'b.xyz'; give a name that ends in \.ply, "),
         ("b.ply", {"sh_degree": 4}, "expected 0 to 3"),
@@ -217,7 +224,7 @@ def test_no_input_is_written_over(source, tmp_path, rng):
         ([tmp_path / "b.ply", source], source),
         (tmp_path / "f", tmp_path / "f" / "meta.json"),
     ]:
-        with pytest.raises(ConfigError, match="is one of the files that are read; give another name"):
+        with pytest.raises(ConfigError, match="is one of the input files; give another name"):
             clsplat.convert(sources, out, sh_degree=0)
     assert source.read_bytes() == data
     assert (tmp_path / "link.ply").is_symlink()
@@ -317,7 +324,7 @@ def test_a_run_folder_stands_for_its_model(source, tmp_path):
     (tmp_path / "point_cloud.ply").write_bytes(source.read_bytes())
     (tmp_path / "log.txt").write_bytes(bytes(5000))
     assert clsplat.convert(tmp_path, tmp_path / "b.spz")["bytes_read"] == source.stat().st_size
-    with pytest.raises(ConfigError, match="is one of the files that are read"):
+    with pytest.raises(ConfigError, match="is one of the input files"):
         clsplat.convert(tmp_path, tmp_path / "point_cloud.ply")
 
 
@@ -370,16 +377,16 @@ def test_check_counts_what_shows_nothing(tmp_path, rng):
     found = clsplat.check(tmp_path / "a.ply")
     assert found["degenerate"] == {"not_finite": 1, "no_rotation": 1, "flat": 1, "invisible": 3}
     assert not found["valid"]
-    assert "1 of 40 Gaussians hold values that are not finite; 1 quaternions have no length" in verdict(found)
+    assert "1 of 40 Gaussians have values that are not finite; 1 quaternions have length 0" in verdict(found)
     json.dumps(found, allow_nan=False)
 
 
 @pytest.mark.parametrize(
     ("table", "values", "words"),
     [
-        ("log_scales", (0.5, 3.0), "not logarithms"),
+        ("log_scales", (0.5, 3.0), "not logarithmic"),
         ("logit_opacity", (0.01, 0.99), "not logits"),
-        ("sh_base", (0.1, 0.9), "not coefficients"),
+        ("sh_base", (0.1, 0.9), "not SH coefficients"),
     ],
 )
 def test_check_sees_activations_that_were_applied_already(table, values, words, tmp_path, rng):
@@ -394,7 +401,7 @@ def test_a_format_that_knows_no_empty_model_refuses_one(name, tmp_path, rng):
     with pytest.raises(DataError, match="the model has no Gaussians; only a PLY can be empty"):
         write(tmp_path / name, splats(rng, 0))
     write(tmp_path / "a.ply", splats(rng, 0))
-    assert verdict(clsplat.check(tmp_path / "a.ply")).endswith("it holds no Gaussians; export it again")
+    assert verdict(clsplat.check(tmp_path / "a.ply")).endswith("it has no Gaussians; export it again")
 
 
 def test_bright_colors_are_coefficients(tmp_path, rng):

@@ -219,8 +219,8 @@ REFUSED = {
     "count": ({"count": 10**8}, "declares 100000000 splats"),
     "no count": ({"count": None}, "count is None; expected a whole number"),
     "version": ({"version": 3}, "version 3; expected 1 or 2"),
-    "path": ({"means__files": ["../means_l.webp", "x"]}, "the name of a file beside it"),
-    "names": ({"means__files": 3}, "expected the names of one or two files"),
+    "path": ({"means__files": ["../means_l.webp", "x"]}, "the name of a file in the same folder"),
+    "names": ({"means__files": 3}, "expected one or two file names"),
     "one file": ({"means__files": ["means_l.webp"]}, "names 1 files"),
     "missing": ({"quats__files": ["other.webp"]}, "cannot be read"),
     "codebook": ({"scales__codebook": [1.0] * 255}, "expected 256 numbers"),
@@ -229,7 +229,7 @@ REFUSED = {
     "bands": ({"shN__bands": 4}, "from 1 to 3"),
     "palette": ({"shN__count": 2**40}, "shN.count is 1099511627776; expected a whole number from 1 to 65536"),
     "longer palette": ({"shN__count": 60000}, "centroids of shN has .* px; expected 180000 to"),
-    "shorter palette": ({"shN__count": 2}, r"labels of shN name \d+ centroids; shN.count is 2"),
+    "shorter palette": ({"shN__count": 2}, r"labels of shN use \d+ centroids, but shN.count is 2"),
     "not JSON": ({"means": 3}, "has no 'means'"),
 }
 
@@ -290,7 +290,7 @@ def test_a_bundle_that_is_compressed_in_another_way_is_refused(tmp_path, rng):
     path = tmp_path / "a.sog"
     write(path, splats(rng, 100, 1))
     repacked(path, zipfile.ZIP_LZMA)
-    with pytest.raises(DataError, match=r"'meta.json' is compressed in another way; expected .* stored or deflated"):
+    with pytest.raises(DataError, match=r"'meta.json' uses an unsupported compression; expected .* stored or deflated"):
         read(path)
     repacked(path, zipfile.ZIP_DEFLATED)
     assert len(read(path)) == 100

@@ -83,7 +83,9 @@ def test_positions_get_the_bits_that_they_need(tmp_path, rng, caplog):
         warned = [record for record in caplog.records if record.levelname == "WARNING"]
         assert (lost in caplog.text) == bool(warned) == (fraction < 12)
     source.parameters["means"][0] = 8388608.0
-    with pytest.raises(DataError, match=r"SPZ holds positions to 8388607; the model has 8\.38861e\+06: crop it"):
+    with pytest.raises(
+        DataError, match=r"SPZ stores positions up to 8388607, but the model has 8\.38861e\+06; crop it"
+    ):
         write(tmp_path / "a.spz", source)
     source = splats(rng, 50)
     fine = there_and_back(tmp_path / "a.spz", source, Writing(quality="high")).parameters["means"]

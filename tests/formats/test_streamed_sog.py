@@ -239,7 +239,7 @@ def test_an_environment_is_part_of_the_model(written, rng):
 WRONG = {
     "another version": ({"version": 2}, "of version 2; expected 1"),
     "no names": ({"filenames": None}, "filenames is None"),
-    "a name twice": ({"filenames": ["0_0/meta.json", "0_0/meta.json"]}, "each once"),
+    "a name twice": ({"filenames": ["0_0/meta.json", "0_0/meta.json"]}, "distinct file names"),
     "a name that leads out": ({"filenames": ["../meta.json"]}, "expected a meta.json in a folder below"),
     "an absolute name": ({"filenames": ["/etc/meta.json"]}, "expected a meta.json in a folder below"),
     "a NUL in a name": ({"filenames": ["0_0/meta.json", "\0/meta.json"]}, "expected a meta.json in a folder below"),
@@ -253,9 +253,9 @@ WRONG = {
         {"filenames": [f"{i}_9/meta.json" for i in range(20)]},
         "_9/meta.json: cannot be read (No such file",
     ),
-    "too few names": ({"filenames": []}, "name a file of level 0 that it has not"),
+    "too few names": ({"filenames": []}, "refers to a missing file of level 0"),
     "no counts": ({"counts": []}, "expected a number for each of 1 to 64 levels"),
-    "more levels than are declared": ({"lodLevels": 2}, "lodLevels is 2; expected 3, as it has counts"),
+    "more levels than are declared": ({"lodLevels": 2}, "lodLevels is 2; expected 3, the number of counts"),
     "more levels than there can be": (
         {"counts": [0] * 65, "lodLevels": 65},
         "expected a number for each of 1 to 64 levels",
@@ -263,14 +263,14 @@ WRONG = {
     "no number of levels": ({"lodLevels": None}, "lodLevels is None; expected 3"),
     "a level beyond": (
         {"counts": [700, 300], "lodLevels": 2},
-        "a leaf names level '2'; expected 0 to 1",
+        "a leaf refers to level '2'; expected 0 to 1",
     ),
-    "another count": ({"counts": [701, 0, 0]}, "declares 701 splats of level 0; its leaves have 700"),
+    "another count": ({"counts": [701, 0, 0]}, "declares 701 splats of level 0, but its leaves have 700"),
     "no tree": ({"tree": 7}, "a node of its tree is 7"),
-    "an empty tree": ({"tree": {"children": []}}, "name no file of level 0"),
+    "an empty tree": ({"tree": {"children": []}}, "have no file of level 0"),
     "no number": ({"tree": {"lods": {"0": {"file": 0, "offset": "0", "count": 1}}}}, "offset of a leaf is '0'"),
     "a negative number": ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": -1}}}}, "count of a leaf is -1"),
-    "beyond its file": ({"tree": {"lods": {"0": {"file": 0, "offset": 10**6, "count": 1}}}}, "which holds"),
+    "beyond its file": ({"tree": {"lods": {"0": {"file": 0, "offset": 10**6, "count": 1}}}}, "which has"),
     "a run twice": ({"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 9}}}] * 2}}, "in other"),
 }
 
@@ -331,6 +331,6 @@ def test_check_names_each_missing_or_damaged_level_file(written):
     missing, damaged, count, spare = found["findings"]
     assert missing.startswith(f"{folder / coarse[0]}: cannot be read (No such file")
     assert str(folder / coarse[1]) in damaged
-    assert "splats of level 2; its leaves have 100" in count
+    assert "splats of level 2, but its leaves have 100" in count
     assert spare.startswith(f"{folder / 'more'}")
     assert verdict(found).endswith("; write it again")
