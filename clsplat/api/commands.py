@@ -381,13 +381,15 @@ def convert(
     drop_below: float = 0.0,
     time: float | None = None,
     frames: int | None = None,
+    world: bool = False,
 ) -> dict[str, Any]:
     """Merge models and write them as one file, in the format of its name; return `format`, `gaussians`, `bytes`.
 
-    crop: x0, y0, z0, x1, y1, z1 in scene units, after `transform`, such as "scale=2 rotate=90,0,0" (degrees);
+    crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`, such as "scale=2 rotate=90,0,0" (degrees);
     drop_below: an opacity.  Gaussians that are not finite are dropped.
     time: write a moving model as a static one, at this time from 0 to 1; frames: write this number of files, one per
-    timestamp: `out` is a folder, for PLY, or a file name to which the numbers are added.
+    timestamp: `out` is a folder, for PLY, or a file name to which the numbers are added; world: write world coordinates
+    instead of an origin.
     """
     from clsplat.gaussians import conversion
     from clsplat.gaussians.conversion import check_time, convert_frames
@@ -403,6 +405,7 @@ def convert(
         None if box is None else conversion.parse_crop(box),
         conversion.check_degree(sh_degree),
         check_time(time),
+        world,
     )
     if frames is not None:
         return convert_frames(files, Path(out), frames, changes, quality)

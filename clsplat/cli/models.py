@@ -135,7 +135,8 @@ def convert(
         Literal["small", "balanced", "high"], typer.Option(help="SPZ, SOG: precision of the values.")
     ] = "balanced",
     crop: Annotated[
-        str | None, typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep the Gaussians in this box, after --transform.")
+        str | None,
+        typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep this box, in world coordinates after --transform."),
     ] = None,
     transform: Annotated[
         str | None,
@@ -151,6 +152,7 @@ def convert(
         int | None,
         typer.Option(metavar="N", help="Moving model: write N files, one per timestamp; OUT: a folder, or frame.spz."),
     ] = None,
+    world: Annotated[bool, typer.Option("--world", help="Write world coordinates instead of an origin.")] = False,
 ) -> None:
     """Convert models to another format: PLY, SPZ, SOG, glTF and others."""
     done = commands.convert(
@@ -163,6 +165,7 @@ def convert(
         drop_below=drop_below,
         time=time,
         frames=frames,
+        world=world,
     )
     share = 100 * done["bytes"] / max(done["bytes_read"], 1)
     size = f"{done['bytes'] / 1e6:.3g} MB, {share:,.1f} % of what was read"

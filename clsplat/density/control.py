@@ -82,9 +82,9 @@ class Box(Settings):
     """An axis-aligned box; adjacent boxes share no point, since it includes only its lower faces."""
 
     low: Corner = Field(default=[None, None, None])
-    """Smallest x, y and z, scene units, inclusive; null: no bound."""
+    """Smallest x, y and z, in the dataset's coordinates, inclusive; null: no bound."""
     high: Corner = Field(default=[None, None, None])
-    """Largest x, y and z, scene units, exclusive; null: no bound."""
+    """Largest x, y and z, in the dataset's coordinates, exclusive; null: no bound."""
 
     @model_validator(mode="after")
     def _with_room(self) -> "Box":
@@ -92,6 +92,16 @@ class Box(Settings):
             if low is not None and high is not None and not low < high:
                 raise ValueError(f"expected 'low' below 'high' on each axis, got {low:g} and {high:g} for {name}")
         return self
+
+    def shifted(self, origin: NDArray[np.floating]) -> "Box":
+        """Return the box in coordinates whose zero is at `origin`, [3] in the present coordinates."""
+        if not origin.any():
+            return self
+        low, high = (
+            [None if one is None else float(one - by) for one, by in zip(corner, origin, strict=True)]
+            for corner in (self.low, self.high)
+        )
+        return self.model_copy(update={"low": low, "high": high})
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return which points, [N, 3] scene units, are inside, [N]; NaN never is."""

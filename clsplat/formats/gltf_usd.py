@@ -68,7 +68,7 @@ class Gltf:
                     placements.append(matrix)
         if not self.primitives:
             raise DataError(f"{path}: has no Gaussians ({EXTENSION}); export it again with that extension")
-        if any(not np.allclose(matrix, placements[0]) for matrix in placements):
+        if any(not np.allclose(matrix, placements[0], rtol=1e-7) for matrix in placements):
             raise DataError(f"{path}: its Gaussians have different transforms; export them separately and merge them")
         if not np.allclose(placements[0], np.eye(4)):
             self.placement = FLIP @ placements[0] @ FLIP
@@ -193,8 +193,11 @@ def read_glb(path: Path) -> SplatFile:
         raise DataError(f"{path}: its parts have different SH degrees; export them separately")
     parameters = flip_axes({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
     ours = extras.get("clsplat") if isinstance(extras, dict) else None
-    rendering = check_rendering(path, ours) if isinstance(ours, dict) else {}
-    return SplatFile(parameters, rendering, "mip" if rendering.get("compensate") else "default", found.placement)
+    rendering, placement = check_rendering(path, ours) if isinstance(ours, dict) else {}, found.placement
+    if rendering.pop("origin", None) and placement is not None:  # the node has it, where others may have changed it
+        rendering["origin"] = placement[:3, 3].tolist()
+        placement[:3, 3] = 0
+    return SplatFile(parameters, rendering, "mip" if rendering.get("compensate") else "default", placement)
 
 
 def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
@@ -235,6 +238,8 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
         "bufferViews": views,
         "buffers": [{"byteLength": start}],
     }
+    if origin := _origin(splats):
+        tree["nodes"] = [{"mesh": 0, "translation": origin}]
     text = json.dumps(tree, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     with open_hashed(path) as file:
@@ -243,6 +248,12 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
         for block in blocks:
             file.write(block)
     return file.sha256
+
+
+def _origin(splats: SplatFile) -> list[float] | None:
+    """Return the origin of a model in the axes of glTF; None if it has none."""
+    origin: list[float] | None = splats.rendering.get("origin")
+    return origin and (np.diag(FLIP)[:3] * origin).tolist()
 
 
 def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
@@ -355,6 +366,9 @@ def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
     with open_hashed(path) as file:
         file.write(START.encode())
         file.write(f"    uniform int radiance:sphericalHarmonicsDegree = {splats.sh_degree}\n".encode())
+        if origin := _origin(splats):
+            file.write(f"    double3 xformOp:translate = {tuple(origin)}\n".encode())
+            file.write(b'    uniform token[] xformOpOrder = ["xformOp:translate"]\n')
         for name, table in tables.items():
             _array(file, name, table)
         file.write(b"}\n")

@@ -217,10 +217,10 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     names += [FILTER] if "filter_variance" in parameters else []
     names += motion_columns(parameters[MOTION].shape[1]) if MOTION in parameters else ()
+    types = dict.fromkeys("xyz", "double") if parameters["means"].dtype == np.float64 else {}
+    properties = [f"{types.get(name, 'float')} {name}" for name in names]
     with open_hashed(path) as file:
-        file.write(
-            format_ply_header(rendering_comments(rendering), vertex=(count, (f"float {name}" for name in names)))
-        )
+        file.write(format_ply_header(rendering_comments(rendering), vertex=(count, properties)))
         for first in range(0, count, ROWS):
             file.write(_body({name: table[first : first + ROWS] for name, table in parameters.items()}))
     return file.sha256
@@ -229,8 +229,9 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
 def _body(parameters: Parameters) -> bytes:
     """Return the rows of a file as bytes."""
     count, rest = parameters["sh_rest"].shape
+    means = parameters["means"]
     blocks = [
-        parameters["means"],
+        means.astype("<f8").view("<f4") if means.dtype == np.float64 else means,  # a double in two columns
         np.zeros((count, 3), np.float32),
         parameters["sh_base"],
         reorder_columns(parameters["sh_rest"], rest // 3, 3),
@@ -273,6 +274,9 @@ def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
                 f"{path}: its comment says {name} = {quote(value)}; expected a number from 0 to {MAX_NUMBER:g}; "
                 "export it again, or correct that line"
             )
+    origin = values.get("origin", [0, 0, 0])
+    if not (isinstance(origin, list) and len(origin) == 3 and all(map(_is_coordinate, origin))):
+        raise DataError(f"{path}: its comment has the origin {quote(origin)}; expected 3 numbers: export it again")
     try:
         json.dumps(values, allow_nan=False)
     except (ValueError, RecursionError) as error:
@@ -280,6 +284,10 @@ def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
             f"{path}: its comment is not valid JSON ({quote(error)}); export it again, or correct it"
         ) from error
     return values
+
+
+def _is_coordinate(value: Any) -> bool:
+    return isinstance(value, int | float) and abs(value) < MAX_NUMBER
 
 
 def _read(path: Path, file: BinaryIO, header: PlyHeader) -> Parameters:
@@ -314,6 +322,9 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
             f"{path}: has {rest} f_rest properties; expected 0, 9, 24, or 45, numbered from 0; export it again"
         )
     parameters = {name: _columns(vertices, columns) for name, columns in columns_of.items()}
+    if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, which a float cannot hold
+        wide = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
+        parameters["means"] = np.where(np.isfinite(parameters["means"]), wide, parameters["means"])
     by_channel = _columns(vertices, columns)
     per_channel = sh_coefficients(degree) - 1
     parameters["sh_rest"] = reorder_columns(by_channel, 3, per_channel)

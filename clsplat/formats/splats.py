@@ -135,6 +135,7 @@ class Writing:
 
     quality: Quality = "balanced"  # SPZ and SOG
     quiet: bool = False  # do not warn about what the format does not store
+    world: bool = False  # positions in world coordinates, instead of an origin
 
 
 def sh_coefficients(degree: int) -> int:

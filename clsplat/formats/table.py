@@ -65,6 +65,8 @@ class Codec:
     keeps_mode: bool = True  # whether a model is a mip model
     keeps_numbers: bool = False  # numbers for rendering
     keeps_nan: bool = False
+    keeps_origin: bool = False  # in another place than the numbers for rendering
+    keeps_doubles: bool = False  # positions in float64
     has_quality: bool = False  # writing uses Writing.quality
 
 
@@ -107,6 +109,7 @@ CODECS = (
         keeps_motion=True,
         keeps_numbers=True,
         keeps_nan=True,
+        keeps_doubles=True,
     ),
     Codec(
         "compressed PLY",
@@ -155,6 +158,7 @@ CODECS = (
         None,
         write_usda,
         keeps_mode=False,
+        keeps_origin=True,
     ),
     Codec(
         "ksplat",
@@ -249,7 +253,7 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
 
 
 def warn_about_losses(path: Path, splats: SplatFile) -> None:
-    """Warn if the format of a file name does not store the mip mark or the numbers for rendering."""
+    """Warn if the format of a file name does not store the mip mark, the numbers for rendering, or the origin."""
     codec = writing_format(path)
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning(
@@ -259,6 +263,11 @@ def warn_about_losses(path: Path, splats: SplatFile) -> None:
         )
     if not codec.keeps_numbers and (lost := _unusual(splats)):
         LOG.warning("%s: %s does not store %s; PLY, SOG, and GLB do", path, codec.name, lost)
+    if (origin := splats.rendering.get("origin")) and not (codec.keeps_numbers or codec.keeps_origin):
+        LOG.warning(
+            "%s: %s does not store the origin (%s) of the coordinates; PLY, SOG, GLB, and OpenUSD do",
+            *(path, codec.name, ", ".join(f"{value:.15g}" for value in origin)),
+        )
 
 
 def _unusual(splats: SplatFile) -> str:

@@ -49,6 +49,7 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     Raises DataError if the models use different screen filters or incompatible motions.
     """
     first = models[0]
+    origin = next((model.origin for model in models if model.origin.any()), first.origin)
     if len(models) == 1:
         return first
     for model, name in zip(models, names, strict=True):
@@ -58,12 +59,13 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
         own, kept = model.rendering.comment(), first.rendering.comment()
         if other := [f"{key} = {own.get(key, 'not given')}" for key in KEPT if own.get(key) != kept.get(key)]:
             LOG.warning("%s: has %s; the values of %s are used", name, ", ".join(other), names[0])
+    models = [model.with_origin(origin) for model in models]
     if any(model.filter_variance is None for model in models):
         models = [model.baked() for model in models]
     degree = max(model.sh_degree for model in models)
     tables = with_motion([with_degree(model.tables(), degree) for model in models], names)
     merged: dict[str, Any] = {n: np.concatenate([t[n] for t in tables]) for n in tables[0]}
-    return Model(**merged, rendering=first.rendering, sky=first.sky)
+    return Model(**merged, rendering=first.rendering, sky=first.sky, origin=origin)
 
 
 def _kind(model: Model) -> str:
@@ -83,9 +85,10 @@ class Changes:
 
     drop_below: float = 0.0  # opacity below which Gaussians are dropped
     transform: NDArray[np.float64] | None = None  # [4, 4], a uniform scale, rotation, and translation
-    crop: tuple[float, ...] | None = None  # x0, y0, z0, x1, y1, z1, scene units; Gaussians outside are dropped
+    crop: tuple[float, ...] | None = None  # x0, y0, z0, x1, y1, z1, world coordinates; Gaussians outside are dropped
     sh_degree: int | None = None  # at most
     time: float | None = None  # of a moving model: the timestamp to extract
+    world: bool = False  # write world coordinates instead of an origin
 
     def apply(self, model: Model) -> Model:
         """Return the changed model.  Raises DataError if nothing is left, and ConfigError for an extreme transform."""
@@ -98,7 +101,7 @@ class Changes:
             except ValueError as error:
                 raise ConfigError(f"--transform: {error}") from error
         if self.crop is not None:
-            low, high = np.array(self.crop, np.float64).reshape(2, 3)
+            low, high = np.array(self.crop, np.float64).reshape(2, 3) - kept.origin
             kept = kept[((kept.means >= low) & (kept.means <= high)).all(axis=1)]
         if self.sh_degree is not None and self.sh_degree < kept.sh_degree:
             kept = replace(kept, sh_rest=with_degree(kept.tables(), self.sh_degree)["sh_rest"])
@@ -107,13 +110,13 @@ class Changes:
         return kept
 
 
-def writing_options(out: Path, quality: Quality) -> Writing:
+def writing_options(out: Path, quality: Quality, changes: Changes) -> Writing:
     """Return the options for writing a file.  Raises ConfigError for an unknown quality, or one without effect."""
     if quality not in QUALITIES:
         raise ConfigError(f"--quality {quote(quality)}: expected one of {', '.join(QUALITIES)}")
     if quality != "balanced" and not writing_format(out).has_quality:
         raise ConfigError(f"{out}: --quality is only for SPZ and SOG; give a name that ends in .spz or .sog")
-    return Writing(quality)
+    return Writing(quality, world=changes.world)
 
 
 def convert(
@@ -126,8 +129,9 @@ def convert(
     if not sources:
         raise ConfigError("convert: give a model file to read and one to write")
     check_output(sources, out)
-    writing = writing_options(out, quality)
-    return write_model(sources, (changes or Changes()).apply(read(sources)), out, writing)
+    changes = changes or Changes()
+    writing = writing_options(out, quality, changes)
+    return write_model(sources, changes.apply(read(sources)), out, writing)
 
 
 def read(sources: Sequence[Path]) -> Model:
@@ -213,7 +217,7 @@ def parse_crop(text: str) -> tuple[float, ...]:
     except ValueError:
         box = ()
     if len(box) != 6 or not all(low <= high for low, high in zip(box[:3], box[3:], strict=True)):
-        raise ConfigError(f"--crop {quote(text)}: expected x0,y0,z0,x1,y1,z1, the minimum first, in scene units")
+        raise ConfigError(f"--crop {quote(text)}: expected x0,y0,z0,x1,y1,z1, the minimum first, in world coordinates")
     return box
 
 
@@ -273,7 +277,7 @@ def convert_frames(
     for file in files:
         check_output(sources, file)
     _require_no_others(folder, re.compile(re.escape(prefix) + r"\d{4,}" + re.escape(suffix)), files)
-    writing, model = writing_options(files[0], quality), read(sources)
+    writing, model = writing_options(files[0], quality, changes), read(sources)
     changes_by_frame = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
     for change in changes_by_frame:  # check all before anything is written
         try:

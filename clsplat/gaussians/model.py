@@ -1,5 +1,6 @@
 """A model on the host: NumPy arrays in the units of model files, and the numbers with which they are rendered."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import DataError
+from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.files import METRICS, is_inside
 from clsplat.core.harmonics import rotate_sh
 from clsplat.core.quaternions import multiply, unit_quaternions
@@ -39,6 +40,7 @@ from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.motion import at_time, transformed_motion
 from clsplat.gaussians.sky import Sky, read_sky_file, write_sky_file
 from clsplat.opencl.device import Device
+from clsplat.scene.scene import far_origin, position_text
 
 # The numbers with which a model is rendered, as its file says them.
 
@@ -139,6 +141,7 @@ class Model:
     rendering: Rendering = NUMBERS
     sky: Sky | None = None  # behind the Gaussians, in place of a background of one color
     motion: Floats | None = None  # [N, 5 or more] of Gaussians that move, see clsplat/formats/splats.py
+    origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of the zero
 
     def __post_init__(self) -> None:
         count = len(self.means)
@@ -148,6 +151,7 @@ class Model:
                 widths = " or ".join(map(str, WIDTHS[name]))
                 raise ValueError(f"{name} has shape {array.shape}; expected ({count}, {widths})")
             object.__setattr__(self, name, array)
+        object.__setattr__(self, "origin", np.array(self.origin, np.float64).reshape(3))
 
     def __len__(self) -> int:
         return len(self.means)
@@ -212,8 +216,8 @@ class Model:
     ) -> "Model":
         """Return the model after x -> scale · rotation x + translation; colors turn with it.
 
-        rotation: [3, 3]; translation: [3] scene units.  Raises ValueError for a matrix that is not a rotation, and
-        where the result is more than a model file holds.
+        rotation: [3, 3]; translation: [3] scene units.  An origin moves in place of the means' zero.  Raises ValueError
+        for a matrix that is not a rotation, and where the result is more than a model file holds.
         """
         turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
         if np.shape(translation) != (3,):
@@ -222,9 +226,12 @@ class Model:
             raise ValueError("expected a positive scale and a rotation matrix [3, 3]")
         if np.linalg.det(turn) < 0:
             raise ValueError("expected a rotation; this matrix mirrors")
+        origin, shift = self.origin, np.asarray(translation, np.float64)
+        if origin.any():
+            origin, shift = scale * turn @ origin + shift, np.zeros(3)
         with np.errstate(over="ignore", invalid="ignore"):
             changed: dict[str, Any] = {
-                "means": scale * self.means.astype(np.float64) @ turn.T + np.asarray(translation, np.float64),
+                "means": scale * self.means.astype(np.float64) @ turn.T + shift,
                 "quats": multiply(unit_quaternions(turn), self.quats.astype(np.float64)),
                 "log_scales": self.log_scales + np.log(scale),
                 "sh_rest": rotate_sh(self.sh_rest, turn),
@@ -238,7 +245,21 @@ class Model:
         if near >= MAX_NUMBER or (not_finite({**self.tables(), **tables}) & ~not_finite(self.tables())).any():
             raise ValueError("expected a smaller scale and translation: no model file holds so large numbers")
         sky = self.sky.rotated(turn) if self.sky and rotation is not None else self.sky
-        return replace(self, **tables, rendering=replace(self.rendering, near=near), sky=sky)
+        return replace(self, **tables, rendering=replace(self.rendering, near=near), sky=sky, origin=origin)
+
+    def with_origin(self, origin: NDArray[np.floating]) -> "Model":
+        """Return the model with its means relative to another origin, [3] world coordinates.
+
+        Many formats and programs lose the origin.  A model without one that is nearer to zero than to `origin` is
+        therefore taken as relative to `origin` already.
+        """
+        if not self.origin.any() and np.any(origin) and len(self):
+            middle = np.median(self.means, axis=0).astype(np.float64)
+            if np.linalg.norm(middle) < np.linalg.norm(middle - origin):
+                LOG.info("the model names no origin; its means are taken as relative to %s", position_text(origin))
+                return replace(self, origin=origin)
+        shift = self.origin - origin
+        return replace(self, means=self.means + shift, origin=origin) if shift.any() else self
 
     def baked(self) -> "Model":
         """Return the model with the world filter as part of its scales and opacities (Yu et al. 2024, eq. 9).
@@ -263,16 +284,38 @@ class Model:
         A world filter that is not `baked` is kept in a PLY, as a property `filter_3D`, and baked for other formats.  A
         sky is written beside it, as NAME_sky.json, which names the SHA-256 of the file: no other model takes it.
         Returns the SHA-256 of what was written; of a folder of SOG that of its meta.json.
-        Raises ConfigError for another name, and OutputError when the file cannot be written.
+        Raises ConfigError for another name, and for world coordinates that the format cannot hold, and OutputError when
+        the file cannot be written.
         """
         model = self if writing_format(Path(path)).keeps_filter else self.baked()
-        digest = write(Path(path), model.to_splat_file(), options)
+        splats = model.to_splat_file() if not (options and options.world) else model._in_world(Path(path))
+        digest = write(Path(path), splats, options)
         write_sky_file(self.sky, Path(path), digest)
         return digest
 
+    def _in_world(self, path: Path) -> SplatFile:
+        """Return what a file in world coordinates holds: means in float64 where float32 is too coarse."""
+        if not self.origin.any():
+            LOG.warning("%s: the model names no origin; its coordinates are written as they are", path)
+            return self.to_splat_file()
+        means: Any = self.means + self.origin
+        if float32_holds(means, self.log_scales):
+            means = means.astype(np.float32)
+        elif writing_format(path).keeps_doubles:
+            LOG.info("%s: x, y and z are doubles, since floats are too coarse for world coordinates", path)
+        else:
+            raise ConfigError(
+                f"{path}: world coordinates around {position_text(self.origin)} need more digits than this format has; "
+                "write a .ply, or leave --world out: GLB and OpenUSD keep the origin in their node"
+            )
+        local = replace(self, origin=np.zeros(3)).to_splat_file()
+        return replace(local, parameters={**local.parameters, "means": means})
+
     def to_splat_file(self) -> SplatFile:
         """Return what a model file holds, with the arrays of the model."""
-        return SplatFile(self.tables(), self.rendering.comment(), "mip" if self.rendering.compensate else "default")
+        origin = {"origin": self.origin.tolist()} if self.origin.any() else {}
+        mode = "mip" if self.rendering.compensate else "default"
+        return SplatFile(self.tables(), {**self.rendering.comment(), **origin}, mode)
 
     def __repr__(self) -> str:
         moving = ", moving" if self.motion is not None else ""
@@ -288,24 +331,51 @@ class Model:
             "box, scene units": f"({', '.join(f'{v:.3g}' for v in low)}) to ({', '.join(f'{v:.3g}' for v in high)})",
             "median scale": f"{float(np.median(self.scales)):.3g} scene units" if len(self) else "–",
             "median opacity": f"{float(np.median(self.opacities)):.3g}" if len(self) else "–",
+            **({"origin, world coordinates": position_text(self.origin)} if self.origin.any() else {}),
             "size as PLY": f"{sum(table.nbytes for table in self.tables().values()) / 2**20:,.1f} MiB",
         }
         return summary(rows)
 
 
+LOG = logging.getLogger("clsplat")
+COARSE = 0.05  # of the median scale: a spacing of positions that shows
+
+
+def float32_holds(means: NDArray[np.floating], log_scales: Floats) -> bool:
+    """Return whether float32 numbers are dense enough for means, [N, 3], of Gaussians with these scales, [N, 3]."""
+    if not len(means):
+        return True
+    spacing = np.spacing(np.float32(np.abs(np.median(means, axis=0)).max()))
+    return bool(spacing <= COARSE * np.exp(min(float(np.median(log_scales)), MAX_LOG)))
+
+
 def load(path: str | Path, options: Reading | None = None) -> Model:
     """Read a model file of any format (docs/formats.md), or the model of a run folder.
 
+    The origin is what the file says; means in world coordinates that float32 cannot hold get one.
     Raises DataError when it is missing, damaged or not a splat.
     """
     path = Path(path)
     file = read(model_path(path), options)
     sky = read_sky_file(model_path(path), file.rendering.get("sky") == "directions" and not (options and options.quiet))
-    model = Model(**file.parameters, rendering=Rendering.from_comment(file.rendering, file.mode), sky=sky)
-    if file.placement is None:
-        return model
-    scale = float(np.cbrt(np.linalg.det(file.placement[:3, :3])))
-    try:
-        return model.transformed(scale, file.placement[:3, :3] / (scale or 1), file.placement[:3, 3])
-    except ValueError as error:
-        raise DataError(f"{path}: a node stretches or mirrors its Gaussians, or moves them too far: {error}") from error
+    comment, tables = dict(file.rendering), dict[str, Any](file.parameters)
+    origin: NDArray[np.floating] = np.array(comment.pop("origin", np.zeros(3)), np.float64)
+    finite = tables["means"][~not_finite({"means": tables["means"]})]
+    if not origin.any() and not float32_holds(finite, tables["log_scales"]):
+        finite = finite.astype(np.float64)
+        origin = far_origin(np.median(finite, axis=0), finite)
+        tables["means"] = np.asarray(tables["means"] - origin, np.float32)
+    model = Model(**tables, rendering=Rendering.from_comment(comment, file.mode), sky=sky)
+    if file.placement is not None:
+        scale = float(np.cbrt(np.linalg.det(file.placement[:3, :3])))
+        turn, shift = file.placement[:3, :3] / (scale or 1), file.placement[:3, 3]
+        origin = scale * turn @ origin
+        if not float32_holds(shift[None], model.log_scales + np.log(abs(scale) or 1)):
+            origin, shift = origin + shift, np.zeros(3)
+        try:
+            model = model.transformed(scale, turn, shift)
+        except ValueError as error:
+            raise DataError(
+                f"{path}: a node stretches or mirrors its Gaussians, or moves them too far: {error}"
+            ) from error
+    return replace(model, origin=origin) if origin.any() else model

@@ -10,6 +10,7 @@ from clsplat.formats.splats import Reading, motion_fields, not_finite, too_large
 from clsplat.formats.streamed_sog import LOD_META, find_level_faults
 from clsplat.formats.table import detect, format_of_name, model_file
 from clsplat.gaussians.model import Model, load
+from clsplat.scene.scene import position_text
 
 ENOUGH = 16  # Gaussians needed for statistics
 FLAT = 1e-6  # scene units; smaller scales are those of discs or needles
@@ -57,6 +58,7 @@ def examine(path: Path) -> dict[str, Any]:
         "moves": model.motion is not None,
         "ranges": _ranges(whole),
         "bounds": [whole.means.min(axis=0).tolist(), whole.means.max(axis=0).tolist()] if len(whole) else [],
+        **({"origin": model.origin.tolist()} if model.origin.any() else {}),
         "degenerate": {
             "not_finite": int(bad.sum()),
             "no_rotation": zero,
@@ -79,6 +81,8 @@ def lines(found: dict[str, Any]) -> str:
     for low, high in [found["bounds"]] if found["bounds"] else []:
         text = (", ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
         rows.append(f"  {'bounds':<12} ({next(text)}) to ({next(text)})")
+    if origin := found.get("origin"):
+        rows.append(f"  {'origin':<12} {position_text(np.array(origin))}, to which the bounds are relative")
     counts = found["degenerate"]
     rows.append(f"  {'degenerate':<12} " + ", ".join(f"{counts[name]} {words}" for name, words in DEGENERATE.items()))
     return "\n".join(rows)

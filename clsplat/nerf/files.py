@@ -2,11 +2,11 @@
 
 parameters.npy    [P, 1] float32, the parameters in the layout of clsplat.nerf.shape
 meta.npy          JSON: `format`, the `version` that wrote it, `shape` with the keys of `train_field.field`, the
-                  `background`, and the `alpha` of the photographs
+                  `background`, the `alpha` of the photographs, and the `origin` if it is not 0
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -39,22 +39,32 @@ class Notes(BaseModel):
     shape: WrittenShape
     background: Literal["black", "white"]
     alpha: Literal["transparency", "mask"]
+    origin: list[float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class FieldModel:
     """A field on the host, as `train_field` trains it.
 
-    Raises ValueError if the parameters do not fit the shape.
+    Raises ValueError if the parameters do not fit the shape, or the origin is not 3 numbers.
     """
 
     shape: FieldShape
     parameters: NDArray[np.float32]  # [P]
     rendering: Rendering  # background, and the meaning of the photographs' fourth channel
+    origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of its zero
 
     def __post_init__(self) -> None:
         if self.parameters.shape != (self.shape.parameters,):
             raise ValueError(f"its parameters are {self.parameters.shape}; expected ({self.shape.parameters},)")
+        if self.origin.shape != (3,):
+            raise ValueError(f"its origin has {len(self.origin)} numbers; expected 3")
+
+    def with_origin(self, origin: NDArray[np.floating]) -> "FieldModel":
+        """Return the field, which cannot be moved.  Raises DataError for an origin other than its own."""
+        if np.array_equal(self.origin, origin):
+            return self
+        raise DataError(f"the field has the origin {self.origin}, the scene {origin}; give the scene it was trained on")
 
     def upload(self, device: Device) -> Field:
         """Copy the field and its background to a device."""
@@ -71,8 +81,11 @@ class FieldModel:
             background=shown.background or "black",
             alpha=shown.alpha,
         )
+        origin = {"origin": self.origin.tolist()} if self.origin.any() else {}
         with open_atomic(path) as file:
-            archive.write(file, notes.model_dump(), [(PARAMETERS, self.parameters[:, None])])
+            archive.write(
+                file, {**notes.model_dump(exclude={"origin"}), **origin}, [(PARAMETERS, self.parameters[:, None])]
+            )
         return sha256(path)
 
     def __repr__(self) -> str:
@@ -120,4 +133,5 @@ def _checked(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel:
         raise DataError(f"{PARAMETERS} are not [{meta.shape.parameters}, 1] float32")
     if not np.isfinite(table).all():
         raise DataError(f"{PARAMETERS} contain values that are not finite")
-    return FieldModel(meta.shape, np.array(table[:, 0]), Rendering(background=meta.background, alpha=meta.alpha))
+    rendering, origin = Rendering(background=meta.background, alpha=meta.alpha), np.array(meta.origin or np.zeros(3))
+    return FieldModel(meta.shape, np.array(table[:, 0]), rendering, origin)

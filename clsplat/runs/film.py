@@ -43,7 +43,7 @@ from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import BUDGET, Page, Which, described, is_viewer
 from clsplat.viewer.video.film import Film, Side, Wish, files, plan, shoot
-from clsplat.viewer.video.paths import nearest
+from clsplat.viewer.video.paths import Floats, nearest
 from clsplat.viewer.video.pictures import Canvas, Image, letterboxed
 
 LOG = logging.getLogger("clsplat")
@@ -91,7 +91,9 @@ def film(
         raise ConfigError("--side needs --video: pictures of a folder stand alone")
     loaded = _read(model)
     found = _scene(model, scene, loaded, downscale, needed=not wish.of_a_file or extras.side == PHOTOGRAPH)
-    made = plan(wish, found, points_of(loaded, found), moves=moves(loaded))
+    origin = found.origin if found else loaded.origin
+    loaded = loaded.with_origin(origin)
+    made = plan(wish, found, points_of(loaded, found), moves=moves(loaded), origin=origin)
     background = loaded.rendering.background or (found.background if found else "black")
     opened = open_correct(device)
     canvas = Canvas(painter_of(loaded, opened, background))
@@ -99,7 +101,7 @@ def film(
         taken = [view.image_path for view in found.views] if found else []
         written = write_pictures(canvas, made.views, place.out, place.kind, extras.layers, taken, film=True)
     else:
-        side = _side(extras.side, made, found, background, opened)
+        side = _side(extras.side, made, found, background, opened, origin)
         shoot(canvas, made, videos, side, lambda views: counted(views, "frames rendered", len(views)))
         written = list(videos.values())
     return {
@@ -132,12 +134,14 @@ def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | N
     return source.scene(loaded).downscaled(source.settings.downscale if downscale is None else downscale)
 
 
-def _side(name: str | None, made: Film, scene: Scene | None, background: Background, device: Device) -> Side | None:
+def _side(
+    name: str | None, made: Film, scene: Scene | None, background: Background, device: Device, origin: Floats
+) -> Side | None:
     """Return what is shown next to a frame: the photo with the nearest camera, or another model."""
     if name is None:
         return None
     if name != PHOTOGRAPH:
-        other = _read(Path(name))
+        other = _read(Path(name)).with_origin(origin)
         return Canvas(painter_of(other, device, other.rendering.background or background)).picture
     assert scene is not None
     taken, reach = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
@@ -197,19 +201,21 @@ def view(
     first = next(iter(loaded.values()))
     found = source.scene(first).downscaled(source.settings.downscale) if source else None
     background = first.rendering.background or (found.background if found else "black")
+    origin = found.origin if found else first.origin
+    loaded = {name: model.with_origin(origin) for name, model in loaded.items()}
 
     def read(one: View) -> NDArray[np.uint8]:
         return load_photograph(one, BACKGROUNDS[background])[:, :, :3]
 
     views = described(found, read, photographs, photograph_budget) if found else []
     start = (found.split("test") or found.views)[0] if found else None
-    stand = Viewpoint.from_points(first.means, found.views if found else (), start)
+    stand = Viewpoint.from_points(next(iter(loaded.values())).means, found.views if found else (), start)
     title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
     if found is None:
         LOG.info("without a scene, up is -y; add --scene if the model is upside down")
     packed = counted(loaded.items(), "models packed", len(loaded))
     shown = {name: pack(model, splats) for name, model in packed}
-    Page(title, shown, stand, background, views).write(out)
+    Page(title, shown, stand, background, views, origin).write(out)
     return out
 
 

@@ -333,9 +333,10 @@ class ModelFile:
     ) -> None:
         """downscale: divisor of the image size; default: that of the run, or 1 for a file."""
         self.source = ModelSource.of(model, scene)
-        self.loaded = read(self.source.file)
+        loaded = read(self.source.file)
         self.device = open_correct(device)
-        found = self.source.scene(self.loaded)
+        found = self.source.scene(loaded)
+        self.loaded = loaded.with_origin(found.origin)
         self.photographs = apply_side_files(self.source.file, found) if scene is None else found
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)

@@ -52,6 +52,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "pipeline": run.name,
         "seconds": {name: round(seconds, 3) for name, seconds in spent.items()},
         "scene": str(run.scene.path.resolve()),
+        **({"origin": run.scene.origin.tolist()} if run.scene.origin.any() else {}),
         "files": {name: path.relative_to(run.out).as_posix() for name, path in files.items()},
         **({"preparation": run.preparation} if run.preparation else {}),
         **({"changes": run.changes} if run.changes else {}),

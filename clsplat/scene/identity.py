@@ -22,7 +22,7 @@ from clsplat.core.progress import Count
 from clsplat.core.reading import read_file
 from clsplat.scene.images import MAX_BYTES, TAIL_SIZE, decode_image, parse_header
 from clsplat.scene.scene import SPLITS, PointCloud, Scene
-from clsplat.scene.view import NO_FILE, Size, View, needs_rotation
+from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 
 # Decode every photograph and mask of a scene once, before training: a damaged one is found while it costs nothing.
 
@@ -149,7 +149,9 @@ class Identity:
     @classmethod
     def from_scene(cls, scene: Scene, files: Mapping[Path, ImageFile]) -> "Identity":
         """Return the identity of a scene whose image files were decoded."""
-        train, test, fold = ({view.name: _row(view, files) for view in scene.split(name)} for name in SPLITS)
+        train, test, fold = (
+            {view.name: _row(view, files, scene.origin) for view in scene.split(name)} for name in SPLITS
+        )
         return cls(train, test, _points_hash(scene.points) if scene.points else "", fold)
 
     @property
@@ -199,14 +201,14 @@ class Identity:
         raise ValueError("damaged")
 
 
-def _row(view: View, files: Mapping[Path, ImageFile]) -> Row:
+def _row(view: View, files: Mapping[Path, ImageFile], origin: Floats) -> Row:
     camera, lens = view.camera, view.lens
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, view.downscale]
     distortion = [lens.model, lens.width, lens.height, lens.whole, *map(float, lens.params)] if lens else []
     return {
         "photograph": files[view.image_path].digest if view.image_path in files else "",
         "mask": files[view.mask_path].digest if view.mask_path else "",
-        "camera": _hash(numbers, view.world_to_camera, text=repr(distortion)),
+        "camera": _hash(numbers, view.world_to_camera, *([origin] if origin.any() else []), text=repr(distortion)),
         **({} if view.time is None else {"time": repr(view.time)}),
     }
 

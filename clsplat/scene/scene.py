@@ -207,7 +207,7 @@ def make_scene(
     points = points if points and len(points) else None
     origin = choose_origin(views, points)
     if origin.any():
-        LOG.info("%s: coordinates are far from zero; the scene is moved by %s", path, -origin)
+        LOG.info("%s: coordinates are far from zero; those of the run are relative to %s", path, position_text(origin))
         views = [view.shifted(origin) for view in views]
         points = points and replace(points, positions=points.positions - origin)
     views = [replace(view, camera_to_world=None) if view.camera_to_world is not None else view for view in views]
@@ -230,13 +230,22 @@ def choose_origin(views: Sequence[View], points: PointCloud | None) -> Floats:
     multiple of a power of ten, so that differences are exact where the file's digits allow that.
     """
     centers = np.stack([view.position for view in views])
-    middle = np.median(centers, axis=0)
     around = centers if points is None else np.asarray(points.positions, np.float64)
+    return far_origin(np.median(centers, axis=0), around)
+
+
+def far_origin(middle: Floats, around: Floats) -> Floats:
+    """Return the origin near `middle`, [3], of positions `around`, [N, 3]; 0 unless that is far for their spread."""
     spread = float(np.median(np.linalg.norm(around - middle, axis=1)))
     if np.abs(middle).max() <= MAX_OFFSET * (spread or 1.0):
         return np.zeros(3)
     step = 10.0 ** math.ceil(math.log10(10 * (spread or 1.0)))
     return np.round(middle / step) * step + 0.0  # no -0.0
+
+
+def position_text(position: Floats) -> str:
+    """Return a position, [3], with all its digits."""
+    return f"({', '.join(f'{value:.15g}' for value in position)})"
 
 
 def camera_extent(views: list[View]) -> float:

@@ -102,6 +102,8 @@ class View:
 
     def shifted(self, origin: Floats) -> "View":
         """Return the view in coordinates whose zero is at `origin`, [3] float64 in the present coordinates."""
+        if not origin.any():
+            return self
         if (matrix := self.camera_to_world) is not None:
             matrix = np.array(matrix, np.float64)
             matrix[:3, 3] -= origin

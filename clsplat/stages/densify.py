@@ -102,7 +102,7 @@ class Densify(Scheduled):
         fits = most_gaussians(run, wanted)
         limit = int(min(fits, wanted))
         room = partial(make_room, run)
-        change = densify(edit, self.rules, run.rasterizer.tiler, limit, self.inside, room)
+        change = densify(edit, self.rules, run.rasterizer.tiler, limit, self._box(run), room)
         run.refresh_filter()
         if change.after == fits:
             remedy = f"smaller photos{more_room(run)} leave room for more"
@@ -125,22 +125,25 @@ class Densify(Scheduled):
             LOG.info("step %d: growth ends, since the model was best at step %d", run.step, best.measured.step)
         return best.growth_ended is not None
 
-    def _outside(self, edit: Edit) -> int:
-        """Return the number of Gaussians outside the box in which they grow."""
-        if self.inside is None:
-            return 0
-        return int((~self.inside.holds(edit.gaussians.get("means"))).sum())
+    def _box(self, run: Run) -> Box | None:
+        """Return the box in which Gaussians grow, in the run's coordinates."""
+        return self.inside and self.inside.shifted(run.scene.origin)
+
+    def _outside(self, run: Run, edit: Edit) -> int:
+        """Return the number of Gaussians outside that box."""
+        box = self._box(run)
+        return int((~box.holds(edit.gaussians.get("means"))).sum()) if box else 0
 
     def _limits(self, run: Run, edit: Edit) -> Iterator[int]:
         """Yield the numbers of Gaussians at which the settings stop growth."""
         if self._has_grown(run):
             yield 0
         if self.max_gaussians is not None:
-            yield int(edit.at(self.max_gaussians)) + self._outside(edit)
+            yield int(edit.at(self.max_gaussians)) + self._outside(run, edit)
         if self.per_pixel is not None:
             views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
             sizes = [view.camera.width * view.camera.height for view in views]
-            yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._outside(edit)
+            yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._outside(run, edit)
         if self.budget and self.every and self.stop:
             left = len(fire_steps(self.every, run.step - 1, self.stop))
             context = BudgetContext(run.step / self.stop, left, run.image_downscale)

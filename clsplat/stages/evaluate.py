@@ -79,7 +79,11 @@ class Evaluate(Scheduled):
     def _painter(self, run: Run) -> Painter:
         if self.file is None:
             return run.painter()
-        return SplatPainter(run.rasterizer, load(run.out / self.file).upload(run.device), run.photographs.background)
+        return SplatPainter(
+            run.rasterizer,
+            load(run.out / self.file).with_origin(run.scene.origin).upload(run.device),
+            run.photographs.background,
+        )
 
     def run(self, run: Run) -> None:
         if not run.scene.split(self.split):

@@ -134,7 +134,7 @@ class Init(Stage):
         require_times(run.scene, run.model_settings.time)
         source = self._source(run.scene)
         if source == "model":
-            self._read()
+            self._read(run.scene)
         elif source in ("random", "hull"):
             self._require_memory(run, self.count)
         elif source in ("points", "points+sweep"):
@@ -158,7 +158,7 @@ class Init(Stage):
         """
         source = self._source(scene)
         if source == "model":
-            return len(self._read()["means"])
+            return len(self._read(scene)["means"])
         if source in ("points", "points+sweep"):
             return (0 if scene.points is None else len(scene.points)) + self.sweep_points * self._is_joined(scene)
         return self.sweep_points if source == "sweep" else self.count
@@ -190,7 +190,8 @@ class Init(Stage):
         """Return the parameters and their source, which is "random" if another source gives too few points."""
         source = self._source(run.scene)
         if source == "model":
-            return with_motion(with_degree(self._read(), degree), run.model_settings.time, str(self.file)), source
+            parameters = with_degree(self._read(run.scene), degree)
+            return with_motion(parameters, run.model_settings.time, str(self.file)), source
         sources: dict[str, Callable[[], PointCloud | None]] = {
             "sweep": lambda: enough_swept(run, self.sweep_points),
             "hull": lambda: on_hull(run, self.count),
@@ -207,9 +208,9 @@ class Init(Stage):
         seen = points.times if self.times == "per_frame" else None
         return moving(parameters, run.model_settings.time, seen, (self.duration, self.min_duration), run.seed), source
 
-    def _read(self) -> Parameters:
+    def _read(self, scene: Scene) -> Parameters:
         assert self.file is not None  # as `check` requires
-        parameters = load(Path(self.file)).tables()
+        parameters = load(Path(self.file)).with_origin(scene.origin).tables()
         if not len(parameters["means"]):
             raise DataError(f"{self.file}: the model has no Gaussians to start from")
         return parameters

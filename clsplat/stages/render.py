@@ -94,13 +94,13 @@ class Viewer(Stage):
         views = described(scene, read, self.photographs, self.photograph_budget, through)
         viewpoint = Viewpoint.from_points(model.means, scene.views, (scene.split("test") or scene.views)[0])
         packed = pack(model)
-        page = Page(f"{run.name} · {run.scene_name}", {run.name: packed}, viewpoint, name, views)
+        page = Page(f"{run.name} · {run.scene_name}", {run.name: packed}, viewpoint, name, views, scene.origin)
         if page.size > MAX_SIZE and (number := page.max_splats):  # without room for any, `write` blames the photos
             LOG.warning(
                 "%s: shows only the %s most important splats of %s, so that browsers can open it; "
                 "`clsplat compress` makes smaller models",
                 *(path, f"{number:,}", packed.count_text),
             )
-            page = Page(page.title, {run.name: pack(model, number)}, viewpoint, name, views)
+            page = Page(page.title, {run.name: pack(model, number)}, viewpoint, name, views, scene.origin)
         page.write(path)
         LOG.debug("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)

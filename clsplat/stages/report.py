@@ -20,7 +20,7 @@ from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import SHARES, Gains, ViewMetrics, measure, render_view
 from clsplat.prepare.gather import summarize_placement
-from clsplat.scene.scene import SPLITS
+from clsplat.scene.scene import SPLITS, position_text
 from clsplat.scene.view import View, sample_views
 from clsplat.scene.viewpoint import nearest_to_axes, perpendicular, up_direction
 from clsplat.training.best_model import Measured
@@ -435,6 +435,8 @@ def _figures(run: Run) -> dict[str, str]:
     values[unit] = number
     values["steps"] = f"{run.step:,}"
     values["training"] = duration_text(run.train_seconds)
+    if run.scene.origin.any():
+        values["origin of the coordinates"] = position_text(run.scene.origin)
     return values
 
 

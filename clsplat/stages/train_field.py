@@ -166,7 +166,8 @@ class ExportField(Stage):
         assert isinstance(run.learned_field, LearnedField)
         field, file = run.learned_field.field, run.out / self.file
         rendering = Rendering(background=run.photographs.background_name, alpha=run.original.views[0].alpha)
-        run.model_hashes[self.file] = FieldModel(field.shape, field.parameters.get(), rendering).save(file)
+        model = FieldModel(field.shape, field.parameters.get(), rendering, run.scene.origin)
+        run.model_hashes[self.file] = model.save(file)
         try:
             load_field(file)
         except DataError as error:

@@ -258,7 +258,7 @@ def host_model(run: Run) -> Model:
     if not tables["filter_variance"].any():
         del tables["filter_variance"]
     rendering = Rendering.from_comment({"version": __version__, **_rendering(run)}, "default")
-    return Model(**tables, rendering=rendering, sky=model.sky.host() if model.sky else None)
+    return Model(**tables, rendering=rendering, sky=model.sky.host() if model.sky else None, origin=run.scene.origin)
 
 
 def _rendering(run: Run) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from clsplat.core.errors import OutputError
 from clsplat.core.files import write_text
 from clsplat.core.page import data_url, inline, render, shrink
 from clsplat.core.reading import read_file
-from clsplat.scene.scene import Scene
+from clsplat.scene.scene import Scene, position_text
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import Packed
@@ -65,6 +65,9 @@ class Page:
     viewpoint: Viewpoint
     background: str = "black"
     views: Sequence[dict[str, Any]] = field(default_factory=list)
+    origin: NDArray[np.floating] = field(
+        default_factory=lambda: np.zeros(3)
+    )  # [3] world coordinates of the page's zero
 
     def text(self) -> str:
         """Return the page; the same models and views give the same bytes."""
@@ -138,7 +141,8 @@ class Page:
             blur = f"{header['variance']:g} px²{', normalized' if header['compensate'] else ''}"
             facts[f"screen filter{of}"] = f"pixel box, drawn here as a blur of {blur}" if "box" in header else blur
             facts[f"size{of}"] = f"{len(packed.data) / 1e6:.2f} MB"
-        return facts | ({"views": f"{len(self.views):,}"} if self.views else {})
+        facts |= {"views": f"{len(self.views):,}"} if self.views else {}
+        return facts | ({"origin": position_text(self.origin)} if self.origin.any() else {})
 
 
 def is_viewer(path: Path) -> bool:

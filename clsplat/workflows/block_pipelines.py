@@ -17,7 +17,7 @@ from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.training.stage import Stage
-from clsplat.workflows.partition import GROWTH, Block
+from clsplat.workflows.partition import Block
 
 
 def require_divisible(pipeline: Pipeline) -> None:
@@ -61,7 +61,7 @@ def block_pipeline(
 
     extent: of the whole scene; share: of the pipeline's steps that are trained, with the rates of `_shared`.
     """
-    data, last, cell = pipeline.resolved(), _last(pipeline), block.cell.box.model_dump()
+    data, last, cell = pipeline.resolved(), _last(pipeline), block.box.model_dump()
     stages = [_growing(stage, block) for stage in _starting(data["stages"][:last], start)]
     names = [view["name"] for view in block.views]
     scene = {**data["scene"], "holdout": 0, "train": {"names": names}, "extent": extent}
@@ -137,7 +137,7 @@ def _growing(stage: dict[str, Any], block: Block) -> dict[str, Any]:
 
 def _limited(densify: Densify, block: Block) -> Densify:
     """The stage in a block: Gaussians grow in its cell, up to its share, by pairs, of the number of the whole."""
-    changed: dict[str, Any] = {"inside": block.cell.grown(GROWTH)}
+    changed: dict[str, Any] = {"inside": block.growth}
     if densify.max_gaussians is not None:
         changed["max_gaussians"] = divide(densify.max_gaussians, 1 / block.pairs)
         if min(schedule_values(changed["max_gaussians"])) < 1:

@@ -156,8 +156,9 @@ class Blocks:
             LOG.info("the coarse model")
             file = raw_model(train_in_folder(self.coarse, self.out / COARSE, self.device))
         assert file is not None
+        model = load_model(file).with_origin(self.scene.scene.origin)
         photographs = Photographs(self.device, self.scene.background, budget=0)  # each is used once in a pass
-        work = Partitioner(load_model(file), self.scene.scene, self.device, photographs)
+        work = Partitioner(model, self.scene.scene, self.device, photographs)
         found = work.partition(self.plan.blocks, sha256(file), self.plan.min_coverage)
         found.write(self.out)
         return found
@@ -224,7 +225,7 @@ class Blocks:
 
         def check(number: int, means: NDArray[np.float32]) -> None:
             block, path = parts[number]
-            if not block.cell.box.holds(means).all():
+            if not block.box.shifted(block.origin).holds(means).all():  # as the stage crop does
                 raise DataError(f"{path}: holds Gaussians outside its cell; remove its folder, and train it again")
 
         count = join_plys(file, [path for _, path in parts], check)
@@ -324,13 +325,14 @@ def plan_blocks(
     """
     settings = load(pipeline, [f"scene.path={as_setting(photographs_of(scene))}", "init.file=points"]).settings
     with log_level(logging.ERROR):  # it is read again, and told then
-        points = read_run_scene(settings.scene, settings.scene.folder).original.points
+        original = read_run_scene(settings.scene, settings.scene.folder).original
+        points = original.points
     if points is None or not len(points):
         raise DataError(f"{scene}: has no points to cut by; `clsplat blocks --plan` trains a coarse model first")
     with tempfile.TemporaryDirectory() as made:
         model = Path(made, "points.ply")
         tables = from_points(points, Init().opacity, settings.model.sh_degree)
-        Model(**tables, rendering=NUMBERS, sky=None).save(model)
+        Model(**tables, rendering=NUMBERS, sky=None, origin=original.origin).save(model)
         work = Blocks(scene, Path(made), BlocksPlan(pipeline, str(model), blocks), device)
         try:
             return work.plan_data(work.partition())

@@ -222,8 +222,8 @@ class Measurer:
 
     def figures(self, model: Model) -> tuple[float, float]:
         """Return PSNR, dB, and SSIM."""
-        views = self.opened.scene.split(self.split)
-        painter = SplatPainter(self.rasterizer, model.upload(self.opened.device), self.photographs.background)
+        views, placed = self.opened.scene.split(self.split), model.with_origin(self.opened.scene.origin)
+        painter = SplatPainter(self.rasterizer, placed.upload(self.opened.device), self.photographs.background)
         results = measure(painter, views, self.photographs)
         averages = mean(results)
         return averages["psnr"], averages["ssim"]

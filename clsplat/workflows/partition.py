@@ -183,15 +183,26 @@ class Block:
     start: Bits  # [N] the Gaussians that it starts from: its own, and those that its views see, or none
     views: list[dict[str, Any]]  # name, why, share of pixels
     memory: int  # bytes on the device at the beginning
+    origin: NDArray[np.floating]  # [3] world coordinates of the zero of `cell`
 
     @property
     def name(self) -> str:
         """The name of its folder."""
         return block_name(self.number)
 
+    @property
+    def box(self) -> Box:
+        """The cell in world coordinates, as in pipeline files."""
+        return self.cell.box.shifted(-self.origin)
+
+    @property
+    def growth(self) -> Box:
+        """The box in which Gaussians grow, in world coordinates."""
+        return self.cell.grown(GROWTH).shifted(-self.origin)
+
     def data(self) -> dict[str, Any]:
         """Return what the manifest says of it."""
-        grown = {"cell": self.cell.box, "growth": self.cell.grown(GROWTH)}
+        grown = {"cell": self.box, "growth": self.growth}
         return {
             "name": self.name,
             **{name: box.model_dump() for name, box in grown.items()},
@@ -254,6 +265,7 @@ class Partitioner:
                 start := seen[number] | (owner == number),
                 self._listed(members, number),
                 self._memory(int(start.sum()), np.flatnonzero(members.chosen[:, number]).tolist()),
+                self.model.origin,
             )
             for number, cell in enumerate(found)
         ]

@@ -28,9 +28,9 @@ def write_scene(folder, shift=0.0):
         matrix[:3, 3] = center + shift
         frames.append({"file_path": f"images/{i}.png", "transform_matrix": matrix.tolist()})
         (folder / "images").mkdir(parents=True, exist_ok=True)
-        write_image(folder / "images" / f"{i}.png", np.zeros((48, 64, 3), np.uint8))
+        write_image(folder / "images" / f"{i}.png", np.full((48, 64, 3), 50 * i, np.uint8))
     (folder / "transforms.json").write_text(json.dumps(LENS | {"frames": frames, "ply_file_path": "p.ply"}))
-    write_points_ply(folder / "p.ply", PointCloud(POINTS + shift, np.zeros((3, 3))))
+    write_points_ply(folder / "p.ply", PointCloud(POINTS + shift, np.full((3, 3), 0.5)))
     return read_scene(folder, holdout=0)
 
 

@@ -253,6 +253,7 @@ class Facts:
     points: PointFacts | None
     points_per_view: dict[str, int]  # sparse points that each view shows; empty if the dataset does not say
     extent: float | None  # scene units
+    origin: list[float]  # [3] world coordinates, of a scene far from zero
     outlier_cameras: list[str]
     timestamps: int  # distinct times of the views; 0 for static scenes
     moving_cameras: int  # distinct cameras of a dynamic scene; 0 for static scenes
@@ -295,6 +296,7 @@ def measure_dataset(parts: Parts) -> Facts:
         points=measure_points(parts, extent, centers) if parts.points else None,
         points_per_view=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
+        origin=parts.scene.origin.tolist() if parts.scene else [0.0] * 3,
         outlier_cameras=[view.name for view, far in zip(views, outlier_cameras(views), strict=True) if far]
         if views
         else [],

@@ -6,6 +6,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Literal
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -22,6 +23,7 @@ from clsplat.prepare.inspect.facts import (
     read_parts,
 )
 from clsplat.scene.reader import Parts
+from clsplat.scene.scene import position_text
 
 Level = Literal["error", "warning", "note"]
 LEVELS: tuple[Level, ...] = ("error", "warning", "note")
@@ -311,6 +313,8 @@ def summarize(facts: Facts) -> dict[str, str]:
         lines["extent"] = f"{facts.extent:.4g} scene units, of the cameras"
         if facts.outlier_cameras:
             lines["extent"] += f", without {len(facts.outlier_cameras)} far away from all others"
+    if any(facts.origin):
+        lines["origin"] = f"{position_text(np.array(facts.origin))}, which is subtracted from all coordinates"
     if points := facts.points:
         lines["points"] = f"{points.count:,}"
         if points.error_mean is not None:

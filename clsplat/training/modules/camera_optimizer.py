@@ -122,7 +122,9 @@ class CameraOptimizer(TrainingModule):
         rows = data.get("photographs") if isinstance(data, dict) else None
         if not isinstance(rows, dict):
             raise DataError(f"{path}: expected a mapping 'photographs'; train again, or remove the file")
-        return replace_cameras(scene, [_with_pose(path, view, rows.get(view.name)) for view in scene.views])
+        return replace_cameras(
+            scene, [_with_pose(path, view, rows.get(view.name), scene.origin) for view in scene.views]
+        )
 
 
 @dataclass(frozen=True)
@@ -284,7 +286,7 @@ class CameraState(ModuleState):
             "photographs": {
                 view.name: {
                     "learned": view.name in names,
-                    "world_to_camera": view.world_to_camera.tolist(),
+                    "world_to_camera": view.shifted(-run.original.origin).world_to_camera.tolist(),
                     **({"focal_lengths": [view.camera.fx, view.camera.fy]} if cameras else {}),
                 }
                 for view in views
@@ -351,8 +353,8 @@ def _range(low: float, high: float) -> str:
     return f"{low:.4f}" if low == high else f"{low:.4f} to {high:.4f}"
 
 
-def _with_pose(path: Path, view: View, row: Any) -> View:
-    """Return a view with the camera in its row of a side file; without a row, the view itself."""
+def _with_pose(path: Path, view: View, row: Any, origin: NDArray[np.floating]) -> View:
+    """Return a view with the camera in its row of a side file, in world coordinates; without a row, the view itself."""
     if row is None:
         return view
     try:
@@ -360,7 +362,8 @@ def _with_pose(path: Path, view: View, row: Any) -> View:
         if not all(1 / MAX_ZOOM <= zoom <= MAX_ZOOM for zoom in (fx / view.camera.fx, fy / view.camera.fy)):
             raise ValueError("focal lengths out of range")
         camera = replace(view.camera, fx=fx, fy=fy).check()
-        return replace(view, world_to_camera=np.array(row["world_to_camera"], np.float64), camera=camera)
+        pose = np.array(row["world_to_camera"], np.float64)
+        return replace(view, world_to_camera=pose, camera=camera).shifted(origin)
     except (AttributeError, KeyError, TypeError, ValueError, PoseError) as error:
         raise DataError(
             f"{path}: {quote(view.name)} has no valid pose of 3 rows of 4 numbers, or no focal lengths within "

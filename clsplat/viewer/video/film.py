@@ -138,21 +138,24 @@ class Film:
         return len(self.views) / self.fps
 
 
-def plan(wish: Wish, scene: Scene | None, points: Floats, moves: bool = False) -> Film:
+def plan(wish: Wish, scene: Scene | None, points: Floats, moves: bool = False, origin: Floats | None = None) -> Film:
     """Return the film of a scene.  points: [M, 3], means of a model, or points of the scene; moves: whether it does.
+
+    origin: [3] world coordinates of the points' zero, by default that of the scene.
 
     Raises ConfigError without a scene where the path needs one, and for times where nothing moves; DataError where the
     scene has no such path.
     """
-    found = _path(wish, scene, points)
+    found = _path(wish, scene, points, scene.origin if scene and origin is None else origin)
     return replace(found, views=as_time_runs(found.views, wish.times, moves))
 
 
-def _path(wish: Wish, scene: Scene | None, points: Floats) -> Film:
+def _path(wish: Wish, scene: Scene | None, points: Floats, origin: Floats | None) -> Film:
     """The film without regard to time."""
     if wish.of_a_file:
         found = camera_path.read(Path(wish.path), scene.path if scene else None)
         views = found.resized(wish.size) if wish.size else found.views
+        views = views if origin is None else [view.shifted(origin) for view in views]  # files have world coordinates
         return Film(camera_path.spread(views, wish.frames or len(views)), wish.fps or found.fps)
     if scene is None:
         raise ConfigError(f"the path {wish.path} needs the cameras of a scene; give --scene, a run folder, or a file")
