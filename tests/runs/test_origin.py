@@ -12,8 +12,8 @@ from clsplat.core.errors import ConfigError
 from clsplat.formats.ply import MAX_HEADER, parse_ply_header
 from clsplat.gaussians.model import Model, load
 from clsplat.scene.images import read_image
-from tests.scene.test_origin import write_scene
 from tests.support.runs import train
+from tests.support.transforms_scene import write_shifted
 
 ORIGIN = np.array([500_000.0, 4_500_000, 100])
 STAGES = """\
@@ -33,7 +33,7 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("origin")
     (folder / "few.yaml").write_text(STAGES)
     for name, shift in (("local", 0.0), ("world", ORIGIN)):
-        write_scene(folder / f"{name}_scene", shift)
+        write_shifted(folder / f"{name}_scene", shift)
         train(folder / f"{name}_scene", folder / name, pipeline=str(folder / "few.yaml"))
     return folder
 

@@ -6,6 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import write_image
+from clsplat.scene.points import write_points_ply
+from clsplat.scene.scene import PointCloud
+from clsplat.scene.transforms_json import opengl_matrix
+from clsplat.scene.view import View
+
 
 def several_cameras(folder: Path, counts: dict[str, int], *posed: str) -> Path:
     """Videos as folders of frames, and a transforms.json with a pose for each camera."""
@@ -44,3 +51,23 @@ def write(path: Path, name: str = "transforms.json", size: tuple[int, int] = (64
         file.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(file), np.full((size[1], size[0], 3), 128, np.uint8))
     return path
+
+
+# A dataset of nerfstudio that is moved as a whole, with four cameras around a few points.
+
+CENTERS = np.array([[1.25, 0, 2], [-2, 0.5, 1], [0.25, -3, 2], [2, 2, -1.5]])
+SHIFTED_POINTS = np.array([[0.125, 0.25, -0.5], [0.5, -0.5, 0.25], [0, 0, 0]])
+
+
+def write_shifted(folder, shift=0.0):
+    """A nerfstudio dataset whose coordinates are all moved by `shift`."""
+    frames = []
+    for i, center in enumerate(CENTERS):
+        matrix = opengl_matrix(View.looking_at(center, (0, 0, 0), (0, 0, 1), None).world_to_camera)
+        matrix[:3, 3] = center + shift
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": matrix.tolist()})
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        write_image(folder / "images" / f"{i}.png", np.full((48, 64, 3), 50 * i, np.uint8))
+    (folder / "transforms.json").write_text(json.dumps(LENS | {"frames": frames, "ply_file_path": "p.ply"}))
+    write_points_ply(folder / "p.ply", PointCloud(SHIFTED_POINTS + shift, np.full((3, 3), 0.5)))
+    return read_scene(folder, holdout=0)
