@@ -342,10 +342,16 @@ COARSE = 0.05  # of the median scale: a spacing of positions that shows
 
 
 def float32_holds(means: NDArray[np.floating], log_scales: Floats) -> bool:
-    """Return whether float32 numbers are dense enough for means, [N, 3], of Gaussians with these scales, [N, 3]."""
+    """Return whether float32 numbers are dense enough for means, [N, 3], of Gaussians with these scales, [N, 3].
+
+    Beyond MAX_NUMBER they are not coordinates, and stay as they are.
+    """
     if not len(means):
         return True
-    spacing = np.spacing(np.float32(np.abs(np.median(means, axis=0)).max()))
+    place = np.abs(np.median(means, axis=0)).max()
+    if place >= MAX_NUMBER:
+        return True
+    spacing = np.spacing(np.float32(place))
     return bool(spacing <= COARSE * np.exp(min(float(np.median(log_scales)), MAX_LOG)))
 
 
