@@ -1,11 +1,14 @@
 """Run the command `clsplat`, also as `python -m clsplat`."""
 
+import os
+
 from clsplat.core.signals import exit_on_signals
 
 
 def main() -> None:
     """Run the command line.  Signals end it in the same way while it is still being imported."""
     exit_on_signals()
+    os.environ["PYTHONSAFEPATH"] = "1"  # -P for all child processes, also those of Dask and multiprocessing
     from clsplat.cli import main as command_line
 
     command_line()

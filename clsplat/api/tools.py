@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, path_of
-from clsplat.opencl.runtimes import INSTALL as INSTALL
+from clsplat.opencl.runtimes import no_device_advice as no_device_advice
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.conformance.bench.measurement import Measurement

@@ -126,7 +126,7 @@ def choose(device_name: str | None = None) -> DeviceInfo:
     device_name = device_name or os.environ.get(DEVICE_VARIABLE)
     devices = list_devices()
     if not devices:
-        raise DeviceError(f"no OpenCL device was found; {runtimes.INSTALL}")
+        raise DeviceError(f"no OpenCL device was found; {runtimes.no_device_advice()}")
     if device_name:
         return _named(device_name, devices)
     faults = []

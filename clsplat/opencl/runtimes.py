@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from clsplat.core.errors import OutputError
+from clsplat.core.errors import OutputError, quote
 from clsplat.core.files import write_text
 from clsplat.core.machine import cache_folder
 from clsplat.opencl.kernel_caches import damaged_kernels, empty_kernel_caches, remove_cut_kernels
@@ -26,6 +26,7 @@ INSTALL = (
     "install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', apt install pocl-opencl-icd, or "
     "your GPU's driver"
 )
+VARIABLES = ("POCL_DEVICES", "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # any of them may hide a runtime
 _HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
 _NO_EXECUTION = "PoCL's cache is on a file system mounted with `noexec`: mount it with `exec`, or set POCL_CACHE_DIR"
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
@@ -42,6 +43,14 @@ def prepare() -> None:
     """Prepare the environment for the loader: make runtimes' caches writable, and add Intel's.  Raises OutputError."""
     cache_folder()
     _add_intel_runtime()
+
+
+def no_device_advice() -> str:
+    """Return what to do if there is no device: correct the variables that the user has set, or install a runtime."""
+    own = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # set by `prepare`
+    given = {name: os.environ[name] for name in VARIABLES if not os.environ.get(name, own[0]).startswith(own)}
+    named = ", ".join(f"{name}={quote(value)}" for name, value in given.items())
+    return f"{named} may hide the runtimes: correct or unset it; or {INSTALL}" if named else INSTALL
 
 
 def _add_intel_runtime() -> None:

@@ -207,7 +207,9 @@ def undistorted_folder(out: Path) -> Path:
     temporary files are unique only within a host.
     """
     shared = out.absolute().parent / UNDISTORTED
-    return shared / Owner.current().host_slug if shared.is_symlink() and shared.is_dir() else out / UNDISTORTED
+    store = Path(*shared.parts[:-4]) / UNDISTORTED  # links to other places may come from somebody else
+    is_of_store = shared.is_symlink() and shared.is_dir() and shared.resolve().parent == store.resolve()
+    return shared / Owner.current().host_slug if is_of_store else out / UNDISTORTED
 
 
 def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:

@@ -123,14 +123,19 @@ def check_output_paths(pipeline: Pipeline, state: RunState) -> None:
 def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path] = ()) -> None:
     """Raise ConfigError if a file that a run or a matrix writes is outside of its folder, or is not from a run."""
     out, files = state.out, [*(state.out / name for name in sorted(names)), *outputs]
-    folder = out.resolve()
-    if outside := [path for path in files if not path.resolve().is_relative_to(folder)]:
-        raise ConfigError(f"{outside[0]}: is a link to outside of the run folder; remove it, or choose another name")
+    require_inside(out, files)
     own = EARLY_RUN_FILES if Owner.from_record(state.status) else {LOCK} if _is_lock(out / LOCK) else set[str]()
     leftovers = {out / name for name in own}  # of a run that has not started
     for path in files if state.phase < Phase.BEGUN else ():
         if path not in leftovers and (path.is_file() or (path.is_dir() and any(path.iterdir()))):
             raise ConfigError(f"{path}: exists, and is not from a run; use another folder for the run")
+
+
+def require_inside(out: Path, files: Sequence[Path]) -> None:
+    """Raise ConfigError if one of the files is a link to outside of a folder."""
+    folder = out.resolve()
+    if outside := [path for path in files if not path.resolve().is_relative_to(folder)]:
+        raise ConfigError(f"{outside[0]}: is a link to outside of the run folder; remove it, or choose another name")
 
 
 def _is_lock(file: Path) -> bool:

@@ -7,6 +7,7 @@ stopping it.  At most one cell per device is in flight, since a worker that dies
 import asyncio
 import json
 import logging
+import os
 import ssl
 import threading
 import time
@@ -112,6 +113,7 @@ def work(cell: str, store: str, command: list[str], options: str) -> str:
 
 def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
     """Return the engine that `execution` selects.  Raises DeviceError if there are no devices."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # workers start with -P: they import nothing from the working folder
     with ExitStack() as settings:
         settings.enter_context(dask.config.set(SETTINGS))  # until the engine is closed
         cluster = _engine(execution, store, devices)

@@ -10,7 +10,18 @@ from typing import Any
 
 from clsplat.core import terminal
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted, shell_quote, shorten
-from clsplat.core.files import COMPARISON, LOG_FILE, MATRIX_FILES, PIPELINE, STATUS, STORE, path_exists, write_text
+from clsplat.core.files import (
+    COMPARISON,
+    LOG_FILE,
+    MATRIX_FILES,
+    PIPELINE,
+    PREPARED,
+    STATUS,
+    STORE,
+    UNDISTORTED,
+    path_exists,
+    write_text,
+)
 from clsplat.core.reading import sha256
 from clsplat.core.signals import stop_at_once, stop_if_signaled, stopping_on_signals
 from clsplat.opencl.device import Device
@@ -284,6 +295,7 @@ def read_cells(experiment: Experiment, out: Path, start: Start) -> tuple[dict[st
 def check_matrix_folder(state: RunState) -> None:
     """Raise ConfigError when the folder holds a single run, or files of others under the names of a matrix."""
     outputs.check_names(state, MATRIX_FILES)
+    outputs.require_inside(state.out, [state.out / PREPARED, state.out / UNDISTORTED])  # cells share them
     out = state.out
     if PIPELINE in state.names and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")

@@ -9,7 +9,7 @@ from clsplat.core.errors import DataError, one_line
 from clsplat.core.files import METRICS
 from clsplat.core.reading import read_json
 from clsplat.runs.results import read_metrics
-from clsplat.sweeps.store import CELLS, SPEC, STALE_AFTER_S, CellAttempt, CellFolder, Store
+from clsplat.sweeps.store import CELLS, SPEC, STALE_AFTER_S, CellAttempt, CellFolder, Store, number_of
 from clsplat.training.status import read_status
 
 NO_BEAT_S = 60.0  # seconds without a beat after which a run may have ended
@@ -50,7 +50,8 @@ def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, A
     facts = {"key": folder.key, "sweep": names[0], "name": names[1], "bits": spec.get("bits")}
     facts |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
     if manifest := folder.manifest():
-        values = {key: manifest.get(key) for key in ("seconds", "device", "host", "worker")}
+        values = {key: manifest.get(key) for key in ("device", "host", "worker")}
+        values["seconds"] = number_of(manifest.get("seconds"))
         return {**facts, "state": "published", **values, **_figures(folder)}
     attempts = sorted(folder.attempts(), key=lambda attempt: attempt.last_beat)
     alive = [one for one in attempts if one.exit_code is None and now - one.last_beat < NO_BEAT_S]
@@ -62,7 +63,7 @@ def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, A
 
 def _steps(pipeline: dict[str, Any]) -> int | None:
     """Return the steps of all trainings of a resolved pipeline."""
-    with suppress(KeyError, TypeError, AttributeError):
+    with suppress(KeyError, TypeError, AttributeError, ValueError, OverflowError):
         return int(sum(part.get("steps", 0) for stage in pipeline["stages"] for part in stage.values()))
     return None
 
@@ -103,8 +104,8 @@ def overview_text(status: dict[str, Any]) -> str:
 
 def _detail(cell: dict[str, Any]) -> str:
     if cell["state"] == "published":
-        psnr = f", {cell['psnr']:.2f} dB" if "psnr" in cell else ""
-        return psnr + (f", {cell['seconds']:.0f} s" if isinstance(cell.get("seconds"), int | float) else "")
+        psnr = f", {cell['psnr']:.2f} dB" if cell.get("psnr") is not None else ""
+        return psnr + (f", {cell['seconds']:.0f} s" if cell["seconds"] is not None else "")
     step = f", step {cell['step']}/{cell['steps']}" if cell.get("step") is not None else ""
     more = f": {cell['message']}" if cell.get("message") else ""
     if cell["state"] == "silent":

@@ -73,6 +73,8 @@ def copy_files(source: Path, target: Path, left_out: Collection[str]) -> None:
         is_top = here == Path()
         skipped = left_out if is_top else ()
         folders[:] = [name for name in folders if name not in skipped]
+        if not is_top and (target / here).is_symlink():  # it may lead outside of the target
+            (target / here).unlink()
         (target / here).mkdir(parents=True, exist_ok=True)
         for name in files:
             if name in skipped or PARTIAL.fullmatch(name):
@@ -156,7 +158,7 @@ class CellAttempt:
     def exit_code(self) -> int | None:
         """Exit code of the run; None if it is running, or its process was killed."""
         code = self.lease.get("exit_code")
-        return code if isinstance(code, int) else None
+        return code if isinstance(code, int) and abs(code) < 1 << 32 else None
 
     @property
     def has_failed(self) -> bool:
@@ -165,7 +167,7 @@ class CellAttempt:
     @property
     def since(self) -> float:
         """When the caller started, by the clock of the store."""
-        return float(self.lease.get("since", 0))
+        return number_of(self.lease.get("since")) or 0.0
 
     @property
     def start_rank(self) -> Rank:
@@ -239,7 +241,7 @@ def readable_checkpoints(attempts: Iterable[CellAttempt]) -> Iterator[tuple[Rank
 
 
 def _rank_of(name: str) -> Rank:
-    found = re.fullmatch(r"(step|refit)_(\d+)\.npz", name)
+    found = re.fullmatch(r"(step|refit)_(\d{1,18})\.npz", name)
     return (found[1] == "refit", int(found[2])) if found else (False, 0)
 
 
@@ -325,7 +327,8 @@ class CellFolder:
     def attempts(self) -> list[CellAttempt]:
         """Return the existing attempts."""
         paths = (self.path / ATTEMPTS).glob("*")
-        return [CellAttempt(path) for path in paths if NAME.fullmatch(path.name) and path.is_dir()]
+        named = [path for path in paths if NAME.fullmatch(path.name)]
+        return [CellAttempt(path) for path in named if path.is_dir() and not path.is_symlink()]
 
     def begin(self, worker: str, since: float) -> CellAttempt:
         """Start a new attempt, which continues from the newest readable checkpoint.  Raises OutputError."""
@@ -397,6 +400,26 @@ class CellFolder:
                 shutil.rmtree(attempt.path, ignore_errors=True)
 
 
+# A store may come from somebody else: links, which may lead outside of it, are refused, and damaged values ignored.
+
+
+def without_links(root: Path, *names: str) -> Path:
+    """Return a path below a folder.  Raises DataError if a part of it is a symbolic link."""
+    path = root
+    for name in names:
+        path /= name
+        if path.is_symlink():
+            raise DataError(f"{path}: is a symbolic link, which may lead outside of the store; remove it")
+    return path
+
+
+def number_of(value: Any) -> float | None:
+    """Return a finite number in a record, or None."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e18:
+        return None
+    return float(value)
+
+
 CELLS, EVENTS, SWEEPS, CANCEL = "cells", "events", "sweeps", "cancel"
 ALL = "all"
 
@@ -419,23 +442,26 @@ class Store:
     @property
     def prepared(self) -> Path:
         """The folder of the output of `prepare`."""
-        return self.root / PREPARED
+        return without_links(self.root, PREPARED)
 
     def undistorted(self, scene: str, code: str) -> Path:
         """Return the folder of a scene's undistorted photos.  Both arguments are fingerprints, as in a cell's key."""
-        return self.root / UNDISTORTED / f"{scene[:16]}-{code}"
+        return without_links(self.root, UNDISTORTED, f"{scene[:16]}-{code}", Owner.current().host_slug).parent
 
     def folder(self, key: str) -> CellFolder:
-        """Return the folder of a cell, which need not exist."""
+        """Return the folder of a cell, which need not exist.  Raises DataError if it is, or has, a symbolic link."""
+        for name in (ATTEMPTS, RESULT):
+            without_links(self.root, CELLS, key, name)
         return CellFolder(self.root / CELLS / key)
 
     def folders(self) -> list[CellFolder]:
-        """Return the folders of all cells."""
-        return [CellFolder(path) for path in sorted((self.root / CELLS).glob("*")) if path.is_dir()]
+        """Return the folders of all cells.  Raises DataError as `folder` does."""
+        names = sorted(path.name for path in (self.root / CELLS).glob("*") if path.is_dir())
+        return [self.folder(name) for name in names if is_key(name)]
 
     def now(self) -> float:
         """Return the time by the clock of the store's file system, which all machines share, in seconds."""
-        clock = self.root / EVENTS / f".{self._own}.clock"
+        clock = without_links(self.root, EVENTS, f".{self._own}.clock")
         with raising_output_error(clock):
             make_folder(clock.parent)
             clock.touch()
@@ -443,7 +469,7 @@ class Store:
 
     def log_event(self, event: str, **values: Any) -> None:
         """Append an event to the file of this process."""
-        path = self.root / EVENTS / f"{self._own}.jsonl"
+        path = without_links(self.root, EVENTS, f"{self._own}.jsonl")
         with raising_output_error(path):
             make_folder(path.parent)
             with path.open("a", encoding="utf-8") as file:
@@ -456,7 +482,7 @@ class Store:
             for line in read_file(path).decode(errors="replace").splitlines() if path.is_file() else ():
                 with suppress(ValueError):
                     event = json.loads(line)
-                    events += [event] if isinstance(event, dict) and isinstance(event.get("time"), float | int) else []
+                    events += [event] if isinstance(event, dict) and number_of(event.get("time")) is not None else []
         return sorted(events, key=lambda event: float(event["time"]))
 
     def note_sweep(self, name: str, keys: Mapping[str, str], text: str) -> None:
@@ -464,7 +490,8 @@ class Store:
 
         text: distinguishes matrices with the same name, such as the text of the file.  Other cells of it stay recorded.
         """
-        file = self.root / SWEEPS / f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
+        folder = without_links(self.root, SWEEPS)
+        file = folder / f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
         cells = {**dict(self.sweeps([file])).get(name, {}), **keys}
         write_text(file, json.dumps({"name": name, "cells": cells}, indent=1) + "\n")
 
@@ -496,7 +523,7 @@ class Store:
 
     def stop(self, name: str) -> None:
         """Request that everything that started under a name stops."""
-        flag = self.root / CANCEL / name
+        flag = without_links(self.root, CANCEL, name)
         with raising_output_error(flag):
             make_folder(flag.parent)
             flag.touch()

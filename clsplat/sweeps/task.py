@@ -119,6 +119,8 @@ def _equip(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt
     for name, target in shared.items():
         make_folder(target)
         link = folder.path / ATTEMPTS / name
+        if link.is_symlink() and not link.samefile(target):
+            raise DataError(f"{link}: is a symbolic link to another place than {target}; remove it")
         if not link.exists():
             with suppress(OSError):
                 link.symlink_to(os.path.relpath(target, link.parent), target_is_directory=True)

@@ -270,3 +270,16 @@ def test_wide_needs_no_kernel_with_barriers(info, rng, monkeypatch):
     image = image_of(Device(info, "wide"), np.random.default_rng(1))
     capped(monkeypatch, 1, "sort_tiles", "blend_forward", "blend_backward", "scan_offsets", "radix_count")
     np.testing.assert_array_equal(image_of(Device(info, "wide"), np.random.default_rng(1)), image)
+
+
+@pytest.mark.parametrize("name", ["POCL_DEVICES", "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES"])
+def test_a_variable_that_hides_all_devices_is_named(monkeypatch, name):
+    monkeypatch.setattr(discovery, "list_devices", list)
+    for other in runtimes.VARIABLES:
+        monkeypatch.delenv(other, raising=False)
+    monkeypatch.setenv(name, "wrong")
+    with pytest.raises(DeviceError, match=f"^no OpenCL device was found; {name}='wrong' may hide .*; or install a"):
+        discovery.choose()
+    monkeypatch.setenv(name, str(runtimes.cache_folder() / "drivers" / "x"))  # as `prepare` sets it
+    with pytest.raises(DeviceError, match=r"^no OpenCL device was found; install a runtime"):
+        discovery.choose()
