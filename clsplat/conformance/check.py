@@ -24,7 +24,7 @@ class Deviation:
     """The result of one comparison with the reference, and its bound."""
 
     kernel: str
-    what: str  # the values that were compared
+    label: str  # the values that were compared
     value: float
     bound: float
     counts: bool = False  # whether `value` is a number of wrong values, else it is a difference
@@ -38,8 +38,8 @@ class Deviation:
         """The deviation as a sentence."""
         if self.counts:
             wrong = "1 wrong value" if self.value == 1 else f"{self.value:g} wrong values"
-            return f"{self.kernel} gives {wrong} in {self.what}" + (f", bound {self.bound:g}" if self.bound else "")
-        return f"{self.kernel} differs by {self.value:.1g} in {self.what}, bound {self.bound:.1g}"
+            return f"{self.kernel} gives {wrong} in {self.label}" + (f", bound {self.bound:g}" if self.bound else "")
+        return f"{self.kernel} differs by {self.value:.1g} in {self.label}, bound {self.bound:.1g}"
 
 
 def relative_error(value: NDArray[Any], expected: NDArray[Any]) -> float:
@@ -47,41 +47,41 @@ def relative_error(value: NDArray[Any], expected: NDArray[Any]) -> float:
     return float(np.linalg.norm(value - expected)) / max(float(np.linalg.norm(expected)), 1e-30)
 
 
-def by_norm(kernel: str, what: str, value: NDArray[Any], expected: NDArray[Any], bound: float) -> Deviation:
+def by_norm(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any], bound: float) -> Deviation:
     """Compare by norm: for gradients, whose small components suffer from cancellation."""
-    return Deviation(kernel, what, relative_error(value, expected), bound)
+    return Deviation(kernel, label, relative_error(value, expected), bound)
 
 
 def by_element(
-    kernel: str, what: str, value: NDArray[Any], expected: NDArray[Any], bound: float, floor: float = 0.0
+    kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any], bound: float, floor: float = 0.0
 ) -> Deviation:
     """Compare value by value: the largest |value - expected| / (|expected| + floor)."""
     if value.size == 0:
-        return Deviation(kernel, what, 0.0, bound)
+        return Deviation(kernel, label, 0.0, bound)
     difference, size = np.abs(np.subtract(value, expected, dtype=np.float64)), np.abs(expected) + floor
     error = np.where(difference == 0, 0, difference / np.where(size > 0, size, 1e-30))
-    return Deviation(kernel, what, float(error.max()), bound)
+    return Deviation(kernel, label, float(error.max()), bound)
 
 
-def equal(kernel: str, what: str, value: NDArray[Any], expected: NDArray[Any] | float) -> Deviation:
+def equal(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any] | float) -> Deviation:
     """Count the values that are not exactly as expected."""
-    return wrong(kernel, what, value != expected)
+    return wrong(kernel, label, value != expected)
 
 
-def wrong(kernel: str, what: str, mask: NDArray[Any], allowed: float = 0) -> Deviation:
+def wrong(kernel: str, label: str, mask: NDArray[Any], allowed: float = 0) -> Deviation:
     """Count the values of a mask that are True."""
-    return Deviation(kernel, what, float(np.count_nonzero(mask)), allowed, counts=True)
+    return Deviation(kernel, label, float(np.count_nonzero(mask)), allowed, counts=True)
 
 
-def check_image(kernel: str, what: str, value: NDArray[Any], expected: NDArray[Any]) -> Iterator[Deviation]:
+def check_image(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any]) -> Iterator[Deviation]:
     """Compare images, [C, H, W], and allow a few pixels in which a splat falls on the other side of a threshold.
 
     One splat more or less changes a pixel by up to 1/255 of its color, and colors reach 3.
     """
     difference = np.abs(value - expected).max(axis=0)
-    yield Deviation(kernel, f"{what}: largest difference", float(difference.max()), 1.5e-2)
-    yield Deviation(kernel, f"{what}: share of pixels off by 2e-5", float(np.mean(~(difference <= 2e-5))), 2e-3)
-    yield Deviation(kernel, f"{what}: median difference", float(np.median(difference)), 1e-6)
+    yield Deviation(kernel, f"{label}: largest difference", float(difference.max()), 1.5e-2)
+    yield Deviation(kernel, f"{label}: share of pixels off by 2e-5", float(np.mean(~(difference <= 2e-5))), 2e-3)
+    yield Deviation(kernel, f"{label}: median difference", float(np.median(difference)), 1e-6)
 
 
 @dataclass(frozen=True)

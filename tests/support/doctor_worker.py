@@ -14,7 +14,7 @@ for name in sys.argv[4:]:
         continue
     if name == "leaves":
         sys.exit(3)
-    deviation = {"kernel": "blend_backward", "what": "x", "value": %s, "bound": 0.1, "counts": False}
+    deviation = {"kernel": "blend_backward", "label": "x", "value": %s, "bound": 0.1, "counts": False}
     print(json.dumps({"deviation": deviation}))
     print(json.dumps({"end": name, "seconds": 0.1}), flush=True)
 """

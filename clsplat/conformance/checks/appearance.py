@@ -61,7 +61,7 @@ def check_grid(
     device: Device, rng: np.random.Generator, width: int, height: int, nodes: tuple[int, ...], channels: int = 3
 ) -> Results:
     """Compare an image, its gradient, and the gradient of the grid."""
-    what = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
+    label = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
     grids = grids_of(device, rng, nodes)
     grid = of_photograph(grids, grids.tables()["values"][1])
     image = image_for(rng, grid, width, height, channels)
@@ -71,31 +71,31 @@ def check_grid(
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
     exact = image[:3].astype(np.float64)
-    found = grids.changed(workspace, camera, planes, 1).get()
+    actual = grids.changed(workspace, camera, planes, 1).get()
     expected = ref.gridded(exact, grid)
-    yield by_element("color_grid_forward", f"colors, {what}", found[:3, :height, :width], expected, 3e-6, floor=1.0)
-    yield equal("color_grid_forward", f"pixels outside the image, {what}", outside(camera, found[:3]), 0.0)
+    yield by_element("color_grid_forward", f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
+    yield equal("color_grid_forward", f"pixels outside the image, {label}", outside(camera, actual[:3]), 0.0)
     passed, by_grid = grids.differentiated(workspace, camera, planes, uploaded, 1)
     by_image, expected = ref.gridded_backward(exact, grid, gradient[:3].astype(np.float64))
     largest = max(float(np.abs(by_image).max()), 1.0)
     grad_image, grad_grid = passed.get(), by_grid.get()
     yield by_element(
-        "color_grid_backward", f"gradient, {what}", grad_image[:3, :height, :width], by_image, 1e-5, floor=largest
+        "color_grid_backward", f"gradient, {label}", grad_image[:3, :height, :width], by_image, 1e-5, floor=largest
     )
-    yield equal("color_grid_backward", f"gradient outside the image, {what}", outside(camera, grad_image[:3]), 0.0)
+    yield equal("color_grid_backward", f"gradient outside the image, {label}", outside(camera, grad_image[:3]), 0.0)
     floor = max(float(np.sqrt(gradient.size)) / 8, 1.0)
     for kernel in ("color_grid_row_sums", "color_grid_gather"):
         yield by_element(
-            kernel, f"gradient by the grid, {what}", of_photograph(grids, grad_grid), expected, SUM, floor=floor
+            kernel, f"gradient by the grid, {label}", of_photograph(grids, grad_grid), expected, SUM, floor=floor
         )
     if channels > 3:
-        yield equal("color_grid_forward", f"fourth plane, {what}", found[3], planes.get()[3])
-        yield equal("color_grid_backward", f"gradient of the fourth plane, {what}", grad_image[3], uploaded.get()[3])
+        yield equal("color_grid_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
+        yield equal("color_grid_backward", f"gradient of the fourth plane, {label}", grad_image[3], uploaded.get()[3])
 
 
 def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Results:
     """Compare the smoothness of a grid and three updates of it, which leave the other grids unchanged."""
-    what, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
+    label, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
     grids, workspace = grids_of(device, rng, nodes, weight), Workspace(device)
     expected = grids.tables()["values"].astype(np.float64).reshape(3, -1)
     moment1, moment2 = np.zeros((2, row_length(nodes)))
@@ -104,12 +104,12 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
         shares = grids.smoothness(workspace, 1)
         by_smoothness = workspace.array("grid smoothness", row_length(nodes)).get()
         smooth, slope = ref.grid_smoothness(of_photograph(grids, expected[1]))
-        found, wanted = np.array([shares.get().sum(dtype=np.float64)]), np.array([weight * smooth])
+        actual, wanted = np.array([shares.get().sum(dtype=np.float64)]), np.array([weight * smooth])
         kernel = "color_grid_smoothness"
-        yield by_element(kernel, f"value, {what}", found, wanted, SUM, floor=1e-2)
-        found, wanted = of_photograph(grids, by_smoothness), weight * slope
+        yield by_element(kernel, f"value, {label}", actual, wanted, SUM, floor=1e-2)
+        actual, wanted = of_photograph(grids, by_smoothness), weight * slope
         largest = max(float(np.abs(wanted).max()), 1e-6)
-        yield by_element(kernel, f"derivatives, {what}", found, wanted, 2e-5, floor=largest)
+        yield by_element(kernel, f"derivatives, {label}", actual, wanted, 2e-5, floor=largest)
         gradient = rng.normal(0, 0.1, row_length(nodes)).astype(np.float32)
         grids.learn(workspace, 1, device.upload(gradient), step)
         whole = gradient.astype(np.float64) + by_smoothness
@@ -118,11 +118,11 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
         expected = ref.centered_grids(updated).reshape(expected.shape)
     tables = {name: table.reshape(3, -1) for name, table in grids.tables().items()}
     for kernel in ("color_grid_update", "color_grid_center"):
-        yield by_element(kernel, f"grids, {what}", tables["values"], expected, 2e-6, floor=1.0)
+        yield by_element(kernel, f"grids, {label}", tables["values"], expected, 2e-6, floor=1.0)
     for name, moment, bound in (("moment1", moment1, SUM), ("moment2", moment2, 3 * SUM)):
         floor = 0.1 * float(np.abs(moment).max())
-        yield by_element("color_grid_update", f"{name}, {what}", tables[name][1], moment, bound, floor=floor)
-        yield equal("color_grid_update", f"{name} of other photographs, {what}", tables[name][[0, 2]], 0.0)
+        yield by_element("color_grid_update", f"{name}, {label}", tables[name][1], moment, bound, floor=floor)
+        yield equal("color_grid_update", f"{name} of other photographs, {label}", tables[name][[0, 2]], 0.0)
 
 
 @CHECKS.add("color_grid_forward", "color_grid_backward", "color_grid_row_sums", "color_grid_gather")
@@ -140,7 +140,7 @@ def color_grid_tables(device: Device, rng: np.random.Generator) -> Results:
 
 def check_color(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
     """Compare an image with a third of its pixels above white, its gradient, and the gradient of the matrix."""
-    what = f"{width} x {height} px"
+    label = f"{width} x {height} px"
     matrix = (IDENTITY + rng.normal(0, 0.2, (3, 4))).astype(np.float32).astype(np.float64)
     image = rng.uniform(-0.2, 1.6, (channels, height, width)).astype(np.float32)
     near = np.abs(np.einsum("ab,bhw->ahw", matrix[:, :3], image[:3]) + matrix[:, 3, None, None] - 1).min(axis=0)
@@ -150,22 +150,22 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     for name in ("colored", "grad_colored"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes = planes_of(device, camera, image)
-    found = transform_colors(workspace, camera, planes, matrix).get()
+    actual = transform_colors(workspace, camera, planes, matrix).get()
     exact = image[:3].astype(np.float64)
     expected = ref.colored(exact, matrix)
-    yield by_element("colors_forward", f"colors, {what}", found[:3, :height, :width], expected, 2e-6, floor=1.0)
-    yield equal("colors_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)
+    yield by_element("colors_forward", f"colors, {label}", actual[:3, :height, :width], expected, 2e-6, floor=1.0)
+    yield equal("colors_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
     uploaded = planes_of(device, camera, gradient)
     grad_image, waiting = color_gradients(workspace, camera, planes, matrix, uploaded)
     by_image, by_matrix = ref.colored_backward(exact, matrix, gradient[:3].astype(np.float64))
     passed = grad_image.get()
-    yield by_element("colors_backward", f"gradient, {what}", passed[:3, :height, :width], by_image, 2e-6, floor=1.0)
-    yield equal("colors_backward", f"gradient outside the image, {what}", outside(camera, passed), 0.0)
+    yield by_element("colors_backward", f"gradient, {label}", passed[:3, :height, :width], by_image, 2e-6, floor=1.0)
+    yield equal("colors_backward", f"gradient outside the image, {label}", outside(camera, passed), 0.0)
     size = float(np.sqrt(gradient.size))
-    yield by_element("colors_backward", f"gradient by the matrix, {what}", waiting(), by_matrix, SUM, floor=size)
+    yield by_element("colors_backward", f"gradient by the matrix, {label}", waiting(), by_matrix, SUM, floor=size)
     if channels > 3:
-        yield equal("colors_forward", f"fourth plane, {what}", found[3], planes.get()[3])
-        yield equal("colors_backward", f"gradient of the fourth plane, {what}", passed[3], uploaded.get()[3])
+        yield equal("colors_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
+        yield equal("colors_backward", f"gradient of the fourth plane, {label}", passed[3], uploaded.get()[3])
 
 
 @CHECKS.add("colors_forward", "colors_backward")
@@ -177,7 +177,7 @@ def colors(device: Device, rng: np.random.Generator) -> Results:
 
 def check_response(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
     """Compare the response of a camera to an image with values below black and above white, and both gradients."""
-    what, kernel = f"{width} x {height} px", "camera_response"
+    label, kernel = f"{width} x {height} px", "camera_response"
     row = np.concatenate([rng.normal(0, 0.1, 5), rng.normal(0, 0.4, 12)])
     image = rng.uniform(-0.3, 1.5, (channels, height, width)).astype(np.float32)
     gradient = rng.normal(size=image.shape).astype(np.float32)
@@ -187,24 +187,24 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     for name in ("response", "grad_response"):
         workspace.array(name, (channels, camera.rows, camera.stride)).fill(np.nan)
     planes, uploaded = planes_of(device, camera, image), planes_of(device, camera, gradient)
-    found, passed = (
+    actual, passed = (
         respond(workspace, camera, planes, row).get(),
         respond(workspace, camera, planes, row, uploaded).get(),
     )
     sums = workspace.array("response sums", (20, camera.rows)).get()
     exact, given = image[:3].astype(np.float64), gradient[:3].astype(np.float64)
     expected = appearance.taken(exact, row, middle)
-    yield by_element(kernel, f"colors, {what}", found[:3, :height, :width], expected, 3e-6, floor=1.0)
-    yield equal(kernel, f"pixels outside the image, {what}", outside(camera, found[:3]), 0.0)
+    yield by_element(kernel, f"colors, {label}", actual[:3, :height, :width], expected, 3e-6, floor=1.0)
+    yield equal(kernel, f"pixels outside the image, {label}", outside(camera, actual[:3]), 0.0)
     by_image, by_row = appearance.taken_backward(exact, row, middle, given)
     largest = max(float(np.abs(by_image).max()), 1.0)
-    yield by_element(kernel, f"gradient, {what}", passed[:3, :height, :width], by_image, 1e-5, floor=largest)
-    yield equal(kernel, f"gradient outside the image, {what}", outside(camera, passed[:3]), 0.0)
+    yield by_element(kernel, f"gradient, {label}", passed[:3, :height, :width], by_image, 1e-5, floor=largest)
+    yield equal(kernel, f"gradient outside the image, {label}", outside(camera, passed[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
-    yield by_element(kernel, f"gradient by the numbers, {what}", by_parameters(row, sums), by_row, SUM, floor=floor)
+    yield by_element(kernel, f"gradient by the numbers, {label}", by_parameters(row, sums), by_row, SUM, floor=floor)
     if channels > 3:
-        yield equal(kernel, f"fourth plane, {what}", found[3], planes.get()[3])
-        yield equal(kernel, f"gradient of the fourth plane, {what}", passed[3], uploaded.get()[3])
+        yield equal(kernel, f"fourth plane, {label}", actual[3], planes.get()[3])
+        yield equal(kernel, f"gradient of the fourth plane, {label}", passed[3], uploaded.get()[3])
 
 
 @CHECKS.add("camera_response")

@@ -32,17 +32,17 @@ def render(device: Device, case: Case, sort: Sort = "radix") -> Frame:
     return Rasterizer(device, sort).forward(case.model(device), case.device_camera(device), device.upload(BACKGROUND))
 
 
-def check_blend(device: Device, case: Case, what: str, sort: Sort = "radix") -> Results:
+def check_blend(device: Device, case: Case, label: str, sort: Sort = "radix") -> Results:
     """Compare the image and the transmittance of a scene; both are zero outside the image."""
     frame, (width, height) = render(device, case, sort), case.size
     image, transmittance = frame.image.get(), frame.transmittance.get()
     outside = np.concatenate([image, transmittance[None]])
     outside[:, :height, :width] = 0
-    yield equal("blend_forward", f"pixels outside the image, {what}", outside, 0.0)
+    yield equal("blend_forward", f"pixels outside the image, {label}", outside, 0.0)
     expected, left, _ = ref.blend(case.project(), width, height, BACKGROUND.astype(np.float64))
-    yield from check_image("blend_forward", f"image, {what}", image[:, :height, :width], expected)
-    found = transmittance[None, :height, :width]
-    yield from check_image("blend_forward", f"transmittance, {what}", found, left[None])
+    yield from check_image("blend_forward", f"image, {label}", image[:, :height, :width], expected)
+    actual = transmittance[None, :height, :width]
+    yield from check_image("blend_forward", f"transmittance, {label}", actual, left[None])
 
 
 def pixel_sums_of(
@@ -67,18 +67,18 @@ def pixel_sums_of(
     return pixel_sums.get()[:, : model.gaussians.count].T.astype(np.float64)
 
 
-def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], what: str) -> Results:
+def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], label: str) -> Results:
     """Compare sums over pixels, [N, PIXEL_SUMS or more], after conversion to gradients of splats."""
     kernel, splats = "blend_backward", case.project()
     truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
     mean2d, conic = gradients_of_sums(splats, m)
-    yield by_norm(kernel, f"gradients of splat means, {what}", mean2d, truth.mean2d, GRADIENT)
-    yield by_norm(kernel, f"gradients of conics, {what}", conic, truth.conic, GRADIENT)
-    yield by_norm(kernel, f"gradients of opacities, {what}", m[:, 0], truth.opacity * splats.opacity, GRADIENT)
-    yield by_norm(kernel, f"gradients of colors, {what}", m[:, 6:9], truth.color, GRADIENT)
+    yield by_norm(kernel, f"gradients of splat means, {label}", mean2d, truth.mean2d, GRADIENT)
+    yield by_norm(kernel, f"gradients of conics, {label}", conic, truth.conic, GRADIENT)
+    yield by_norm(kernel, f"gradients of opacities, {label}", m[:, 0], truth.opacity * splats.opacity, GRADIENT)
+    yield by_norm(kernel, f"gradients of colors, {label}", m[:, 6:9], truth.color, GRADIENT)
     if m.shape[1] > PIXEL_SUMS:
-        found = m[:, ABS_X : ABS_X + 2]
-        yield by_norm(kernel, f"absolute gradients, {what}", found, truth.mean2d_abs, GRADIENT)
+        actual = m[:, ABS_X : ABS_X + 2]
+        yield by_norm(kernel, f"absolute gradients, {label}", actual, truth.mean2d_abs, GRADIENT)
 
 
 def _opaque(parameters: dict[str, NDArray[Any]]) -> None:
@@ -112,8 +112,8 @@ def gradients_of_blending(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24)):
         case = safe_case(rng, count, width, height, MARGIN)
         weights = rng.normal(size=(3, height, width)).astype(np.float32)
-        what = f"{count} Gaussians, {width} x {height} px"
-        yield from check_sum(case, pixel_sums_of(device, case, weights), weights, what)
+        label = f"{count} Gaussians, {width} x {height} px"
+        yield from check_sum(case, pixel_sums_of(device, case, weights), weights, label)
     case = safe_case(rng, 300, 14, 14, 2e-6, _opaque)
     weights = rng.normal(size=(3, 14, 14)).astype(np.float32)
     yield from check_sum(case, pixel_sums_of(device, case, weights), weights, "long tiles, finished pixels")
@@ -147,24 +147,26 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("blend_forward", "blend_backward")
 def entropy_of_weights(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
-        case, what = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
+        case, label = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
         rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
         frame = rasterizer.forward(model, camera, device.upload(BACKGROUND), "entropy")
         planes = frame.image.get()
-        yield equal("blend_forward", f"colors beside the entropy, {what}", planes[:3], render(device, case).image.get())
+        yield equal(
+            "blend_forward", f"colors beside the entropy, {label}", planes[:3], render(device, case).image.get()
+        )
         expected = ref.weight_entropy(case.project(), width, height)
-        yield from check_image("blend_forward", f"entropy, {what}", planes[3:, :height, :width], expected[None])
+        yield from check_image("blend_forward", f"entropy, {label}", planes[3:, :height, :width], expected[None])
         weights = np.zeros((4, camera.rows, camera.stride), np.float32)
         weights[:, :height, :width] = rng.normal(size=(4, height, width))
         m = rasterizer.pixel_sums(model, frame, device.upload(weights)).get()[:, :count].T.astype(np.float64)
-        yield from check_sum(case, m, weights[:, :height, :width], f"with the entropy, {what}")
+        yield from check_sum(case, m, weights[:, :height, :width], f"with the entropy, {label}")
 
 
 @CHECKS.add("blend_backward")
 def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
     """A loss of the transmittance is a loss of an image of black splats in front of one white channel."""
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
-        case, what = safe_case(rng, count, width, height, MARGIN), f"with the transmittance, {count} Gaussians"
+        case, label = safe_case(rng, count, width, height, MARGIN), f"with the transmittance, {count} Gaussians"
         rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
         frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
         planes = np.zeros((4, camera.rows, camera.stride), np.float32)
@@ -176,10 +178,10 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
         black, only = replace(splats, color=0 * splats.color), np.stack([weights[3], *np.zeros((2, height, width))])
         of_left = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), only)
         mean2d, conic = gradients_of_sums(splats, sums.get()[:, :count].T.astype(np.float64))
-        yield by_norm("blend_backward", f"splat means, {what}", mean2d, of_image.mean2d + of_left.mean2d, GRADIENT)
-        yield by_norm("blend_backward", f"conics, {what}", conic, of_image.conic + of_left.conic, GRADIENT)
+        yield by_norm("blend_backward", f"splat means, {label}", mean2d, of_image.mean2d + of_left.mean2d, GRADIENT)
+        yield by_norm("blend_backward", f"conics, {label}", conic, of_image.conic + of_left.conic, GRADIENT)
         opacity = (of_image.opacity + of_left.opacity) * splats.opacity
-        yield by_norm("blend_backward", f"opacities, {what}", sums.get()[0, :count], opacity, GRADIENT)
+        yield by_norm("blend_backward", f"opacities, {label}", sums.get()[0, :count], opacity, GRADIENT)
 
 
 @CHECKS.add("sum_records")
@@ -242,43 +244,43 @@ def gradients_of(
     return frame.image.get()[:, :height, :width], sums.get()[:, :count].T.astype(np.float64), depths, means
 
 
-def check_depth(device: Device, case: Case, weights: Floats, what: str) -> Results:
+def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Results:
     """Compare image, sums and gradients with the reference."""
     splats, (width, height), background = case.project(), case.size, BACKGROUND.astype(np.float64)
     image, m, depths, means = gradients_of(device, case, weights)
     expected = ref.inverse_depth(splats, width, height)
-    yield from check_image("blend_forward", f"inverse depth, {what}", image[3:], expected[None])
+    yield from check_image("blend_forward", f"inverse depth, {label}", image[3:], expected[None])
     of_image = ref.blend_backward(splats, width, height, background, weights[:3])
     of_depth, by_depth = ref.inverse_depth_backward(splats, width, height, weights[3])
     mean2d, conic = (getattr(of_image, name) + getattr(of_depth, name) for name in ("mean2d", "conic"))
     opacity = of_image.opacity + of_depth.opacity
-    found = gradients_of_sums(splats, m)
-    yield by_norm("blend_backward", f"splat means with depths, {what}", found[0], mean2d, GRADIENT)
-    yield by_norm("blend_backward", f"conics with depths, {what}", found[1], conic, GRADIENT)
-    yield by_norm("blend_backward", f"opacities with depths, {what}", m[:, 0], opacity * splats.opacity, GRADIENT)
-    yield by_norm("blend_backward", f"colors with depths, {what}", m[:, 6:9], of_image.color, GRADIENT)
+    actual = gradients_of_sums(splats, m)
+    yield by_norm("blend_backward", f"splat means with depths, {label}", actual[0], mean2d, GRADIENT)
+    yield by_norm("blend_backward", f"conics with depths, {label}", actual[1], conic, GRADIENT)
+    yield by_norm("blend_backward", f"opacities with depths, {label}", m[:, 0], opacity * splats.opacity, GRADIENT)
+    yield by_norm("blend_backward", f"colors with depths, {label}", m[:, 6:9], of_image.color, GRADIENT)
     sums = -by_depth * np.where(splats.visible, splats.depth, 0) ** 2
-    yield by_norm("sum_inverse_depths", f"sums of inverse depths, {what}", depths, sums, GRADIENT)
+    yield by_norm("sum_inverse_depths", f"sums of inverse depths, {label}", depths, sums, GRADIENT)
     upstream = mean2d, conic, opacity, of_image.color
     numbers = case.degree, case.variance, case.compensate
     truth = ref.project_backward(case.gaussians(), case.camera(), *numbers, splats, *upstream)["means"]
     truth = truth + by_depth[:, None] * case.camera().rotation[2]
-    yield by_norm("inverse_depth_backward", f"gradients of means, {what}", means, truth, CONIC)
+    yield by_norm("inverse_depth_backward", f"gradients of means, {label}", means, truth, CONIC)
 
 
 @CHECKS.add("project_forward", "blend_forward", "blend_backward", "sum_inverse_depths", "inverse_depth_backward")
 def inverse_depths(device: Device, rng: np.random.Generator) -> Results:
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
-        case, what = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
+        case, label = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
         weights = rng.normal(size=(4, height, width)).astype(np.float32)
-        yield from check_depth(device, case, weights, what)
+        yield from check_depth(device, case, weights, label)
         plain = Rasterizer(device, "radix").forward(
             case.model(device), case.device_camera(device), device.upload(BACKGROUND)
         )
         image, *sums = gradients_of(device, case, weights)
-        yield equal("blend_forward", f"colors, {what}", image[:3], plain.image.get()[:, :height, :width])
+        yield equal("blend_forward", f"colors, {label}", image[:3], plain.image.get()[:, :height, :width])
         for one, other in zip(sums, gradients_of(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
-            yield equal("sum_inverse_depths", f"against bands of tiles, {what}", other, one)
+            yield equal("sum_inverse_depths", f"against bands of tiles, {label}", other, one)
 
 
 @CHECKS.add("inverse_depth_loss")
@@ -296,14 +298,14 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Results:
         comparison.depths = KnownDepths(pixels, device.upload(targets), device.upload(weights), 3.0)
         value, scale = InverseDepth(weight=0.5).add(comparison).value(), 0.5 * 3 / count
         expected, by_plane = ref.inverse_depth_loss(x[3].astype(np.float64), places, targets, weights)
-        what = f"{count} pixels of {width} x {height}"
+        label = f"{count} pixels of {width} x {height}"
         terms = comparison.workspace.array("inverse_depth_terms", count).get()
-        yield by_element("inverse_depth_loss", f"terms, {what}", terms, expected, SUM, floor=1e-3)
+        yield by_element("inverse_depth_loss", f"terms, {label}", terms, expected, SUM, floor=1e-3)
         total = np.array([scale * expected.sum()])
-        yield by_element("inverse_depth_loss", f"value, {what}", np.array([value]), total, SUM, floor=1e-6)
-        found, truth = comparison.gradient.get(), np.zeros(comparison.gradient.shape)
+        yield by_element("inverse_depth_loss", f"value, {label}", np.array([value]), total, SUM, floor=1e-6)
+        actual, truth = comparison.gradient.get(), np.zeros(comparison.gradient.shape)
         truth[3, :height, :width] = scale * by_plane
-        yield by_element("inverse_depth_loss", f"gradient, {what}", found, truth, SUM, floor=1e-9)
+        yield by_element("inverse_depth_loss", f"gradient, {label}", actual, truth, SUM, floor=1e-9)
 
 
 # overlay: a layer of splats in front of an image.
@@ -317,21 +319,21 @@ def check_layer(device: Device, rng: np.random.Generator, width: int, height: in
     gradient = rng.normal(size=image.shape).astype(np.float32)
     signed = np.where(rng.random(left.shape) < 0.5, -1, 1) * left
     planes = {"image": planes_of(device, camera, layer), "transmittance": planes_of(device, camera, signed[None])}
-    frame, what, scale = cast(Any, SimpleNamespace(camera=camera, **planes)), f"{width} x {height} px", 0.01
-    found = lay_over(workspace, frame, planes_of(device, camera, image), scale)
-    both, behind = found.image.get(), found.behind.get()
+    frame, label, scale = cast(Any, SimpleNamespace(camera=camera, **planes)), f"{width} x {height} px", 0.01
+    actual = lay_over(workspace, frame, planes_of(device, camera, image), scale)
+    both, behind = actual.image.get(), actual.behind.get()
     inside = np.s_[..., :height, :width]
     exact = left.astype(np.float64)
-    yield by_element("lay_over", f"both, {what}", both[inside], ref.laid_over(layer, exact, image), 1e-6, floor=1.0)
+    yield by_element("lay_over", f"both, {label}", both[inside], ref.laid_over(layer, exact, image), 1e-6, floor=1.0)
     loss, by_left = ref.layer_cover(exact, scale)
-    yield by_element("lay_over", f"T dL/dT, {what}", behind[inside], (exact * by_left)[None], 1e-6, floor=scale)
-    yield by_element("lay_over", f"loss, {what}", np.array([found.loss()]), np.array([loss]), SUM, floor=0.1)
+    yield by_element("lay_over", f"T dL/dT, {label}", behind[inside], (exact * by_left)[None], 1e-6, floor=scale)
+    yield by_element("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
     for planes_found in (both, behind):
-        yield equal("lay_over", f"pixels outside the image, {what}", outside(camera, planes_found), 0.0)
+        yield equal("lay_over", f"pixels outside the image, {label}", outside(camera, planes_found), 0.0)
     by_both = planes_of(device, camera, gradient)
     look_behind(workspace, frame, by_both)
     expected = ref.gradient_behind(exact, gradient)
-    yield by_element("look_behind", f"derivatives, {what}", by_both.get()[inside], expected, 1e-6, floor=1.0)
+    yield by_element("look_behind", f"derivatives, {label}", by_both.get()[inside], expected, 1e-6, floor=1.0)
 
 
 @CHECKS.add("lay_over", "look_behind")

@@ -74,9 +74,9 @@ def statistics(device: Device, rng: np.random.Generator) -> Results:
         }
         yield equal("count_seen", f"views of {count} Gaussians", gaussians.get(SEEN)[:, 0], 2.0 * seen)
         for (name, kernel), values in columns.items():
-            found = gaussians.get(f"stats/{name}")[:, 0]
+            actual = gaussians.get(f"stats/{name}")[:, 0]
             expected = 2 * values * (seen | (name == "view_error"))  # view_error also counts for unseen Gaussians
-            yield by_element(kernel, f"{name} of {count} Gaussians", found, expected, SUM, floor=0.1)
+            yield by_element(kernel, f"{name} of {count} Gaussians", actual, expected, SUM, floor=0.1)
 
 
 @CHECKS.add("accumulate_splitting")
@@ -94,8 +94,8 @@ def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
             stats.add(ViewGradients(frame, comparison, [], pixel_sums), pixel_sums)
         on_screen = ref.screen_splitting(case.project(), 33, 31, BACKGROUND.astype(np.float64), weights)
         expected = 2 * ref.splitting(case.gaussians(), case.camera(), on_screen)[:, *np.triu_indices(3)]
-        found = model.gaussians.get("stats/splitting")
-        yield by_norm("accumulate_splitting", f"matrices of {count} Gaussians", found, expected, GRADIENT)
+        actual = model.gaussians.get("stats/splitting")
+        yield by_norm("accumulate_splitting", f"matrices of {count} Gaussians", actual, expected, GRADIENT)
 
 
 def _edited(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:
@@ -129,30 +129,30 @@ def edits(device: Device, rng: np.random.Generator) -> Results:
         action = ref.adc_actions(gradient, size, opacity, EXTENT, prune_large=True)
         rows = np.select([action == ref.PRUNE, action == ref.KEEP], [0, 1], 2)
         source = np.repeat(np.arange(count), rows)
-        what = f"an edit of {count} Gaussians"
-        yield Deviation("mark_rule", f"rows after {what}", abs(gaussians.count - len(source)), 0, counts=True)
+        label = f"an edit of {count} Gaussians"
+        yield Deviation("mark_rule", f"rows after {label}", abs(gaussians.count - len(source)), 0, counts=True)
         if gaussians.count != len(source):
             continue
         after = {name: gaussians.get(name) for name in gaussians.tables}
-        yield equal("list_rows", f"places after {what}", after["sh_rest"], before["sh_rest"][source])
+        yield equal("list_rows", f"places after {label}", after["sh_rest"], before["sh_rest"][source])
         split = action[source] == ref.SPLIT
         second = np.concatenate([np.arange(n) for n in rows] or [np.zeros(0)]) == 1
         fresh = split | ((action[source] == ref.CLONE) & second)
         moment = "adam/means/moment1"
         expected = np.where(fresh[:, None], 0, before[moment][source])
-        yield equal("list_rows", f"moments after {what}", after[moment], expected)
+        yield equal("list_rows", f"moments after {label}", after[moment], expected)
         means, scales = before["means"].astype(np.float64)[source], before["log_scales"].astype(np.float64)[source]
         logits = before["logit_opacity"].astype(np.float64)[source]
         cloned = action[source] == ref.CLONE
         logits[cloned] = ref.shared_logit(logits[cloned], 2)
-        yield by_element("share_opacity", f"opacities after {what}", after["logit_opacity"], logits, SUM, floor=1)
+        yield by_element("share_opacity", f"opacities after {label}", after["logit_opacity"], logits, SUM, floor=1)
         for i in np.flatnonzero(split):
             noise = ref.normal3((int(i), STEP, 0, 0), (SEED, 0))
             rotation = ref.rotation_matrix(before["quats"][source[i]].astype(np.float64))
             means[i] += rotation @ (np.exp(scales[i]) * noise)
         scales[split] -= np.log(1.6)
-        yield by_norm("spawn_children", f"means after {what}", after["means"], means, SUM)
-        yield by_element("spawn_children", f"scales after {what}", after["log_scales"], scales, SUM, floor=1)
+        yield by_norm("spawn_children", f"means after {label}", after["means"], means, SUM)
+        yield by_element("spawn_children", f"scales after {label}", after["log_scales"], scales, SUM, floor=1)
 
 
 @CHECKS.add("mark_chosen")
@@ -182,8 +182,8 @@ def opacity_reset(device: Device, rng: np.random.Generator) -> Results:
             expected = oracle.logit_opacity.copy()
             capped = ratio / (1 + np.exp(-expected)) > 0.3
             expected[capped] = ref.reset_logit(expected[capped], ratio[capped], 0.3)
-            found = gaussians.get("logit_opacity")[:, 0]
-            yield by_element("cap_opacity", f"opacities of {count} Gaussians", found, expected, 2e-5, floor=1)
+            actual = gaussians.get("logit_opacity")[:, 0]
+            yield by_element("cap_opacity", f"opacities of {count} Gaussians", actual, expected, 2e-5, floor=1)
 
 
 @CHECKS.add("decay_opacity")
@@ -195,8 +195,8 @@ def opacity_decay(device: Device, rng: np.random.Generator) -> Results:
             gaussians, before = case.model(device).gaussians, case.gaussians().logit_opacity
             expected = ref.decayed_logit(before, factor)
             decay_opacity(gaussians, factor)
-            found = gaussians.get("logit_opacity")[:, 0]
-            yield by_element("decay_opacity", f"opacities of {count} Gaussians", found, expected, 2e-5, floor=1)
+            actual = gaussians.get("logit_opacity")[:, 0]
+            yield by_element("decay_opacity", f"opacities of {count} Gaussians", actual, expected, 2e-5, floor=1)
 
 
 @CHECKS.add("add_noise")
@@ -213,8 +213,8 @@ def noise(device: Device, rng: np.random.Generator) -> Results:
         for i in range(count):
             axes = ref.rotation_matrix(p["quats"][i]) * np.exp(p["log_scales"][i])
             moved[i] = gate[i] * axes @ axes.T @ ref.normal3((i, STEP, 1, 0), (SEED, 0))
-        found = gaussians.get("means").astype(np.float64)
-        yield by_norm("add_noise", f"means of {count} Gaussians", found, p["means"] + moved, SUM)
+        actual = gaussians.get("means").astype(np.float64)
+        yield by_norm("add_noise", f"means of {count} Gaussians", actual, p["means"] + moved, SUM)
 
 
 # Compression of a model: the contribution of each Gaussian, and clusters for a palette.
@@ -237,13 +237,13 @@ def contribution(device: Device, rng: np.random.Generator) -> Results:
         photographs = [photograph_of(device, case, mask) for mask in masks]
         expected = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
         black, background = np.zeros(3, np.float32), rng.random(3).astype(np.float32)
-        found, again = (contributions(_render_views(device, case, photographs, black), count) for _ in range(2))
-        what = f"blend weights of {count} Gaussians"
-        yield by_element("blend_backward", what, found, np.asarray(expected), SUM, floor=0.1)
-        yield equal("blend_backward", f"{what}, a second time", again, found)
-        found = sensitivities(_render_views(device, case, photographs, background), count)
+        actual, again = (contributions(_render_views(device, case, photographs, black), count) for _ in range(2))
+        label = f"blend weights of {count} Gaussians"
+        yield by_element("blend_backward", label, actual, np.asarray(expected), SUM, floor=0.1)
+        yield equal("blend_backward", f"{label}, a second time", again, actual)
+        actual = sensitivities(_render_views(device, case, photographs, background), count)
         squares = np.sum([_squares(case, background, mask) for mask in masks], axis=0)
-        yield by_norm("blend_backward", f"squared changes of the image by {count} Gaussians", found, squares, GRADIENT)
+        yield by_norm("blend_backward", f"squared changes of the image by {count} Gaussians", actual, squares, GRADIENT)
 
 
 def _render_views(
@@ -269,8 +269,8 @@ def alike(device: Device, rng: np.random.Generator) -> Results:
     for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
         points, vectors = (rng.integers(-511, 512, (rows, components)).astype(np.float32) for rows in (count, entries))
         vectors[-1] = vectors[0]  # a tie, which the first wins
-        found, expected = most_alike(device, points, vectors), (points @ vectors.T).argmax(axis=1)
-        yield equal("most_alike", f"labels of {count} points and {entries} vectors", found, expected)
+        actual, expected = most_alike(device, points, vectors), (points @ vectors.T).argmax(axis=1)
+        yield equal("most_alike", f"labels of {count} points and {entries} vectors", actual, expected)
 
 
 @CHECKS.add("share_mean")
@@ -281,7 +281,7 @@ def shared_means(device: Device, rng: np.random.Generator) -> Results:
         weights = rng.random(count).astype(np.float32) * (labels != 0)  # one cluster has no weight
         set_clusters(gaussians, labels, weights)
         share(gaussians, "sh_rest")
-        what, found = f"means of {clusters} clusters of {count} Gaussians", gaussians.get("sh_rest")
-        yield by_element("share_mean", what, found, ref.shared_means(values, labels, weights), SUM, floor=0.1)
+        label, actual = f"means of {clusters} clusters of {count} Gaussians", gaussians.get("sh_rest")
+        yield by_element("share_mean", label, actual, ref.shared_means(values, labels, weights), SUM, floor=0.1)
         share(gaussians, "sh_rest")
-        yield equal("share_mean", f"{what}, a second time", gaussians.get("sh_rest"), found)
+        yield equal("share_mean", f"{label}, a second time", gaussians.get("sh_rest"), actual)

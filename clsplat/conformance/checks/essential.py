@@ -14,16 +14,16 @@ BITONIC = Checks()  # for runs that may use the bitonic sort
 
 @CHECKS.add("project_forward", "project_backward", "emit_pairs", "blend_forward", "blend_backward", "sum_records")
 def rendering(device: Device, rng: np.random.Generator) -> Results:
-    case, what = safe_case(rng, 60, 40, 30, blending.MARGIN), "a scene of 60 Gaussians"
-    yield from projection.check_record(device, case, what)
-    yield from tiles.check_list(device, case, "radix", what)
-    yield from blending.check_blend(device, case, what)
+    case, label = safe_case(rng, 60, 40, 30, blending.MARGIN), "a scene of 60 Gaussians"
+    yield from projection.check_record(device, case, label)
+    yield from tiles.check_list(device, case, "radix", label)
+    yield from blending.check_blend(device, case, label)
     many = safe_case(rng, 300, 14, 14, change=blending.dim)
     yield from blending.check_blend(device, many, "300 that cover each other")
-    for one, of in ((case, what), (many, "300 that cover each other")):
+    for one, of in ((case, label), (many, "300 that cover each other")):
         weights = rng.normal(size=(3, *one.size[::-1])).astype(np.float32)
         yield from blending.check_sum(one, blending.pixel_sums_of(device, one, weights), weights, of)
-    yield from projection.check_gradient(device, case, rng, what)
+    yield from projection.check_gradient(device, case, rng, label)
     filtered = with_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
     yield from projection.check_record(device, filtered, "30 filtered Gaussians")
     yield from projection.check_gradient(device, filtered, rng, "30 filtered Gaussians")

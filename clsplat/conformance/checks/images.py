@@ -62,17 +62,17 @@ def check_loss(
     device: Device, loss: ImageLoss, weight: float, oracle: Any, kernel: str, x: NDArray[Any], y: NDArray[Any]
 ) -> Results:
     """Compare the value and the gradient of a loss."""
-    comparison, what = comparison_of(device, x, y), f"{type(loss).__name__}, {x.shape[2]} x {x.shape[1]} px"
-    found = loss.add(comparison)
+    comparison, label = comparison_of(device, x, y), f"{type(loss).__name__}, {x.shape[2]} x {x.shape[1]} px"
+    actual = loss.add(comparison)
     value, gradient = oracle(x.astype(np.float64), y.astype(np.float64))
     value_of = {"ssim_gradient": "ssim_maps"}.get(kernel, kernel)
-    values = np.array([found.value()]), np.array([weight * value])
-    yield by_element(value_of, f"value of {what}", *values, SUM, floor=1e-2)
+    values = np.array([actual.value()]), np.array([weight * value])
+    yield by_element(value_of, f"value of {label}", *values, SUM, floor=1e-2)
     planes, camera = comparison.gradient.get(), comparison.camera
     error = np.abs(planes[:, : camera.height, : camera.width] - weight * gradient).max()
     largest = max(float(np.abs(weight * gradient).max()), 1e-30)
-    yield Deviation(kernel, f"gradient of {what}", float(error) / largest, LOSS_GRADIENT)
-    yield equal(kernel, f"gradient outside the image, {what}", outside(camera, planes), 0.0)
+    yield Deviation(kernel, f"gradient of {label}", float(error) / largest, LOSS_GRADIENT)
+    yield equal(kernel, f"gradient outside the image, {label}", outside(camera, planes), 0.0)
 
 
 @CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient")
@@ -98,30 +98,30 @@ def losses_that_add_up(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("view_error", "sum_errors")
 def errors_of_views(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
-        (x, y), what = image_pair(rng, width, height), f"{width} x {height} px"
+        (x, y), label = image_pair(rng, width, height), f"{width} x {height} px"
         gradient, comparison = rng.normal(size=x.shape).astype(np.float32), comparison_of(device, x, y)
         comparison.gradient = planes_of(device, comparison.camera, gradient)
-        found = view_error(comparison).get()
+        actual = view_error(comparison).get()
         rows = comparison.workspace.array("row_errors", (3, comparison.camera.rows)).get()
         values = [table.astype(np.float64) for table in (gradient, x, y)]
         expected = np.array([[ref.view_error(*(v[c, row] for v in values)) for row in range(height)] for c in range(3)])
-        yield by_element("view_error", f"errors of rows, {what}", rows[:, :height], expected, SUM, floor=1e-2)
-        yield equal("view_error", f"errors of rows outside the image, {what}", rows[:, height:], 0.0)
-        yield by_element("sum_errors", f"error of {what}", found, np.array([expected.sum()]), SUM)
+        yield by_element("view_error", f"errors of rows, {label}", rows[:, :height], expected, SUM, floor=1e-2)
+        yield equal("view_error", f"errors of rows outside the image, {label}", rows[:, height:], 0.0)
+        yield by_element("sum_errors", f"error of {label}", actual, np.array([expected.sum()]), SUM)
 
 
 @CHECKS.add("weight_entropy")
 def entropies(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
-        x, what = rng.uniform(0, 1, (4, height, width)).astype(np.float32), f"{width} x {height} px"
+        x, label = rng.uniform(0, 1, (4, height, width)).astype(np.float32), f"{width} x {height} px"
         comparison = comparison_of(device, x, x[:3])
         comparison.gradient = device.zeros((4, comparison.camera.rows, comparison.camera.stride))
         value = WeightEntropy(weight=0.7).add(comparison).value()
         expected = np.array([0.7 * x[3].mean(dtype=np.float64)])
-        yield by_element("weight_entropy", f"value, {what}", np.array([value]), expected, SUM)
-        found, truth = comparison.gradient.get(), np.zeros(comparison.gradient.shape)
+        yield by_element("weight_entropy", f"value, {label}", np.array([value]), expected, SUM)
+        actual, truth = comparison.gradient.get(), np.zeros(comparison.gradient.shape)
         truth[3, :height, :width] = 0.7 / (width * height)
-        yield by_element("weight_entropy", f"gradient, {what}", found, truth, SUM, floor=1e-9)
+        yield by_element("weight_entropy", f"gradient, {label}", actual, truth, SUM, floor=1e-9)
 
 
 @CHECKS.add("unpack_pixels", "apply_mask", "change_background")
@@ -129,23 +129,23 @@ def photographs(device: Device, rng: np.random.Generator) -> Results:
     for width, height in SIZES:
         pixels = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
         mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
-        camera, workspace, what = camera_of(device, width, height), Workspace(device), f"{width} x {height} px"
+        camera, workspace, label = camera_of(device, width, height), Workspace(device), f"{width} x {height} px"
         workspace.array("photograph", (3, camera.rows, camera.stride)).fill(9)
         colors = unpack(workspace, camera, device.upload(pixels), 1 / 255, "photograph")
         counted = unpack(workspace, camera, device.upload(mask), 1.0, "mask")
-        found = colors.get()
-        yield by_element("unpack_pixels", f"colors, {what}", found[:, :height, :width], pixels / 255, 1e-6)
-        yield equal("unpack_pixels", f"pixels outside the image, {what}", outside(camera, found), 0.0)
-        yield equal("unpack_pixels", f"mask, {what}", counted.get()[:, :height, :width], mask)
+        actual = colors.get()
+        yield by_element("unpack_pixels", f"colors, {label}", actual[:, :height, :width], pixels / 255, 1e-6)
+        yield equal("unpack_pixels", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
+        yield equal("unpack_pixels", f"mask, {label}", counted.get()[:, :height, :width], mask)
         apply_mask(workspace, camera, colors, counted)
-        yield equal("apply_mask", f"masked colors, {what}", colors.get(), found * counted.get())
+        yield equal("apply_mask", f"masked colors, {label}", colors.get(), actual * counted.get())
         shows, before, after = pixels[:1], *rng.random((2, 3)).astype(np.float32)
         uploaded = device.upload(np.ascontiguousarray(shows)), device.upload(before), device.upload(after)
         masked = colors.get()
         change_background(workspace, camera, colors, *uploaded)
         truth = masked.astype(np.float64)
         truth[:, :height, :width] += shows / 255 * (after - before.astype(np.float64))[:, None, None]
-        yield by_element("change_background", f"colors, {what}", colors.get(), truth, 1e-6, floor=1.0)
+        yield by_element("change_background", f"colors, {label}", colors.get(), truth, 1e-6, floor=1.0)
 
 
 @CHECKS.add("blur_rows", "blur_columns")
@@ -157,11 +157,11 @@ def blur(device: Device, rng: np.random.Generator) -> Results:
             camera, workspace = camera_of(device, width, height), Workspace(device)
             counted = None if mask is None else planes_of(device, camera, mask[None])
             planes = Planes(workspace, camera, planes_of(device, camera, image), counted)
-            found = Blur(sigma=sigma).apply(planes, step=1).colors.get()
+            actual = Blur(sigma=sigma).apply(planes, step=1).colors.get()
             expected = ref.blurred(image.astype(np.float64), sigma, mask)
-            what = f"sigma {sigma:g}, {width} x {height} px"
-            yield by_element("blur_columns", what, found[:, :height, :width], expected, 2e-5, floor=0.05)
-            yield equal("blur_columns", f"pixels outside the image, {what}", outside(camera, found), 0.0)
+            label = f"sigma {sigma:g}, {width} x {height} px"
+            yield by_element("blur_columns", label, actual[:, :height, :width], expected, 2e-5, floor=0.05)
+            yield equal("blur_columns", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
 
 
 def check_haar(
@@ -170,21 +170,21 @@ def check_haar(
     """Compare a photograph after the Haar transform, and the gradient of its filter."""
     image, gradient = rng.uniform(0, 1, (3, height, width)).astype(np.float32), rng.normal(size=(3, height, width))
     mask = None if share is None else rng.random((height, width)) < share
-    camera, workspace, what = camera_of(device, width, height), Workspace(device), f"{width} x {height} px, h = {taps}"
+    camera, workspace, label = camera_of(device, width, height), Workspace(device), f"{width} x {height} px, h = {taps}"
     for name in ("haar", "haar sums"):
         workspace.array(name, (3, camera.rows, camera.stride)).fill(np.nan)
     counted = None if mask is None else planes_of(device, camera, mask[None])
     numbers = {"haar/scale": (taps[0] - taps[1]) / np.sqrt(2), "haar/leak": taps.sum() / np.sqrt(2)}
     planes = Planes(workspace, camera, planes_of(device, camera, image), counted)
-    found, exact = apply_filter(planes, numbers).colors.get(), image.astype(np.float64)
+    actual, exact = apply_filter(planes, numbers).colors.get(), image.astype(np.float64)
     expected = ref.haar_filtered(exact, taps, mask)
-    yield by_element("haar_forward", what, found[:, :height, :width], expected, 2e-6, floor=1.0)
-    yield equal("haar_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)
+    yield by_element("haar_forward", label, actual[:, :height, :width], expected, 2e-6, floor=1.0)
+    yield equal("haar_forward", f"pixels outside the image, {label}", outside(camera, actual), 0.0)
     derivatives = filter_gradients(planes, numbers, planes_of(device, camera, gradient))()
     by_taps = ref.haar_gradient(exact, gradient, taps, mask)
     by_both = np.array([by_taps[0] - by_taps[1], by_taps.sum()]) / np.sqrt(2)
-    found, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
-    yield by_element("haar_backward", what, found, by_both, SUM, floor=size)
+    actual, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
+    yield by_element("haar_backward", label, actual, by_both, SUM, floor=size)
 
 
 @CHECKS.add("haar_forward", "haar_backward")
@@ -206,17 +206,17 @@ def texture(device: Device, rng: np.random.Generator) -> Results:
     for width, height in ((1, 1), (7, 5), (17, 17), (40, 30), (65, 3)):
         image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
         mask = rng.random((height, width)) < 0.9
-        camera, workspace, what = camera_of(device, width, height), Workspace(device), f"{width} x {height} px"
+        camera, workspace, label = camera_of(device, width, height), Workspace(device), f"{width} x {height} px"
         workspace.array("texture", (camera.rows, camera.stride)).fill(9)
         expected = magnitude_of(image)
         for counted in (None, mask):
             uploaded = None if counted is None else planes_of(device, camera, counted[None])
-            found = known_gradient(workspace, camera, planes_of(device, camera, image), uploaded).get()
+            actual = known_gradient(workspace, camera, planes_of(device, camera, image), uploaded).get()
             if counted is not None:
                 expected = np.where(ndimage.minimum_filter(counted, 3, mode="nearest"), expected, -1)
             kernel = "image_gradient" if counted is None else "hide_masked"
-            yield by_element(kernel, f"texture, {what}", found[:height, :width], expected, 1e-6, floor=1)
-            yield equal(kernel, f"texture outside the image, {what}", outside(camera, found), 0.0)
+            yield by_element(kernel, f"texture, {label}", actual[:height, :width], expected, 1e-6, floor=1)
+            yield equal(kernel, f"texture outside the image, {label}", outside(camera, actual), 0.0)
 
 
 SCALES = (1.0, 1e-2, 8.0)  # factors on differences: some are outside the histogram on either side
@@ -234,21 +234,21 @@ def check_transient(
         workspace.array(name, (1, camera.rows, camera.stride)).fill(7)
     mask = None if share is None else planes_of(device, camera, counted[None])
     planes = planes_of(device, camera, x), planes_of(device, camera, y)
-    found, waiting = measure_residuals(workspace, camera, *planes, mask)
-    what, values = f"{width} x {height} px", found.get()[0, :height, :width]
+    actual, waiting = measure_residuals(workspace, camera, *planes, mask)
+    label, values = f"{width} x {height} px", actual.get()[0, :height, :width]
     exact = ref.residuals(x.astype(np.float64), y.astype(np.float64))
-    yield by_element("measure_residuals", f"residuals, {what}", values[counted], exact[counted], 1e-6, floor=1e-6)
-    rest = found.get()[0].copy()
+    yield by_element("measure_residuals", f"residuals, {label}", values[counted], exact[counted], 1e-6, floor=1e-6)
+    rest = actual.get()[0].copy()
     rest[:height, :width][counted] = -1
-    yield equal("measure_residuals", f"pixels that do not count, {what}", rest, -1.0)
+    yield equal("measure_residuals", f"pixels that do not count, {label}", rest, -1.0)
     numbers = ref.residual_numbers(values[counted].astype(np.float64))
-    yield equal("measure_residuals", f"numbers, {what}", waiting(), numbers)
+    yield equal("measure_residuals", f"numbers, {label}", waiting(), numbers)
     for quantile, reach in ((0.2, 1), (0.5, 1), (0.6, 3), (0.9, 2)):
         threshold = float(np.float32(np.quantile(values, quantile)))
-        kept = mask_transients(workspace, camera, found, threshold, reach).get()[0]
+        kept = mask_transients(workspace, camera, actual, threshold, reach).get()[0]
         expected = np.zeros_like(kept)
         expected[:height, :width] = ref.without_transients(values, counted, threshold, reach)
-        yield equal("mask_transients", f"mask, {what}", kept, expected)
+        yield equal("mask_transients", f"mask, {label}", kept, expected)
 
 
 @CHECKS.add("measure_residuals", "mask_transients")

@@ -42,17 +42,17 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
 def check_moment(device: Device, rng: np.random.Generator, count: int, width: int) -> Results:
     """Compare the tables at a time, and the gradients of the motion."""
     case, (degree, turns) = moving_case(rng, count, width), WIDTHS[width]
-    model, camera, what = case.model(device), case.device_camera(device), f"{count} of {width} columns"
+    model, camera, label = case.model(device), case.device_camera(device), f"{count} of {width} columns"
     p = {name: table.astype(np.float64) for name, table in case.parameters.items()}
     logit = p["logit_opacity"][:, 0]
     drawn = at_moment(Workspace(device), model, camera).gaussians
     means, quats, logits = ref.moved(p[MOTION], p["means"], p["quats"], logit, TIME, degree, turns)
     there = np.isfinite(means).all(axis=1)
-    found = drawn.get("means")
-    yield wrong("move_forward", f"which are there, {what}", np.isfinite(found).all(axis=1) != there)
-    yield by_element("move_forward", f"means, {what}", found[there], means[there], 1e-6, floor=1.0)
-    yield by_element("move_forward", f"logits, {what}", drawn.get("logit_opacity")[there, 0], logits[there], 1e-5, 1.0)
-    yield by_element("turn_forward", f"quaternions, {what}", drawn.get("quats"), quats, 1e-6, floor=1.0)
+    actual = drawn.get("means")
+    yield wrong("move_forward", f"which are there, {label}", np.isfinite(actual).all(axis=1) != there)
+    yield by_element("move_forward", f"means, {label}", actual[there], means[there], 1e-6, floor=1.0)
+    yield by_element("move_forward", f"logits, {label}", drawn.get("logit_opacity")[there, 0], logits[there], 1e-5, 1.0)
+    yield by_element("turn_forward", f"quaternions, {label}", drawn.get("quats"), quats, 1e-6, floor=1.0)
 
     gradients = GaussianGradients(model.gaussians)
     given = {name: rng.normal(size=p[name].shape).astype(np.float32) for name in ("means", "quats", "logit_opacity")}
@@ -65,11 +65,11 @@ def check_moment(device: Device, rng: np.random.Generator, count: int, width: in
     g = {name: values.astype(np.float64) for name, values in given.items()}
     upstream = g["means"], g["quats"], g["logit_opacity"][:, 0]
     by_motion, by_logit = ref.moved_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
-    found, center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
+    actual, center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
     kernel = "turn_backward" if turns else "move_backward"
     for name, columns in motion_fields(width).items():
-        yield by_norm(kernel, f"by {name}, {what}", found[:, columns], by_motion[:, columns], CONIC)
-    yield by_norm("move_backward", f"by the logit at the center, {what}", center, by_logit, CONIC)
+        yield by_norm(kernel, f"by {name}, {label}", actual[:, columns], by_motion[:, columns], CONIC)
+    yield by_norm("move_backward", f"by the logit at the center, {label}", center, by_logit, CONIC)
 
 
 def check_still(device: Device, rng: np.random.Generator) -> Results:
@@ -106,12 +106,12 @@ def check_step(device: Device, rng: np.random.Generator, count: int, width: int,
         values, m, v = ref.adam_step(values, gradient.astype(np.float64), m, v, step, each, seen=seen)
         values[seen, 4] = np.maximum(values[seen, 4], min_duration)
         update_motion(gaussians, gradients, frame.depth_key, rates, step, every)
-    what = f"{count} of {width} columns" + (", of seen rows alone" if every == 0 else "")
-    found, before = gaussians.get(MOTION), case.parameters[MOTION]
-    yield equal("motion_step", f"values of rows not seen, {what}", found[~seen], before[~seen])
-    yield by_element("motion_step", f"values, {what}", found, values, 2e-5, floor=1.0)
+    label = f"{count} of {width} columns" + (", of seen rows alone" if every == 0 else "")
+    actual, before = gaussians.get(MOTION), case.parameters[MOTION]
+    yield equal("motion_step", f"values of rows not seen, {label}", actual[~seen], before[~seen])
+    yield by_element("motion_step", f"values, {label}", actual, values, 2e-5, floor=1.0)
     for moment, expected in zip(moment_tables(MOTION), (m, v), strict=True):
-        yield by_norm("motion_step", f"moments, {what}", gaussians.get(moment), expected, 3 * SUM)
+        yield by_norm("motion_step", f"moments, {label}", gaussians.get(moment), expected, 3 * SUM)
 
 
 @CHECKS.add("move_forward", "turn_forward", "move_backward", "turn_backward", "motion_step")
@@ -135,11 +135,11 @@ def penalties_of_motion(device: Device, rng: np.random.Generator) -> Results:
             (ShortDuration(weight=3.0, below=0.4), ref.short_duration(table.astype(np.float64), 0.4)),
         ):
             gaussians = Gaussians(device, {**random_case(rng, count).parameters, MOTION: table})
-            gradients, what = GaussianGradients(gaussians), f"{count} Gaussians"
+            gradients, label = GaussianGradients(gaussians), f"{count} Gaussians"
             gradients[MOTION].fill(0.25)
             inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
-            found = np.array([penalty.add(inputs).value()])
-            yield by_element(penalty.type, f"value, {what}", found, np.array([3 * value]), SUM, floor=1e-7)
+            actual = np.array([penalty.add(inputs).value()])
+            yield by_element(penalty.type, f"value, {label}", actual, np.array([3 * value]), SUM, floor=1e-7)
             added = gradients[MOTION].get()[:, :count].T.astype(np.float64) - 0.25
             floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
-            yield by_element(penalty.type, f"gradient, {what}", added, 3 * gradient, 1e-4, floor)
+            yield by_element(penalty.type, f"gradient, {label}", added, 3 * gradient, 1e-4, floor)

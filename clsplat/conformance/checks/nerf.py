@@ -137,7 +137,7 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
             yield from _check_edge(replace(case, rays=rays), f"{count} rays, {'drawn' if rays.draw else 'even'}")
 
 
-def _check_edge(case: FieldCase, what: str) -> Results:
+def _check_edge(case: FieldCase, label: str) -> Results:
     coarse, fine = ((level.edges.get(), level.weights.get()) for level in case.levels.render(case.on_device, case.rays))
     shape, (edges, weights) = case.shape, coarse
     drawn, again = case.units(shape.coarse_samples, ref.COARSE), case.units(shape.fine_samples, ref.FINE)
@@ -145,10 +145,10 @@ def _check_edge(case: FieldCase, what: str) -> Results:
     expected = [
         ref.coarse_edges(shape.near, shape.far, shape.coarse_samples, own if is_drawn else None) for own in drawn
     ]
-    yield by_element("spread_edges", what, edges, np.stack(expected), EDGES, floor=shape.far)
+    yield by_element("spread_edges", label, edges, np.stack(expected), EDGES, floor=shape.far)
     pairs = zip(edges.astype(np.float64), weights.astype(np.float64), again, strict=True)
     expected = [ref.fine_edges(t, w, shape.fine_samples, own if is_drawn else None) for t, w, own in pairs]
-    yield by_element("resample_edges", what, fine[0], np.stack(expected), 10 * EDGES, floor=shape.far)
+    yield by_element("resample_edges", label, fine[0], np.stack(expected), 10 * EDGES, floor=shape.far)
 
 
 @CHECKS.add("encode_frustums", "encode_directions")
@@ -161,12 +161,12 @@ def encodings(device: Device, rng: np.random.Generator) -> Results:
         (table, first), (seen, row) = (
             place(level.raw_colors.shape[0]) for place in (case.levels.network.position, case.levels.network.seen)
         )
-        found = rows_of(table, first, case.shape.position_rows)
-        yield by_element("encode_frustums", f"{count} rays", found[:, : position.shape[1]], position, ENCODING, 1.0)
-        yield equal("encode_frustums", f"what fills blocks, {count} rays", found[:, position.shape[1] :], 0.0)
-        found = rows_of(seen, row, case.shape.direction_rows)
-        yield by_element("encode_directions", f"{count} rays", found[:, : direction.shape[1]], direction, 2e-6, 1.0)
-        yield equal("encode_directions", f"what fills blocks, {count} rays", found[:, direction.shape[1] :], 0.0)
+        actual = rows_of(table, first, case.shape.position_rows)
+        yield by_element("encode_frustums", f"{count} rays", actual[:, : position.shape[1]], position, ENCODING, 1.0)
+        yield equal("encode_frustums", f"what fills blocks, {count} rays", actual[:, position.shape[1] :], 0.0)
+        actual = rows_of(seen, row, case.shape.direction_rows)
+        yield by_element("encode_directions", f"{count} rays", actual[:, : direction.shape[1]], direction, 2e-6, 1.0)
+        yield equal("encode_directions", f"what fills blocks, {count} rays", actual[:, direction.shape[1] :], 0.0)
 
 
 # A grid of features: positions of samples in it, features, and gradients of its entries.
@@ -196,9 +196,9 @@ def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
         case = FieldCase.sample(device, rng, count, Draw(1, 2, 0), grid=GRID)
         level = next(case.levels.render(case.on_device, case.rays))
         at, variances = case.places(level.edges.get())
-        found = rows_of(case.levels.encoding.places(level.raw_colors.shape[0]), 0, PLACE_ROWS)
-        yield by_element("grid_places", f"means of {count} rays", found[:, :3], at, 1e-5, 1.0)
-        yield by_element("grid_places", f"variances of {count} rays", found[:, 3], variances, 1e-3)
+        actual = rows_of(case.levels.encoding.places(level.raw_colors.shape[0]), 0, PLACE_ROWS)
+        yield by_element("grid_places", f"means of {count} rays", actual[:, :3], at, 1e-5, 1.0)
+        yield by_element("grid_places", f"variances of {count} rays", actual[:, 3], variances, 1e-3)
     for tiles, ends, keys in CASES:
         case = FieldCase.sample(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
         yield from _check_grid(device, rng, case, _places(rng, tiles, ends))
@@ -219,7 +219,7 @@ def _by_sample(table: NDArray[np.float32]) -> NDArray[np.float64]:
 def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, places: NDArray[np.float32]) -> Results:
     shape, encoding, tiles = case.shape, case.levels.encoding, len(places)
     assert shape.grid is not None
-    what = f"{tiles} tiles, {shape.grid.levels} levels to {shape.grid.finest} with {shape.grid.entries}"
+    label = f"{tiles} tiles, {shape.grid.levels} levels to {shape.grid.finest} with {shape.grid.entries}"
     encoding.places(tiles).set(places)
     encoding.read_grid(case.on_device, tiles)
     table, first = case.levels.network.position(tiles)
@@ -231,21 +231,21 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, place
         encoding.parts, sums = parts, device.zeros(shape.parameters)
         encoding.backward(device.upload(by_features), sums)
         gradients.append(sums.get())
-    found, *others = gradients
+    actual, *others = gradients
     for parts, gradient in zip((1, 3), others, strict=True):
-        yield equal("grid_backward", f"sums in {parts} of its parts, {what}", gradient, found)
+        yield equal("grid_backward", f"sums in {parts} of its parts, {label}", gradient, actual)
     by_sample = _by_sample(by_features)
     at, variances = np.split(_by_sample(places), [3], axis=1)
     variances = variances[:, 0]
     for number, grid in enumerate(case.grid_levels()):
         rows = slice(FEATURES * number, FEATURES * (number + 1))
         expected = grid.level.forward(grid.entries(case.parameters), at, variances)
-        yield by_element("grid_forward", f"level {number}, {what}", features[:, rows], expected, 5e-5, 1.0)
-        expected, by_entries = grid.level.backward(by_sample[:, rows], at, variances), grid.entries(found)
-        yield by_norm("grid_backward", f"level {number}, {what}", by_entries, expected, GRADIENT)
+        yield by_element("grid_forward", f"level {number}, {label}", features[:, rows], expected, 5e-5, 1.0)
+        expected, by_entries = grid.level.backward(by_sample[:, rows], at, variances), grid.entries(actual)
+        yield by_norm("grid_backward", f"level {number}, {label}", by_entries, expected, GRADIENT)
         untouched = np.all(expected == 0, axis=1)
-        yield equal("grid_backward", f"entries without samples, level {number}, {what}", by_entries[untouched], 0.0)
-    yield equal("grid_backward", f"parameters of the network, {what}", found[: shape.network_parameters], 0.0)
+        yield equal("grid_backward", f"entries without samples, level {number}, {label}", by_entries[untouched], 0.0)
+    yield equal("grid_backward", f"parameters of the network, {label}", actual[: shape.network_parameters], 0.0)
 
 
 # A field: its network, colors of rays, all gradients, images and updates.
@@ -281,25 +281,25 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
                 by_features = by_position[:, FEATURES * number : FEATURES * (number + 1)]
                 by_entries[number] += grid.level.backward(by_features, *case.places(level.edges.get()))
         for number, (grid, truth) in enumerate(zip(case.grid_levels(), by_entries, strict=True)):
-            what = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
+            label = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
             for name in ("dense_backward", "grid_backward"):
-                yield by_norm(name, what, grid.entries(gradient.get()), truth, GRADIENT)
+                yield by_norm(name, label, grid.entries(gradient.get()), truth, GRADIENT)
         yield from _check_gradient(case.shape, gradient.get(), expected, f"{count} rays")
 
 
-def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[ref.Weights], what: str) -> Results:
+def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[ref.Weights], label: str) -> Results:
     gradient = gradient[: shape.network_parameters]
     used = np.zeros(shape.network_parameters, bool)
     for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
         of_weights, of_biases = (sum(level[number][part] for level in expected) for part in (0, 1))
         kernel = "composite_backward" if layer.name in ("density", "color") else "dense_backward"
         for name in (kernel, "dense_weights", "dense_sums"):
-            yield by_norm(name, f"weights of {layer.name}, {what}", weights, np.asarray(of_weights), GRADIENT)
-        yield by_norm("dense_biases", f"biases of {layer.name}, {what}", biases, np.asarray(of_biases), GRADIENT)
+            yield by_norm(name, f"weights of {layer.name}, {label}", weights, np.asarray(of_weights), GRADIENT)
+        yield by_norm("dense_biases", f"biases of {layer.name}, {label}", biases, np.asarray(of_biases), GRADIENT)
         table = used[layer.first : layer.first_bias].reshape(layer.rows, layer.columns)
         table[np.ix_(layer.inputs, range(layer.outputs))] = True
         used[layer.first_bias : layer.first_bias + layer.outputs] = True
-    yield equal("dense_sums", f"what fills blocks, {what}", gradient[~used], 0.0)
+    yield equal("dense_sums", f"what fills blocks, {label}", gradient[~used], 0.0)
 
 
 @dataclass(frozen=True)
@@ -329,16 +329,16 @@ class _Comparison:
         differences[: case.rays.counted] -= case.target_colors()
         return cls(level, scale, network, weights, (colors, densities), inputs, composite, differences)
 
-    def deviations(self, what: str) -> Results:
+    def deviations(self, label: str) -> Results:
         colors, densities = (
             rows_of(table, 0, count) for table, count in ((self.level.raw_colors, 3), (self.level.raw_densities, 1))
         )
-        for name, found, expected in (("colors", colors, self.raw[0]), ("densities", densities, self.raw[1])):
-            yield by_element("dense_forward", f"raw {name}, {what}", found, expected, 1e-4, 1.0)
+        for name, actual, expected in (("colors", colors, self.raw[0]), ("densities", densities, self.raw[1])):
+            yield by_element("dense_forward", f"raw {name}, {label}", actual, expected, 1e-4, 1.0)
         weights, left = self.composite.weights()
         for name, table, truth in (("weights", self.level.weights, weights), ("left", self.level.left, left)):
-            yield by_element("composite_forward", f"{name}, {what}", table.get(), truth, 1e-4, 1.0)
-        yield by_element("composite_forward", what, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
+            yield by_element("composite_forward", f"{name}, {label}", table.get(), truth, 1e-4, 1.0)
+        yield by_element("composite_forward", label, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
 
     def backward(self, counted: int) -> tuple[ref.Weights, NDArray[np.float64]]:
         by_colors = 2 * self.scale * self.differences
@@ -370,7 +370,7 @@ def updates_of_fields(device: Device, rng: np.random.Generator) -> Results:
         learned.update(device.upload(gradient), AdamStep(0.01, epsilon), number)
         exact = gradient.astype(np.float64)
         values, moment1, moment2 = adam_step(values, exact, moment1, moment2, number, 0.01, epsilon=epsilon)
-    found = learned.tables()
-    yield by_element("dense_update", "parameters", found["parameters"][:, 0], values, 1e-4, 0.01)
-    yield by_element("dense_update", "first moments", found["moment1"][:, 0], moment1, 1e-4, 1e-12)
-    yield by_element("dense_update", "second moments", found["moment2"][:, 0], moment2, 1e-4, 1e-24)
+    actual = learned.tables()
+    yield by_element("dense_update", "parameters", actual["parameters"][:, 0], values, 1e-4, 0.01)
+    yield by_element("dense_update", "first moments", actual["moment1"][:, 0], moment1, 1e-4, 1e-12)
+    yield by_element("dense_update", "second moments", actual["moment2"][:, 0], moment2, 1e-4, 1e-24)

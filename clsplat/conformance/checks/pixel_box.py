@@ -40,9 +40,9 @@ def of_size(size: float, rng: np.random.Generator, count: int, width: int, heigh
 @CHECKS.add("project_forward", "project_backward", "update_gaussians")
 def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> Results:
     for count in (1, 17, 65):
-        case, what = random_case(rng, count, **BOX), f"{count} Gaussians for the pixel's box"
-        yield from check_record(device, case, what)
-        yield from check_gradient(device, case, rng, what)
+        case, label = random_case(rng, count, **BOX), f"{count} Gaussians for the pixel's box"
+        yield from check_record(device, case, label)
+        yield from check_gradient(device, case, rng, label)
     filtered = with_world_filter(random_case(rng, 30, **BOX), rng)
     yield from check_record(device, filtered, "filtered Gaussians for the pixel's box")
     yield from check_gradient(device, filtered, rng, "filtered Gaussians for the pixel's box")
@@ -55,14 +55,14 @@ def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Res
         case = of_size(0.0, rng, count, width, height)
         yield from check_blend(device, case, f"{count} Gaussians over the pixel's box, {width} x {height} px")
     yield from check_blend(device, safe_case(rng, 300, 14, 14, 2e-6, dim, **BOX), "long tiles over the pixel's box")
-    for what, size in SIZES.items():
+    for label, size in SIZES.items():
         case = of_size(size, rng, 25, 40, 30)
-        yield from check_blend(device, case, f"splats {what} over the pixel's box")
+        yield from check_blend(device, case, f"splats {label} over the pixel's box")
         weights = rng.normal(size=(3, 30, 40)).astype(np.float32)
         sums = pixel_sums_of(device, case, weights, ALL_SUMS, texture=np.ones((30, 40), np.float32))
-        yield from check_sum(case, sums, weights, f"splats {what} over the pixel's box")
+        yield from check_sum(case, sums, weights, f"splats {label} over the pixel's box")
         squares = ref.falloff_squares(case.project(), 40, 30, BACKGROUND.astype(np.float64), weights)
-        yield by_norm("blend_backward", f"sums of squares, {what}", sums[:, SQUARE], squares, GRADIENT)
+        yield by_norm("blend_backward", f"sums of squares, {label}", sums[:, SQUARE], squares, GRADIENT)
     few = pixel_sums_of(device, case, weights)
     yield from check_sum(case, few, weights, "without more sums over the pixel's box")
 

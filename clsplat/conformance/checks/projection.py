@@ -41,7 +41,7 @@ def splats_of(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], N
     return frame.splats.get(), keys, frame.radius.get()[: len(keys)]
 
 
-def check_record(device: Device, case: Case, what: str) -> Results:
+def check_record(device: Device, case: Case, label: str) -> Results:
     """Compare the records of a scene with the reference."""
     kernel = "project_forward"
     records, keys, radius = splats_of(device, case)
@@ -51,27 +51,27 @@ def check_record(device: Device, case: Case, what: str) -> Results:
     x, y = truth.mean2d.T
     unseen = (x < 0) | (y < 0) | (x > width) | (y > height) | (truth.opacity < 1.001 / 255)
     yield wrong(
-        kernel, f"which splats are drawn, {what}", (drawn & ~truth.visible) | (truth.visible & ~drawn & ~unseen)
+        kernel, f"which splats are drawn, {label}", (drawn & ~truth.visible) | (truth.visible & ~drawn & ~unseen)
     )
     drawn &= truth.visible
     record = records[drawn]
-    yield by_element(kernel, f"means, {what}", record[:, :2], truth.mean2d[drawn], PROJECTION, floor=50)
+    yield by_element(kernel, f"means, {label}", record[:, :2], truth.mean2d[drawn], PROJECTION, floor=50)
     conic = covariances_of(record) if case.pixel_box else record[:, 2:5]
     size = np.maximum(np.linalg.norm(truth.conic[drawn], axis=1), 1e-30)
     error = np.linalg.norm(conic - truth.conic[drawn], axis=1) / size
-    yield Deviation(kernel, f"conics, {what}", float(error.max(initial=0)), CONIC)
-    yield by_element(kernel, f"opacities, {what}", record[:, 5], truth.opacity[drawn], PROJECTION)
-    yield by_element(kernel, f"colors, {what}", record[:, 6:9], truth.color[drawn], PROJECTION, floor=1)
-    yield by_element(kernel, f"depths, {what}", keys[drawn].view(np.float32), truth.depth[drawn], DEPTH)
+    yield Deviation(kernel, f"conics, {label}", float(error.max(initial=0)), CONIC)
+    yield by_element(kernel, f"opacities, {label}", record[:, 5], truth.opacity[drawn], PROJECTION)
+    yield by_element(kernel, f"colors, {label}", record[:, 6:9], truth.color[drawn], PROJECTION, floor=1)
+    yield by_element(kernel, f"depths, {label}", keys[drawn].view(np.float32), truth.depth[drawn], DEPTH)
     if not case.pixel_box:
         power_min = -np.log(255 * truth.opacity[drawn])
-        yield by_element(kernel, f"reaches, {what}", record[:, 13], power_min, PROJECTION, floor=1)
+        yield by_element(kernel, f"reaches, {label}", record[:, 13], power_min, PROJECTION, floor=1)
     hidden = records[:, 5] <= 0
-    yield wrong(kernel, f"culled splats, {what}", (keys[hidden] != CULLED) | (records[hidden] != 0).any(axis=1))
+    yield wrong(kernel, f"culled splats, {label}", (keys[hidden] != CULLED) | (records[hidden] != 0).any(axis=1))
     # ceil() may jump by a pixel where the radius is close to an integer
-    yield wrong(kernel, f"radii, {what}", ~(np.abs(radius - truth.radius) <= 1))
-    yield wrong(kernel, f"exact radii, {what}", radius != truth.radius, allowed=0.02 * len(radius))
-    yield wrong(kernel, f"extents, {what}", _wrong_extents(record, truth, drawn))
+    yield wrong(kernel, f"radii, {label}", ~(np.abs(radius - truth.radius) <= 1))
+    yield wrong(kernel, f"exact radii, {label}", radius != truth.radius, allowed=0.02 * len(radius))
+    yield wrong(kernel, f"extents, {label}", _wrong_extents(record, truth, drawn))
 
 
 def covariances_of(record: NDArray[Any]) -> NDArray[Any]:
@@ -96,7 +96,7 @@ def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any])
     return ~right
 
 
-def check_gradient(device: Device, case: Case, rng: np.random.Generator, what: str) -> Results:
+def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
     """Compare the gradients of the parameters from the same sums over each Gaussian's pixels."""
     model, camera = case.model(device), case.device_camera(device)
     rasterizer = Rasterizer(device, "radix")
@@ -109,9 +109,9 @@ def check_gradient(device: Device, case: Case, rng: np.random.Generator, what: s
     expected = expected_gradients(case, truth, pixel_sums[:, : gaussians.count].astype(np.float64).T)
     for name, array in gradients.arrays.items():
         value = array.get()[:, : gaussians.count].T
-        yield by_norm("project_backward", f"gradients of {name}, {what}", value, expected[name], CONIC)
+        yield by_norm("project_backward", f"gradients of {name}, {label}", value, expected[name], CONIC)
     value = gradients.mean2d.get()[:, : gaussians.count].T
-    yield by_norm("project_backward", f"gradients of the projected means, {what}", value, expected["mean2d"], CONIC)
+    yield by_norm("project_backward", f"gradients of the projected means, {label}", value, expected["mean2d"], CONIC)
 
 
 def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -186,15 +186,15 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: in
     hide(model.gaussians, left_out)
     rasterizer, background = Rasterizer(device, "radix"), device.upload(np.full(3, 0.25, np.float32))
     for view in sorted({0, min(HIDDEN_VIEWS, views) - 1, views - 1}):
-        what = f"what view {view} of {views} leaves out of {count} Gaussians"
+        label = f"what view {view} of {views} leaves out of {count} Gaussians"
         frame = rasterizer.forward(model, replace(camera, view=view), background)
-        found, hidden = frame.image.get().copy(), left_out[view]
-        yield equal("project_forward", f"records of {what}", frame.splats.get()[hidden], 0.0)
-        yield equal("project_forward", f"depths of {what}", frame.depth_key.get()[:count][hidden], CULLED)
-        yield equal("project_forward", f"radii of {what}", frame.radius.get()[:count][hidden], 0.0)
+        actual, hidden = frame.image.get().copy(), left_out[view]
+        yield equal("project_forward", f"records of {label}", frame.splats.get()[hidden], 0.0)
+        yield equal("project_forward", f"depths of {label}", frame.depth_key.get()[:count][hidden], CULLED)
+        yield equal("project_forward", f"radii of {label}", frame.radius.get()[:count][hidden], 0.0)
         others = Case({name: values[~hidden] for name, values in case.parameters.items()}, case.view)
         expected = rasterizer.forward(others.model(device), camera, background).image.get()
-        yield equal("project_forward", f"a picture without {what}", found, expected)
+        yield equal("project_forward", f"a picture without {label}", actual, expected)
 
 
 @CHECKS.add("project_forward")
@@ -232,8 +232,8 @@ def world_filter(device: Device, rng: np.random.Generator) -> Results:
         cameras = [replace(case, view=view).camera() for view in views]
         means = case.parameters["means"].astype(np.float64)
         interval = ref.sampling_interval(means, cameras, [view.camera.fx for view in views])
-        found = gaussians.get("filter_variance")[:, 0]
-        yield by_element("filter_variance", f"variances, {count} Gaussians", found, 0.2 * interval**2, SUM)
+        actual = gaussians.get("filter_variance")[:, 0]
+        yield by_element("filter_variance", f"variances, {count} Gaussians", actual, 0.2 * interval**2, SUM)
 
 
 @CHECKS.add("paint_depth")
@@ -253,14 +253,14 @@ def depth(device: Device, rng: np.random.Generator) -> Results:
 # poses.cl: gradients of the pose and the focal length of a camera.
 
 
-def check_pose(device: Device, case: Case, rng: np.random.Generator, what: str) -> Results:
+def check_pose(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
     """Compare the gradients of the pose from the same sums over each Gaussian's pixels."""
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device, "radix")
     frame, count = rasterizer.forward(model, camera, device.zeros(3)), model.gaussians.count
     pixel_sums = np.full((PIXEL_SUMS, model.gaussians.capacity), np.nan, np.float32)
     drawn = frame.splats.get()[:, 5] > 0
     pixel_sums[:, :count] = rng.normal(size=(PIXEL_SUMS, count)) * drawn
-    found = pose_gradient(rasterizer.workspace, model, frame, device.upload(pixel_sums))()
+    actual = pose_gradient(rasterizer.workspace, model, frame, device.upload(pixel_sums))()
     m, truth = pixel_sums[:, :count].astype(np.float64).T, case.project()
     grad_mean2d, grad_conic = gradients_of_sums(truth, m)
     by_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
@@ -268,9 +268,9 @@ def check_pose(device: Device, case: Case, rng: np.random.Generator, what: str) 
     numbers = case.degree, case.variance, case.compensate
     expected = ref.pose_gradient(case.gaussians(), case.camera(), *numbers, truth, *upstream)
     turn = case.camera().rotation
-    values = {"shift": turn @ found[:3], "turn": turn @ found[3:6], "focal length": found[6:]}
+    values = {"shift": turn @ actual[:3], "turn": turn @ actual[3:6], "focal length": actual[6:]}
     for (name, value), exact in zip(values.items(), expected, strict=True):
-        yield by_norm("pose_gradient", f"derivative by the {name}, {what}", value[None], exact[None], CONIC)
+        yield by_norm("pose_gradient", f"derivative by the {name}, {label}", value[None], exact[None], CONIC)
 
 
 @CHECKS.add("pose_gradient")

@@ -59,27 +59,27 @@ def planes_in_rows(texels: NDArray[Any]) -> NDArray[np.float32]:
 
 def check_sky(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
     """Compare an image and the gradient of the map; finished pixels have a negative transmittance."""
-    view, what = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels a side"
+    view, label = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels a side"
     image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
     planes = view.planes(image)
     view.skies.paint(view.sky, view.camera, planes, view.transmittance)
     expected = image.astype(np.float32) + view.left * ref.sky_image(view.texels.astype(np.float64), view.directions)
-    found = planes.get()
-    yield by_element("sky_forward", f"picture, {what}", view.inside(found), expected, 5 * NEAR, floor=1.0)
-    yield equal("sky_forward", f"pixels outside the image, {what}", outside(view.camera, found), 0.0)
+    actual = planes.get()
+    yield by_element("sky_forward", f"picture, {label}", view.inside(actual), expected, 5 * NEAR, floor=1.0)
+    yield equal("sky_forward", f"pixels outside the image, {label}", outside(view.camera, actual), 0.0)
     by_texels = view.skies.by_texels(view.sky, view.camera, view.transmittance, view.planes(gradient))
     all_texels = ref.sky_gradient(side, view.directions, view.left.astype(np.float64), gradient.astype(np.float64))
     shown = view.skies.runs(view.camera, side).shown.get()
     rows = all_texels.reshape(-1, 3)
-    yield by_norm("sky_backward", f"derivatives, {what}", by_texels.get().T, rows[shown], SUM)
-    yield by_norm("sky_gather", f"derivatives by texels, {what}", by_texels.get().T, rows[shown], SUM)
+    yield by_norm("sky_backward", f"derivatives, {label}", by_texels.get().T, rows[shown], SUM)
+    yield by_norm("sky_gather", f"derivatives by texels, {label}", by_texels.get().T, rows[shown], SUM)
     hidden = np.delete(rows, shown, axis=0)
-    yield equal("sky_gather", f"texels that are not shown, {what}", hidden, 0.0)
+    yield equal("sky_gather", f"texels that are not shown, {label}", hidden, 0.0)
 
 
 def check_cover(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
     """Compare the loss of Gaussians that cover the sky; no pixel is close to the threshold on differences."""
-    view, what, difference, weight = SkyView(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
+    view, label, difference, weight = SkyView(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
     sky = ref.sky_image(view.texels.astype(np.float64), view.directions)
     far = np.where(rng.random((height, width)) < 0.3, 2.0, 0.4) * difference
     photograph = (sky + far * np.where(rng.random(sky.shape) < 0.5, -1, 1)).astype(np.float32)
@@ -88,14 +88,14 @@ def check_cover(device: Device, rng: np.random.Generator, width: int, height: in
         view.sky, view.learned, view.camera, view.planes(photograph), view.transmittance, difference, scale
     )
     held = ref.sky_image(1.0 - view.free[..., None], view.directions)[0] > 0
-    chosen, found = ref.shows_sky(sky, np.where(held, 9, photograph), difference), behind.get()
+    chosen, actual = ref.shows_sky(sky, np.where(held, 9, photograph), difference), behind.get()
     loss, by_left = ref.sky_cover(chosen, view.left.astype(np.float64), weight)
     for kernel in ("sky_matches", "sky_cover"):
         expected = view.left * by_left
-        yield by_element(kernel, f"T dL/dT, {what}", view.inside(found), expected, NEAR, floor=scale)
-    yield equal("sky_cover", f"T dL/dT outside the image, {what}", outside(view.camera, found[None]), 0.0)
+        yield by_element(kernel, f"T dL/dT, {label}", view.inside(actual), expected, NEAR, floor=scale)
+    yield equal("sky_cover", f"T dL/dT outside the image, {label}", outside(view.camera, actual[None]), 0.0)
     value = np.array([scale * sums.get().sum(dtype=np.float64)])
-    yield by_element("sky_cover", f"loss, {what}", value, np.array([loss]), SUM, floor=0.1)
+    yield by_element("sky_cover", f"loss, {label}", value, np.array([loss]), SUM, floor=0.1)
 
 
 @CHECKS.add("sky_forward", "sky_backward", "sky_gather")
@@ -127,9 +127,9 @@ def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
         given = pixels * gradient.astype(np.float64)
         new, first, second = ref.adam_step(expected, given, first, second, updates, 0.01, epsilon=1.0)
         expected = np.where(free, new, expected)
-    found = view.sky.texels.get()
-    yield by_element("sky_update", "colors of texels", found[:, shown], expected, 1e-6, floor=1.0)
+    actual = view.sky.texels.get()
+    yield by_element("sky_update", "colors of texels", actual[:, shown], expected, 1e-6, floor=1.0)
     yield by_element("sky_update", "their first moments", moments["moment1"].get()[:, shown], first, 1e-5, floor=0.1)
     yield by_element("sky_update", "their second moments", moments["moment2"].get()[:, shown], second, 1e-5, floor=0.1)
     hidden = np.setdiff1d(np.arange(texels), shown)
-    yield equal("sky_update", "texels that the view does not show", found[:, hidden], before[:, hidden])
+    yield equal("sky_update", "texels that the view does not show", actual[:, hidden], before[:, hidden])

@@ -48,8 +48,8 @@ def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, 
     offsets, ordered = tiler_of(device, "bitonic")._sort_in_tiles(
         upload(pair_tile), upload(pair_splat), upload(depth_key), pairs, tiles
     )
-    found = offsets.get()
-    yield equal("count_pairs", "offsets of tiles", found, np.concatenate([[0], np.cumsum(lengths)]))
+    actual = offsets.get()
+    yield equal("count_pairs", "offsets of tiles", actual, np.concatenate([[0], np.cumsum(lengths)]))
     expected = np.lexsort((pair_splat, depth_key, pair_tile))
     yield equal("sort_tiles", f"order of {pairs} pairs in {tiles} tiles", ordered.get(), expected)
 
@@ -87,7 +87,7 @@ def tile_lists(device: Device, rng: np.random.Generator) -> Results:
             yield from check_list(device, case, sort, f"{count} Gaussians, {width} x {height} px, {sort}")
 
 
-def check_list(device: Device, case: Case, sort: Sort, what: str) -> Results:
+def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
     """Check that each tile lists the splats that reach it, front to back, once, and few others."""
     rasterizer = Rasterizer(device, sort)
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
@@ -96,25 +96,25 @@ def check_list(device: Device, case: Case, sort: Sort, what: str) -> Results:
     splats, offsets = lists.pair_splat.get()[: lists.pairs], lists.tile_offset.get()[: tiles + 1]
     ordered = splats[np.minimum(lists.tile_pairs.get()[: lists.pairs], max(lists.pairs, 1) - 1)]
     kernel = "find_tile_offsets" if sort == "radix" else "count_pairs"
-    yield wrong(kernel, f"offsets of tiles, {what}", np.diff(offsets.astype(np.int64), append=lists.pairs) < 0)
+    yield wrong(kernel, f"offsets of tiles, {label}", np.diff(offsets.astype(np.int64), append=lists.pairs) < 0)
     tile = np.repeat(np.arange(tiles), np.maximum(np.diff(offsets.astype(np.int64)), 0))[: lists.pairs]
     if len(tile) < lists.pairs:
-        yield wrong(kernel, f"pairs outside all tiles, {what}", np.ones(lists.pairs - len(tile)))
+        yield wrong(kernel, f"pairs outside all tiles, {label}", np.ones(lists.pairs - len(tile)))
         return
     sorted_places = np.lexsort((ordered, keys[ordered], tile))
     kernel = "radix_scatter" if sort == "radix" else "sort_tiles"
-    yield equal(kernel, f"order in tiles, {what}", sorted_places, np.arange(lists.pairs))
+    yield equal(kernel, f"order in tiles, {label}", sorted_places, np.arange(lists.pairs))
     listed = np.zeros((tiles, count), int)
     np.add.at(listed, (tile, ordered), 1)
-    yield wrong("emit_pairs", f"pairs listed twice, {what}", listed > 1)
+    yield wrong("emit_pairs", f"pairs listed twice, {label}", listed > 1)
     strongest, bounded = _strongest(frame, case)
-    yield wrong("emit_pairs", f"pairs that are missing, {what}", (strongest >= 1.0001 / 255) & (listed == 0))
-    yield wrong("emit_pairs", f"pairs too many, {what}", bounded & (strongest <= 0.95 / 255) & (listed > 0))
+    yield wrong("emit_pairs", f"pairs that are missing, {label}", (strongest >= 1.0001 / 255) & (listed == 0))
+    yield wrong("emit_pairs", f"pairs too many, {label}", bounded & (strongest <= 0.95 / 255) & (listed > 0))
     pairs = np.bincount(splats, minlength=count)
     kept = lists.tile_count.get()[:count]
-    yield equal("emit_pairs", f"number of pairs of each Gaussian, {what}", pairs, kept)
+    yield equal("emit_pairs", f"number of pairs of each Gaussian, {label}", pairs, kept)
     first = lists.first_pair.get()[:count][kept > 0]
-    yield equal("emit_pairs", f"first pairs, {what}", splats[first], np.flatnonzero(kept))
+    yield equal("emit_pairs", f"first pairs, {label}", splats[first], np.flatnonzero(kept))
 
 
 def _strongest(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -166,8 +166,8 @@ def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Results:
 def check_all(device: Device, rng: np.random.Generator) -> Results:
     """Compare lists of images with many rows, of rectangles at the limits of a mask, and of wrong counts."""
     for columns, rows in (TALL, *WHOLE):
-        case, what = case_of(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
-        yield from check_list(device, case, "radix", what)
+        case, label = case_of(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
+        yield from check_list(device, case, "radix", label)
     yield from check_miscounted(device, case_of(device, rng, *TALL))
 
 
@@ -177,10 +177,10 @@ def check_miscounted(device: Device, case: Case) -> Results:
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     number, camera = len(case.parameters["means"]), frame.camera
     box = rasterizer.workspace.array("tile_box", number, np.uint32)
-    found = frame.lists.tile_count.get()[:number].astype(int)
-    large = (box.get() >> 24 == 33) & (found > 0)
+    actual = frame.lists.tile_count.get()[:number].astype(int)
+    large = (box.get() >> 24 == 33) & (actual > 0)
     for surplus in SURPLUS:
-        count = np.where(large, np.maximum(1, found + surplus), 0)
+        count = np.where(large, np.maximum(1, actual + surplus), 0)
         first = np.concatenate([[0], np.cumsum(count)])
         arrays = [device.upload(np.full(first[-1] + 64, UNTOUCHED, np.uint32)) for _ in range(2)]
         device.program("large.cl").emit_large(
@@ -198,11 +198,11 @@ def check_miscounted(device: Device, case: Case) -> Results:
             count=number,
         )
         tile, splat = (array.get() for array in arrays)
-        what = f"large Gaussians counted with {surplus:+d} tiles"
+        label = f"large Gaussians counted with {surplus:+d} tiles"
         owner = np.repeat(np.arange(number), count)
-        yield equal("emit_large", f"places of {what}", splat, np.append(owner, np.full(64, UNTOUCHED)))
-        yield wrong("emit_large", f"tiles outside, {what}", tile[: len(owner)] >= camera.tiles)
-        yield equal("emit_large", f"places behind {what}", tile[len(owner) :], UNTOUCHED)
+        yield equal("emit_large", f"places of {label}", splat, np.append(owner, np.full(64, UNTOUCHED)))
+        yield wrong("emit_large", f"tiles outside, {label}", tile[: len(owner)] >= camera.tiles)
+        yield equal("emit_large", f"places behind {label}", tile[len(owner) :], UNTOUCHED)
         pairs = np.stack([owner, tile[: len(owner)]], axis=1)
         twice = len(pairs) - len(np.unique(pairs, axis=0)) - int(np.maximum(0, count - camera.tiles).sum())
-        yield Deviation("emit_large", f"tiles listed twice, {what}", max(0, twice), 0, counts=True)
+        yield Deviation("emit_large", f"tiles listed twice, {label}", max(0, twice), 0, counts=True)

@@ -52,15 +52,15 @@ def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
             )
         adam.step(model, frame, gradients, rates)
     for name in PARAMETERS:
-        moved, what = float(np.abs(values[name] - case.parameters[name]).max()), f"{name}, {count} Gaussians"
-        found = model.gaussians.get(name)
+        moved, label = float(np.abs(values[name] - case.parameters[name]).max()), f"{name}, {count} Gaussians"
+        actual = model.gaussians.get(name)
         # values are rounded to float32, and their changes to 2e-5 of the largest change
-        yield by_element("adam_step", what, found, values[name], 3e-7, floor=2e-5 * moved / 3e-7)
+        yield by_element("adam_step", label, actual, values[name], 3e-7, floor=2e-5 * moved / 3e-7)
         # 1 - 0.999f is off by 1.3e-5 in float32
         for moment, expected, bound in zip(moment_tables(name), moments[name], (SUM, 3 * SUM), strict=True):
             largest = float(np.abs(expected).max())
-            found = model.gaussians.get(moment)
-            yield by_element("adam_step", f"moments of {what}", found, expected, bound, floor=0.1 * largest)
+            actual = model.gaussians.get(moment)
+            yield by_element("adam_step", f"moments of {label}", actual, expected, bound, floor=0.1 * largest)
 
 
 def _sums_of(
@@ -74,7 +74,7 @@ def _sums_of(
     return frame, rasterizer.pixel_sums(model, frame, device.upload(weights))
 
 
-def check_fused(device: Device, rng: np.random.Generator, case: Case, what: str) -> Results:
+def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
     """Compare one fused update: moments with the reference's gradients, values with the device's own moments."""
     kernel, count = "update_gaussians", len(case.parameters["means"])
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
@@ -82,18 +82,18 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, what: str)
     frame, pixel_sums = _sums_of(device, rng, case, rasterizer, model)
     grad_mean2d = adam.update(model, frame, pixel_sums, rates).get()[:, :count].T
     expected = expected_gradients(case, case.project(), pixel_sums.get()[:, :count].T.astype(np.float64))
-    yield by_norm(kernel, f"gradients of the projected means, {what}", grad_mean2d, expected["mean2d"], CONIC)
+    yield by_norm(kernel, f"gradients of the projected means, {label}", grad_mean2d, expected["mean2d"], CONIC)
     for name in PARAMETERS:
         moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in moment_tables(name))
-        yield by_norm(kernel, f"first moment of {name}, {what}", moment1, 0.1 * expected[name], CONIC)
-        yield by_norm(kernel, f"second moment of {name}, {what}", moment2, 1e-3 * expected[name] ** 2, 2 * CONIC)
+        yield by_norm(kernel, f"first moment of {name}, {label}", moment1, 0.1 * expected[name], CONIC)
+        yield by_norm(kernel, f"second moment of {name}, {label}", moment2, 1e-3 * expected[name] ** 2, 2 * CONIC)
         step = rates[name] * (moment1 / 0.1) / (np.sqrt(moment2 / 1e-3) + 1e-15)
         before = case.parameters[name].astype(np.float64)
         floor = 2e-5 * max(float(np.abs(step).max()), 1e-30) / 3e-7
-        yield by_element(kernel, f"{name}, {what}", gaussians.get(name), before - step, 3e-7, floor)
+        yield by_element(kernel, f"{name}, {label}", gaussians.get(name), before - step, 3e-7, floor)
 
 
-def check_seen(device: Device, rng: np.random.Generator, case: Case, what: str) -> Results:
+def check_seen(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
     """Compare the fifth update, only of visible rows, with earlier moments, by each kernel from the same gradients."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
@@ -122,9 +122,9 @@ def check_seen(device: Device, rng: np.random.Generator, case: Case, what: str) 
         else:
             adam.update(model, frame, pixel_sums, rates, rows="seen")
         for table, truth in expected.items():
-            found = gaussians.get(table)
-            yield equal(kernel, f"{table} of rows not seen, {what}", found[~seen], truth[~seen])
-            yield by_element(kernel, f"{table} of rows seen, {what}", found[seen], truth[seen], 3 * SUM, floor=0.1)
+            actual = gaussians.get(table)
+            yield equal(kernel, f"{table} of rows not seen, {label}", actual[~seen], truth[~seen])
+            yield by_element(kernel, f"{table} of rows seen, {label}", actual[seen], truth[seen], 3 * SUM, floor=0.1)
 
 
 def behind_each_fifth(case: Case) -> Case:
@@ -149,8 +149,8 @@ def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Results:
 def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Results:
     for count, degree in ((1, 3), (17, 0), (40, 2), (150, 3)):
         case = with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
-        what = f"{count} Gaussians, degree {degree}"
-        yield from check_fused(device, rng, behind_each_fifth(case), what)
+        label = f"{count} Gaussians, degree {degree}"
+        yield from check_fused(device, rng, behind_each_fifth(case), label)
 
 
 def check_penalty(
@@ -172,13 +172,13 @@ def check_penalty(
     gradients = GaussianGradients(gaussians)
     gradients[parameter].fill(0.25)
     inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
-    found = penalty.add(inputs).value()
+    actual = penalty.add(inputs).value()
     value, gradient = oracle(case.parameters[parameter].astype(np.float64))
-    kernel, what = str(getattr(penalty, "type", "penalty")), f"{count} Gaussians"
-    yield by_element(kernel, f"value, {what}", np.array([found]), np.array([3 * value]), SUM, floor=1e-7)
+    kernel, label = str(getattr(penalty, "type", "penalty")), f"{count} Gaussians"
+    yield by_element(kernel, f"value, {label}", np.array([actual]), np.array([3 * value]), SUM, floor=1e-7)
     added = gradients[parameter].get()[:, :count].T.astype(np.float64) - 0.25
     floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
-    yield by_element(kernel, f"gradient, {what}", added, 3 * gradient, 1e-4, floor)
+    yield by_element(kernel, f"gradient, {label}", added, 3 * gradient, 1e-4, floor)
 
 
 @CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity")
@@ -228,8 +228,8 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
     for value in (np.nan, np.inf, -np.inf):
         case = random_case(rng, 65)
         case.parameters["quats"][64, 2] = case.parameters["sh_rest"][0, 44] = value
-        found = case.model(device).gaussians.not_finite()
-        mistaken = {"quats", "sh_rest"} ^ set(found)
+        actual = case.model(device).gaussians.not_finite()
+        mistaken = {"quats", "sh_rest"} ^ set(actual)
         yield Deviation("count_not_finite", f"tables with {value}", len(mistaken), 0, counts=True)
 
 
@@ -283,15 +283,15 @@ def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Resu
     for step, gradient in enumerate(gradients, 1):
         rate = Rates().at(step, extent=2.0)["sh_rest"]
         values, moment1, moment2 = ref.adam_step(values, gradient.astype(np.float64), moment1, moment2, step, rate)
-    found = train(device, case.model(device), seen, gradients, "deferred")
+    actual = train(device, case.model(device), seen, gradients, "deferred")
     at_once = train(device, case.model(device), seen, gradients, "all")
     moved = max(float(np.abs(values - before).max(initial=0)), 1e-6)
-    yield by_element("replay_updates", f"{count} Gaussians", found["sh_rest"], values, 3e-7, 2e-5 * moved / 3e-7)
+    yield by_element("replay_updates", f"{count} Gaussians", actual["sh_rest"], values, 3e-7, 2e-5 * moved / 3e-7)
     for name, expected, bound in zip(Deferred.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
         floor = 0.1 * float(np.abs(expected).max(initial=0))
-        yield by_element("replay_updates", f"{name}, {count} Gaussians", found[name], expected, bound, floor)
+        yield by_element("replay_updates", f"{name}, {count} Gaussians", actual[name], expected, bound, floor)
     for name in Deferred.names:
-        bits, expected_bits = found[name].view(np.uint32), at_once[name].view(np.uint32)
+        bits, expected_bits = actual[name].view(np.uint32), at_once[name].view(np.uint32)
         yield equal("note_update", f"bits of {name}, {count} Gaussians", bits, expected_bits)
 
 
@@ -327,8 +327,8 @@ def check_average(device: Device, rng: np.random.Generator, count: int) -> Resul
         values = np.stack([parameters[name].astype(np.float64) for parameters in steps])
         expected = values.mean(axis=0)
         expected[-1] = values[1 if count > 1 else 0 :, -1].mean(axis=0)
-        found = gaussians.get(name)
-        yield by_element("take_average", f"average of {name}, {count} Gaussians", found, expected, SUM, floor=1)
+        actual = gaussians.get(name)
+        yield by_element("take_average", f"average of {name}, {count} Gaussians", actual, expected, SUM, floor=1)
 
 
 # dropout.cl, and the projection of the Gaussians that it keeps.
@@ -337,10 +337,10 @@ SEED, STEP = 0x9E3779B9, 700
 DROPOUT = DropoutMask(0.3, SEED, STEP)
 
 
-def check_dropout(device: Device, case: Case, rng: np.random.Generator, what: str) -> Results:
+def check_dropout(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
     """Compare the records and the gradients of a step that drops Gaussians."""
-    yield from check_record(device, case, what)
-    yield from check_gradient(device, case, rng, what)
+    yield from check_record(device, case, label)
+    yield from check_gradient(device, case, rng, label)
 
 
 def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Results:
@@ -348,10 +348,10 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Result
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     left_out = rng.random((2, count)) < 0.5
     hide(model.gaussians, left_out)
-    found = Rasterizer(device, "radix").forward(model, replace(camera, view=1), device.zeros(3)).splats.get()
+    actual = Rasterizer(device, "radix").forward(model, replace(camera, view=1), device.zeros(3)).splats.get()
     expected, _, _ = splats_of(device, case)
     expected[left_out[1]] = 0
-    yield equal("draw_left_out", f"records of {count} Gaussians, some dropped and some hidden", found, expected)
+    yield equal("draw_left_out", f"records of {count} Gaussians, some dropped and some hidden", actual, expected)
 
 
 @CHECKS.add("draw_left_out", "project_forward", "project_backward")

@@ -75,20 +75,20 @@ def training(device: Device, rng: np.random.Generator) -> Results:
     start["sh_base"] *= 0  # gray
     values, tables = train(device, case, start, STEPS)
     again, same = train(device, case, start, len(values))
-    count, what = len(tables["means"]), f"{len(values)} steps"
+    count, label = len(tables["means"]), f"{len(values)} steps"
     yield Note("training", {"steps": len(values), "losses": [values[0], values[-1]], "gaussians": count})
-    yield equal("training", f"losses of {what}, a second time", np.array(again), np.array(values[: len(again)]))
+    yield equal("training", f"losses of {label}, a second time", np.array(again), np.array(values[: len(again)]))
     for name, table in tables.items():
         if table.shape != same[name].shape:
-            difference, where = abs(len(same[name]) - count), f"rows of {name} after {what}, a second time"
+            difference, where = abs(len(same[name]) - count), f"rows of {name} after {label}, a second time"
             yield Deviation("training", where, difference, 0, counts=True)
         else:
             bits = same[name].view(np.uint32), table.view(np.uint32)
-            yield equal("training", f"{name} after {what}, a second time", *bits)
+            yield equal("training", f"{name} after {label}, a second time", *bits)
     finite = sum(int(np.count_nonzero(~np.isfinite(table))) for table in tables.values())
-    yield Deviation("training", f"values that are not finite after {what}", finite, 0, counts=True)
+    yield Deviation("training", f"values that are not finite after {label}", finite, 0, counts=True)
     if len(values) == STEPS:
-        yield Deviation("training", f"the loss after {what}, as a share of the first one", values[-1] / values[0], 0.7)
+        yield Deviation("training", f"the loss after {label}, as a share of the first one", values[-1] / values[0], 0.7)
 
 
 @SPEED.add()
@@ -123,9 +123,9 @@ def _check_buffer(device: Device, size: int) -> Results:
     whole.fill(1.5)
     Array(device, whole.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not show up at the other end
     places = [*range(0, size // 4, max(1, size // 4 // 64)), size // 4 - 1]
-    found = np.array([whole.get_item(i) for i in places])
-    expected = np.where(np.arange(len(found)) == 0, 2.5, 1.5)
-    yield equal("fill_words", f"samples of a buffer of {size / 2**20:,.0f} MiB", found, expected)
+    actual = np.array([whole.get_item(i) for i in places])
+    expected = np.where(np.arange(len(actual)) == 0, 2.5, 1.5)
+    yield equal("fill_words", f"samples of a buffer of {size / 2**20:,.0f} MiB", actual, expected)
 
 
 @SPEED.add("peak_fma", "peak_exp", "peak_copy")
