@@ -60,7 +60,7 @@ class Commands(TyperGroup):
 
             self.commands[cmd_name] = data = typer.main.get_command(tools)
             data.name = cmd_name
-            data.short_help = "Prepare datasets: photos, video, undistort, resize, masks, cameras, …"
+            data.short_help = "Prepare datasets: photos, video, undistort, cameras, …"
         return super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

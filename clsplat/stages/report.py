@@ -182,7 +182,7 @@ def _measured(run: Run, trial: bool = False) -> list[Line]:
 
 
 def gaussians_charts(run: Run) -> list[Markup]:
-    """Draw distributions of size, shape and opacity, effects of the density rules, and PSNR by number of Gaussians."""
+    """Draw distributions of size, shape and opacity, and effects of the density rules."""
     lines = run.records.read("distribution")
     if len(lines) < 2:
         return []
@@ -196,35 +196,18 @@ def gaussians_charts(run: Run) -> list[Markup]:
             curve("size (rms scale, scene units), quantiles", quantiles("size"), logarithmic=True),
             curve("anisotropy (longest / shortest axis), quantiles", quantiles("anisotropy"), logarithmic=True),
             curve("opacity, quantiles", quantiles("opacity")),
-            curve("Gaussians changed by each rule, total", _totals(run, "causes")),
-            curve("fraction of growth so far, by rule", _shares(_totals(run, "grown"))),
-            curve("test PSNR, dB, over thousands of Gaussians", _psnr_by_gaussians(run)),
+            curve("Gaussians changed by each rule, total", _totals(run)),
         ]
     )
 
 
-def _totals(run: Run, key: str) -> list[Line]:
-    """Return the numbers of Gaussians that each density rule has changed or added so far.  key: of the record."""
+def _totals(run: Run) -> list[Line]:
+    """Return the numbers of Gaussians that each density rule has changed so far."""
     edits = run.records.read("densify")
-    names = dict.fromkeys(name for edit in edits for name in edit.get(key, {}))
-    totals = {name: np.cumsum([edit.get(key, {}).get(name, 0) for edit in edits]) for name in names}
+    names = dict.fromkeys(name for edit in edits for name in edit["causes"])
+    totals = {name: np.cumsum([edit["causes"].get(name, 0) for edit in edits]) for name in names}
     steps = [edit["step"] for edit in edits]
     return [Line(list(zip(steps, map(float, total), strict=True)), name) for name, total in totals.items()]
-
-
-def _shares(lines: Sequence[Line]) -> list[Line]:
-    """Divide lines by their sum where it is not zero; drop lines that are always zero."""
-    sums = np.sum([[y for _, y in line.points] for line in lines], axis=0) if lines else []
-    shares = [[(x, y / total) for (x, y), total in zip(line.points, sums, strict=True) if total > 0] for line in lines]
-    return [Line(points, line.name) for points, line in zip(shares, lines, strict=True) if any(y for _, y in points)]
-
-
-def _psnr_by_gaussians(run: Run) -> list[Line]:
-    """Return test PSNR over the number of Gaussians, in order of steps: where Gaussians are pruned, it turns back."""
-    counts = {r["step"]: r["gaussians"] for r in run.records.read("train") if "gaussians" in r}
-    tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["downscale"] == run.downscale]
-    points = {r["step"]: (counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts}
-    return [Line(list(points.values()))]
 
 
 # Overfitting.
