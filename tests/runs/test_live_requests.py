@@ -89,7 +89,7 @@ def test_an_impossible_camera_is_refused(text):
 @pytest.mark.parametrize("text", ["x", "nan", "1.01", "-0.1"])
 def test_a_moment_is_from_0_to_1(text):
     assert moment("0.35") == 0.35
-    with pytest.raises(Refused, match="time: expected a number from 0"):
+    with pytest.raises(Refused, match="time: expected a timestamp from 0"):
         moment(text)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.runs.live import server as module
-from clsplat.runs.live.preview import MOST, Credit, EncodedPicture, Orders, PageCamera
+from clsplat.runs.live.preview import MAX_WAITING, Credit, EncodedPicture, Orders, PageCamera
 from clsplat.runs.live.server import Answer, Server
 
 
@@ -111,7 +111,7 @@ def test_used_port_is_one_sentence_or_the_next_one_is_taken(server):
     with pytest.raises(ConfigError, match=rf"--live: port {server.port} of 127.0.0.1 cannot be used \(.*\); give ano"):
         Server(server.port, "token", server.answer)
     other = Server(0, "token", server.answer)
-    assert server.port < other.port < module.PORT + module.TRIED
+    assert server.port < other.port < module.PORT + module.PORTS
     other.stop()
 
 
@@ -152,7 +152,7 @@ def asked(orders: Orders, *wanted: PageCamera) -> list[threading.Thread]:
 
 def test_motion_comes_before_rest_and_the_queue_is_short():
     orders, picture = Orders(), EncodedPicture(b"", 1)
-    wanted = [PageCamera(page, None, "again" if page < 2 else "moving") for page in range(MOST)]
+    wanted = [PageCamera(page, None, "again" if page < 2 else "moving") for page in range(MAX_WAITING)]
     threads = asked(orders, *wanted)
     assert not orders.ask(PageCamera(99, None, "moving"), 0)
     for order in (wanted[2], wanted[3], wanted[0], wanted[1]):
